@@ -43,7 +43,7 @@ import numpy as np
 import shapely
 
 from bench.carlasgg_frames import CONFIG, Edge, Ours, View, theirs
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY
+from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

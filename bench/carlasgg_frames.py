@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sgstore.config import preset
-from sgstore.map_files import read_map_file
-from sgstore.opendrive import read_map
+from sgstore.graphs.relations import IS_SIGNAL
+from sgstore.graphs.relations._scene import IS_VEHICLE
+from sgstore.maps.map_files import read_map_file
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import preset
+from sgstore.model.vocabulary import KIND_CODE, KINDS, LIGHT_STATES, RELATIONS
 from sgstore.readers import open_trace
-from sgstore.relations import IS_SIGNAL
-from sgstore.relations._scene import IS_VEHICLE
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
-from sgstore.vocabulary import KIND_CODE, KINDS, LIGHT_STATES, RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.config import Config
-    from sgstore.graph import GraphBlock
+    from sgstore.model.config import Config
+    from sgstore.model.graph import GraphBlock
 
 Edge = tuple[str, str, str]
 

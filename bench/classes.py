@@ -22,7 +22,7 @@ from networkx.algorithms.isomorphism import DiGraphMatcher
 
 from bench.ingest import CARS, MINUTE, recording
 from bench.measure import Measure
-from sgstore.abstractions import (
+from sgstore.graphs.abstractions import (
     AT_INGEST,
     Classes,
     GraphColumns,
@@ -30,9 +30,9 @@ from sgstore.abstractions import (
     MapColumns,
     abstraction_named,
 )
-from sgstore.config import Config
 from sgstore.ingest import BLOCK_FRAMES
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.graph import GraphBlock
+    from sgstore.model.graph import GraphBlock
 
 THEIRS = 12
 """Graphs that networkx gets."""

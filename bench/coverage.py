@@ -25,9 +25,22 @@ import numpy as np
 from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 
 from bench.measure import Measure
-from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named
-from sgstore.config import Config
-from sgstore.coverage import (
+from sgstore.graphs.abstractions import Classes, GraphColumns, MapColumns, abstraction_named
+from sgstore.model.config import Config
+from sgstore.model.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence, named_graph
+from sgstore.model.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY, RELATION_CODE, RELATIONS
+from sgstore.model.world import (
+    Channel,
+    Entities,
+    FrameBlock,
+    MessageRefs,
+    States,
+    TraceInfo,
+    TraceReport,
+)
+from sgstore.pipeline.importing._run import parts_map
+from sgstore.store import StoreFile
+from sgstore.testsets.coverage import (
     classed,
     classes,
     combos,
@@ -37,11 +50,6 @@ from sgstore.coverage import (
     novel,
     selection_of,
 )
-from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence, named_graph
-from sgstore.importing._run import parts_map
-from sgstore.store import StoreFile
-from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY, RELATION_CODE, RELATIONS
-from sgstore.world import Channel, Entities, FrameBlock, MessageRefs, States, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -49,7 +57,7 @@ if TYPE_CHECKING:
     import networkx as nx
     from numpy.typing import NDArray
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
     Ints = NDArray[np.int64]
 

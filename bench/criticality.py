@@ -5,8 +5,9 @@
     python -m bench criticality [--quick]
 
 Pairs are boxes that move and accelerate, half of them one behind the other. What is told is processor time of
-arrays (:class:`~sgstore.pair_numbers.PairNumbers`), each measure with all that it is made of; ``--quick`` takes
-a tenth of the pairs. Floors: the closed forms 1 s, searches of manoeuvres, which are closed forms here, 20 s.
+arrays (:class:`~sgstore.model.pair_numbers.PairNumbers`), each measure with all that it is made of; ``--quick``
+takes a tenth of the pairs. Floors: the closed forms 1 s, searches of manoeuvres, which are closed forms here,
+20 s.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.measure import Measure
-from sgstore.pair_numbers import PAIR_FUNCTIONS, PairNumbers
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS, PairNumbers
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,7 +29,7 @@ TOGETHER = 1 << 14
 
 
 def pairs(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """States of both, as columns of :data:`sgstore.pair_numbers.COLUMNS`."""
+    """States of both, as columns of :data:`sgstore.model.pair_numbers.COLUMNS`."""
     rng = np.random.default_rng(seed)
     found: list[np.ndarray] = []
     for _ in "ab":

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sgstore.vocabulary import KIND_CODE
-from sgstore.world import Channel, Entities, FrameBlock, MessageRefs, States, TraceInfo
+from sgstore.model.vocabulary import KIND_CODE
+from sgstore.model.world import Channel, Entities, FrameBlock, MessageRefs, States, TraceInfo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

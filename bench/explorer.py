@@ -32,10 +32,10 @@ import httpx
 
 from bench.measure import Measure
 from bench.real import QUICK, TRACES, made
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
+from sgstore.apps.report import report
 from sgstore.ingest import ingest
 from sgstore.query import Store
-from sgstore.report import report
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 from recordings import Recorder, car, person

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sgstore.compiled import compiled, use_loops
-from sgstore.roads._footprints import _Shapes
+from sgstore.base.compiled import compiled, use_loops
+from sgstore.maps.roads._footprints import _Shapes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sgstore.roads import RoadMap
-    from sgstore.world import FrameBlock
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.world import FrameBlock
 
 BOUNDS = np.array([2.0, 4.0, 7.0, 10.0, 16.0, 25.0]) ** 2
 

@@ -22,9 +22,9 @@ from typing import TYPE_CHECKING
 from bench.measure import Measure
 from bench.replicas import DATA
 from bench.sgg import town
-from sgstore.config import Config
 from sgstore.ingest import BLOCK_FRAMES, ingest
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile

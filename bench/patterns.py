@@ -30,12 +30,12 @@ from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 from bench import drives, peers
 from bench.least_bytes import sizes
 from bench.measure import Measure
-from sgstore.config import Config, PairSettings
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, PairSettings
+from sgstore.model.world import TraceReport
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -23,9 +23,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from bench.measure import Measure
-from sgstore.coverage import selection_of
-from sgstore.importing import import_graphs
-from sgstore.selection import (
+from sgstore.pipeline.importing import import_graphs
+from sgstore.testsets.coverage import selection_of
+from sgstore.testsets.selection import (
     MEASURES,
     Priority,
     PrioritySpec,
@@ -37,7 +37,7 @@ from sgstore.selection import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from sgstore.coverage import ChosenFrames
+    from sgstore.testsets.coverage import ChosenFrames
 
 Size = tuple[str, float | None, float | None]
 STRATEGIES: Final = {"random": "random strategy", "rl_based": "reinforcement learning"}

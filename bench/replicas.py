@@ -23,20 +23,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sgstore.config import Config
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
+from sgstore.model.vocabulary import KIND_CODE, kinds_labelled
+from sgstore.model.world import Origin, origin_of, quantize
 from sgstore.readers import on_map, open_trace
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.store import StoreFile
-from sgstore.vocabulary import KIND_CODE, kinds_labelled
-from sgstore.world import Origin, origin_of, quantize
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
-    from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import FrameBlock, States, TraceInfo, TraceReport
 
 DATA = Path(os.environ.get("SGSTORE_DATA") or Path(__file__).parents[2] / "shared/data").resolve()
 RECORDINGS = (

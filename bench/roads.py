@@ -22,13 +22,13 @@ import numpy as np
 import shapely
 
 from bench.measure import Measure
-from sgstore.opendrive import parse_map, read_map
-from sgstore.vocabulary import RELATION_CODE
+from sgstore.maps.opendrive import parse_map, read_map
+from sgstore.model.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 APART = 120.0
 """Distance of junctions; m."""

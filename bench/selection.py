@@ -23,10 +23,10 @@ import numpy as np
 
 from bench.coverage import PARTS, Library, made
 from bench.measure import Measure
-from sgstore.coverage import selection_of
 from sgstore.errors import ConfigError
-from sgstore.importing._run import parts_map
-from sgstore.selection import Budget, SelectionSpec, SelectionUnit, Strategy, curve, select
+from sgstore.pipeline.importing._run import parts_map
+from sgstore.testsets.coverage import selection_of
+from sgstore.testsets.selection import Budget, SelectionSpec, SelectionUnit, Strategy, curve, select
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -20,22 +20,22 @@ import numpy as np
 import sgstore
 from bench.floor import floor
 from bench.measure import Measure
-from sgstore import compiled
-from sgstore.config import Config, LaneSettings
-from sgstore.opendrive import read_map
+from sgstore.base import compiled
+from sgstore.graphs.relations._bearing import BESIDE
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, LaneSettings
+from sgstore.model.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY
+from sgstore.model.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, States
 from sgstore.readers import open_trace
-from sgstore.relations._bearing import BESIDE
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY
-from sgstore.world import BUCKET_FRAMES, Entities, FrameBlock, MessageRefs, States
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 SECOND = 1_000_000_000
-SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+SAMPLE = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
 NO_MESSAGES = MessageRefs(*(np.zeros(0, np.int64) for _ in range(5)))
 
 

@@ -23,7 +23,7 @@ import duckdb
 
 import sgstore
 from bench.measure import Measure
-from sgstore.sandbox import Sandbox
+from sgstore.apps.sandbox import Sandbox
 from sgstore.store._locking import Access
 from sgstore.store._staging import scratch
 
@@ -120,7 +120,7 @@ def run(quick: bool = False) -> list[Measure]:
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "town.sgstore"
         with sgstore.open(path, create=True) as store:
-            store.ingest(Path(sgstore.__file__).parent / "sample" / "town.mcap")
+            store.ingest(Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap")
         table = list(small_questions(path, 20 * times))
         for number, how, label in (
             (0, "", "a writer alone has the file after"),

@@ -21,19 +21,19 @@ import duckdb
 from bench.ingest import CARS, MINUTE, recording
 from bench.least_bytes import bytes_of, sizes
 from bench.measure import Measure
-from sgstore.config import Config
 from sgstore.ingest import BLOCK_FRAMES
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
+from sgstore.model.vocabulary import KINDS, RELATIONS
+from sgstore.model.world import TraceReport
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.vocabulary import KINDS, RELATIONS
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
-    from sgstore.world import TraceInfo
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import TraceInfo
 
 BASELINE_FRAMES = 20
 BYTES = 300

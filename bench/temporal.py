@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from bench.measure import Measure
-from sgstore.step import Frame
+from sgstore.graphs.online import Frame
 from sgstore.temporal import Monitor, MonitorEvent, evaluate
 from sgstore.temporal._formula import Bound, Not, Or, Proposition, Since, Until, always, eventually
 from sgstore.temporal._robustness import MarginTable
@@ -31,8 +31,8 @@ from oracle_robustness import of_rtamt  # pyright: ignore[reportMissingImports]
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from sgstore.model.world import Bools, Floats, Ints
     from sgstore.temporal import Formula
-    from sgstore.world import Bools, Floats, Ints
 
 FORMULAS: Final = (
     "ALWAYS NOT a",

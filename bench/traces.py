@@ -31,8 +31,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 from bench.measure import Measure
 from sgstore.mcap import McapFile, read_chunk_head
+from sgstore.model.world import TraceReport
 from sgstore.readers import open_trace
-from sgstore.world import TraceReport
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 import carla_recordings

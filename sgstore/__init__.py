@@ -23,7 +23,7 @@ _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def load_ipython_extension(ipython: object) -> None:
     """Make ``%%sgql`` and pictures of graphs known to a notebook: ``%load_ext sgstore``."""
-    from sgstore.notebook import load
+    from sgstore.apps.notebook import load
 
     load(ipython)
 

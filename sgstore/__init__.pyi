@@ -2,7 +2,7 @@
 
 from .collection import Collection as Collection
 from .collection import open as open
-from .config import Config as Config
+from .model.config import Config as Config
 from .errors import AbstractionError as AbstractionError
 from .errors import ConfigError as ConfigError
 from .errors import ExportError as ExportError
@@ -13,23 +13,23 @@ from .errors import SgstoreError as SgstoreError
 from .errors import SqlError as SqlError
 from .errors import StoreError as StoreError
 from .errors import TraceError as TraceError
-from .graph import SceneGraph as SceneGraph
+from .model.graph import SceneGraph as SceneGraph
 from .lang import Pattern as Pattern
-from .map_files import read_map_file as read_map_file
+from .maps.map_files import read_map_file as read_map_file
 from .matches import Interval as Interval
 from .matches import Matches as Matches
 from .query import ClipAnimation as ClipAnimation
 from .query import Store as Store
 from .query import StoreFrame as StoreFrame
 from .sgg import SceneGraphGenerator as SceneGraphGenerator
-from .step import Frame as Frame
+from .graphs.online import Frame as Frame
 from .store import FrameRef as FrameRef
 from .store import duckdb as duckdb
 from .store import Rows as Rows
 from .temporal import CheckRun as CheckRun
 from .temporal import Monitor as Monitor
 from .temporal import Verdict as Verdict
-from .world import Clip as Clip
+from .model.world import Clip as Clip
 
 __version__: str
 

@@ -1,5 +1,5 @@
 """``python -m sgstore``: the command line."""
 
-from sgstore.cli import main
+from sgstore.apps.cli import main
 
 main()

@@ -19,17 +19,17 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from sgstore.config import Config
+from sgstore.base.logs import logger
+from sgstore.base.processes import command
 from sgstore.errors import SgstoreError, StoreError, TraceError, failure, url_named
-from sgstore.logs import logger
-from sgstore.map_files import Maps
+from sgstore.maps.map_files import Maps
 from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of, remote_names
-from sgstore.processes import command
+from sgstore.model.config import Config
+from sgstore.model.trace_parts import TracePart
+from sgstore.model.world import BUCKET_FRAMES
+from sgstore.pipeline.segments import Job, Progress, SegmentReader, TraceOutcome
 from sgstore.readers import ENDINGS, is_recording
-from sgstore.segments import Job, Progress, SegmentReader, TraceOutcome
 from sgstore.store import Folder, PresentError, Sealed, StoreFile, refuse_name
-from sgstore.trace_parts import TracePart
-from sgstore.world import BUCKET_FRAMES
 
 _log = logger("ingest")
 
@@ -248,7 +248,7 @@ class Workers:
         while len(self._workers) < count:
             separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
             process = subprocess.Popen(  # noqa: S603  a module of ours
-                command("sgstore.segments"),
+                command("sgstore.pipeline.segments"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 encoding="utf-8",

@@ -18,6 +18,8 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from sgstore.base.quoting import quoted
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, SgstoreError
 from sgstore.lang import (
     Compiled,
@@ -30,8 +32,8 @@ from sgstore.lang import (
     rewritten,
 )
 from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
-from sgstore.quoting import quoted
-from sgstore.records import dataclass
+from sgstore.model.vocabulary import natural
+from sgstore.model.world import Clip, tolerance_ns
 from sgstore.store import (
     IN_NOTEBOOK,
     SEQ_BITS,
@@ -43,8 +45,6 @@ from sgstore.store import (
     scope_of,
     write_batches,
 )
-from sgstore.vocabulary import natural
-from sgstore.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog, Compared, Gathered, SqlStatement, UnionParts
     from sgstore.lang.ir import Query
     from sgstore.store import Given, StoreFile
-    from sgstore.truth_lanes import TruthLanes
+    from sgstore.temporal.truth_lanes import TruthLanes
 
 SHOWN: Final = 80
 """Maximum length of the query text in the repr of matches; characters."""
@@ -178,7 +178,7 @@ class Matches(Tabular):
 
     def _repr_html_(self) -> str:
         """Return HTML for notebooks: the first rows, the number of frames, and pictures of the first scenes."""
-        from sgstore.display import html_table
+        from sgstore.base.display import html_table
 
         with self._file.snapshot():
             columns, rows = self.for_people()
@@ -192,7 +192,7 @@ class Matches(Tabular):
 
     def _pictures(self) -> Iterator[str]:
         """Yield small pictures of the first frame of the first intervals, or nothing if drawing fails."""
-        from sgstore.display import html_media
+        from sgstore.base.display import html_media
         from sgstore.draw import thumbnail
 
         before: FrameRef | None = None
@@ -329,7 +329,9 @@ class Matches(Tabular):
 
         See :meth:`sgstore.Store.parts`.
         """
-        from sgstore.truth_lanes import truth_lanes  # with numpy, which a question does without
+        from sgstore.temporal.truth_lanes import (
+            truth_lanes,  # with numpy, which a question does without
+        )
 
         with self._compiled() as compiled:
             found = self.bindings(frame) if binding is None else [dict(binding)]
@@ -354,7 +356,7 @@ class Matches(Tabular):
         graph has the attributes ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``t``, and the other values
         of ``RETURN SUBGRAPHS``.
         """
-        from sgstore.graph import graph_of_records
+        from sgstore.model.graph import graph_of_records
 
         with self._compiled() as compiled:
             layout = Layout.of(compiled.bound)

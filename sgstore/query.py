@@ -8,11 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
-from sgstore.criticality import KNOWN
+from sgstore.base.records import dataclass
 from sgstore.errors import StoreError, place_named, url_named
 from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
-from sgstore.records import dataclass
+from sgstore.model.criticality import KNOWN
+from sgstore.model.vocabulary import normalize_name
 from sgstore.store import (
     IN_NOTEBOOK,
     FrameRef,
@@ -20,7 +21,6 @@ from sgstore.store import (
     UserTables,
     measured,
 )
-from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from sgstore.lang import Catalog, FrameView, Pattern, WhyNot, WhyNotSteps
     from sgstore.lang.ir import Query
     from sgstore.matches import Interval, Matches
-    from sgstore.segments import TraceOutcome
+    from sgstore.model.world import Clip
+    from sgstore.pipeline.segments import TraceOutcome
     from sgstore.store import Rows, SimilarFrames, StoredTrace
     from sgstore.temporal import CheckRun, ShortestClip
-    from sgstore.truth_lanes import TruthLanes
-    from sgstore.world import Clip
+    from sgstore.temporal.truth_lanes import TruthLanes
 
 
 class StoreFrame:
@@ -113,7 +113,7 @@ class ClipAnimation:
         return f"<ClipAnimation from {self.frames[0]!r} to {self.frames[1]!r}: {self.form}>"
 
     def _repr_html_(self) -> str:
-        from sgstore.display import html_media
+        from sgstore.base.display import html_media
 
         kind = "image/gif" if self.form == "gif" else f"video/{self.form}"
         return html_media(self.data, kind, f"{self.frames[0]} to {self.frames[1]}")
@@ -126,8 +126,8 @@ class ClipAnimation:
         ExportError
             The file suffix does not match the form of the animation, or the file is not writable.
         """
+        from sgstore.base.files import write_bytes
         from sgstore.errors import ExportError
-        from sgstore.files import write_bytes
 
         if Path(path).suffix != f".{self.form}":
             raise ExportError(f"{path}: the animation is a {self.form}; expected .{self.form}")
@@ -201,7 +201,7 @@ class Store:
 
     def _repr_html_(self) -> str:
         """Return the traces as an HTML table, for notebooks."""
-        from sgstore.display import html_table
+        from sgstore.base.display import html_table
 
         columns = ("trace", "frames", "seconds", "ego", "map", "flavour")
         traces = self.traces()
@@ -382,7 +382,7 @@ class Store:
         -------
         networkx.MultiDiGraph
             Without an abstraction: node ids with all known attributes; see
-            :meth:`sgstore.graph.SceneGraph.to_networkx`. With an abstraction: names as in the literature
+            :meth:`sgstore.model.graph.SceneGraph.to_networkx`. With an abstraction: names as in the literature
             (``ego``, ``car_12``, ``Ego Lane``, ``Lane 5_-1``), with the attributes ``name`` and ``base_class``,
             and edges with the attribute ``label``.
 
@@ -393,8 +393,8 @@ class Store:
         AbstractionError
             The abstraction does not exist.
         """
-        from sgstore.abstractions import abstractions
-        from sgstore.graph import named_graph
+        from sgstore.graphs.abstractions import abstractions
+        from sgstore.model.graph import named_graph
 
         if abstraction is None:
             return self.file.graph(_ref(frame)).to_networkx()
@@ -629,8 +629,8 @@ class Store:
         MissingExtraError
             The packages for drawing are not installed.
         """
+        from sgstore.base.files import working_folder
         from sgstore.draw import draw_clip
-        from sgstore.files import working_folder
 
         frames = self._range_of(clip)
         matches = None if query is None else self.find(query)
@@ -807,7 +807,7 @@ class Store:
     def _view(self, frame: FrameRef, query: Query) -> FrameView:
         """Return a frame for evaluation in memory, with the store values that the query needs."""
         from sgstore.lang import FrameView, events_in, looked_up
-        from sgstore.world import seconds_of
+        from sgstore.model.world import seconds_of
 
         trace = self.file.trace(frame.trace_id)
         about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}

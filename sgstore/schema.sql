@@ -391,7 +391,7 @@ FROM inside.frame f JOIN inside.gap_repeated g ON g.bucket = f.bucket AND (g.mas
 
 COMMENT ON VIEW main.lane_gaps IS 'How far it is along the lanes: one row for each edge src follows dst (and dst leads src). gap: from bumper to bumper along the centre lines, m; 0 where they overlap, NULL where a length is not known.';
 
--- Pairs are not stored: they are functions of two states. Their numbers are declared in sgstore/pair_numbers, which also
+-- Pairs are not stored: they are functions of two states. Their numbers are declared in sgstore/model/pair_numbers, which also
 -- writes the SELECT of this view, with a column for each of them, and what its comment says of them.
 CREATE VIEW main.pairs AS {{pairs}};
 

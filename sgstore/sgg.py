@@ -1,12 +1,12 @@
 """Scene graph generator: converts frames and a road map into scene graphs, block by block.
 
 *Contents of a graph.* The range of an ego is a disc around its centre or another area; see
-:mod:`sgstore.relations._extent`. An entity is in range if its footprint meets the area. An entity without a
-size counts as a point. An entity without a position is out of range, except the ego. *Frames without an ego*,
-or with an ego without a position, have no range: their graphs contain all entities and the whole map, and no
-ego relations. :meth:`sgstore.relations._map_context.LaneContact.ground` selects the map parts; the static edges
-among them come from the map. Excluded entities and relations (:mod:`sgstore.relations._registry`) are
-treated as absent.
+:mod:`sgstore.graphs.relations._extent`. An entity is in range if its footprint meets the area. An entity
+without a size counts as a point. An entity without a position is out of range, except the ego. *Frames without
+an ego*, or with an ego without a position, have no range: their graphs contain all entities and the whole map,
+and no ego relations. :meth:`sgstore.graphs.relations._map_context.LaneContact.ground` selects the map parts;
+the static edges among them come from the map. Excluded entities and relations
+(:mod:`sgstore.graphs.relations._registry`) are treated as absent.
 
 *Surroundings of a graph.* Entities within ``[range] world`` of the ego, but outside its graph. The same
 functions compute their states, static entities, map parts and lane places, but no edges.
@@ -23,13 +23,18 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore import compiled
-from sgstore.abstractions import Classes, GraphColumns, MapColumns, abstraction_named, lane_roles
-from sgstore.columns import chained, taken
+from sgstore.base import compiled
+from sgstore.base.columns import chained, taken
 from sgstore.errors import ConfigError
-from sgstore.graph import Edges, GraphBlock, LaneStates, LeftOut, StaticPresence, WorldBlock
-from sgstore.pair_numbers import UNEVEN, all_level
-from sgstore.relations import (
+from sgstore.graphs.abstractions import (
+    Classes,
+    GraphColumns,
+    MapColumns,
+    abstraction_named,
+    lane_roles,
+)
+from sgstore.graphs.online import Stepper
+from sgstore.graphs.relations import (
     IS_SIGNAL,
     IS_UPRIGHT,
     IS_USER,
@@ -60,22 +65,23 @@ from sgstore.relations import (
     renamed,
     waypoints_of,
 )
-from sgstore.step import Stepper
-from sgstore.vocabulary import BEYOND, OWN_RELATIONS, RELATION_CODE, RELATIONS
-from sgstore.world import States
+from sgstore.model.graph import Edges, GraphBlock, LaneStates, LeftOut, StaticPresence, WorldBlock
+from sgstore.model.pair_numbers import UNEVEN, all_level
+from sgstore.model.vocabulary import BEYOND, OWN_RELATIONS, RELATION_CODE, RELATIONS
+from sgstore.model.world import States
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from sgstore.config import Config
-    from sgstore.graph import LaneGaps, SceneGraph, Whole
+    from sgstore.graphs.online import Frame
+    from sgstore.graphs.relations import Areas, MapContext, Standing
+    from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Loss
-    from sgstore.relations import Areas, MapContext, Standing
-    from sgstore.roads import RoadMap
-    from sgstore.step import Frame
-    from sgstore.world import Bools, Codes, Floats, FrameBlock, Ints
+    from sgstore.model.config import Config
+    from sgstore.model.graph import LaneGaps, SceneGraph, Whole
+    from sgstore.model.world import Bools, Codes, Floats, FrameBlock, Ints
 
     Rows = NDArray[np.intp]
     Gathered = tuple[tuple[Rows, Rows], Bools]
@@ -447,7 +453,7 @@ class SceneGraphGenerator:
         Parameters
         ----------
         frame : Frame
-            See :class:`sgstore.step.Frame`.
+            See :class:`sgstore.graphs.online.Frame`.
         egos : sequence of str
             Ids of the egos. An empty id means the ego of the frame, else that of the config.
 
@@ -465,7 +471,8 @@ class SceneGraphGenerator:
 
         Notes
         -----
-        Memory does not grow with time: see :mod:`sgstore.step`. Steps and blocks are independent of each other.
+        Memory does not grow with time: see :mod:`sgstore.graphs.online`. Steps and blocks are independent of
+        each other.
         """
         if self._online is None:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
@@ -519,7 +526,7 @@ class SceneGraphGenerator:
         Returns
         -------
         dict
-            Role by node id, for lanes with a known role; see :func:`sgstore.abstractions.lane_roles`.
+            Role by node id, for lanes with a known role; see :func:`sgstore.graphs.abstractions.lane_roles`.
 
         Raises
         ------

@@ -9,7 +9,7 @@ from textwrap import dedent
 from typing import Any
 
 import sgstore
-from sgstore.relations import as_markdown
+from sgstore.graphs.relations import as_markdown
 from sgstore.store import Tabular
 
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"

@@ -17,9 +17,9 @@ import numpy as np
 import shapely
 import shapely.affinity
 
-from sgstore.config import Config
-from sgstore.geometry import wrapped
-from sgstore.roads import (
+from sgstore.base.geometry import wrapped
+from sgstore.graphs.online import Frame
+from sgstore.maps.roads import (
     STOREY,
     LaneCourses,
     LaneHits,
@@ -29,13 +29,13 @@ from sgstore.roads import (
     Ribbons,
     RoadMap,
 )
+from sgstore.model.config import Config
+from sgstore.model.vocabulary import KIND_CODE, RELATION_CODE, RELATIONS
+from sgstore.model.world import Entities, Floats, FrameBlock, Ints, MessageRefs, States
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE, RELATIONS
-from sgstore.world import Entities, Floats, FrameBlock, Ints, MessageRefs, States
 
 if TYPE_CHECKING:
-    from sgstore.graph import GraphBlock
+    from sgstore.model.graph import GraphBlock
 
 NO_MESSAGES = MessageRefs(*(np.zeros(0, np.int64) for _ in range(5)))
 

@@ -21,14 +21,14 @@ from mcap_ros2._dynamic import serialize_dynamic
 from opendrive_maps import a_map, a_road, element, line
 from recordings import COMPRESSIONS
 
+from sgstore.model.vocabulary import KINDS
 from sgstore.readers import open_trace
-from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from sgstore.world import FrameBlock, TraceInfo, TraceReport
+    from sgstore.model.world import FrameBlock, TraceInfo, TraceReport
 
 DEFINITIONS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",

@@ -23,6 +23,8 @@ AFFORDED_S = 90
 """Seconds of processor for tests; types take one of two processors for up to half a minute meanwhile."""
 SIDE_BY_SIDE = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
 TESTS = {
+    "arrays": "query pair_numbers",
+    "logs": "cli cli_people",
     "abstractions": "abstractions lane_roles classes",
     "cli": "cli cli_* junit",
     "columns": "roads relations ingest",
@@ -65,8 +67,8 @@ TESTS = {
     "sumo_net": "sumo",
     "sgg": "sgg sgg_* crowds world_rows",
     "notes": "serve",
-    "serve": "serve live report explorer sandbox_pool",
-    "step": "online identity",
+    "explorer": "serve live report explorer sandbox_pool",
+    "online": "online identity",
     "store": "everyday store store_* doors events world_rows",
     "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink"
     " windows tolerance clock",
@@ -78,7 +80,10 @@ TESTS = {
     "docs": "docs_* lang_docs",
     "README": "docs_*",
 }
-"""Room, or folder or page beside the package → names of test files, without ``test_``."""
+"""Package or part of one, or folder or page beside sgstore → names of test files, without ``test_``."""
+
+PARTS_OF = {"apps", "base", "graphs", "maps", "model", "pipeline", "testsets"}
+"""Packages whose parts have tests of their own."""
 
 WHOLE = {
     *("architecture", "docstrings", "frozen", "fuzz", "mutants", "packaging", "public_paths"),
@@ -103,6 +108,13 @@ def room_of(path: Path) -> str:
     return inside[0].partition(".")[0]
 
 
+def part_of(path: Path) -> str:
+    """The part of a package that has tests of its own, ``files`` of ``base/files.py``, or the package."""
+    package, *inside = path.parts[1:] if path.parts[0] == "sgstore" else path.parts
+    part = inside[0].partition(".")[0] if inside and package in PARTS_OF else "__init__"
+    return package.partition(".")[0] if part == "__init__" else part
+
+
 def patterns_of(room: str) -> list[str]:
     return TESTS.get(room, f"{room} {room}_*").split()
 
@@ -118,7 +130,7 @@ def tests_of(files: list[Path]) -> tuple[list[str], list[str]]:
         if path.parts[0] == "tests":
             always |= {path.stem.removeprefix("test_")} & known
         else:
-            wanted |= {name for one in patterns_of(room_of(path)) for name in fitting(known, one)}
+            wanted |= {name for one in patterns_of(part_of(path)) for name in fitting(known, one)}
     run, left = sorted(always), list[str]()
     spent = sum(map(seconds, run))
     for name in sorted(wanted - always, key=lambda name: (seconds(name), name)):

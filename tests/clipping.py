@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from sgstore.world import Clip, MessageRefs
+    from sgstore.model.world import Clip, MessageRefs
 
 
 class Source(NamedTuple):

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from mcap.writer import Writer
 
+from sgstore.model.world import TraceReport
 from sgstore.readers import open_recording
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,7 +17,7 @@ import pytest
 import typer.main
 from slow import seconds
 
-from sgstore import compiled
+from sgstore.base import compiled
 
 try:
     from hypothesis import HealthCheck, settings
@@ -96,7 +96,7 @@ def data() -> Path:
 @pytest.fixture(scope="session")
 def town_of_the_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the bundled recording, made by the first process of the run that asks; nobody writes to it."""
-    from sgstore.demo import RECORDING
+    from sgstore.apps.demo import RECORDING
     from sgstore.ingest import ingest
 
     run = tmp_path_factory.getbasetemp()
@@ -142,7 +142,7 @@ def kept_open() -> Iterator[Callable[[Path | str], None]]:
 @pytest.fixture
 def own_names() -> Iterator[None]:
     """Names of kinds, relations and states of lights that a test makes known are forgotten behind it."""
-    from sgstore import vocabulary
+    from sgstore.model import vocabulary
 
     growing = (
         *("_entity_kinds", "_kinds", "_kind_code", "_made_known"),

@@ -14,7 +14,7 @@ import shapely
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sgstore.world import Floats
+    from sgstore.model.world import Floats
 
 COLUMNS = ("x", "y", "z", "heading", "length", "width", "vx", "vy")
 STEP = 1e-3

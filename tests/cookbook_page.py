@@ -15,7 +15,7 @@ from roundabouts import circling, driven, roundabout
 from scenes import Scene, actor, along, ego, store_of, through
 
 from sgstore.ingest import ingest
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
 from sgstore.query import Store
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import shapely
 
-from sgstore.graph import SceneGraph
-from sgstore.roads import MapEdges, MapNodes, Ribbons, RoadMap
-from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY
+from sgstore.maps.roads import MapEdges, MapNodes, Ribbons, RoadMap
+from sgstore.model.graph import SceneGraph
+from sgstore.model.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY
 
 WIDTH = 3.5
 ARM = 80.0

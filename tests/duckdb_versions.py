@@ -94,7 +94,7 @@ def under_this_version(folder: Path) -> None:
     import duckdb
     from oracle import try_many
 
-    from sgstore.demo import RECORDING
+    from sgstore.apps.demo import RECORDING
     from sgstore.ingest import ingest
 
     version = duckdb.__version__

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from sgstore.errors import TextSpan
-    from sgstore.world import Bools, Ints
+    from sgstore.model.world import Bools, Ints
 
 
 def formula_of(text: str) -> Formula:

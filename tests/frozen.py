@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import sgstore
-from sgstore.cli import run as command_line
-from sgstore.demo import RECORDING
+from sgstore.apps.cli import run as command_line
+from sgstore.apps.demo import RECORDING
 from sgstore.ingest import ingest
 from sgstore.lang import patterns
 

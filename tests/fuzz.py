@@ -49,9 +49,9 @@ import sgstore
 import sgstore.mcap._reader as mcap_file
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest
+from sgstore.model.world import States
 from sgstore.readers import open_trace
 from sgstore.readers.osi._schema import fields_of
-from sgstore.world import States
 
 if TYPE_CHECKING:
     from collections.abc import Callable

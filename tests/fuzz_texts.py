@@ -24,19 +24,19 @@ from fuzz_queries import documented
 from recordings import drive
 
 import sgstore
-from sgstore.cli import run as command_line
-from sgstore.config import PRESETS, Config, as_toml, load, preset
-from sgstore.contrib.sgsm import translated
-from sgstore.demo import RECORDING
+from sgstore.apps.cli import run as command_line
+from sgstore.apps.demo import RECORDING
 from sgstore.draw import draw_frame
 from sgstore.errors import SgstoreError
+from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
-from sgstore.locks import cases_of, read_lock, verify
-from sgstore.opendrive import read_map
+from sgstore.lang.contrib.sgsm import translated
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import summary
+from sgstore.model.config import PRESETS, Config, as_toml, load, preset
 from sgstore.readers import open_trace
-from sgstore.roads import summary
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame
+from sgstore.testsets.locks import cases_of, read_lock, verify
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sgstore.config import Config
-from sgstore.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
-from sgstore.roads import LaneCourses, MapEdges, MapNodes, MapPlaces
-from sgstore.vocabulary import KIND_CODE, OWN_ENTITY_KINDS, OWN_RELATIONS, RELATION_CODE
-from sgstore.world import (
+from sgstore.maps.roads import LaneCourses, MapEdges, MapNodes, MapPlaces
+from sgstore.model.config import Config
+from sgstore.model.graph import Edges, GraphBlock, LaneGaps, LaneStates, StaticPresence
+from sgstore.model.vocabulary import KIND_CODE, OWN_ENTITY_KINDS, OWN_RELATIONS, RELATION_CODE
+from sgstore.model.world import (
     Channel,
     Entities,
     FrameBlock,

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parents[1] / "sgstore"
 
+INTERFACES_BELOW = {"apps", "base", "graphs", "maps", "model", "pipeline", "testsets"}
+"""Packages whose parts have an interface each."""
+
 WH = {"what", "whether", "who", "which", "where", "how", "when", "why", "whose"}
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
@@ -81,6 +84,13 @@ class House:
         """The length that a share of the functions do not exceed."""
         ordered = sorted(self.lengths)
         return ordered[min(int(len(ordered) * share), len(ordered) - 1)]
+
+
+def is_at_home(module: str, inner: str) -> bool:
+    """Tell whether a module may import an inner one: both are of one package, or of one part of a package."""
+    names = inner.split(".")
+    parts = 2 if names[0] in INTERFACES_BELOW and len(names) > 2 else 1
+    return module.split(".")[:parts] == names[:parts]
 
 
 def module_of(path: Path) -> str:
@@ -134,7 +144,7 @@ def _look_at(path: Path, modules: set[str], house: House) -> None:
         known = target.removeprefix("sgstore.")
         if known in modules and known != name:
             house.imports.add_edge(name, known)
-        if "._" in target and known.split(".")[0] != name.split(".")[0]:
+        if "._" in target and not is_at_home(name, known):
             house.past_faces.add((name, target))
 
 
@@ -195,7 +205,7 @@ def walk(verb: str, store: str) -> Walk:
     import sgstore
     from sgstore import ingest as ingesting
 
-    sample = PACKAGE / "sample" / "town.mcap"
+    sample = PACKAGE / "apps" / "sample" / "town.mcap"
     with Walk() as walked:
         if verb == "ingest":
             (outcome,) = ingesting.ingest(store, [sample])

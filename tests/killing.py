@@ -35,7 +35,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from opendrive_maps import a_map, a_road, line
 from recordings import Recorder, car, drive
 
-from sgstore.cli import run as sgstore
+from sgstore.apps.cli import run as sgstore
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
@@ -106,16 +106,16 @@ def serve() -> None:
 
     import duckdb  # noqa: F401
 
-    import sgstore.cli._process as ending
-    import sgstore.derive
+    import sgstore.apps.cli._process as ending
     import sgstore.exporters._write
-    import sgstore.importing
     import sgstore.ingest
-    import sgstore.locks
+    import sgstore.pipeline.derive
+    import sgstore.pipeline.importing
+    import sgstore.pipeline.rebuild
     import sgstore.query
-    import sgstore.rebuild
-    import sgstore.selection
-    from sgstore import cli
+    import sgstore.testsets.locks
+    import sgstore.testsets.selection
+    from sgstore.apps import cli
 
     cli.application()
     sgstore.ingest.BLOCK_FRAMES = 60

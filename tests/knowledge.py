@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 from scenes import crossroads, street
 
-from sgstore.config import Config, RangeSettings
-from sgstore.step import Frame
+from sgstore.graphs.online import Frame
+from sgstore.model.config import Config, RangeSettings
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Callable, Sequence
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
     from sgstore.temporal import Verdict
 
 Car = dict[str, Any]

@@ -24,11 +24,11 @@ from torch_geometric.loader import DataLoader
 from torch_geometric.nn import HeteroConv, RGCNConv, SAGEConv, global_add_pool, global_mean_pool
 
 import sgstore
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
 from sgstore.exporters import Export, labelled, write_export
 from sgstore.exporters.graph_data import GraphData, GraphDataset
 from sgstore.ingest import ingest
-from sgstore.world import Clip
+from sgstore.model.world import Clip
 
 LABEL = "EXISTS {(ego)-[:near_coll|super_near|very_near|near]->(:Person)}"
 CLIP_S = 5

@@ -14,7 +14,7 @@ from library_scenes import SCENES
 from scenes import LANE
 
 from sgstore.lang import patterns
-from sgstore.vocabulary import DRIVING
+from sgstore.model.vocabulary import DRIVING
 
 if TYPE_CHECKING:
     from scenes import Actor, Scene

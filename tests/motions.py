@@ -9,12 +9,12 @@ import numpy as np
 import shapely
 import shapely.affinity
 
-from sgstore.roads import RoadMap
-from sgstore.vocabulary import RELATION_CODE, VEHICLE_LIGHTS
+from sgstore.maps.roads import RoadMap
+from sgstore.model.vocabulary import RELATION_CODE, VEHICLE_LIGHTS
 
 if TYPE_CHECKING:
-    from sgstore.graph import GraphBlock
-    from sgstore.world import Floats, FrameBlock, States
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import Floats, FrameBlock, States
 
 LEFT, RIGHT = (1 << VEHICLE_LIGHTS.index(f"light_{side}") for side in ("left", "right"))
 SIDES = (RELATION_CODE["toLeftOf"], RELATION_CODE["toRightOf"])

@@ -64,7 +64,7 @@ ROOMS: Final[dict[str, tuple[str, ...]]] = {
         ),
         "test_classes.py",
     ),
-    "relations": (
+    "graphs/relations": (
         *("test_relations*.py", "test_extent.py", "test_lane_*.py", "test_sgg*.py"),
         *("test_crowds.py", "test_plugins.py", "test_compiled.py"),
     ),

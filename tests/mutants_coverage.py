@@ -152,7 +152,7 @@ def coverage_of(
 
 
 def _place(room: str, name: str, folder: Path) -> Path:
-    return folder / f"{room}-{name.removesuffix('.py')}.json"
+    return folder / f"{room.replace('/', '-')}-{name.removesuffix('.py')}.json"
 
 
 def _kept(room: str, name: str, folder: Path) -> dict | None:
@@ -195,7 +195,7 @@ def _measure(room: str, name: str, tree: Path, folder: Path) -> str:
         }
     text = digest((tree / "tests" / name).read_bytes())
     told = {"text": text, "seconds": seconds, "failed": noted["failed"], "lines": lines}
-    beside = folder / f".{room}-{name}"
+    beside = folder / f".{room.replace('/', '-')}-{name}"
     beside.write_text(json.dumps(told), encoding="utf-8")
     beside.replace(_place(room, name, folder))
     failed = f", FAILED and not used: {noted['failed']}" if noted["failed"] else ""

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
-from sgstore.vocabulary import SIGNALS
+from sgstore.model.vocabulary import SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

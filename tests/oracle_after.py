@@ -25,7 +25,7 @@ from oracle_patterns import SIMPLE, Writer
 
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
-from sgstore.vocabulary import natural
+from sgstore.model.vocabulary import natural
 
 if TYPE_CHECKING:
     from oracle import Binding, Compared

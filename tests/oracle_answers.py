@@ -34,7 +34,7 @@ from oracle_patterns import SIMPLE, Writer
 
 import sgstore
 from sgstore.errors import QueryError
-from sgstore.vocabulary import natural
+from sgstore.model.vocabulary import natural
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from sgstore.lanelet2 import Projection, lanelet2_text
-from sgstore.opendrive import read_map
-from sgstore.vocabulary import DRIVING, KINDS, RELATIONS
+from sgstore.maps.lanelet2 import Projection, lanelet2_text
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import DRIVING, KINDS, RELATIONS
 
 if TYPE_CHECKING:
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 EXAMPLE = "maps/lanelet2/mapping_example.osm"
 ORIGIN = (49.0, 8.4)

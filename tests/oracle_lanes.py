@@ -24,17 +24,17 @@ from test_lane_courses import by_elevation, by_its_points
 from test_lane_dist import FARTHEST, lane_ways
 from test_lane_places import PARTS, SORTS, columns_of, stretches, town, traffic
 
-from sgstore.config import Config
 from sgstore.lang import FrameView
+from sgstore.model.config import Config
+from sgstore.model.world import TraceReport
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
 from sgstore.temporal import Monitor
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
-    from sgstore.graph import SceneGraph
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import SceneGraph
 
     Place = tuple[int, float]
 

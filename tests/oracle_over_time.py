@@ -25,13 +25,13 @@ from oracle_worlds import random_world
 
 import sgstore
 from sgstore.errors import TextSpan
-from sgstore.graph import SceneGraph
 from sgstore.lang import parse
 from sgstore.lang import syntax as s
-from sgstore.pair_numbers import PAIR_FUNCTIONS, columns_needed
+from sgstore.model.graph import SceneGraph
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS, columns_needed
+from sgstore.model.vocabulary import normalize_name
 from sgstore.store import StoreFile
 from sgstore.temporal import Monitor
-from sgstore.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -17,13 +17,13 @@ from oracle_over_time import Told, many_ways, names_of, spelled_out, visible_nam
 from sgstore.errors import QueryError
 from sgstore.lang import Catalog, bind_query, parse
 from sgstore.lang import syntax as s
+from sgstore.model.world import longest_step_ns, tolerance_ns
 from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._offline import TimedRelation, TraceReader
 from sgstore.temporal._sequence_monitor import FrameTime
 from sgstore.temporal._sequences import Finder
 from sgstore.temporal._signals import Clock
 from sgstore.temporal._valuation import QueryCache, StreamClock
-from sgstore.world import longest_step_ns, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

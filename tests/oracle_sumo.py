@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from sgstore.map_files import read_map_file
+from sgstore.maps.map_files import read_map_file
+from sgstore.model.vocabulary import LIGHT_STATES
 from sgstore.readers import on_map, open_trace
-from sgstore.vocabulary import LIGHT_STATES
 
 STEPS, STEP = 240, 0.5
 TYPES = {"DEFAULT_VEHTYPE": "passenger", "city_bus": "bus", "a_bike": "bicycle", "lorry": "truck"}

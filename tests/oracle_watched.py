@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sgstore.config import Config
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
 from sgstore.errors import SgstoreError
 from sgstore.ingest import ingest
 from sgstore.lang import patterns
+from sgstore.model.config import Config
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.temporal import Monitor, opened
@@ -26,9 +26,9 @@ from sgstore.temporal import Monitor, opened
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from sgstore.graph import SceneGraph
+    from sgstore.maps.roads import RoadMap
     from sgstore.matches import Interval
-    from sgstore.roads import RoadMap
+    from sgstore.model.graph import SceneGraph
     from sgstore.temporal import MonitorEvent, Verdict
 
 CHECKS = """

@@ -16,9 +16,9 @@ import duckdb
 import networkx as nx
 
 from sgstore.lang import Catalog, TraceFacts
+from sgstore.model.vocabulary import MAP_KINDS
 from sgstore.store._locking import without_faults
 from sgstore.store._schema import schema_sql
-from sgstore.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
     from pathlib import Path

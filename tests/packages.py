@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).parents[1]
-RECORDING = Path("sample") / "town.mcap"
-"""In the package of a checkout only: a wheel has a small one (``sgstore/demo.py`` says why)."""
+RECORDING = Path("apps") / "sample" / "town.mcap"
+"""In the package of a checkout only: a wheel has a small one (``sgstore/apps/demo.py`` says why)."""
 
 SHORT = (
     "test_cli_errors.py",

@@ -31,7 +31,10 @@ from test_temporal import files_of, property_named
 from thorough import LONG
 
 from bench.prioritize import ONE_SIZE, SIZES, STRATEGIES, TIES, kinds_found, written
-from sgstore.coverage import (
+from sgstore.draw import draw_curve
+from sgstore.pipeline.importing import import_graphs
+from sgstore.temporal._verdicts import PRESUMABLY_TRUE, Settled
+from sgstore.testsets.coverage import (
     classed,
     classes,
     read_specifications,
@@ -39,9 +42,7 @@ from sgstore.coverage import (
     slot_coverage,
     specification,
 )
-from sgstore.draw import draw_curve
-from sgstore.importing import import_graphs
-from sgstore.selection import (
+from sgstore.testsets.selection import (
     Priority,
     PrioritySpec,
     failed_in_order,
@@ -49,12 +50,11 @@ from sgstore.selection import (
     fault_detection,
     prioritize,
 )
-from sgstore.temporal._verdicts import PRESUMABLY_TRUE, Settled
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from sgstore.coverage import ChosenFrames
+    from sgstore.testsets.coverage import ChosenFrames
 
 ROOT: Final = Path(__file__).parents[1]
 DATA: Final = Path(os.environ.get("SGSTORE_DATA", ROOT.parent / "shared" / "data"))

@@ -23,10 +23,10 @@ from opendrive_maps import (
     width,
 )
 
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
 
 if TYPE_CHECKING:
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 Point = tuple[float, float]
 

@@ -32,14 +32,14 @@ from opendrive_maps import (
     width,
 )
 
-from sgstore.config import Config
 from sgstore.lang import looked_up
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
+from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, VEHICLE_LIGHTS
+from sgstore.model.world import Entities, FrameBlock, MessageRefs, States, TraceReport
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, VEHICLE_LIGHTS
-from sgstore.world import Entities, FrameBlock, MessageRefs, States, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang import FrameView
     from sgstore.lang.ir import Query
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
     from sgstore.store import Sealed
 
 Point = tuple[float, float]

@@ -15,7 +15,7 @@ import carla
 import numpy as np
 from mcap.reader import make_reader
 
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
 from sgstore.readers import message_class
 
 if TYPE_CHECKING:

@@ -13,7 +13,8 @@ from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 from thorough import LONG
 
 import sgstore
-from sgstore.abstractions import (
+from sgstore.errors import AbstractionError
+from sgstore.graphs.abstractions import (
     ABSTRACTIONS,
     AT_INGEST,
     GraphColumns,
@@ -24,10 +25,9 @@ from sgstore.abstractions import (
     contents_of,
     register,
 )
-from sgstore.abstractions._literature import roadscene2vec
-from sgstore.abstractions._registry import _REGISTERED as REGISTERED
-from sgstore.errors import AbstractionError
-from sgstore.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY, RELATION_CODE
+from sgstore.graphs.abstractions._literature import roadscene2vec
+from sgstore.graphs.abstractions._registry import _REGISTERED as REGISTERED
+from sgstore.model.vocabulary import DIRECTIONS, KIND_CODE, PROXIMITY, RELATION_CODE
 
 BETWEEN = {*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf"}
 EGO, CAR, BUS, PERSON = range(4)

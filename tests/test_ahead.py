@@ -23,8 +23,8 @@ import sgstore.mcap._reader as mcap_file
 from sgstore.errors import TraceError
 from sgstore.mcap import McapFile
 from sgstore.mcap._read_ahead import MOST_BUFFERED, MOST_BUFFERS, Buffers
+from sgstore.model.world import TraceReport
 from sgstore.readers import open_trace
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,7 +10,7 @@ import pytest
 from api_page import PAGE, PARTS, page
 
 import sgstore
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from check import TESTS, WHOLE, patterns_of
-from house import survey
+from check import TESTS, WHOLE, part_of, patterns_of
+from house import is_at_home, module_of, survey
 from slow import SECONDS
 
 from sgstore.errors import MissingExtraError
@@ -22,43 +22,38 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parents[1] / "sgstore"
 
-# From the ground up. An import may only point to a lower layer; rooms of one layer are strangers to
-# one another, except that the files of one folder know each other.
+# From the ground up. An import may only point to a lower layer. Packages and files of one layer do not know one
+# another, except that the files of one folder do, and those of TOGETHER.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset({"arrays", "logs", "records"}),
-    frozenset(
-        {
-            "columns",
-            "compiled",
-            "display",
-            "errors",
-            "geometry",
-            "json_text",
-            "markup",
-            "pair_numbers",
-            "plugins",
-            "processes",
-            "quoting",
-        }
-    ),
-    frozenset({"mcap", "vocabulary"}),
-    frozenset({"criticality"}),
-    frozenset({"abstractions", "config", "files", "graph", "lang", "notes", "roads", "world"}),
-    frozenset({"contrib", "opendrive", "relations", "step", "trace_parts", "truth_lanes"}),
-    frozenset({"lanelet2", "sumo_net"}),
-    frozenset({"draw", "map_files", "readers", "sgg"}),
+    frozenset({"errors"}),
+    frozenset({"base", "mcap"}),
+    frozenset({"model"}),
+    frozenset({"lang", "maps"}),
+    frozenset({"graphs"}),
+    frozenset({"draw", "readers", "sgg"}),
     frozenset({"store"}),
-    frozenset({"derive", "importing", "matches", "segments"}),
-    frozenset({"doctor", "exporters", "ingest", "temporal"}),
-    frozenset({"query", "rebuild", "record"}),
+    frozenset({"ingest", "matches", "pipeline", "temporal"}),
+    frozenset({"exporters"}),
+    frozenset({"query"}),
     frozenset({"collection"}),
-    frozenset({"demo", "locks", "notebook", "sandbox"}),
-    frozenset({"coverage", "pytest_plugin"}),
-    frozenset({"assistant", "diff", "selection"}),
-    frozenset({"serve"}),
-    frozenset({"report"}),
-    frozenset({"cli"}),
+    frozenset({"testsets"}),
+    frozenset({"apps"}),
 )
+TOGETHER = ({"ingest", "pipeline"}, {"matches", "temporal"})
+"""Files of the design at the top, and the package each of them belongs to."""
+
+OUTER = {"apps", "collection", "draw", "exporters", "testsets"}
+"""Packages around the core."""
+
+LOOK_OUT = {
+    "__init__": {"apps"},
+    "__main__": {"apps"},
+    "matches": {"draw"},
+    "query": {"draw", "exporters"},
+    "temporal/_shrink": {"draw"},
+}
+"""Files of the core that may import outer packages, inside functions or at their top, and which."""
+
 OWNERS = {
     "duckdb": {"store"},
     "mcap": {"mcap", "readers", "exporters"},
@@ -66,43 +61,46 @@ OWNERS = {
     "zstandard": {"mcap", "readers", "exporters"},
     "lz4": {"mcap", "exporters"},
     "isal": {"mcap"},
-    "numba": {"compiled"},
-    "typer": {"cli"},
-    "rich": {"cli"},
-    "networkx": {"graph", "exporters"},
-    "shapely": {"geometry", "roads", "opendrive"},
+    "numba": {"base/compiled"},
+    "typer": {"apps/cli"},
+    "rich": {"apps/cli"},
+    "networkx": {"model/graph", "exporters"},
+    "shapely": {"base/geometry", "maps/roads", "maps/opendrive"},
     "lark": {"lang"},
-    "highspy": {"selection"},
-    "sklearn": {"selection"},
-    "threadpoolctl": {"selection"},
+    "highspy": {"testsets/selection"},
+    "sklearn": {"testsets/selection"},
+    "threadpoolctl": {"testsets/selection"},
     "matplotlib": {"draw"},
     "PIL": {"draw", "exporters"},
     "av": {"draw"},
-    "pytest": {"pytest_plugin"},
+    "pytest": {"apps/pytest_plugin"},
     "rerun": {"exporters"},
     "torch": {"exporters"},
     "torch_geometric": {"exporters"},
     "carla": {"readers"},
-    "mcp": {"assistant"},
-    "pydantic": {"assistant"},
+    "mcp": {"apps/assistant"},
+    "pydantic": {"apps/assistant"},
     "obstore": {"mcap"},
     "ray": {"collection"},
     "pyspark": {"collection"},
-    "starlette": {"serve"},
-    "uvicorn": {"serve"},
+    "starlette": {"apps/explorer"},
+    "uvicorn": {"apps/explorer"},
 }
+"""Third-party package → the packages or files that import it."""
+
 MASKS_ARE_KNOWN_TO = {"store", "lang/_sql_masks", "lang/_results"}
 SQL_OF_MASKS = re.compile(r"\bmask\b|\bbit_or\b|\bbit_count\b|<<")
 FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill"}
 FORBIDDEN_CALLS = {"eval", "exec", "__import__"}
-NO_ROOMS = {"utils", "util", "common", "core", "base", "helpers", "manager", "misc"}
+NO_ROOMS = {"utils", "util", "common", "core", "helpers", "manager", "misc"}
 
 FILES = sorted(PACKAGE.rglob("*.py"))
 ROOMS = {room for layer in LAYERS for room in layer}
 
 
 def room_of(path: Path) -> str:
-    """The first step below the package: ``traces/osi.py`` and ``traces/__init__.py`` are ``traces``."""
+    """The first step below the package: ``readers`` of ``readers/osi/_trace.py`` and of
+    ``readers/__init__.py``."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
@@ -112,6 +110,11 @@ def name_of(path: Path) -> str:
 
 def is_type_checking(node: ast.AST) -> bool:
     return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+
+
+def is_in(path: Path, places: set[str]) -> bool:
+    """Tell whether a file is one of some places, ``store`` or ``base/files``, or lies below one."""
+    return any(f"{name_of(path)}/".startswith(f"{place}/") for place in places)
 
 
 @cache
@@ -164,6 +167,7 @@ def test_imports_point_down_the_layers() -> None:
         if room in {"__init__", "__main__"}:
             return set()
         targets = {n.split(".")[1] for n in imports_of(path) if n.startswith("sgstore.")} - {room}
+        targets -= {one for known in TOGETHER if room in known for one in known}
         return {t for t in targets if t not in ROOMS or height(t) >= height(room)}
 
     assert len(FILES) > 100
@@ -172,12 +176,8 @@ def test_imports_point_down_the_layers() -> None:
 
 def test_rooms_are_entered_by_their_faces() -> None:
     def past_the_face(path: Path) -> set[str]:
-        own = f"sgstore.{room_of(path)}."
-        return {
-            name
-            for name in imports_of(path)
-            if name.startswith("sgstore.") and not name.startswith(own) and "._" in name
-        }
+        names = {n.removeprefix("sgstore.") for n in imports_of(path) if n.startswith("sgstore.")}
+        return {n for n in names if "._" in n and not is_at_home(module_of(path), n)}
 
     assert offending(past_the_face) == {}
 
@@ -203,6 +203,17 @@ def _is_there(package: object, name: str) -> bool:
         return name is not None and name.partition(".")[0] in OWNERS
 
 
+def test_the_core_imports_no_outer_package() -> None:
+    def outward(path: Path) -> set[str]:
+        names = imports_of(path) | {  # and those for types
+            n.module for n in nodes_of(path) if isinstance(n, ast.ImportFrom) and n.module
+        }
+        own = {room_of(path)} if room_of(path) not in OUTER else OUTER
+        return {n.split(".")[1] for n in names if n.startswith("sgstore.")} & OUTER - own
+
+    assert offending(outward) == LOOK_OUT
+
+
 def test_files_import_one_another_in_one_direction() -> None:
     assert survey().circles() == []
 
@@ -221,7 +232,7 @@ def test_every_file_has_a_room_in_the_plan() -> None:
 
 def test_the_page_names_every_room() -> None:
     page = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
-    rooms = page[page.index("\n## Rooms\n") :]
+    rooms = page[page.index("\n## Packages\n") :]
     told = re.findall(r"^\| `([a-z0-9_]+)(?:\.py|/)` \|", rooms, re.MULTILINE)
 
     assert sorted(told) == sorted({room_of(path) for path in FILES} - {"__init__", "__main__"})
@@ -230,7 +241,7 @@ def test_the_page_names_every_room() -> None:
 def test_third_party_packages_are_met_in_their_one_home() -> None:
     def abroad(path: Path) -> set[str]:
         packages = {name.split(".")[0] for name in imports_of(path)}
-        return {p for p in packages if p in OWNERS and room_of(path) not in OWNERS[p]}
+        return {p for p in packages if p in OWNERS and not is_in(path, OWNERS[p])}
 
     assert offending(abroad) == {}
 
@@ -279,7 +290,8 @@ def test_tests_that_are_called_slow_or_long_are_there() -> None:
 
 def test_every_file_of_tests_belongs_to_a_room() -> None:
     tests = {path.stem.removeprefix("test_") for path in Path(__file__).parent.glob("test_*.py")}
-    patterns = [one for room in ROOMS | {*TESTS} for one in patterns_of(room)]
+    parts = {part_of(path.relative_to(PACKAGE.parent)) for path in FILES} | {*TESTS}
+    patterns = [one for part in parts for one in patterns_of(part)]
 
     assert [one for one in WHOLE if one not in tests] == []
     assert [
@@ -290,7 +302,7 @@ def test_every_file_of_tests_belongs_to_a_room() -> None:
 
 def test_masks_are_a_secret_of_the_store() -> None:
     def told(path: Path) -> list[str]:
-        if {room_of(path), name_of(path)} & MASKS_ARE_KNOWN_TO:
+        if is_in(path, MASKS_ARE_KNOWN_TO):
             return []
         nodes = nodes_of(path)
         docstrings = {id(n.value) for n in nodes if isinstance(n, ast.Expr)}

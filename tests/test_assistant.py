@@ -20,7 +20,7 @@ from test_docs_queries import queries_of
 from test_sandbox import RUNAWAY
 from thorough import some
 
-from sgstore.assistant import StoreTools
+from sgstore.apps.assistant import StoreTools
 from sgstore.errors import ExportError, QueryError, StoreError
 from sgstore.query import Store
 
@@ -508,7 +508,9 @@ def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "query",
-    queries_of((Path(__file__).parents[1] / "sgstore" / "assistant" / "language.md").read_text()),
+    queries_of(
+        (Path(__file__).parents[1] / "sgstore" / "apps" / "assistant" / "language.md").read_text()
+    ),
 )
 def test_the_queries_of_the_page_are_answered(query: str, tools: StoreTools) -> None:
     if query.startswith("CHECK"):

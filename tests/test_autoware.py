@@ -15,10 +15,10 @@ from test_carla_bags import METADATA, split
 
 import sgstore
 from sgstore.errors import TraceError
-from sgstore.lanelet2 import lanelet2_text
-from sgstore.opendrive import read_map
+from sgstore.maps.lanelet2 import lanelet2_text
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.readers import open_trace
-from sgstore.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
 
 if TYPE_CHECKING:
     from pathlib import Path

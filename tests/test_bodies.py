@@ -17,23 +17,23 @@ from graph_blocks import trace_info
 from scenes import NO_MESSAGES
 from test_relations import bodies, flat, footprint, storeys_apart
 
-from sgstore.config import Config, Proximity
-from sgstore.derive import derive
+from sgstore.graphs.online import Frame
+from sgstore.graphs.relations import relations
 from sgstore.lang import FrameView
+from sgstore.model.config import Config, Proximity
+from sgstore.model.vocabulary import KINDS, PROXIMITY, SIGNALS
+from sgstore.model.world import TraceReport
+from sgstore.pipeline.derive import derive
 from sgstore.query import Store
 from sgstore.readers import open_trace
-from sgstore.relations import relations
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame
 from sgstore.store import StoreFile
-from sgstore.vocabulary import KINDS, PROXIMITY, SIGNALS
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.world import FrameBlock
+    from sgstore.model.world import FrameBlock
 
 NUMBERS = ("dist", "gap", "lon", "ttc", "closing_speed", "rss_margin", "clearance")
 CLOSE = {*PROXIMITY, "overlaps", "leads", "follows"}

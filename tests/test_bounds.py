@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from recordings import Recorder, car
 
 import sgstore
-from sgstore.config import configured
-from sgstore.derive import derive
 from sgstore.ingest import ingest
+from sgstore.model.config import configured
+from sgstore.pipeline.derive import derive
 
 BOUNDS = st.integers(21, 400).map(lambda tenths: tenths / 10)
 """In metres; 32 bits hold most of them as less or more than the text."""

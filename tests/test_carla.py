@@ -18,12 +18,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from thorough import LONG
 
-from sgstore.config import Config
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
+from sgstore.model.vocabulary import KINDS, LIGHT_STATES
 from sgstore.readers import read_message
 from sgstore.readers.carla._trace import _turned
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import KINDS, LIGHT_STATES
 
 if TYPE_CHECKING:
     from pathlib import Path

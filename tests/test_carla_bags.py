@@ -14,12 +14,12 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 import sgstore
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest, recordings
 from sgstore.mcap import McapFile, digest_of, parts_of
+from sgstore.model.world import Clip, TraceReport
 from sgstore.readers import open_trace, read_message
-from sgstore.world import Clip, TraceReport
 
 if TYPE_CHECKING:
     from pathlib import Path

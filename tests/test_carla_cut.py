@@ -9,8 +9,8 @@ from thorough import some
 
 from sgstore.errors import TraceError
 from sgstore.mcap import McapFile
+from sgstore.model.world import TraceReport
 from sgstore.readers import open_trace
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -24,12 +24,12 @@ from recordings import OSI  # noqa: E402
 from standin_carla import StandInActor, StandInWorld, box, transform  # noqa: E402
 
 import sgstore  # noqa: E402
-from sgstore.config import Config  # noqa: E402
+from sgstore.apps.record import record  # noqa: E402
 from sgstore.ingest import ingest  # noqa: E402
-from sgstore.opendrive import read_map  # noqa: E402
+from sgstore.maps.opendrive import read_map  # noqa: E402
+from sgstore.model.config import Config  # noqa: E402
 from sgstore.readers import LiveWorld  # noqa: E402
 from sgstore.readers.carla._signals import least_sum  # noqa: E402
-from sgstore.record import record  # noqa: E402
 from sgstore.temporal import opened  # noqa: E402
 
 if TYPE_CHECKING:

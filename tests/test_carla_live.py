@@ -14,13 +14,13 @@ carla = pytest.importorskip("carla")
 
 from standin_carla import StandInActor, at_red, box, transform  # noqa: E402
 
-from sgstore.config import Config  # noqa: E402
 from sgstore.errors import MissingExtraError, TraceError  # noqa: E402
+from sgstore.model.config import Config  # noqa: E402
+from sgstore.model.vocabulary import VEHICLE_LIGHTS  # noqa: E402
 from sgstore.readers import LiveWorld, Sensor, connect  # noqa: E402
 from sgstore.readers.carla._live import LIGHTS, in_world  # noqa: E402
 from sgstore.sgg import SceneGraphGenerator  # noqa: E402
 from sgstore.temporal import opened  # noqa: E402
-from sgstore.vocabulary import VEHICLE_LIGHTS  # noqa: E402
 
 
 def graph_of(live: LiveWorld):

@@ -24,21 +24,21 @@ from clipping import Source, write_clips
 from opendrive_maps import a_map, a_road, element, lane, line, link, section
 
 import sgstore
-from sgstore.doctor import examine
 from sgstore.ingest import ingest
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import lanes_ref
+from sgstore.model.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
+from sgstore.model.world import Clip, Event
+from sgstore.pipeline.doctor import examine
 from sgstore.readers import open_trace
 from sgstore.readers.carla._signals import Light, signals_of
-from sgstore.roads import lanes_ref
 from sgstore.store import StoreFile
-from sgstore.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
-from sgstore.world import Clip, Event
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from sgstore.maps.roads import RoadMap
     from sgstore.query import Store
-    from sgstore.roads import RoadMap
 
 
 def kept(path: Path) -> Store:

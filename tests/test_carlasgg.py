@@ -14,10 +14,10 @@ import pytest
 from builders import edges, frames, graph_of, thing
 from opendrive_maps import a_map, a_road, lane, line, section
 
-from sgstore.config import preset
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import preset
+from sgstore.model.vocabulary import PROXIMITY
 from sgstore.readers.carla._signals import signals_of
-from sgstore.vocabulary import PROXIMITY
 
 sys.path.append(str(Path(__file__).parents[1]))
 from bench.against_carlasgg import Comparison, main

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
 
 if TYPE_CHECKING:
     from collections.abc import Callable

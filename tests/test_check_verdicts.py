@@ -15,9 +15,9 @@ from oracle_over_time import compare_unknown, unknown_check, worlds
 from thorough import LONG
 
 import sgstore
-from sgstore.cli._checks import write_junit
-from sgstore.config import Config, RangeSettings
+from sgstore.apps.cli._checks import write_junit
 from sgstore.ingest import ingest
+from sgstore.model.config import Config, RangeSettings
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 
-from sgstore.abstractions import Classes, Labelled, classes_of
+from sgstore.graphs.abstractions import Classes, Labelled, classes_of
 
 PAIRS = int(os.environ.get("SGSTORE_CLASS_PAIRS", "1500"))
 """Random pairs; ``make oracle`` takes 12,000."""
@@ -264,7 +264,7 @@ def test_multiplicity_direction_and_loops_count_and_the_order_of_rows_does_not()
 def test_a_class_is_the_same_in_every_process_and_for_ever() -> None:
     code = (
         "import numpy as np\n"
-        "from sgstore.abstractions import Labelled, classes_of\n"
+        "from sgstore.graphs.abstractions import Labelled, classes_of\n"
         "z, n = np.zeros(3, np.int64), np.arange(3)\n"
         "g = Labelled.assembled(2, [(z, n, n % 2)], [(z[:2], n[:2], n[:2] * 0 + 2, n[1:])], 'abc')\n"
         "print(*classes_of(g))"

@@ -16,11 +16,11 @@ from typing import Any
 import pytest
 from recordings import drive
 
-from sgstore.cli import VERBS, run
+from sgstore.apps.cli import VERBS, run
 from sgstore.query import Store
 
 REPOSITORY = Path(__file__).parents[1]
-SAMPLE = REPOSITORY / "sgstore" / "sample" / "town.mcap"
+SAMPLE = REPOSITORY / "sgstore" / "apps" / "sample" / "town.mcap"
 CROSSING = """
 MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(p:Person),
       (:TrafficLight {light_state: 'red'})-[:controlsTrafficOf]->(lane)
@@ -412,10 +412,11 @@ def unloaded(*names):
     assert not there, (sys.argv, there)
 
 import sgstore
-unloaded("numpy", "duckdb", "typer", "rich", "sgstore.cli")
-from sgstore.cli import run, spare_packages
+unloaded("numpy", "duckdb", "typer", "rich", "sgstore.apps.cli")
+from sgstore.apps.cli import run, spare_packages
 engine = ("numpy", "duckdb", "mcap", "lz4", "zstandard", "isal", "shapely", "networkx", "matplotlib", "lark")
-heavy = ("pydantic", "sgstore.lang", "sgstore.store", "sgstore.coverage", "sgstore.readers", "sgstore.roads")
+heavy = ("pydantic", "sgstore.lang", "sgstore.store", "sgstore.testsets.coverage", "sgstore.readers",
+    "sgstore.maps.roads")
 spare_packages()
 assert run(["--help"]) == 0
 unloaded(*engine, *heavy, "markdown_it", "pygments", "xml.etree.ElementTree")
@@ -427,9 +428,11 @@ assert Traceback.extract(KeyError, KeyError("a"), None).stacks[0].exc_type == "K
 for module in [name for name in sys.modules if name.split(".")[0] in {"rich", "markdown_it"}]:
     del sys.modules[module]
 assert run(["find", sys.argv[1], "MATCH (e:Ego) WHERE e.speed > 5", "--count"]) == 0
-unloaded("numpy", *engine[2:], "pydantic", "rich", "sgstore.readers", "sgstore.roads", "sgstore.relations")
-unloaded("sgstore.coverage", "sgstore.selection", "sgstore.draw", "sgstore.exporters._write", "sgstore.sgg")
-unloaded("sgstore.mcap._chunks", "sgstore.opendrive", "sgstore.config", "sgstore.sandbox")
+unloaded("numpy", *engine[2:], "pydantic", "rich", "sgstore.readers", "sgstore.maps.roads",
+    "sgstore.graphs.relations")
+unloaded("sgstore.testsets.coverage", "sgstore.testsets.selection", "sgstore.draw", "sgstore.exporters._write",
+    "sgstore.sgg")
+unloaded("sgstore.mcap._chunks", "sgstore.maps.opendrive", "sgstore.model.config", "sgstore.apps.sandbox")
 with sgstore.open(sys.argv[1]) as store:
     assert store.find("MATCH (e:Ego)").rows()
 unloaded("ray", "pyspark", "obstore", "sgstore.collection._questions", "sgstore.collection._engines")
@@ -445,10 +448,10 @@ def test_what_is_not_needed_is_not_loaded(store: str) -> None:
 
 def test_a_command_line_knows_its_verb_alone_and_without_one_all_of_them() -> None:
     program = (
-        "import sys; from sgstore.cli import VERBS, application;"
+        "import sys; from sgstore.apps.cli import VERBS, application;"
         "known = application(sys.argv[1:]); names = [v.name or v.callback.__name__ for v in"
         " known.registered_commands] + [g.name for g in known.registered_groups];"
-        "modules = [m for m in VERBS if f'sgstore.cli._{m}' in sys.modules];"
+        "modules = [m for m in VERBS if f'sgstore.apps.cli._{m}' in sys.modules];"
         "print(*sorted(names)); print(*modules)"
     )
 

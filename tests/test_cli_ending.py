@@ -20,10 +20,10 @@ from test_cli_streams import SLOTS
 from verb_lines import LINES, verbs
 
 import sgstore
-import sgstore.cli._process as ending
+import sgstore.apps.cli._process as ending
 import sgstore.store._rows as rows
-from sgstore.cli import application, run
-from sgstore.demo import RECORDING
+from sgstore.apps.cli import application, run
+from sgstore.apps.demo import RECORDING
 from sgstore.errors import SqlError
 from sgstore.query import Store
 from sgstore.store._locking import Access
@@ -591,7 +591,8 @@ def test_a_refused_export_removes_the_folders_of_a_killed_one(
     more = ["--format", "parquet"] if verb == "export" else []
     line = [verb, str(town_store), "MATCH (e:Ego) WHERE e.speed > 9", "--to", str(to), *more]
     code = (
-        "import os, signal, sys; from sgstore import cli, files; sys.argv[0] = 'sgstore'\n"
+        "import os, signal, sys; from sgstore.apps import cli; from sgstore.base import files; "
+        "sys.argv[0] = 'sgstore'\n"
         "if sys.argv[1] == 'kill':\n"
         "    files.HeldFolder.remove = lambda self: os.kill(os.getpid(), signal.SIGKILL)\n"
         "del sys.argv[1]; cli.main()"
@@ -618,7 +619,7 @@ def test_a_refused_export_removes_the_folders_of_a_killed_one(
 
 def test_the_exit_code_is_kept_wherever_the_interruption_came_from() -> None:
     code = (
-        "import signal, sys; from sgstore.cli import ending\n"
+        "import signal, sys; from sgstore.apps.cli import ending\n"
         "ending.heed_signals()\n"
         "try: exec('signal.raise_signal(signal.SIGTERM)')\n"
         "except KeyboardInterrupt: ending.ignore_signals(); sys.exit(ending.exit_code())"
@@ -630,7 +631,7 @@ def test_the_exit_code_is_kept_wherever_the_interruption_came_from() -> None:
 @pytest.mark.parametrize("place", ["ending._hear_of_lost", "run", "ending.clear_deadline"])
 def test_a_signal_at_the_edge_of_a_run_ends_it_like_any_other(place: str) -> None:
     code = (
-        "import signal, sys; from sgstore import cli; sys.argv = ['sgstore', '--version']\n"
+        "import signal, sys; from sgstore.apps import cli; sys.argv = ['sgstore', '--version']\n"
         f"cli.{place} = lambda *a: signal.raise_signal(signal.SIGTERM)\n"
         "cli.main()"
     )
@@ -642,7 +643,7 @@ def test_a_signal_at_the_edge_of_a_run_ends_it_like_any_other(place: str) -> Non
 
 def test_what_its_parent_ignores_is_ignored(town_store: Path) -> None:
     code = (
-        "import signal, sgstore.cli._process as ending; ending.heed_signals();"
+        "import signal, sgstore.apps.cli._process as ending; ending.heed_signals();"
         " print(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN)"
     )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 from recordings import Recorder, car, drive
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
-SAMPLE = Path(str(files("sgstore"))) / "sample" / "town.mcap"
+SAMPLE = Path(str(files("sgstore"))) / "apps" / "sample" / "town.mcap"
 
 
 def sgstore(*arguments: object, stdin: str = "") -> subprocess.CompletedProcess[bytes]:

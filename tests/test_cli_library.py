@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.lang import pattern_named, patterns
 from sgstore.lang.library import search
 from sgstore.query import Store

@@ -10,8 +10,8 @@ from conftest import REPOSITORY
 from opendrive_maps import a_map, a_road, arc, element, lane, line, section
 from recordings import Recorder, car
 
-from sgstore.cli import run
-from sgstore.roads import lane_text, summary
+from sgstore.apps.cli import run
+from sgstore.maps.roads import lane_text, summary
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -148,7 +148,7 @@ def test_what_has_no_map_is_an_error_that_names_the_file(tmp_path: Path, call: A
 
 
 def test_types_that_begin_beyond_the_road_hold_from_its_start() -> None:
-    from sgstore.opendrive import read_map
+    from sgstore.maps.opendrive import read_map
 
     kinds = element("type", s=-5, type="town") + element("type", s=1e9, type="rural")
     road_map = read_map(a_map(a_road("1", line(50.0), type=kinds)), "odd")

@@ -17,9 +17,9 @@ import pytest
 import typer
 from verb_lines import verbs
 
-from sgstore.cli import application, run
-from sgstore.cli._examples import EXAMPLES
-from sgstore.cli._output import Format, write_rows
+from sgstore.apps.cli import application, run
+from sgstore.apps.cli._examples import EXAMPLES
+from sgstore.apps.cli._output import Format, write_rows
 from sgstore.lang import parse
 
 RULE = "CHECK slow: ALWAYS ego.speed < 14"
@@ -174,11 +174,11 @@ def test_a_shell_at_a_terminal_completes_what_is_typed(
 ASKED = """
 import os, sys
 os.environ.update(_SGSTORE_COMPLETE="complete_bash", COMP_WORDS="sgstore\\nfind\\ns\\n-p\\njay", COMP_CWORD="4")
-from sgstore.cli import run
+from sgstore.apps.cli import run
 try:
     run([])
 except SystemExit:
-    there = {"duckdb", "numpy", "sgstore.store", "sgstore.cli._coverage"} & {*sys.modules}
+    there = {"duckdb", "numpy", "sgstore.store", "sgstore.apps.cli._coverage"} & {*sys.modules}
     assert not there, there
 """
 

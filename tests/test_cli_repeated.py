@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import pytest
 import typer
 
-from sgstore.cli import application, run
-from sgstore.demo import RECORDING
+from sgstore.apps.cli import application, run
+from sgstore.apps.demo import RECORDING
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -193,7 +193,7 @@ def test_a_parameter_that_nobody_has_is_refused(
 def test_monitor_watches_everything_and_calls_patterns_by_their_names(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from sgstore.demo import RECORDING
+    from sgstore.apps.demo import RECORDING
 
     asked = ["-p", "cut_in", "-p", "lead_hard_braking", "-p", "phi1", "-e", BROKEN, "-e", KEPT]
 

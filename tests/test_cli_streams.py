@@ -16,7 +16,7 @@ import typer
 from thorough import LONG, some
 from verb_lines import LINES, verbs
 
-from sgstore.cli import application, run
+from sgstore.apps.cli import application, run
 
 CONDITIONS = ("", "stdout full", "stdout closed", "reader gone", "stderr full", "stderr closed")
 SLOTS = """
@@ -47,7 +47,7 @@ No simulator runs, locks are files, no assistant asks, and the explorer has no a
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """What stands in the command lines."""
-    from sgstore.demo import RECORDING
+    from sgstore.apps.demo import RECORDING
 
     folder = tmp_path_factory.mktemp("files")
     texts = {

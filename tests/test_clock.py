@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import recordings as osi
 
-from sgstore.coverage import ChosenFrames, happenings, sequences_in
+from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
+from sgstore.model.world import JUMP_NS
 from sgstore.query import Store
-from sgstore.step import Frame
 from sgstore.temporal import Monitor
-from sgstore.world import JUMP_NS
+from sgstore.testsets.coverage import ChosenFrames, happenings, sequences_in
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -16,8 +16,7 @@ from oracle_collection import compare, renamed, texts, worlds
 from oracle_worlds import random_world
 from thorough import LONG, some
 
-from sgstore import coverage
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
 from sgstore.collection import Collection, PartialAnswerError, gc, pack, unpack, verify
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _engines as engines
@@ -28,6 +27,7 @@ from sgstore.lang import _parts as parts
 from sgstore.lang._aggregates import AGGREGATES
 from sgstore.query import Store
 from sgstore.store import CATALOGUE, StoreFile, _bundles, write_parquet
+from sgstore.testsets import coverage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -19,7 +19,7 @@ from opendrive_maps import a_map, a_road, lane, line, section
 from recordings import Recorder, car
 from thorough import LONG
 
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
 from sgstore.collection import Collection, commit, gc, land, pack, rebuild, verify
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _landing as landing

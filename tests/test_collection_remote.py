@@ -20,7 +20,7 @@ from oracle_worlds import random_trace, random_world, store_all
 from recordings import Recorder, car
 from thorough import LONG
 
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
 from sgstore.collection import (
     Collection,
     PartialAnswerError,

@@ -12,10 +12,11 @@ from oracle_worlds import random_world
 from thorough import some
 
 from sgstore.collection import Collection, pack
-from sgstore.coverage import ChosenFrames, classed, frames_of
 from sgstore.errors import ConfigError
 from sgstore.query import Store
-from sgstore.selection import (
+from sgstore.store import SEQ_BITS, StoreFile
+from sgstore.testsets.coverage import ChosenFrames, classed, frames_of
+from sgstore.testsets.selection import (
     SelectionSpec,
     SelectionUnit,
     Strategy,
@@ -26,14 +27,13 @@ from sgstore.selection import (
     split_table,
     units_of,
 )
-from sgstore.selection._bundles import cheapest_units
-from sgstore.store import SEQ_BITS, StoreFile
+from sgstore.testsets.selection._bundles import cheapest_units
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.selection import Selection
+    from sgstore.testsets.selection import Selection
 
 SEEDS = range(8)
 TRACES = 6

@@ -13,8 +13,8 @@ import pytest
 from recordings import Recorder, car, person
 from thorough import LONG, some
 
-from sgstore.cli import run
-from sgstore.cli._options import LOSS
+from sgstore.apps.cli import run
+from sgstore.apps.cli._options import LOSS
 from sgstore.collection import Collection, pack
 from sgstore.collection import _worker as worker
 from sgstore.errors import StoreError

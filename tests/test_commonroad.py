@@ -19,14 +19,14 @@ from thorough import some
 import sgstore
 from sgstore.errors import StoreError, TraceError
 from sgstore.ingest import recordings
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import KIND_CODE, KINDS
+from sgstore.model.world import FrameBlock, TraceReport
 from sgstore.readers import open_recording, open_trace, read_message
-from sgstore.vocabulary import KIND_CODE, KINDS
-from sgstore.world import FrameBlock, TraceReport
 
 if TYPE_CHECKING:
+    from sgstore.maps.roads import RoadMap
     from sgstore.readers import CommonRoadFile
-    from sgstore.roads import RoadMap
 
 DATA = Path(os.environ.get("SGSTORE_DATA") or Path(__file__).parents[2] / "shared/data")
 SCENARIOS = sorted((DATA / "commonroad").glob("*.xml"))
@@ -150,7 +150,7 @@ def test_lanelets_are_a_road_map(made: Path) -> None:
 
 
 def _edges(found: RoadMap) -> list[tuple[str, int, int]]:
-    from sgstore.vocabulary import RELATIONS
+    from sgstore.model.vocabulary import RELATIONS
 
     edges = found.edges
     columns = (edges.relation.tolist(), edges.src.tolist(), edges.dst.tolist())

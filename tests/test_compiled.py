@@ -14,20 +14,20 @@ import pytest
 from builders import Thing, frames, thing
 from test_relations import TOWN, busy, crowd
 
-from sgstore import compiled
-from sgstore.config import Config, configured
-from sgstore.demo import RECORDING
-from sgstore.opendrive import read_map
+from sgstore.apps.demo import RECORDING
+from sgstore.base import compiled
+from sgstore.graphs.relations import _loops
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, configured
 from sgstore.readers import open_trace
-from sgstore.relations import _loops
 from sgstore.sgg import SceneGraphGenerator
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
-    from sgstore.world import FrameBlock
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import FrameBlock
 
 CONFIGS = [
     Config(),
@@ -137,9 +137,9 @@ def test_without_numba_nothing_is_compiled() -> None:
     program = """if True:
         import sys
         sys.modules["numba"] = None
-        from sgstore import compiled
+        from sgstore.base import compiled
         assert not compiled.use_loops(0) and not compiled.worth()
-        from sgstore.relations import _loops
+        from sgstore.graphs.relations import _loops
         import numpy as np
         order, end = np.arange(3), np.full(3, 3)
         place, found = (np.array([0.0, 1.0, 9.0]), *np.zeros((2, 3))), tuple(np.zeros((2, 9), int))

@@ -15,8 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from opendrive_maps import a_map, a_road, element, line
 
-from sgstore.cli import run
-from sgstore.config import (
+from sgstore.apps.cli import run
+from sgstore.errors import ConfigError
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import (
     MAX_CONFIG_BYTES,
     PRESETS,
     Config,
@@ -33,14 +35,12 @@ from sgstore.config import (
     load,
     preset,
 )
-from sgstore.errors import ConfigError
-from sgstore.opendrive import read_map
-from sgstore.vocabulary import KINDS, SIGNALS, TypeMeaning
+from sgstore.model.vocabulary import KINDS, SIGNALS, TypeMeaning
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 
 def written(folder: Path, text: str) -> Path:

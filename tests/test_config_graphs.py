@@ -13,16 +13,12 @@ import pytest
 from conftest import REPOSITORY
 from test_online import columns, shown
 
-from sgstore.config import Config, configured
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
+from sgstore.graphs.online import Replay
 from sgstore.ingest import ingest
-from sgstore.opendrive import read_map
-from sgstore.query import Store
-from sgstore.readers import open_trace
-from sgstore.sgg import SceneGraphGenerator, map_of_graphs
-from sgstore.step import Replay
-from sgstore.store import StoreFile
-from sgstore.vocabulary import (
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, configured
+from sgstore.model.vocabulary import (
     DIRECTIONS,
     PROXIMITY,
     RELATION_CODE,
@@ -31,14 +27,18 @@ from sgstore.vocabulary import (
     TypeMeaning,
     kinds_labelled,
 )
-from sgstore.vocabulary import KINDS as ALL_KINDS
+from sgstore.model.vocabulary import KINDS as ALL_KINDS
+from sgstore.query import Store
+from sgstore.readers import open_trace
+from sgstore.sgg import SceneGraphGenerator, map_of_graphs
+from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
-    from sgstore.world import FrameBlock
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import FrameBlock
 
 CHOICES: dict[str, dict[str, list[Any]]] = {
     "range": {
@@ -81,7 +81,7 @@ def any_config(seed: int) -> Config:
 
 @cache
 def sample() -> tuple[list[FrameBlock], RoadMap]:
-    with open_trace(REPOSITORY / "sgstore/sample/town.mcap") as trace:
+    with open_trace(REPOSITORY / "sgstore/apps/sample/town.mcap") as trace:
         return list(islice(trace.blocks(30), 2)), read_map(trace.info.map_text, "town")
 
 
@@ -122,7 +122,7 @@ def test_every_edge_ends_at_nodes_and_is_there_once(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_frames_one_by_one_give_the_same_whatever_the_settings(seed: int) -> None:
     config, (blocks, road_map) = any_config(100 + seed), sample()
-    with open_trace(REPOSITORY / "sgstore/sample/town.mcap") as trace:
+    with open_trace(REPOSITORY / "sgstore/apps/sample/town.mcap") as trace:
         few = list(islice(trace.blocks(7), 4))
 
     def edges_of(parts: list[FrameBlock]) -> list[tuple[int, ...]]:

@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from conftest import REPOSITORY
 
-from sgstore.cli import run
-from sgstore.config import Config, configured, from_dict, preset
+from sgstore.apps.cli import run
 from sgstore.ingest import ingest
-from sgstore.map_files import Maps
-from sgstore.opendrive import SIGNS
+from sgstore.maps.map_files import Maps
+from sgstore.maps.opendrive import SIGNS
+from sgstore.model.config import Config, configured, from_dict, preset
+from sgstore.model.vocabulary import KIND_CODE, TypeMeaning
 from sgstore.query import Store
 from sgstore.readers import open_trace
 from sgstore.store import StoreFile
-from sgstore.vocabulary import KIND_CODE, TypeMeaning
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
-SAMPLE = REPOSITORY / "sgstore/sample/town.mcap"
+SAMPLE = REPOSITORY / "sgstore/apps/sample/town.mcap"
 
 
 def stored(folder: Path, config: Config) -> Path:

@@ -18,8 +18,11 @@ import pytest
 from networkx.algorithms.isomorphism import MultiDiGraphMatcher
 
 import sgstore
-from sgstore.abstractions import ABSTRACTIONS
-from sgstore.coverage import (
+from sgstore.errors import ConfigError, QueryError, StoreError
+from sgstore.graphs.abstractions import ABSTRACTIONS
+from sgstore.ingest import ingest
+from sgstore.pipeline.importing import import_graphs
+from sgstore.testsets.coverage import (
     Classed,
     Missing,
     classed,
@@ -41,13 +44,10 @@ from sgstore.coverage import (
     specification,
     venn,
 )
-from sgstore.coverage._compare import estimate, expected_classes
-from sgstore.coverage._features import tree
-from sgstore.coverage._frames import block_of, query_of_features
-from sgstore.coverage._slots import slot_sets
-from sgstore.errors import ConfigError, QueryError, StoreError
-from sgstore.importing import import_graphs
-from sgstore.ingest import ingest
+from sgstore.testsets.coverage._compare import estimate, expected_classes
+from sgstore.testsets.coverage._features import tree
+from sgstore.testsets.coverage._frames import block_of, query_of_features
+from sgstore.testsets.coverage._slots import slot_sets
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -398,7 +398,7 @@ def test_each_feature_has_a_query_that_finds_the_frames_that_have_it(
 def test_too_many_combinations_are_an_error_and_not_a_part_of_them(
     worlds: Worlds, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sgstore.coverage._features as room
+    import sgstore.testsets.coverage._features as room
 
     monkeypatch.setattr(room, "MOST", 3)
 
@@ -828,7 +828,7 @@ def test_a_tree_parts_what_one_question_parts_and_weighs_nothing_twice() -> None
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> str:
     store = tmp_path_factory.mktemp("town") / "town.sgstore"
-    ingest(store, [Path(sgstore.__file__).parent / "sample" / "town.mcap"], rate=RATE)
+    ingest(store, [Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"], rate=RATE)
     return str(store)
 
 

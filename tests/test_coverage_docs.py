@@ -11,9 +11,9 @@ import typer
 from verb_lines import verbs
 
 import sgstore
-from sgstore.cli import application, run
-from sgstore.importing import FORMATS
+from sgstore.apps.cli import application, run
 from sgstore.ingest import ingest
+from sgstore.pipeline.importing import FORMATS
 
 PAGE = (Path(__file__).parents[1] / "docs" / "coverage.md").read_text(encoding="utf-8")
 COMMANDS = [
@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("page")
     for name, text in GIVEN.items():
         (place / name).write_text(text, encoding="utf-8")
-    sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+    sample = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
     for name, since, until in (("drives", 0, 45), ("new", 40, 70)):
         copy = place / f"{name}.mcap"
         copy.symlink_to(sample)

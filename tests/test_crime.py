@@ -58,7 +58,8 @@ import pytest
 import shapely
 from thorough import LONG, some
 
-from sgstore.criticality import (
+from sgstore.base.geometry import corners
+from sgstore.model.criticality import (
     Encounter,
     Track,
     cpi,
@@ -72,14 +73,13 @@ from sgstore.criticality import (
     ttc_recorded,
     ttce_recorded,
 )
-from sgstore.geometry import corners
-from sgstore.pair_numbers import PairNumbers
+from sgstore.model.pair_numbers import PairNumbers
 from sgstore.readers import open_trace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from sgstore.world import Floats
+    from sgstore.model.world import Floats
 
 DATA = Path(os.environ.get("SGSTORE_DATA") or Path(__file__).parents[2] / "shared/data")
 FOLDER = DATA / "commonroad"

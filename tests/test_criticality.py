@@ -20,15 +20,15 @@ from contacts import distances, random_movers
 from test_pair_numbers import Box, moving
 from thorough import LONG
 
-from sgstore.geometry import corners
+from sgstore.base.geometry import corners
 from sgstore.lang import FrameView
-from sgstore.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers, columns_needed
+from sgstore.model.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers, columns_needed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from sgstore.model.world import Floats
     from sgstore.query import Store
-    from sgstore.world import Floats
 
 MEASURES = {name: one for name, one in PAIR_FUNCTIONS.items() if one.view == "criticality"}
 PAGE = Path(__file__).parents[1] / "docs" / "criticality.md"
@@ -758,7 +758,7 @@ def rows() -> Iterator[str]:
 
 def test_the_page_lists_the_measures() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    begin, end = "<!-- measures, made from sgstore/pair_numbers -->\n", "<!-- end -->"
+    begin, end = "<!-- measures, made from sgstore/model/pair_numbers -->\n", "<!-- end -->"
     head, rest = page.split(begin)
     expected = f"{head}{begin}{''.join(rows())}{end}{rest.partition(end)[2]}"
     if os.environ.get("SGSTORE_UPDATE_GOLDEN"):

@@ -18,9 +18,10 @@ from thorough import LONG
 from typer.testing import CliRunner
 
 import sgstore
-from sgstore.cli import application
-from sgstore.coverage import ChosenFrames
-from sgstore.criticality import (
+from sgstore.apps.cli import application
+from sgstore.base.geometry import corners
+from sgstore.errors import ConfigError, QueryError, SqlError, StoreError
+from sgstore.model.criticality import (
     RECORDED,
     Encounter,
     Track,
@@ -38,15 +39,14 @@ from sgstore.criticality import (
     ttc_recorded,
     ttce_recorded,
 )
-from sgstore.errors import ConfigError, QueryError, SqlError, StoreError
-from sgstore.geometry import corners
-from sgstore.selection import PrioritySpec, SelectionUnit, prioritize
+from sgstore.model.vocabulary import VEHICLES
 from sgstore.temporal import Monitor
-from sgstore.vocabulary import VEHICLES
+from sgstore.testsets.coverage import ChosenFrames
+from sgstore.testsets.selection import PrioritySpec, SelectionUnit, prioritize
 
 if TYPE_CHECKING:
+    from sgstore.model.world import Floats
     from sgstore.query import Store
-    from sgstore.world import Floats
 
 STEP = 0.1
 
@@ -437,7 +437,9 @@ def test_no_pair_is_worked_out_that_the_rest_of_a_question_excludes(
     copied: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Encounter] = []
-    monkeypatch.setattr(sgstore.criticality, "et_recorded", lambda of: asked.append(of) or 1.5)
+    monkeypatch.setattr(
+        sgstore.model.criticality, "et_recorded", lambda of: asked.append(of) or 1.5
+    )
     query = "MATCH (e:Ego), (v:Vehicle) WHERE {} dist(e, v) < 8 RETURN DISTINCT v.id"
     near = copied.find(query.format("")).rows()
 
@@ -451,7 +453,7 @@ def test_a_long_trace_is_read_pair_by_pair(
     copied: Store, open_town: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sgstore.store._encounters.MOST_STATES", 100)
-    monkeypatch.setattr("sgstore.criticality._encounter._CIRCLES", 3)
+    monkeypatch.setattr("sgstore.model.criticality._encounter._CIRCLES", 3)
 
     assert recorded(copied).values == recorded(open_town).values
 
@@ -461,7 +463,7 @@ def test_measures_end_with_their_statement(copied: Store, monkeypatch: pytest.Mo
         time.sleep(0.05)
         return 1.0
 
-    monkeypatch.setattr(sgstore.criticality, "cpi", slow)
+    monkeypatch.setattr(sgstore.model.criticality, "cpi", slow)
     begin = time.monotonic()
     sql = "SELECT sum(recorded('cpi', trace_id, dst, src)) FROM encounters"
     with pytest.raises(SqlError, match="stopped after"):
@@ -498,7 +500,10 @@ PAGE = Path(__file__).parents[1] / "docs" / "criticality.md"
 
 def test_the_page_lists_the_recorded_measures() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    begin, end = "<!-- recorded, made from sgstore/criticality -->\n", "<!-- end of recorded -->"
+    begin, end = (
+        "<!-- recorded, made from sgstore/model/criticality -->\n",
+        "<!-- end of recorded -->",
+    )
     rows = "".join(f"| `{name}` | {one.doc} | {one.unit} |\n" for name, one in RECORDED.items())
     head, rest = page.split(begin)
     table = f"| measure | is | unit |\n|---|---|---|\n{rows}"

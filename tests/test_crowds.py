@@ -16,23 +16,23 @@ from scenes import crossroads
 from thorough import LONG
 
 import sgstore
-import sgstore.relations._pairs as crowds
+import sgstore.graphs.relations._pairs as crowds
 import sgstore.store._packing as packing
 import sgstore.store._staging as staging
-from sgstore import graph as graphs
-from sgstore.cli import run
-from sgstore.config import Config, configured
-from sgstore.derive import derive
-from sgstore.graph import EdgeColumns
+from sgstore.apps.cli import run
+from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
+from sgstore.model import graph as graphs
+from sgstore.model.config import Config, configured
+from sgstore.model.graph import EdgeColumns
+from sgstore.pipeline.derive import derive
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.graph import GraphBlock
-    from sgstore.world import FrameBlock
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import FrameBlock
 
 VIEWS = ("edges", "nodes", "lane_states", "lane_gaps", "frames", "entities", "events", "payloads")
 BETWEEN_OTHERS = """
@@ -114,8 +114,8 @@ def test_egos_of_a_frame_with_as_many_pairs_as_there_may_be_share_their_memory(
 
 STEPS = """
 import math, sys
-from sgstore.config import Config
-from sgstore.step import Frame
+from sgstore.model.config import Config
+from sgstore.graphs.online import Frame
 from sgstore.sgg import SceneGraphGenerator
 
 generator = SceneGraphGenerator(None, Config())

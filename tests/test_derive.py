@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 import sgstore
-from sgstore.config import configured
-from sgstore.derive import derive
 from sgstore.errors import AbstractionError, ConfigError
 from sgstore.ingest import ingest
+from sgstore.model.config import configured
+from sgstore.pipeline.derive import derive
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-SAMPLE = resources.files("sgstore") / "sample" / "town.mcap"
+SAMPLE = resources.files("sgstore") / "apps" / "sample" / "town.mcap"
 
 OTHERS = {
     "thresholds": configured(

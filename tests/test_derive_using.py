@@ -8,15 +8,15 @@ import pytest
 from recordings import Recorder, car
 
 import sgstore
-from sgstore.abstractions import SUBSETS
-from sgstore.cli import run
-from sgstore.config import configured
-from sgstore.derive import derive, keep_abstraction
+from sgstore.apps.cli import run
 from sgstore.errors import AbstractionError, QueryError, QueryNameError
+from sgstore.graphs.abstractions import SUBSETS
 from sgstore.ingest import ingest
-from sgstore.vocabulary import RELATIONS
+from sgstore.model.config import configured
+from sgstore.model.vocabulary import RELATIONS
+from sgstore.pipeline.derive import derive, keep_abstraction
 
-SAMPLE = resources.files("sgstore") / "sample" / "town.mcap"
+SAMPLE = resources.files("sgstore") / "apps" / "sample" / "town.mcap"
 OTHER = configured(
     range={"radius": 28.0, "by": "centre"},
     proximity={"upper": [3.0, 5.0, 9.0, 12.0, 18.0, 28.0]},

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 import sgstore
-from sgstore.config import Config
-from sgstore.derive import derive
 from sgstore.lang import patterns
+from sgstore.model.config import Config
+from sgstore.pipeline.derive import derive
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

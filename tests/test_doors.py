@@ -21,7 +21,7 @@ from thorough import LONG
 
 import sgstore
 import sgstore.store._schema as shape
-from sgstore.cli import run as command_line
+from sgstore.apps.cli import run as command_line
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
@@ -39,7 +39,7 @@ BOTH_CHILDREN = """
 import json, sys
 from pathlib import Path
 from sgstore.ingest import ingest
-from sgstore.sandbox import Sandbox
+from sgstore.apps.sandbox import Sandbox
 store, *recordings = map(Path, json.loads(sys.argv[1]))
 {before}
 outcomes = ingest(store, recordings, jobs=2)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
 SVG = "{http://www.w3.org/2000/svg}"
 WINDOW = (14.0, 40.0, 534.0, 560.0)
@@ -352,7 +352,7 @@ def test_importing_is_cheap_and_drawing_leaves_no_global_state(tmp_path: Path) -
     program = """
 import sys
 import sgstore.draw as d
-from sgstore.graph import SceneGraph
+from sgstore.model.graph import SceneGraph
 assert 'matplotlib' not in sys.modules
 from pathlib import Path
 d.draw_frame(SceneGraph(1, 't', 0, 0, None, {}, []), None, Path(sys.argv[1]))
@@ -454,7 +454,7 @@ def test_what_is_below_the_egos_road_is_not_drawn_as_if_on_it(
 ) -> None:
     from opendrive_maps import a_map, a_road, cubic, lane, line, section
 
-    from sgstore.opendrive import read_map
+    from sgstore.maps.opendrive import read_map
 
     lanes = section(lane(1), lane(0), lane(-1))
     bridge = a_road(

@@ -14,7 +14,7 @@ from drawing import Crossing, crowd, entity, graph_of, related
 from matplotlib.artist import Artist
 from PIL import Image
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.draw import draw_clip, draw_stored, range_of
 from sgstore.draw._animation import Gif, animation, changed
 from sgstore.draw._film import FilmPage, TextSprites

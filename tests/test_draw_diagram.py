@@ -19,7 +19,7 @@ from sgstore.draw._diagram import NEIGHBOURS, excerpt_of, rows, scattered
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
 SVG = "{http://www.w3.org/2000/svg}"
 NONE: frozenset[int] = frozenset()

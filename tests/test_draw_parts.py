@@ -32,8 +32,8 @@ from sgstore.draw._view import (
     sentences,
     view_of,
 )
-from sgstore.opendrive import read_map
-from sgstore.vocabulary import ENTITY_KINDS, LIGHT_STATES, PROXIMITY, SIGNALS
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import ENTITY_KINDS, LIGHT_STATES, PROXIMITY, SIGNALS
 
 if TYPE_CHECKING:
     from pathlib import Path

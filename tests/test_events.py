@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from recordings import Recorder, car
 
 import sgstore
-from sgstore.config import Config
 from sgstore.ingest import ingest
+from sgstore.model.config import Config
+from sgstore.model.world import Event
 from sgstore.store import StoreFile, frame_ids
 from sgstore.store._payloads import Happenings
-from sgstore.world import Event
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -109,7 +109,7 @@ def test_without_locks_one_reads_and_does_not_write(
 def test_the_demo_runs_without_extras(tmp_path: Path) -> None:
     extras = ("PIL", "matplotlib", "pyarrow", "pandas", "polars", "isal", "numba", "av", "highspy")
     hidden = f"import sys; sys.modules.update(dict.fromkeys({extras!r}))"
-    told = f"{hidden}; from sgstore.cli import run; sys.exit(run(['demo', 'demo']))"
+    told = f"{hidden}; from sgstore.apps.cli import run; sys.exit(run(['demo', 'demo']))"
     done = subprocess.run(
         [sys.executable, "-c", told], cwd=tmp_path, capture_output=True, text=True, check=False
     )

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 import httpx
 import pytest
 
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
+from sgstore.apps.report import inline, report
 from sgstore.ingest import ingest
 from sgstore.lang import patterns
 from sgstore.query import Store
-from sgstore.report import inline, report
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

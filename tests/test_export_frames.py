@@ -24,8 +24,8 @@ from sgstore.errors import ExportError, TraceError
 from sgstore.exporters import Export, labelled, write_export
 from sgstore.exporters._frames import Sensed, cloud_file, sensor_of
 from sgstore.ingest import ingest
+from sgstore.model.world import Clip
 from sgstore.readers import png
-from sgstore.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Callable

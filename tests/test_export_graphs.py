@@ -33,12 +33,12 @@ from recordings import drive
 
 import sgstore
 import sgstore.exporters._foxglove as foxglove_scene
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
 from sgstore.errors import ExportError
 from sgstore.exporters import Export, labelled, write_export
 from sgstore.ingest import ingest
+from sgstore.model.world import Clip
 from sgstore.readers import open_trace
-from sgstore.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -196,7 +196,7 @@ def fields(message: Any) -> dict[str, tuple[Any, ...]]:
 
 
 def test_entities_without_a_place_or_a_size_are_drawn_as_far_as_they_can_be() -> None:
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
     nodes = {
         1: {"kind": "car", "name": "car 1", "is_ego": True, "x": 1.0, "y": 2.0},

@@ -18,13 +18,13 @@ from recordings import Recorder, bulb, car, drive, house, ns
 
 from sgstore.errors import ExportError, TraceError
 from sgstore.exporters._clips import clip_name
+from sgstore.model.world import Clip, MessageRefs, States
 from sgstore.readers import open_trace
-from sgstore.world import Clip, MessageRefs, States
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.world import FrameBlock
+    from sgstore.model.world import FrameBlock
 
 Key = tuple[str, int, int, int, bytes]
 

@@ -15,7 +15,7 @@ from PIL import Image
 import sgstore
 from sgstore.errors import MissingExtraError
 from sgstore.exporters import Export, parse_mounts, write_export
-from sgstore.world import Clip
+from sgstore.model.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -18,7 +18,7 @@ import sgstore
 from sgstore.exporters import Export, write_export
 from sgstore.ingest import ingest
 from sgstore.lang.library import patterns
-from sgstore.world import Clip
+from sgstore.model.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 import sgstore
 from sgstore.errors import ExportError
 from sgstore.exporters import Export, Mount, parse_mounts, write_export
-from sgstore.world import Clip
+from sgstore.model.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

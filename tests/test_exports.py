@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 import pytest
 
 import sgstore
-from sgstore.cli import run
-from sgstore.demo import RECORDING
+from sgstore.apps.cli import run
+from sgstore.apps.demo import RECORDING
 from sgstore.errors import AbstractionError, ExportError, QueryError, TraceError
 from sgstore.exporters import (
     EXPORTERS,
@@ -38,7 +38,7 @@ from sgstore.exporters._clips import export_folder, safe_name
 from sgstore.exporters._pyg import ACTORS, RELATIONS
 from sgstore.exporters.graph_data import GraphData
 from sgstore.ingest import ingest
-from sgstore.world import Clip
+from sgstore.model.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -301,13 +301,13 @@ def test_a_format_of_another_package_is_found(
         def load(self) -> Exporter:
             raise ImportError("no module named elsewhere")
 
-    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Point()])
+    monkeypatch.setattr("sgstore.base.plugins.entry_points", lambda group: [Point()])
     (file,) = write_export(export, tmp_path / "out", "lines")
     assert isinstance(file, WrittenFile)
     assert file.file.read_text().split() == [str(i) for _, i in frames_in(export)]
     assert list(exporters()) == [*(one.name for one in EXPORTERS), "lines"]
 
-    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Broken()])
+    monkeypatch.setattr("sgstore.base.plugins.entry_points", lambda group: [Broken()])
     with pytest.raises(ExportError, match=r"'broken' .* cannot be loaded: ImportError"):
         exporter_named("nothing")
 
@@ -331,7 +331,7 @@ def test_a_format_that_breaks_is_told_by_its_name_in_one_line(
 
             return Exporter("lines", write)
 
-    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Point()])
+    monkeypatch.setattr("sgstore.base.plugins.entry_points", lambda group: [Point()])
     line = ["export", str(store.file.path), "MATCH (e:Ego)", "--format", "lines", "--to"]
 
     assert run([*line, str(tmp_path / "out")]) == 1
@@ -880,7 +880,7 @@ def test_a_recording_that_was_replaced_is_refused(recording: Path, tmp_path: Pat
 
 
 def test_rows_of_s3c_come_in_again_as_the_same_classes(store: Store, tmp_path: Path) -> None:
-    from sgstore.importing import import_graphs
+    from sgstore.pipeline.importing import import_graphs
 
     export = Export(store, (Clip("town", 5 * S, 8 * S), Clip("town", 24 * S, 24 * S)))
     write_export(export, tmp_path / "out", "s3c")
@@ -899,7 +899,7 @@ def test_rows_of_s3c_come_in_again_as_the_same_classes(store: Store, tmp_path: P
 def test_lines_of_networkx_come_in_again_as_the_same_graphs(
     export: Export, written: Callable[..., Path], tmp_path: Path
 ) -> None:
-    from sgstore.importing import import_graphs
+    from sgstore.pipeline.importing import import_graphs
 
     import_graphs(tmp_path / "again.sgstore", [written("nx") / "town_001.jsonl"], "nodelink")
     again = sgstore.open(tmp_path / "again.sgstore")

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import sgstore
-from sgstore.cli import run
-from sgstore.demo import RECORDING
+from sgstore.apps.cli import run
+from sgstore.apps.demo import RECORDING
 from sgstore.exporters import EXPORTERS, GROUP, Export, write_export
 from sgstore.ingest import ingest
-from sgstore.world import Clip
+from sgstore.model.world import Clip
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -116,7 +116,7 @@ def test_the_format_of_the_page_can_be_exported(
         def load(self) -> Any:
             return own
 
-    monkeypatch.setattr("sgstore.plugins.entry_points", lambda group: [Point()])
+    monkeypatch.setattr("sgstore.base.plugins.entry_points", lambda group: [Point()])
     store = sgstore.open(folder / "drives.sgstore")
 
     (written,) = write_export(

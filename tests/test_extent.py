@@ -14,15 +14,22 @@ from builders import Thing, edges, frames, graph_of, present, thing
 from conftest import REPOSITORY
 from opendrive_maps import a_map, a_road, arc, cubic, lane, line, link, section
 
-from sgstore.config import Config, LaneSettings, PairSettings, RangeSettings, configured
-from sgstore.opendrive import read_map
-from sgstore.relations import EgoPoses, Extent
+from sgstore.graphs.relations import EgoPoses, Extent
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, LaneSettings, PairSettings, RangeSettings, configured
+from sgstore.model.vocabulary import (
+    DRIVING,
+    KIND_CODE,
+    KINDS,
+    RELATION_CODE,
+    RELATIONS,
+    TypeMeaning,
+)
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
-from sgstore.vocabulary import DRIVING, KIND_CODE, KINDS, RELATION_CODE, RELATIONS, TypeMeaning
 
 if TYPE_CHECKING:
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
 
 ARROW = ((40.0, 0.0), (-10.0, 18.0), (0.0, 0.0), (-10.0, -18.0))
 SHAPES = {

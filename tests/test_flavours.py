@@ -27,11 +27,13 @@ from test_export_mcap import cut
 from test_online import agree
 
 import sgstore
-from sgstore import Frame, SceneGraphGenerator, plugins
-from sgstore.config import Config
+from sgstore import Frame, SceneGraphGenerator
+from sgstore.base import plugins
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
+from sgstore.model.world import Channel, FrameBlock, States, TraceInfo, TraceReport
 from sgstore.readers import (
     READERS,
     FramesTrace,
@@ -41,7 +43,6 @@ from sgstore.readers import (
     read_message,
 )
 from sgstore.readers.foxglove._mapping import Ego, EntityMapping, SceneMapping, shipped
-from sgstore.world import Channel, FrameBlock, States, TraceInfo, TraceReport
 
 
 @cache

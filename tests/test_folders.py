@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from sgstore.files import HeldFolder, new_place, temporary_folder, working_folder
+from sgstore.base.files import HeldFolder, new_place, temporary_folder, working_folder
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from sgstore.files import HeldFolder, temporary_folder
+from sgstore.base.files import HeldFolder, temporary_folder
 held = HeldFolder(Path(sys.argv[1]), "kept-")
 (held.path / "data").write_bytes(b"x" * 1000)
 print(held.path, temporary_folder(), flush=True)
@@ -117,7 +117,7 @@ def test_without_a_place_for_temporary_files_a_store_is_read_all_the_same(
 def test_the_next_start_removes_what_a_killed_ingest_and_a_killed_query_left(
     town_store: Path, tmp_path: Path
 ) -> None:
-    from sgstore.demo import RECORDING
+    from sgstore.apps.demo import RECORDING
 
     store = tmp_path / "new.sgstore"
     env = os.environ | {"TMPDIR": str(tmp_path / "tmp")}

@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from recordings import ns
 
 from sgstore.errors import TraceError
+from sgstore.model.vocabulary import KINDS, LIGHT_STATES
+from sgstore.model.world import FrameBlock, States, TraceInfo, TraceReport
 from sgstore.readers import open_trace
 from sgstore.readers.foxglove._mapping import mapping_for, shipped
 from sgstore.readers.foxglove._messages import Axes, angles, normed, product, rotated
-from sgstore.vocabulary import KINDS, LIGHT_STATES
-from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -400,7 +400,7 @@ def test_a_state_of_lights_that_a_process_makes_known_is_read(file: Path) -> Non
     script = """
 import sys
 from sgstore.readers import open_trace
-from sgstore.vocabulary import LIGHT_STATES, add_light_state
+from sgstore.model.vocabulary import LIGHT_STATES, add_light_state
 open_trace(sys.argv[1], mapping=sys.argv[2]).close()  # what was read before changes nothing
 add_light_state("white_bar")
 with open_trace(sys.argv[1], mapping=sys.argv[2]) as trace:

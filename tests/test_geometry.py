@@ -11,10 +11,10 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sgstore.geometry import bearings, corners, gap_to_points, offsets, wrapped
+from sgstore.base.geometry import bearings, corners, gap_to_points, offsets, wrapped
 
 if TYPE_CHECKING:
-    from sgstore.world import Floats
+    from sgstore.model.world import Floats
 
 PI = math.pi
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import networkx as nx
 
-from sgstore.graph import SceneGraph
+from sgstore.model.graph import SceneGraph
 
 GRAPH = SceneGraph(
     frame_id=64,

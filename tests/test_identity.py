@@ -17,19 +17,19 @@ import pytest
 import recordings as osi
 import sumo_recordings as sumo
 
-from sgstore import doctor, segments
-from sgstore.cli import run
-from sgstore.config import Config
+from sgstore.apps.cli import run
+from sgstore.graphs.online import Frame, Replay
 from sgstore.ingest import ingest
+from sgstore.model.config import Config
+from sgstore.model.vocabulary import KINDS
+from sgstore.pipeline import doctor, segments
+from sgstore.pipeline.segments import TraceOutcome
 from sgstore.query import Store
 from sgstore.readers import open_trace
-from sgstore.segments import TraceOutcome
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame, Replay
-from sgstore.vocabulary import KINDS
 
 if TYPE_CHECKING:
-    from sgstore.world import FrameBlock, TraceReport
+    from sgstore.model.world import FrameBlock, TraceReport
 
 Size = tuple[float, float, float]
 

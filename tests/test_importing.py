@@ -19,13 +19,13 @@ import pytest
 from thorough import some
 
 import sgstore
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.errors import ConfigError, QueryError, TraceError
-from sgstore.importing import FORMATS, Words, import_graphs
-from sgstore.importing._resolve import Understanding, survey
-from sgstore.importing._run import Blocks, parts_map
 from sgstore.ingest import ingest
 from sgstore.lang import Binding, FrameView, ScopeSearch, compile_query
+from sgstore.pipeline.importing import FORMATS, Words, import_graphs
+from sgstore.pipeline.importing._resolve import Understanding, survey
+from sgstore.pipeline.importing._run import Blocks, parts_map
 from sgstore.query import Store
 from sgstore.store import StoreFile
 
@@ -164,7 +164,7 @@ def test_what_networkx_writes_comes_back_with_its_attributes(tmp_path: Path) -> 
 
 def test_graphs_of_this_house_have_the_same_classes_when_they_come_back(tmp_path: Path) -> None:
     """Entities and their relations: what is known without a map."""
-    sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+    sample = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
     ingest(tmp_path / "town.sgstore", [sample], rate=1, until=9)
     town = sgstore.open(tmp_path / "town.sgstore")
     frames = town.classes("ER")["frame_id"].tolist()
@@ -381,7 +381,7 @@ def test_text_that_is_no_utf_8_and_a_broken_archive_are_errors_with_their_line(
 def test_an_archive_of_nothing_but_air_is_refused_before_it_fills_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sgstore.importing._formats as lines
+    import sgstore.pipeline.importing._formats as lines
 
     monkeypatch.setattr(lines, "_FREE", 1 << 16)
     monkeypatch.setattr(lines, "MAX_RATIO", 10)
@@ -428,7 +428,7 @@ def test_what_a_small_file_unpacks_to_is_refused_before_it_fills_the_memory(
             packed.write(part)
     program = (
         "import resource, sys\n"
-        "from sgstore.importing import import_graphs\n"
+        "from sgstore.pipeline.importing import import_graphs\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "(done,) = import_graphs(*sys.argv[1:2], sys.argv[2:3], sys.argv[3])\n"
         "print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024, done.error)\n"
@@ -449,7 +449,7 @@ def test_what_a_small_file_unpacks_to_is_refused_before_it_fills_the_memory(
 def test_graphs_of_many_edges_come_in_as_well_as_small_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sgstore.importing._run as running
+    import sgstore.pipeline.importing._run as running
 
     rows = "".join(
         f"d,g{graph},1,0,ego,near,car_{car}\n"
@@ -539,7 +539,7 @@ def test_what_is_exported_as_s3c_comes_back_with_the_same_classes(
         (tmp_path / "two.csv").write_text(TWO)
         import_graphs(first, [tmp_path / "two.csv"], "s3c")
     else:
-        sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+        sample = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
         ingest(first, [sample], rate=1, until=9)
     command = [
         "export",

@@ -15,19 +15,19 @@ from opendrive_maps import a_map, a_road, line
 from recordings import Recorder, car, drive
 
 from sgstore import ingest as running
-from sgstore import map_files as maps
-from sgstore.config import Config, RangeSettings
 from sgstore.errors import MapError, StoreError, TraceError
 from sgstore.ingest import ingest
-from sgstore.map_files import read_map_file
-from sgstore.opendrive import read_map
+from sgstore.maps import map_files as maps
+from sgstore.maps.map_files import read_map_file
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.vocabulary import RELATIONS
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
-    from sgstore.segments import Progress
+    from sgstore.pipeline.segments import Progress
 
 STREET = a_map(a_road("1", line(200.0, x=-20.0, y=2.0)))
 """A lane 200 m long under the drive."""

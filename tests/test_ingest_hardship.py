@@ -17,7 +17,7 @@ from recordings import drive
 from soaking import soak
 from thorough import LONG
 
-from sgstore.cli import run as sgstore
+from sgstore.apps.cli import run as sgstore
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
@@ -36,8 +36,8 @@ def test_a_killed_run_goes_on_and_ends_as_where_nobody_killed_it(tmp_path: Path)
 DYING = """
 import os, signal, sys
 from pathlib import Path
-import sgstore.rebuild
-from sgstore.cli import run
+import sgstore.pipeline.rebuild
+from sgstore.apps.cli import run
 moment, *line = sys.argv[1:]
 def dying(of, name):
     old = getattr(of, name)
@@ -49,7 +49,7 @@ def dying(of, name):
         return old(*args, **named)
     setattr(of, name, new)
 of, name = moment.split(".")
-dying({"Path": Path, "rebuilding": sgstore.rebuild}[of], name)
+dying({"Path": Path, "rebuilding": sgstore.pipeline.rebuild}[of], name)
 run(line)
 """
 """A command line in a process that dies right after a call, or before it reads on a map."""

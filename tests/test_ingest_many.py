@@ -16,17 +16,18 @@ from opendrive_maps import a_map, a_road, line
 from recordings import Recorder, car, drive, person
 
 from sgstore import ingest as workers
-from sgstore import readers, segments
-from sgstore.config import Config, RangeSettings
+from sgstore import readers
 from sgstore.errors import MapError, StoreError, TraceError
 from sgstore.ingest import ingest, recordings
+from sgstore.model.config import Config, RangeSettings
+from sgstore.pipeline import segments
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.segments import Progress, TraceOutcome
+    from sgstore.pipeline.segments import Progress, TraceOutcome
 
 
 def rows(store: Path, sql: str) -> list[tuple[Any, ...]]:

@@ -13,13 +13,11 @@ from graph_blocks import RandomTrace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sgstore.config import Config
 from sgstore.ingest import ingest
-from sgstore.opendrive import read_map
-from sgstore.sgg import SceneGraphGenerator
-from sgstore.store import StoreFile
-from sgstore.vocabulary import KIND_CODE, RELATIONS
-from sgstore.world import (
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
+from sgstore.model.vocabulary import KIND_CODE, RELATIONS
+from sgstore.model.world import (
     BUCKET_FRAMES,
     Entities,
     FrameBlock,
@@ -30,11 +28,13 @@ from sgstore.world import (
     origin_of,
     quantize,
 )
+from sgstore.sgg import SceneGraphGenerator
+from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
-    from sgstore.graph import GraphBlock
+    from sgstore.model.graph import GraphBlock
 
-SAMPLE = Path(str(files("sgstore"))) / "sample" / "town.mcap"
+SAMPLE = Path(str(files("sgstore"))) / "apps" / "sample" / "town.mcap"
 MORE_DATA = ("esmini/traffic_lights.mcap", "esmini/highway_merge.mcap")
 FLOATS = [
     f.name for f in fields(States) if f.name not in {"node", "lights", "light_state", "derived"}

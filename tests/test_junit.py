@@ -9,7 +9,7 @@ from xml.etree import ElementTree as Xml
 import pytest
 from recordings import drive
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.ingest import ingest
 
 if TYPE_CHECKING:

@@ -14,12 +14,12 @@ from test_cli_ingest import in_json, sgstore
 import sgstore as library
 from sgstore import exporters
 from sgstore.exporters import Export, write_export
-from sgstore.importing import import_graphs
+from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
 from sgstore.lang import node_of_kind
-from sgstore.step import Frame
-from sgstore.vocabulary import ENTITY_KINDS, SUPER_KINDS, VEHICLES
-from sgstore.world import Clip
+from sgstore.model.vocabulary import ENTITY_KINDS, SUPER_KINDS, VEHICLES
+from sgstore.model.world import Clip
+from sgstore.pipeline.importing import import_graphs
 
 if TYPE_CHECKING:
     from pathlib import Path

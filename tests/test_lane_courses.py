@@ -28,21 +28,21 @@ from opendrive_maps import (
 from test_roads_carla import lanes_by_name, name_of
 from thorough import LONG
 
-from sgstore.config import Config, RangeSettings
-from sgstore.graph import LaneDistances
 from sgstore.lang import FrameView
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import PlainLane, lane_text, read_lane_text
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.graph import LaneDistances
+from sgstore.model.world import TraceReport
 from sgstore.query import Store
-from sgstore.roads import PlainLane, lane_text, read_lane_text
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
 from sgstore.temporal import Monitor
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
     from sgstore.temporal import MonitorEvent
 
 

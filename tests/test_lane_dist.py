@@ -16,22 +16,22 @@ from builders import PaperMap, Patch, Recording, graph_of, thing
 from graph_blocks import RandomTrace, map_stub, publish
 from thorough import LONG
 
-from sgstore.config import Config, RangeSettings
 from sgstore.errors import QueryError
-from sgstore.graph import LaneDistances
+from sgstore.graphs.online import Frame
 from sgstore.lang import FrameView
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.graph import LaneDistances
+from sgstore.model.vocabulary import RELATION_CODE, SIGNALS
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame
 from sgstore.store import StoreFile
 from sgstore.temporal import Monitor, MonitorEvent
-from sgstore.vocabulary import RELATION_CODE, SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
     Ways = nx.DiGraph[tuple[int, str]]
 

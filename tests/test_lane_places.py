@@ -15,16 +15,16 @@ from graph_blocks import trace_info
 from test_lane_dist import driven, lane_ways
 from thorough import LONG
 
-from sgstore.config import Config
 from sgstore.errors import QueryError
-from sgstore.graph import LaneDistances
 from sgstore.lang import FrameView
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
+from sgstore.model.graph import LaneDistances
+from sgstore.model.vocabulary import KINDS, RELATION_CODE, SIGNALS
+from sgstore.model.world import TraceReport
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.vocabulary import KINDS, RELATION_CODE, SIGNALS
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from test_lane_dist import Ways
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
     Stretches = list[tuple[int, float, float]]
 

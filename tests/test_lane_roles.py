@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 from matching import Matcher
 
-from sgstore.config import Config
+from sgstore.graphs.online import Replay
 from sgstore.lang import compile_query
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Replay
 
-RECORDING = str(resources.files("sgstore") / "sample" / "town.mcap")
+RECORDING = str(resources.files("sgstore") / "apps" / "sample" / "town.mcap")
 INSIDE = "MATCH (x:Entity)-[:isIn]->(l:Lane) WHERE l.role IS NOT NULL"
 BESIDE = "MATCH (x:Vehicle)-[:isIn]->(l:Lane {role: 'Right 1 of Ego Lane'})"
 

@@ -10,15 +10,15 @@ from lanelet2_maps import LaneletMap, two_lanes
 from oracle_lanelet2 import EXAMPLE, ORIGIN, as_told, differences, golden
 
 from sgstore.errors import MapError
-from sgstore.lanelet2 import Projection, lanelet2_text, read_projector_info
-from sgstore.map_files import Maps, read_map_file
-from sgstore.opendrive import read_map
-from sgstore.vocabulary import KINDS, RELATIONS
+from sgstore.maps.lanelet2 import Projection, lanelet2_text, read_projector_info
+from sgstore.maps.map_files import Maps, read_map_file
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import KINDS, RELATIONS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 
 def a_map(made: LaneletMap, projection: Projection | None = None) -> RoadMap:
@@ -171,7 +171,7 @@ def test_what_cannot_be_used_is_named_and_a_map_without_lanelets_refused() -> No
 def test_many_lanelets_in_one_place_are_no_neighbours_of_one_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("sgstore.lanelet2._lanes._MOST_BESIDE", 3)
+    monkeypatch.setattr("sgstore.maps.lanelet2._lanes._MOST_BESIDE", 3)
     made = LaneletMap()
     left, right = (made.way([(0, y), (9, y)]) for y in (3, 0))
     for _ in range(5):

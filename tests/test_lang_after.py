@@ -12,7 +12,7 @@ from oracle_worlds import World, random_world
 from recordings import Recorder, car
 from thorough import LONG
 
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
 from sgstore.ingest import ingest
 from sgstore.query import Store
 

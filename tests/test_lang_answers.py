@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from scenes import Scene, actor, along, cone, ego, light, store_of, street
 
-from sgstore.config import Config, PairSettings, Proximity
+from sgstore.graphs.online import Replay
 from sgstore.lang import RelationScope, TraceFacts
 from sgstore.lang._needs import in_range
 from sgstore.lang.ir import Value
-from sgstore.step import Replay
+from sgstore.model.config import Config, PairSettings, Proximity
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from sgstore.lang._catalog import (
 from sgstore.lang._evaluate import evaluator
 from sgstore.lang._precision import Precision, precision_of
 from sgstore.lang.ir import FrameAttribute, NodeAttribute, TraceAttribute
-from sgstore.pair_numbers import PAIR_FUNCTIONS
-from sgstore.vocabulary import MAP_KINDS
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS
+from sgstore.model.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

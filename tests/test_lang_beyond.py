@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 from scenes import Scene, actor, along, cone, ego, seen_by, store_of, street
 
-from sgstore.config import Config, PairSettings, Proximity, RangeSettings
+from sgstore.graphs.online import replayed
 from sgstore.lang import Binding, ScopeSearch, compile_query
-from sgstore.step import replayed
+from sgstore.model.config import Config, PairSettings, Proximity, RangeSettings
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

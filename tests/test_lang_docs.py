@@ -16,8 +16,8 @@ from sgstore.errors import QueryError
 from sgstore.lang import compile_checks, compile_query, patterns
 from sgstore.lang._functions import FUNCTIONS
 from sgstore.lang.library import predicates
-from sgstore.pair_numbers import PAIR_FUNCTIONS
-from sgstore.vocabulary import KINDS, RELATIONS
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS
+from sgstore.model.vocabulary import KINDS, RELATIONS
 
 PATH = Path(__file__).parents[1] / "docs" / "language.md"
 PAGE = PATH.read_text(encoding="utf-8")
@@ -50,7 +50,7 @@ def test_there_are_queries_on_the_page() -> None:
 
 def test_the_table_of_numbers_of_pairs_is_that_of_the_declarations() -> None:
     page = PATH.read_text(encoding="utf-8")
-    begin, end = "<!-- numbers of pairs, made from sgstore/pair_numbers -->\n", "<!-- end -->"
+    begin, end = "<!-- numbers of pairs, made from sgstore/model/pair_numbers -->\n", "<!-- end -->"
     rows = [f"| `{name}(a, b)` | {one.meaning} |\n" for name, one in PAIR_FUNCTIONS.items()]
     table = "".join(["| function | is |\n|---|---|\n", *rows])
     head, rest = page.split(begin)

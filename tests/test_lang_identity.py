@@ -12,8 +12,8 @@ import pytest
 from oracle_worlds import World, random_world
 
 import sgstore
-from sgstore.cli import run
-from sgstore.sandbox import Sandbox
+from sgstore.apps.cli import run
+from sgstore.apps.sandbox import Sandbox
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:

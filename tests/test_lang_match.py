@@ -17,11 +17,11 @@ from recordings import Recorder, car
 from test_lang_oracle import QUERIES
 from thorough import LONG
 
-from sgstore.demo import QUESTIONS
+from sgstore.apps.demo import QUESTIONS
 from sgstore.errors import QueryError
-from sgstore.graph import SceneGraph
 from sgstore.ingest import ingest
 from sgstore.lang import Catalog, FrameView, compile_query, parse, why_not
+from sgstore.model.graph import SceneGraph
 from sgstore.query import Store
 
 if TYPE_CHECKING:

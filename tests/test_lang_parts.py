@@ -11,10 +11,10 @@ from oracle_worlds import World, random_world
 from recordings import Recorder, car
 from thorough import LONG
 
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
+from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
 from sgstore.query import Store
-from sgstore.step import Frame
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

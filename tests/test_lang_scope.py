@@ -24,12 +24,12 @@ from scenes import (
 from thorough import LONG
 from thorough import some as some_of
 
-from sgstore.config import Config, RangeSettings
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
+from sgstore.graphs.online import replayed
 from sgstore.ingest import ingest
 from sgstore.lang import Binding, ScopeSearch, compile_query, patterns
+from sgstore.model.config import Config, RangeSettings
 from sgstore.query import Store
-from sgstore.step import replayed
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

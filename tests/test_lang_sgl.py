@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sgstore.cli import run
-from sgstore.contrib.sgsm import translated
+from sgstore.apps.cli import run
 from sgstore.errors import QueryError
 from sgstore.lang import parse
+from sgstore.lang.contrib.sgsm import translated
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,7 +17,7 @@ from sgstore.errors import QueryError
 from sgstore.lang import SqlStatement, Window, compile_query
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit
 from sgstore.matches import FIRST_WINDOW, LAST_WINDOW, Windows
-from sgstore.pair_numbers import (
+from sgstore.model.pair_numbers import (
     COLUMNS,
     HUNG,
     PAIR_FUNCTIONS,

@@ -16,7 +16,7 @@ from test_lang_match import view_of
 from thorough import LONG
 from typer.testing import CliRunner
 
-from sgstore.cli import application
+from sgstore.apps.cli import application
 from sgstore.errors import QueryError
 from sgstore.lang import compile_query, parse
 

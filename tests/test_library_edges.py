@@ -10,8 +10,8 @@ from library_edges import COLLISIONS, EDGES, RULES, Edge
 from library_scenes import SCENES
 from scenes import store_of
 
-from sgstore.config import from_dict
 from sgstore.lang import patterns
+from sgstore.model.config import from_dict
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import networkx as nx
 import pytest
 from typer.testing import CliRunner
 
-from sgstore.cli import application
+from sgstore.apps.cli import application
 from sgstore.errors import AbstractionError, QueryError, StoreError
 
 if TYPE_CHECKING:

@@ -18,11 +18,11 @@ import httpx
 import numpy as np
 from columns_read import unpacked
 
-from sgstore.config import Config
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
+from sgstore.apps.explorer import LiveRun, live_application
 from sgstore.errors import QueryNameError, StoreError
-from sgstore.serve import LiveRun, live_application
-from sgstore.step import Frame
+from sgstore.graphs.online import Frame
+from sgstore.model.config import Config
 from sgstore.temporal import Monitor, MonitorEvent, opened, paced
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def moving(i: int, speed: float) -> Frame:
 
 
 def test_what_is_kept_does_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sgstore.serve._live as live
+    import sgstore.apps.explorer._live as live
     import sgstore.temporal._followed as followed
 
     monkeypatch.setattr(live, "MOST_FRAMES", 10)

@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 
 import sgstore
-from sgstore.cli import run
-from sgstore.config import from_dict
-from sgstore.coverage import classed, selection_of
-from sgstore.diff import by_frame, matches, scenes, verdicts
+from sgstore.apps.cli import run
 from sgstore.errors import ExportError, StoreError
 from sgstore.ingest import ingest
-from sgstore.locks import (
+from sgstore.model.config import from_dict
+from sgstore.query import Store
+from sgstore.store import graph_digests
+from sgstore.testsets.coverage import classed, selection_of
+from sgstore.testsets.diff import by_frame, matches, scenes, verdicts
+from sgstore.testsets.locks import (
     Lock,
     cases_of,
     frames_of_lock,
@@ -31,16 +33,20 @@ from sgstore.locks import (
     union,
     verify,
 )
-from sgstore.query import Store
-from sgstore.selection import SelectionSpec, SelectionUnit, Strategy, locked_selection, select
-from sgstore.store import graph_digests
+from sgstore.testsets.selection import (
+    SelectionSpec,
+    SelectionUnit,
+    Strategy,
+    locked_selection,
+    select,
+)
 
 pytest_plugins = ["pytester"]
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+SAMPLE = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
 FRAMES = 61
 NEARER = from_dict({"proximity": {"names": ["near_coll", "near"], "upper": [3.0, 12.0]}})
 

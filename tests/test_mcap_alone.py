@@ -32,7 +32,7 @@ def test_the_reader_needs_nothing_else_of_the_package_but_its_errors() -> None:
 def test_the_page_of_the_reader_tells_the_truth(tmp_path: Path) -> None:
     page = (ROOT / "sgstore/mcap/README.md").read_text(encoding="utf-8")
     (program,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    shutil.copy(ROOT / "sgstore/sample/town.mcap", tmp_path / "drives.mcap")
+    shutil.copy(ROOT / "sgstore/apps/sample/town.mcap", tmp_path / "drives.mcap")
 
     ended = subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False

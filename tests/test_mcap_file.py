@@ -23,8 +23,8 @@ from thorough import LONG, some
 
 from sgstore.errors import TraceError
 from sgstore.mcap import McapFile
+from sgstore.model.world import TraceReport
 from sgstore.readers import open_trace, read_message
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -18,10 +18,10 @@ from oracle_watched import CHECKS, MARGINS, SEQUENCES, VALUES, Drive, library_ch
 from thorough import LONG
 
 import sgstore.temporal._sequences as joins
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
 from sgstore.errors import QueryError
-from sgstore.graph import SceneGraph
-from sgstore.step import Frame
+from sgstore.graphs.online import Frame
+from sgstore.model.graph import SceneGraph
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

@@ -11,20 +11,20 @@ import pytest
 from motions import Motion
 from thorough import LONG
 
-from sgstore.config import Config
-from sgstore.demo import RECORDING
-from sgstore.map_files import Maps
+from sgstore.apps.demo import RECORDING
+from sgstore.maps.map_files import Maps
+from sgstore.model.config import Config
+from sgstore.model.vocabulary import RELATIONS
+from sgstore.model.world import origin_of, quantize
 from sgstore.readers import on_map, open_trace
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import RELATIONS
-from sgstore.world import origin_of, quantize
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
-    from sgstore.world import FrameBlock
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import FrameBlock
 
 MOTIONS = {
     "shift": Motion(shift=(-731.25, 4096.5, 12.0)),

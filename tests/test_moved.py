@@ -9,10 +9,10 @@ import pytest
 from recordings import drive
 
 import sgstore
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest
-from sgstore.rebuild import rebuild
+from sgstore.pipeline.rebuild import rebuild
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,10 +11,10 @@ import pytest
 from recordings import Recorder, car
 
 from sgstore import matches as streams
-from sgstore.cli import run as run_verb
-from sgstore.diff import verdicts
+from sgstore.apps.cli import run as run_verb
 from sgstore.ingest import ingest
 from sgstore.query import Store
+from sgstore.testsets.diff import verdicts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

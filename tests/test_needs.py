@@ -11,16 +11,16 @@ import pytest
 from oracle_over_time import worlds
 from recordings import Recorder, car
 
-from sgstore.cli import run as run_verb
-from sgstore.diff import matches
+from sgstore.apps.cli import run as run_verb
+from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
 from sgstore.lang import Type
 from sgstore.lang._catalog import NODE_ATTRIBUTES
 from sgstore.lang._needs import MEASURED
+from sgstore.model.vocabulary import VEHICLE_LIGHTS, natural, normalize_name
 from sgstore.query import Store
-from sgstore.step import Frame
 from sgstore.temporal import Monitor
-from sgstore.vocabulary import VEHICLE_LIGHTS, natural, normalize_name
+from sgstore.testsets.diff import matches
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

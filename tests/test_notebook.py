@@ -24,9 +24,9 @@ from PIL import Image
 from thorough import LONG
 
 import sgstore
-from sgstore.demo import RECORDING
-from sgstore.display import cell, html_media, html_table
-from sgstore.notebook import SgqlCell
+from sgstore.apps.demo import RECORDING
+from sgstore.apps.notebook import SgqlCell
+from sgstore.base.display import cell, html_media, html_table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
+from sgstore.apps.sandbox import Sandbox
 from sgstore.lang import Type
 from sgstore.lang._catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES
-from sgstore.sandbox import Sandbox
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,22 +14,22 @@ import pytest
 from builders import PaperMap, Patch, Recording, Thing, frame_of, thing
 from thorough import LONG
 
-from sgstore import step as stepping
-from sgstore.config import Config, RangeSettings
-from sgstore.demo import RECORDING
-from sgstore.opendrive import read_map
+from sgstore.apps.demo import RECORDING
+from sgstore.graphs import online as stepping
+from sgstore.graphs.online import Frame, Replay
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.vocabulary import RELATIONS
+from sgstore.model.world import Origin, number, origin_of, quantize
 from sgstore.query import Store
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame, Replay
-from sgstore.vocabulary import RELATIONS
-from sgstore.world import Origin, number, origin_of, quantize
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.graph import GraphBlock, SceneGraph
+    from sgstore.model.graph import GraphBlock, SceneGraph
 
 STREET = PaperMap(
     Patch("east", -400, -4, 40, 0, road="main", controlled_by="s1"),

@@ -13,12 +13,12 @@ import networkx as nx
 import pytest
 
 import sgstore
-from sgstore import vocabulary
-from sgstore.config import Config, load
 from sgstore.errors import ConfigError, QueryError, QueryNameError, StoreError
-from sgstore.importing import Words, import_graphs
 from sgstore.ingest import ingest
 from sgstore.lang import Catalog, compile_query
+from sgstore.model import vocabulary
+from sgstore.model.config import Config, load
+from sgstore.pipeline.importing import Words, import_graphs
 from sgstore.store import StoreFile, verify_file
 
 if TYPE_CHECKING:
@@ -247,7 +247,7 @@ def test_a_store_with_new_names_is_asked_in_a_process_that_knows_none(tmp_path: 
     store = brought_in(tmp_path, scene("a.jpg"), words=Words(unknown_as="own"))
     script = """
 import sys, sgstore
-from sgstore import vocabulary
+from sgstore.model import vocabulary
 vocabulary.add_kind("comes_first"); vocabulary.add_light_state("purple")  # other codes than in the store
 store = sgstore.open(sys.argv[1])
 print(store.find("MATCH (h:Hydrant)<-[:sitting_on]-(m:Man)").count(), len(store.file.verify().faults))
@@ -270,7 +270,7 @@ def test_a_store_made_before_takes_new_kinds_beside_what_it_has(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "x.sgstore"
-    sample = sgstore.__path__[0] + "/sample/town.mcap"
+    sample = sgstore.__path__[0] + "/apps/sample/town.mcap"
     ingest(path, [sample], until=3.0)
     before = sgstore.open(path).sql("SELECT * FROM nodes ORDER BY ALL").values
     store = brought_in(tmp_path, scene("a.jpg"), words=Words(unknown_as="own"))
@@ -299,7 +299,7 @@ def test_labels_for_which_there_is_no_room_are_unknown_and_keep_their_type(tmp_p
 
 
 def test_a_type_of_a_recording_is_of_a_kind_that_the_settings_name(tmp_path: Path) -> None:
-    sample = sgstore.__path__[0] + "/sample/town.mcap"
+    sample = sgstore.__path__[0] + "/apps/sample/town.mcap"
     types = StoreFile.create(tmp_path / "types.db")
     ingest(types.path, [sample], until=2.0)
     ((name,),) = sgstore.open(types.path).sql(
@@ -355,7 +355,7 @@ def with_names(path: Path, **names: list[str]) -> Path:
 
     from sgstore.store._schema import widen
 
-    ingest(path, [sgstore.__path__[0] + "/sample/town.mcap"], until=1.0)
+    ingest(path, [sgstore.__path__[0] + "/apps/sample/town.mcap"], until=1.0)
     with duckdb.connect() as connection:
         connection.execute(f"ATTACH '{path}' AS other")
         widen(connection, "other", names)

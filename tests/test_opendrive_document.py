@@ -26,12 +26,12 @@ from opendrive_maps import (
     width,
 )
 
-import sgstore.opendrive._document as document
-import sgstore.opendrive._lanes as lanes
-import sgstore.relations._extent as extent
+import sgstore.graphs.relations._extent as extent
+import sgstore.maps.opendrive._document as document
+import sgstore.maps.opendrive._lanes as lanes
 from sgstore.errors import MapError
-from sgstore.opendrive import read_map
-from sgstore.relations._extent import LaneHeights
+from sgstore.graphs.relations._extent import LaneHeights
+from sgstore.maps.opendrive import read_map
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,14 +11,14 @@ from opendrive_maps import a_map, a_road, element, lane, line, link, section
 from test_cli_ingest import in_json, sgstore
 from test_opendrive_furniture import lanes_of, road_with, signal, valid
 
-from sgstore.config import Signs
-from sgstore.opendrive import read_map
-from sgstore.vocabulary import RELATION_CODE
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Signs
+from sgstore.model.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 CARLA = Signs(orientation="carla")
 LIGHT = {"type": "1000001", "dynamic": "yes"}

@@ -10,13 +10,13 @@ import pytest
 import shapely
 from opendrive_maps import a_map, a_road, arc, cubic, element, lane, line, section
 
-from sgstore.opendrive import kind_of_object, read_map
-from sgstore.vocabulary import KINDS
+from sgstore.maps.opendrive import kind_of_object, read_map
+from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 LANES = section(
     lane(2, kind="sidewalk"), lane(1), lane(0), lane(-1), lane(-2), lane(-3, kind="shoulder")

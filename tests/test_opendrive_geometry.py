@@ -23,11 +23,11 @@ from opendrive_maps import (
     width,
 )
 
-from sgstore.opendrive import read_map
-from sgstore.opendrive._document import last_before
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.opendrive._document import last_before
 
 if TYPE_CHECKING:
-    from sgstore.roads import LanePoints, RoadMap
+    from sgstore.maps.roads import LanePoints, RoadMap
 
 HAIR = 1e-6
 """What two exact ways to the same place may differ by; m."""

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from opendrive_maps import a_map, a_road, arc, element, lane, line, link, mark, section
 
-from sgstore.opendrive import read_map
-from sgstore.opendrive._network import permitted
-from sgstore.vocabulary import RELATION_CODE
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.opendrive._network import permitted
+from sgstore.model.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 TWO_WAY = section(lane(1), lane(0), lane(-1))
 

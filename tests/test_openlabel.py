@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import sgstore
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.exporters import Export, write_export
-from sgstore.importing import Words, import_graphs
-from sgstore.world import Clip
+from sgstore.model.world import Clip
+from sgstore.pipeline.importing import Words, import_graphs
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -22,8 +22,8 @@ from test_flavours import EXAMPLES
 from thorough import LONG
 
 import sgstore.mcap._order as order
-from sgstore.cli import run
-from sgstore.demo import RECORDING
+from sgstore.apps.cli import run
+from sgstore.apps.demo import RECORDING
 from sgstore.mcap import Findings, McapFile, Messages
 from sgstore.readers import channel_rank, open_trace
 

@@ -23,12 +23,12 @@ from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house
 import sgstore
 import sgstore.readers._blocks as frames
 from sgstore.errors import TraceError
+from sgstore.model.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
+from sgstore.model.world import FASTEST, POSE, FrameBlock, States, TraceInfo, TraceReport
 from sgstore.readers import message_class, open_trace
 from sgstore.readers._blocks import derive
 from sgstore.readers.osi._objects import MovingObjects, light_bits, lit, shown
 from sgstore.readers.osi._schema import fields_of
-from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
-from sgstore.world import FASTEST, POSE, FrameBlock, States, TraceInfo, TraceReport
 
 REAL = [
     *(
@@ -415,7 +415,7 @@ def test_kinds_roles_and_types_that_nobody_knows(tmp_path: Path) -> None:
 
 def test_a_type_that_has_two_names_is_called_by_the_first() -> None:
     """``TYPE_MEDIUM_CAR`` was added to OSI later, as another name of the number of ``TYPE_CAR``."""
-    sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+    sample = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
     with open_trace(sample) as trace:
         names = {name for block in trace.blocks(60) for name in block.entities.type_name}
     assert "TYPE_CAR" in names

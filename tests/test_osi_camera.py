@@ -15,9 +15,9 @@ from test_osi_file import messages, packed
 import sgstore
 from sgstore.exporters import Export, write_export
 from sgstore.ingest import ingest
+from sgstore.model.world import TraceReport
 from sgstore.readers import OsiFile, descriptors, message_class, open_trace
 from sgstore.store import StoreFile
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -17,9 +17,9 @@ from recordings import OSI, Recorder, bulb, car, ground_truth, house, ns, person
 
 import sgstore.readers.osi._file as osi_file
 from sgstore.errors import TraceError
+from sgstore.model.world import FrameBlock, States, TraceInfo, TraceReport
 from sgstore.readers import OsiFile, descriptors, open_trace, read_message
 from sgstore.readers.osi._file import time_of_bytes
-from sgstore.world import FrameBlock, States, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from pathlib import Path

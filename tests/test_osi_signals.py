@@ -17,14 +17,14 @@ from test_roads_text import strip
 import sgstore
 from sgstore.errors import MapError
 from sgstore.ingest import ingest
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import PlainSignal, lane_text
 from sgstore.readers import open_trace
-from sgstore.roads import PlainSignal, lane_text
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 TYPES = roads.TYPES | {
     "Assignment": "assigned_lane_id=1:Identifier s_position=2:double",

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
+from sgstore.base.files import OutputFile, write_bytes, written, written_at
 from sgstore.errors import ExportError
-from sgstore.files import OutputFile, write_bytes, written, written_at
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -56,7 +56,7 @@ def named(
     kept_open: Callable[[Path], None],
 ) -> dict[str, str]:
     """What stands in the command lines."""
-    from sgstore.demo import RECORDING
+    from sgstore.apps.demo import RECORDING
 
     kept_open(town_store)
     lock = tmp_path_factory.mktemp("locks") / "town.lock"
@@ -119,7 +119,7 @@ def test_what_was_there_survives_a_full_disk_and_a_pipe_gets_what_a_file_gets(
 
 INTO_EACH = """
 import sys
-from sgstore.cli import run
+from sgstore.apps.cli import run
 for name in sys.argv[1:]:
     print(f"into {name}", flush=True)
     assert run(["patterns", "show", "cut_in", "-o", name]) == 0

@@ -30,7 +30,7 @@ from oracle_over_time import (
 from oracle_temporal import holds, random_formula, random_word
 from thorough import LONG
 
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
 from sgstore.errors import QueryError
 from sgstore.lang import pattern_named
 from sgstore.lang.ir import BoundHold, Length

@@ -78,15 +78,15 @@ def test_a_wheel_with_another_file_or_too_large_is_refused(
     wheel = tmp_path / "sgstore-1-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
         archive.writestr("sgstore/__init__.py", "")
-        archive.writestr("sgstore/sample/town.mcap", "long")
+        archive.writestr("sgstore/apps/sample/town.mcap", "long")
         archive.writestr("sgstore-1.dist-info/METADATA", "")
 
-    packages.check_contents(wheel, {"sgstore/__init__.py", "sgstore/sample/town.mcap"})
+    packages.check_contents(wheel, {"sgstore/__init__.py", "sgstore/apps/sample/town.mcap"})
     with pytest.raises(AssertionError, match=r"extra .*town\.mcap"):
         packages.check_contents(wheel, {"sgstore/__init__.py"})
     monkeypatch.setattr(packages, "LARGEST", 10)
     with pytest.raises(AssertionError, match="at most 10"):
-        packages.check_contents(wheel, {"sgstore/__init__.py", "sgstore/sample/town.mcap"})
+        packages.check_contents(wheel, {"sgstore/__init__.py", "sgstore/apps/sample/town.mcap"})
 
 
 def test_a_source_distribution_can_run_its_tests(tmp_path: Path) -> None:

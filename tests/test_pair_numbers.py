@@ -14,8 +14,8 @@ from contacts import disagreements, random_movers
 from test_geometry import random_boxes
 from thorough import LONG
 
-from sgstore.geometry import corners
-from sgstore.pair_numbers import (
+from sgstore.base.geometry import corners
+from sgstore.model.pair_numbers import (
     COLUMNS,
     HUNG,
     OPTIONAL,
@@ -26,13 +26,13 @@ from sgstore.pair_numbers import (
     low_and_high,
     pairs_view,
 )
-from sgstore.vocabulary import SIGNALS, VEHICLES
+from sgstore.model.vocabulary import SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from sgstore.world import Floats
+    from sgstore.model.world import Floats
 
 PI = math.pi
 

@@ -12,14 +12,15 @@ import duckdb
 import numpy as np
 import pytest
 
-import sgstore.relations._registry as registry
-from sgstore import plugins, vocabulary
-from sgstore.config import Config, Direction, Proximity, as_toml, from_dict, load
-from sgstore.demo import RECORDING
+import sgstore.graphs.relations._registry as registry
+from sgstore.apps.demo import RECORDING
+from sgstore.base import plugins
 from sgstore.errors import ConfigError, QueryNameError, StoreError
+from sgstore.graphs.relations import BlockScene, Relation, edges_between
 from sgstore.ingest import ingest
+from sgstore.model import vocabulary
+from sgstore.model.config import Config, Direction, Proximity, as_toml, from_dict, load
 from sgstore.query import Store
-from sgstore.relations import BlockScene, Relation, edges_between
 from sgstore.store import StoreFile
 from sgstore.store._schema import widen
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.graph import Edges
+    from sgstore.model.graph import Edges
 
 
 def edges_of_pairs_abreast(scene: BlockScene) -> Edges:

@@ -12,10 +12,10 @@ import pytest
 from recordings import Recorder, car
 
 import sgstore
-from sgstore.cli import run as run_verb
-from sgstore.config import Config
+from sgstore.apps.cli import run as run_verb
+from sgstore.base.json_text import float32, shortest
 from sgstore.ingest import ingest
-from sgstore.json_text import float32, shortest
+from sgstore.model.config import Config
 from sgstore.temporal import Monitor, opened
 
 if TYPE_CHECKING:

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from sgstore.cli import run
-from sgstore.coverage import ChosenFrames, frames_of, selection_of
+from sgstore.apps.cli import run
 from sgstore.errors import ConfigError
-from sgstore.importing import import_graphs
-from sgstore.locks import cases_of, read_lock
-from sgstore.selection import (
+from sgstore.pipeline.importing import import_graphs
+from sgstore.testsets.coverage import ChosenFrames, frames_of, selection_of
+from sgstore.testsets.locks import cases_of, read_lock
+from sgstore.testsets.selection import (
     Budget,
     Priority,
     PrioritySpec,
@@ -31,7 +31,7 @@ from sgstore.selection import (
     prioritize,
     units_of,
 )
-from sgstore.selection._learn import features_of, fitted
+from sgstore.testsets.selection._learn import features_of, fitted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

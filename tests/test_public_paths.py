@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import sgstore
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
 from sgstore.errors import SgstoreError
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -22,16 +22,16 @@ PUBLIC = {
     "sgstore": (),
     "sgstore.query": ("Store",),
     "sgstore.draw": ("draw_frame", "draw_map", "draw_stored", "draw_clip"),
-    "sgstore.locks": (),
-    "sgstore.coverage": (),
-    "sgstore.selection": (),
+    "sgstore.testsets.locks": (),
+    "sgstore.testsets.coverage": (),
+    "sgstore.testsets.selection": (),
     "sgstore.exporters": ("write_export", "Recorder"),
-    "sgstore.record": ("record",),
+    "sgstore.apps.record": ("record",),
     "sgstore.ingest": (),
-    "sgstore.map_files": ("read_map_file",),
-    "sgstore.importing": (),
-    "sgstore.config": ("load",),
-    "sgstore.demo": ("run_demo",),
+    "sgstore.maps.map_files": ("read_map_file",),
+    "sgstore.pipeline.importing": (),
+    "sgstore.model.config": ("load",),
+    "sgstore.apps.demo": ("run_demo",),
 }
 """Modules that people call, with what of them; empty: all that they name in ``__all__``."""
 
@@ -89,9 +89,9 @@ def test_pictures_are_drawn_into_a_file_that_is_named_by_a_text(
 
 @pytest.mark.parametrize("name", ["\udcff.sgstore", "a\0b.sgstore", "none.sgstore", ".", "odd.txt"])
 def test_a_store_that_cannot_be_opened_is_an_error_of_ours(name: str, tmp_path: Path) -> None:
-    from sgstore.derive import derive
+    from sgstore.apps.sandbox import Sandbox
     from sgstore.ingest import ingest
-    from sgstore.sandbox import Sandbox
+    from sgstore.pipeline.derive import derive
     from sgstore.store import StoreFile
 
     (tmp_path / "odd.txt").write_text("no store")

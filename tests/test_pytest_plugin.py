@@ -10,9 +10,9 @@ import pytest
 from recordings import drive
 
 import sgstore
-from sgstore.demo import RECORDING
+from sgstore.apps.demo import RECORDING
 from sgstore.ingest import ingest
-from sgstore.locks import lock_of
+from sgstore.testsets.locks import lock_of
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,8 +18,8 @@ import sgstore
 from sgstore import matches as streams
 from sgstore.errors import QueryError, SqlError, StoreError
 from sgstore.matches import Interval, Matches, merged
+from sgstore.model.world import Clip
 from sgstore.store import FrameRef, StoreFile
-from sgstore.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Callable

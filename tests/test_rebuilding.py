@@ -14,13 +14,13 @@ from killing import content
 from recordings import Recorder, car, drive
 from test_ingest import STREET
 
-from sgstore.cli import run
-from sgstore.config import Config, RangeSettings, preset
-from sgstore.derive import derive, keep_abstraction
+from sgstore.apps.cli import run
 from sgstore.errors import StoreError
-from sgstore.importing import Words, import_graphs
 from sgstore.ingest import ingest
-from sgstore.rebuild import rebuild
+from sgstore.model.config import Config, RangeSettings, preset
+from sgstore.pipeline.derive import derive, keep_abstraction
+from sgstore.pipeline.importing import Words, import_graphs
+from sgstore.pipeline.rebuild import rebuild
 from sgstore.store import StoreFile, remains_of
 from sgstore.store._classes import Abstracted
 from sgstore.store._schema import schema_sql

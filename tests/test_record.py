@@ -18,22 +18,22 @@ from google.protobuf import descriptor_pb2  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 from standin_carla import StandInActor, StandInWorld, at_red, box, transform  # noqa: E402
 
-from sgstore.cli import run  # noqa: E402
-from sgstore.config import Config  # noqa: E402
-from sgstore.demo import RECORDING  # noqa: E402
+from sgstore.apps.cli import run  # noqa: E402
+from sgstore.apps.demo import RECORDING  # noqa: E402
+from sgstore.apps.record import record  # noqa: E402
 from sgstore.errors import ConfigError, ExportError, TraceError  # noqa: E402
 from sgstore.exporters import Recorder  # noqa: E402
+from sgstore.graphs.online import Frame  # noqa: E402
 from sgstore.ingest import ingest  # noqa: E402
+from sgstore.model.config import Config  # noqa: E402
 from sgstore.query import Store  # noqa: E402
 from sgstore.readers import LiveWorld, Sensor, load_sensors, png  # noqa: E402
-from sgstore.record import record  # noqa: E402
 from sgstore.sgg import SceneGraphGenerator  # noqa: E402
-from sgstore.step import Frame  # noqa: E402
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
 CAMERA = Sensor("front", "sensor.camera.rgb", x=1.5, z=2.0, attributes={"image_size_x": "8"})
 ROOF = Sensor("roof", "sensor.lidar.ray_cast", z=2.4, yaw=90.0)

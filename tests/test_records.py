@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from sgstore.records import dataclass
+from sgstore.base.records import dataclass
 
 
 def defined(how: dict[str, Any]) -> list[Any]:

@@ -13,10 +13,10 @@ from builders import PaperMap, Patch, Place, Recording, Thing, edges, frames, gr
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sgstore.config import Config, Direction, PairSettings, Proximity, RangeSettings
-from sgstore.relations import BlockScene, Relation, as_markdown, relations, relations_under
+from sgstore.graphs.relations import BlockScene, Relation, as_markdown, relations, relations_under
+from sgstore.model.config import Config, Direction, PairSettings, Proximity, RangeSettings
+from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY, SIDES, SIGNALS, VEHICLES
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY, SIDES, SIGNALS, VEHICLES
 
 PI = math.pi
 TOWN = PaperMap(
@@ -605,7 +605,7 @@ def test_a_crowd_that_is_looked_at_in_parts_is_related_like_any_other(
     scenes = [[t for t in things if t.name != name] for name in ("e1", "e2", "e3")]
     whole = graph_of(frames(*scenes), TOWN)
 
-    monkeypatch.setattr("sgstore.relations._scene.CHUNK", 100)
+    monkeypatch.setattr("sgstore.graphs.relations._scene.CHUNK", 100)
     parts = graph_of(frames(*scenes), TOWN)
 
     for frame in range(3):

@@ -12,15 +12,15 @@ import shapely
 from builders import PaperMap, Patch, Recording, Thing, edges, frames, graph_of, thing
 from test_sgg_traces import graphs, opened, recording, recordings
 
-from sgstore.config import Config, LaneSettings, RangeSettings
-from sgstore.relations._following import Centrelines, LaneNet
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE, VEHICLES
+from sgstore.graphs.relations._following import Centrelines, LaneNet
+from sgstore.model.config import Config, LaneSettings, RangeSettings
+from sgstore.model.vocabulary import KIND_CODE, RELATION_CODE, VEHICLES
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
 
 PI = math.pi
 FORK = PaperMap(

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_relations import storeys_apart
 
-from sgstore.config import Config, RangeSettings
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.vocabulary import SIGNALS
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import SIGNALS
 
 PI = math.pi
 WIDE = Config(range=RangeSettings(200))
@@ -235,7 +235,7 @@ def test_a_crowd_that_is_looked_at_in_parts_is_seen_like_any_other(
     scenes = [crowd(seed, 40, 15) for seed in range(3)]
     whole = graph_of(Recording().block(*scenes), None, WIDE)
 
-    monkeypatch.setattr("sgstore.relations._scene.CHUNK", 50)
+    monkeypatch.setattr("sgstore.graphs.relations._scene.CHUNK", 50)
     parts = graph_of(Recording().block(*scenes), None, WIDE)
 
     assert all(edges(parts, i) == edges(whole, i) for i in range(3))

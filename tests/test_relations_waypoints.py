@@ -11,17 +11,17 @@ import shapely
 from builders import Place, thing
 from test_sgg_traces import opened, recording
 
-from sgstore.config import Config, LaneSettings, RangeSettings
 from sgstore.errors import ConfigError
-from sgstore.opendrive import read_map
-from sgstore.relations import waypoints_of
+from sgstore.graphs.relations import waypoints_of
+from sgstore.maps.opendrive import read_map
+from sgstore.model.config import Config, LaneSettings, RangeSettings
+from sgstore.model.vocabulary import KIND_CODE, RELATION_CODE
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 PI = math.pi
 WIDTH = '<width sOffset="0" a="3" b="0" c="0" d="0"/>'

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from sgstore.cli import run
+from sgstore.apps.cli import run
+from sgstore.apps.report import report
 from sgstore.errors import QueryError
 from sgstore.query import Store
-from sgstore.report import report
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -28,15 +28,15 @@ from opendrive_maps import (
     width,
 )
 
-from sgstore.columns import chained
-from sgstore.opendrive import read_map
-from sgstore.roads import OFF_ROAD, LaneHits, MapNodes, Ribbons, RoadMap, edges_of
-from sgstore.vocabulary import KINDS
+from sgstore.base.columns import chained
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import OFF_ROAD, LaneHits, MapNodes, Ribbons, RoadMap, edges_of
+from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import Edge
+    from sgstore.maps.roads import Edge
 
 TWO_WAY = section(
     lane(2, width(2.0), kind="sidewalk", after=2),

@@ -33,15 +33,15 @@ from opendrive_maps import (
 )
 from recordings import OSI
 
-from sgstore.opendrive import read_map
-from sgstore.vocabulary import KINDS, RELATION_CODE, SIGNALS
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import KINDS, RELATION_CODE, SIGNALS
 
 carla = pytest.importorskip("carla", reason="the carla wheel is not installed")
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 TOWNS = ("Town01", "Town02", "Town07")
 RECORDED = {"Town04": "esmini/swarm_Town04.mcap", "Town10HD": "sumo/Town10HD_sumo_osi.mcap"}

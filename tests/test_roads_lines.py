@@ -10,11 +10,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import sgstore.roads._lane_lines as lanelines
+import sgstore.maps.roads._lane_lines as lanelines
 from sgstore.errors import MapError
-from sgstore.opendrive import parse_map
-from sgstore.roads import END, START, Area, Border, Joint, LaneLine, RoadMap, lane_text, plain_lanes
-from sgstore.vocabulary import RELATION_CODE
+from sgstore.maps.opendrive import parse_map
+from sgstore.maps.roads import (
+    END,
+    START,
+    Area,
+    Border,
+    Joint,
+    LaneLine,
+    RoadMap,
+    lane_text,
+    plain_lanes,
+)
+from sgstore.model.vocabulary import RELATION_CODE
 
 
 def path(*points: tuple[float, ...]) -> np.ndarray:

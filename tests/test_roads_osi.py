@@ -13,18 +13,18 @@ from mcap.reader import make_reader
 from recordings import Recorder, car
 
 import sgstore
-import sgstore.roads._lane_lines as lanelines
+import sgstore.maps.roads._lane_lines as lanelines
 from sgstore.draw._stored import map_of
 from sgstore.ingest import ingest
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import RELATION_CODE
 from sgstore.readers import open_trace
 from sgstore.readers.osi._lanes import OsiLanes
-from sgstore.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 TYPES = {
     "Pair": "antecessor_lane_id=1:Identifier successor_lane_id=2:Identifier",

@@ -22,14 +22,14 @@ from test_roads_osi import (
 )
 
 import sgstore as library
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
 from sgstore.readers import open_trace
 from sgstore.readers.osi._lanes import OsiLanes
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
 RELATIONS = ("travelsTo", "opposes", "toLeftOf", "toRightOf", "laneChange")
 

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from opendrive_maps import a_map, a_road, line
 
-import sgstore.roads._lane_text as lanetext
+import sgstore.maps.roads._lane_text as lanetext
 from sgstore.errors import MapError
-from sgstore.opendrive import parse_map, read_map
-from sgstore.roads import PlainLane, RoadMap, lane_text
-from sgstore.vocabulary import KINDS, RELATION_CODE
+from sgstore.maps.opendrive import parse_map, read_map
+from sgstore.maps.roads import PlainLane, RoadMap, lane_text
+from sgstore.model.vocabulary import KINDS, RELATION_CODE
 
 
 def strip(x: float = 0.0, y: float = 0.0, n: int = 3, **more: Any) -> PlainLane:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from oracle_robustness import compare, compare_rtamt
 
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
 from sgstore.errors import QueryError
 from sgstore.temporal._formula import Bound, Proposition, Until, always, eventually
 from sgstore.temporal._robustness import MarginTable

@@ -15,25 +15,25 @@ from test_lane_dist import driven as by_dijkstra
 from test_lane_dist import lane_ways
 from thorough import LONG
 
-from sgstore.config import Config, RangeSettings
-from sgstore.lanelet2 import lanelet2_text
+from sgstore.graphs.online import Frame
 from sgstore.lang import FrameView
-from sgstore.opendrive import read_map
+from sgstore.maps.lanelet2 import lanelet2_text
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import read_lane_text
+from sgstore.maps.sumo_net import sumo_net_text
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.vocabulary import KIND_CODE, RELATION_CODE
+from sgstore.model.world import TraceReport
 from sgstore.query import Store
-from sgstore.roads import read_lane_text
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import Frame
 from sgstore.store import StoreFile
-from sgstore.sumo_net import sumo_net_text
 from sgstore.temporal import Monitor
-from sgstore.vocabulary import KIND_CODE, RELATION_CODE
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
     from sgstore.temporal import MonitorEvent
 
 WIDE = Config(range=RangeSettings(500))

@@ -13,7 +13,7 @@ import pytest
 
 import sgstore.matches
 import sgstore.store._rows as rows_of_store
-from sgstore.cli import run
+from sgstore.apps.cli import run
 from sgstore.errors import MissingExtraError, SqlError
 from sgstore.query import Store
 

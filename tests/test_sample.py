@@ -21,12 +21,12 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from PIL import Image
 
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
 
 if TYPE_CHECKING:
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
 
-SAMPLE = Path(str(files("sgstore"))) / "sample" / "town.mcap"
+SAMPLE = Path(str(files("sgstore"))) / "apps" / "sample" / "town.mcap"
 SMALL = SAMPLE.parent / "small" / "town.mcap"
 TOWN = Path(__file__).parents[1] / "samples" / "town"
 IMAGE, CLOUD, CALIBRATION = (

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from probes import PROBES
 
+from sgstore.apps.sandbox import Sandbox
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
 from sgstore.query import Store
-from sgstore.sandbox import Sandbox
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -186,6 +186,6 @@ def test_what_is_no_store_is_refused_at_once(tmp_path: Path) -> None:
 def test_a_process_that_does_not_start_is_told_as_that(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sgstore.sandbox.START_S", 0.001)
+    monkeypatch.setattr("sgstore.apps.sandbox.START_S", 0.001)
     with pytest.raises(SqlError, match=r"did not start: stopped after 0\.001 s"):
         Sandbox(path)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from sgstore.apps.sandbox import SandboxPool
 from sgstore.errors import QueryError, SqlError
 from sgstore.query import Store
-from sgstore.sandbox import SandboxPool
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,7 +23,7 @@ NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
 
 @pytest.fixture(scope="module")
 def pool(town_store: Path) -> Iterator[SandboxPool]:
-    with SandboxPool(town_store, timeout_s=60, worker="sgstore.serve._worker") as pool:
+    with SandboxPool(town_store, timeout_s=60, worker="sgstore.apps.explorer._worker") as pool:
         yield pool
 
 
@@ -101,7 +101,7 @@ def test_a_question_behind_a_runaway_is_answered_at_once(pool: SandboxPool) -> N
 
 
 def test_a_small_question_waits_for_none_of_the_others(town_store: Path) -> None:
-    worker = "sgstore.serve._worker"
+    worker = "sgstore.apps.explorer._worker"
     with SandboxPool(town_store, size=1, small=("why",), timeout_s=60, worker=worker) as pool:
         away = pool.ask({"ask": "matches", "text": NEAR, "parameters": {}}, "away")
         next(away)  # it holds the only turn

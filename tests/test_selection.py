@@ -16,12 +16,13 @@ import pytest
 from recordings import Recorder, car, person
 
 import sgstore
-from sgstore.coverage import ChosenFrames, classed, expected_classes, selection_of
 from sgstore.errors import ConfigError, QueryError
-from sgstore.importing import import_graphs
 from sgstore.ingest import ingest
+from sgstore.pipeline.importing import import_graphs
 from sgstore.query import Store
-from sgstore.selection import (
+from sgstore.store import seq_of, trace_of
+from sgstore.testsets.coverage import ChosenFrames, classed, expected_classes, selection_of
+from sgstore.testsets.selection import (
     Budget,
     Cover,
     Measure,
@@ -40,14 +41,13 @@ from sgstore.selection import (
     units_of,
     within,
 )
-from sgstore.selection._cover import bounded
-from sgstore.selection._sets import greedy
-from sgstore.store import seq_of, trace_of
+from sgstore.testsets.selection._cover import bounded
+from sgstore.testsets.selection._sets import greedy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+SAMPLE = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
 SEEDS = range(36)
 SOLVER = find_spec("highspy") is not None
 needs_solver = pytest.mark.skipif(not SOLVER, reason="needs the extra [solver]")
@@ -135,7 +135,7 @@ def test_a_search_that_may_not_end_still_gives_a_cover_and_a_bound_below_it(
 ENDED = """
 import signal
 import numpy as np
-from sgstore.selection import SetFamily, _cover, minimal
+from sgstore.testsets.selection import SetFamily, _cover, minimal
 
 _cover.SECONDS = 3600.0  # the solver does not give up by itself
 
@@ -255,7 +255,7 @@ def test_the_minimal_set_keeps_every_class(
 def test_a_bound_that_is_not_met_names_the_solver_where_there_is_none(
     store: Store, monkeypatch: pytest.MonkeyPatch, installed: bool
 ) -> None:
-    import sgstore.selection._choose as room
+    import sgstore.testsets.selection._choose as room
 
     def loose(of: SetFamily) -> Cover:
         return replace(minimal(of), bound=1.0)
@@ -285,7 +285,7 @@ def test_each_class_comes_k_times_or_as_often_as_it_is_there(store: Store) -> No
 
 
 def test_pairs_of_features_are_those_that_coverage_counts(store: Store) -> None:
-    from sgstore.coverage import combos
+    from sgstore.testsets.coverage import combos
 
     found = select(
         whole(store), SelectionSpec(Strategy.minimal, SelectionUnit.clip, abstraction="E", combos=2)

@@ -11,7 +11,7 @@ import typer
 from verb_lines import verbs
 
 import sgstore
-from sgstore.cli import application, run
+from sgstore.apps.cli import application, run
 from sgstore.ingest import ingest
 
 PAGE = (Path(__file__).parents[1] / "docs" / "selection.md").read_text(encoding="utf-8")
@@ -25,7 +25,7 @@ COMMANDS = [
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("page")
-    sample = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+    sample = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
     for name, since, until in (("drives", 0, 40), ("new", 20, 60)):
         (place / "town.mcap").unlink(missing_ok=True)
         (place / "town.mcap").symlink_to(sample)

@@ -13,13 +13,14 @@ import pyarrow.parquet as pq
 import pytest
 
 import sgstore
-from sgstore.cli import run
-from sgstore.coverage import ChosenFrames, classed
+from sgstore.apps.cli import run
 from sgstore.errors import ConfigError
 from sgstore.ingest import ingest
-from sgstore.locks import frames_of_lock, intersect, read_lock, union, verify
 from sgstore.query import Store
-from sgstore.selection import (
+from sgstore.store import seq_of
+from sgstore.testsets.coverage import ChosenFrames, classed
+from sgstore.testsets.locks import frames_of_lock, intersect, read_lock, union, verify
+from sgstore.testsets.selection import (
     Budget,
     Selection,
     SelectionSpec,
@@ -35,13 +36,12 @@ from sgstore.selection import (
     split_table,
     units_of,
 )
-from sgstore.selection._cover import reduced
-from sgstore.store import seq_of
+from sgstore.testsets.selection._cover import reduced
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-SAMPLE = Path(sgstore.__file__).parent / "sample" / "town.mcap"
+SAMPLE = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
 
 
 @pytest.fixture(scope="module")

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from scenes import Scene, actor, along, ego, path, store_of, street
 
-from sgstore.cli import run
-from sgstore.coverage import (
+from sgstore.apps.cli import run
+from sgstore.errors import ConfigError, QueryNameError
+from sgstore.testsets.coverage import (
     ChosenFrames,
     happenings,
     manoeuvres_named,
     sequences,
     sequences_in,
 )
-from sgstore.errors import ConfigError, QueryNameError
-from sgstore.selection import SelectionSpec, SelectionUnit, Strategy, select
+from sgstore.testsets.selection import SelectionSpec, SelectionUnit, Strategy, select
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -21,9 +21,9 @@ from columns_read import unpacked
 from probes import PROBES
 from thorough import LONG
 
-import sgstore.serve
+import sgstore.apps.explorer
+from sgstore.apps.explorer import Explorer, application, serve
 from sgstore.query import Store
-from sgstore.serve import Explorer, application, serve
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -200,7 +200,9 @@ def test_only_files_of_the_page_are_given(page: Page) -> None:
 
 
 def test_it_is_a_small_part_of_a_wheel() -> None:
-    files = [one for one in Path(sgstore.serve.__file__).parent.rglob("*.*") if one.is_file()]
+    files = [
+        one for one in Path(sgstore.apps.explorer.__file__).parent.rglob("*.*") if one.is_file()
+    ]
     sizes = [len(zlib.compress(one.read_bytes())) for one in files if one.suffix != ".pyc"]
 
     assert 100_000 < sum(sizes) < 400_000
@@ -337,7 +339,7 @@ def test_small_pictures_have_the_states_of_their_frames(page: Page) -> None:
 def test_the_map_is_near_its_outlines(page: Page, store: Store) -> None:
     import shapely
 
-    from sgstore.opendrive import read_map
+    from sgstore.maps.opendrive import read_map
 
     header, columns = unpacked(page.get("/api/map", trace="town").content)
     text = store.file.road_map_text("town")
@@ -447,7 +449,7 @@ def result_of(text: str) -> Any:
 
 
 def test_coverage_is_that_of_the_verb(page: Page, store: Store) -> None:
-    from sgstore.coverage import ChosenFrames, classed, classes
+    from sgstore.testsets.coverage import ChosenFrames, classed, classes
 
     told = page.post("/api/coverage", what="classes").json()
     table = classes(classed(ChosenFrames("town.sgstore", store), "RSV"))
@@ -457,7 +459,7 @@ def test_coverage_is_that_of_the_verb(page: Page, store: Store) -> None:
 
 
 def test_clips_become_a_test_set(page: Page, store: Store) -> None:
-    from sgstore.locks import read_lock, verify
+    from sgstore.testsets.locks import read_lock, verify
 
     clips = [["town", 10, 40], ["town", 30, 60], ["town", 100, 120]]
     told = page.post("/api/select", clips=clips).json()

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from builders import PaperMap, Patch, Recording, Thing, edges, frames, graph_of, present, thing
 
-from sgstore.config import Config, Direction, PairSettings, Proximity, RangeSettings
+from sgstore.model.config import Config, Direction, PairSettings, Proximity, RangeSettings
+from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 
 if TYPE_CHECKING:
-    from sgstore.graph import GraphBlock
+    from sgstore.model.graph import GraphBlock
 
 PI = math.pi
 STREET = PaperMap(

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from thorough import some
 
-from sgstore.config import Config, RangeSettings
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import OFF_ROAD
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.vocabulary import KIND_CODE, PROXIMITY, RELATION_CODE, VEHICLES
 from sgstore.readers import open_trace
-from sgstore.roads import OFF_ROAD
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.vocabulary import KIND_CODE, PROXIMITY, RELATION_CODE, VEHICLES
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
-    from sgstore.world import FrameBlock
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import FrameBlock
 
 RECORDINGS = [
     "carla/Town01.carla",

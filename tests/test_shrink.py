@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from scenes import Scene, actor, along, ego, path, store_of, street
 
-from sgstore.cli import run
-from sgstore.columns import taken
+from sgstore.apps.cli import run
+from sgstore.base.columns import taken
 from sgstore.errors import QueryError, StoreError
 from sgstore.ingest import ingest
 from sgstore.query import Store
 from sgstore.temporal._shrink import fewest
 
 if TYPE_CHECKING:
-    from sgstore.world import FrameBlock
+    from sgstore.model.world import FrameBlock
 
 ROAD = street("driving", "driving")
 DRIVE = Scene(

@@ -13,8 +13,8 @@ import sgstore.mcap._chunks as chunks
 import sgstore.mcap._read_ahead as ahead
 import sgstore.mcap._read_ahead as spool
 from sgstore.mcap import McapFile
+from sgstore.model.world import FrameBlock, TraceReport
 from sgstore.readers import open_trace
-from sgstore.world import FrameBlock, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,10 +10,10 @@ import pytest
 from oracle_over_time import worlds
 
 import sgstore
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
+from sgstore.apps.sandbox import Sandbox
 from sgstore.errors import QueryError, SqlError
 from sgstore.lang import pattern_tables
-from sgstore.sandbox import Sandbox
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

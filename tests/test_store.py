@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from graph_blocks import CHANNELS, MAP, RandomTrace, map_stub, publish
 
-from sgstore.config import Config, RangeSettings
 from sgstore.errors import StoreError
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.vocabulary import RELATIONS
 from sgstore.store import StoreFile
 from sgstore.store._lease import give_back
 from sgstore.store._locking import BLOCK_SIZE
-from sgstore.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -19,16 +19,16 @@ from google.protobuf import descriptor_pb2
 from permuting import Recorded
 from recordings import Recorder, car, ns
 
-from sgstore.config import Config, Payloads
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest
+from sgstore.model.config import Config, Payloads
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from sgstore.segments import Progress
+    from sgstore.pipeline.segments import Progress
 
 JPEG = b"\xff\xd8\xff\xe0" + bytes(range(256)) + b"\xff\xd9"
 GROUP = 8

@@ -13,11 +13,11 @@ from mcap.reader import make_reader
 from recordings import Recorder, car, drive
 
 import sgstore.store._payloads as payloads
-from sgstore.config import Config, Payloads
 from sgstore.errors import StoreError, TraceError
 from sgstore.ingest import ingest
+from sgstore.model.config import Config, Payloads
+from sgstore.model.world import Channel
 from sgstore.store import StoreFile
-from sgstore.world import Channel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -16,11 +16,11 @@ import pytest
 from graph_blocks import RandomTrace, map_stub, publish, trace_info
 
 import sgstore.store._staging as staging
-from sgstore.config import Config, RangeSettings
 from sgstore.errors import StoreError
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.world import TraceReport
 from sgstore.store import StoreFile, trace_id_of
 from sgstore.store._columns import REPEATED
-from sgstore.world import TraceReport
 
 TABLES = (
     "trace",

@@ -12,11 +12,11 @@ from thorough import LONG
 
 import sgstore.store._locking as access
 import sgstore.store._publish as publishing
-from sgstore.config import Config, RangeSettings
 from sgstore.ingest import ingest
+from sgstore.model.config import Config, RangeSettings
+from sgstore.model.world import TraceReport
 from sgstore.query import Store
 from sgstore.store import StoreFile
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

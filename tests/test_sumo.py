@@ -14,11 +14,11 @@ from test_lanelet2 import edges, row_of
 import sgstore
 from sgstore.errors import MapError, TraceError
 from sgstore.ingest import recordings
-from sgstore.map_files import read_map_file
+from sgstore.maps.map_files import read_map_file
+from sgstore.maps.sumo_net import sumo_net_text
+from sgstore.model.vocabulary import VEHICLE_LIGHTS
 from sgstore.readers import open_trace, read_message
 from sgstore.readers.sumo import _file
-from sgstore.sumo_net import sumo_net_text
-from sgstore.vocabulary import VEHICLE_LIGHTS
 
 if TYPE_CHECKING:
     from pathlib import Path

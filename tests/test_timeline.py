@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from sgstore.cli import run
-from sgstore.demo import RECORDING
+from sgstore.apps.cli import run
+from sgstore.apps.demo import RECORDING
 from sgstore.draw import Lane, Timeline, draw_timelines, lines_of, parts_timeline, timelines
 from sgstore.query import Store
 

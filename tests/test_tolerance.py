@@ -16,11 +16,11 @@ from thorough import LONG
 import sgstore
 from sgstore.errors import StoreError
 from sgstore.exporters import Export, write_export
+from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
+from sgstore.model.world import tolerance_ns
 from sgstore.query import Store
-from sgstore.step import Frame
 from sgstore.temporal import Monitor
-from sgstore.world import tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

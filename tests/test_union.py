@@ -11,11 +11,11 @@ from oracle_answers import run
 from oracle_over_time import worlds
 from thorough import LONG
 
-from sgstore.cli import run as run_verb
+from sgstore.apps.cli import run as run_verb
 from sgstore.errors import QueryError
-from sgstore.step import Frame
+from sgstore.graphs.online import Frame
+from sgstore.model.vocabulary import natural
 from sgstore.temporal import Monitor
-from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 import sgstore
 import sgstore.store._joins as own
-from sgstore.cli import application
+from sgstore.apps.cli import application
+from sgstore.apps.sandbox import Sandbox
 from sgstore.errors import MissingExtraError, QueryError, StoreError
-from sgstore.sandbox import Sandbox
 
 if TYPE_CHECKING:
     from collections.abc import Callable

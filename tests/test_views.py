@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from graph_blocks import RandomTrace, map_stub, publish
 
-from sgstore.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers
+from sgstore.model.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers
+from sgstore.model.vocabulary import KINDS, LIGHT_STATES, RELATIONS
+from sgstore.model.world import BUCKET_FRAMES
 from sgstore.store import StoreFile
-from sgstore.vocabulary import KINDS, LIGHT_STATES, RELATIONS
-from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

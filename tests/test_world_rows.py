@@ -14,18 +14,18 @@ from graph_blocks import trace_info
 from scenes import NO_MESSAGES, Scene, actor, along, ego, light, path, street
 from thorough import LONG
 
+from sgstore.apps.demo import RECORDING
 from sgstore.collection import Collection, pack, unpack
-from sgstore.config import Config, RangeSettings, from_dict
-from sgstore.demo import RECORDING
 from sgstore.errors import ConfigError, StoreError
+from sgstore.graphs.online import replayed
 from sgstore.ingest import ingest
+from sgstore.model.config import Config, RangeSettings, from_dict
+from sgstore.model.world import TraceReport
+from sgstore.pipeline.rebuild import rebuild
 from sgstore.query import Store
-from sgstore.rebuild import rebuild
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import replayed
 from sgstore.store import StoreFile
 from sgstore.store._schema import BEYOND
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -14,20 +14,20 @@ from scenes import APART, Scene, along, ego, store_of
 from thorough import LONG, some
 
 from sgstore.errors import QueryError
-from sgstore.lanelet2 import lanelet2_text
 from sgstore.lang import pattern_named, patterns
-from sgstore.map_files import read_map_file
-from sgstore.opendrive import read_map
+from sgstore.maps.lanelet2 import lanelet2_text
+from sgstore.maps.map_files import read_map_file
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.sumo_net import sumo_net_text
 from sgstore.readers import open_trace
-from sgstore.sumo_net import sumo_net_text
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from sgstore.maps.roads import RoadMap
     from sgstore.query import Store
-    from sgstore.roads import RoadMap
 
 ZONES: Final = {"main": WAYS, "merge": ENTRY, "departure": EXIT}
 """Roads of two lanes, to whose right there is nothing, a lane that leads on, and one that leads off."""

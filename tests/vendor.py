@@ -19,7 +19,7 @@ from typing import Final
 
 ROOT: Final = Path(__file__).parents[1]
 HERE: Final = ROOT / "tests" / "vendor"
-PAGE: Final = ROOT / "sgstore" / "serve" / "page"
+PAGE: Final = ROOT / "sgstore" / "apps" / "explorer" / "page"
 BUILD: Final = ROOT / "build" / "page"
 LISTS: Final = ("package.json", "package-lock.json")
 PARTS: Final = ("core.js", "codemirror.js")

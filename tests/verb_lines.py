@@ -122,7 +122,7 @@ def _take(condition: str, kept: Path) -> None:
 
 def _ended(arguments: list[str], condition: str, kept: Path) -> int:
     """Run a command line, and end as Python does; the exit code."""
-    from sgstore import cli
+    from sgstore.apps import cli
 
     _take(condition, kept)
     sys.argv = ["sgstore", *arguments]
@@ -153,7 +153,7 @@ def _child(asked: list[tuple[list[str], str]], kept: Path, answers: int) -> None
 
 def _warm() -> None:
     """Do once what each process would do: imports, settings, the grammar, fonts; no database is opened."""
-    import sgstore.cli
+    import sgstore.apps.cli
     from sgstore import readers
 
     ours = [one.name for one in pkgutil.walk_packages(sgstore.__path__, "sgstore.")]
@@ -161,8 +161,8 @@ def _warm() -> None:
         if not name.endswith("__main__"):
             importlib.import_module(name)
     with Path(os.devnull).open("w") as nothing, redirect_stdout(nothing):
-        sgstore.cli.run(["config"])
-        sgstore.cli.run(["patterns", "show", "cut_in"])
+        sgstore.apps.cli.run(["config"])
+        sgstore.apps.cli.run(["patterns", "show", "cut_in"])
     sgstore.lang.parse(PATTERN)
     # No simulator answers here, however long one waits.
     readers.connect = partial(readers.connect, timeout_s=0.3)

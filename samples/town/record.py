@@ -1,4 +1,4 @@
-"""Record the sample: run SUMO on our town and write ``sgstore/sample/town.mcap``.
+"""Record the sample: run SUMO on our town and write ``sgstore/apps/sample/town.mcap``.
 
 Run it in an environment with the extra ``sample``; ``make sample`` makes one. The same versions of SUMO,
 Pillow and zstandard give the same bytes again.
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message
 
 HERE = Path(__file__).parent
-TARGET = HERE.parents[1] / "sgstore" / "sample" / "town.mcap"
+TARGET = HERE.parents[1] / "sgstore" / "apps" / "sample" / "town.mcap"
 
 CHUNK = 256 * 1024
 PICTURES, CLOUDS = (0.2, 0.037), (0.5, 0.083)

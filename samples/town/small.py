@@ -13,7 +13,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-SAMPLE = Path(__file__).parents[2] / "sgstore" / "sample"
+SAMPLE = Path(__file__).parents[2] / "sgstore" / "apps" / "sample"
 SOURCE, TARGET = SAMPLE / "town.mcap", SAMPLE / "small" / "town.mcap"
 
 LEFT_OUT = "/ego/lidar/points"

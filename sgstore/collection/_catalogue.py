@@ -15,10 +15,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.files import working_folder
 from sgstore.collection._place import ABOUT, MissingObjectError, digest_of_file
 from sgstore.errors import ExportError, StoreError
-from sgstore.files import working_folder
 from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, own_type
+from sgstore.model.vocabulary import NAMES, natural
 from sgstore.store import (
     CATALOGUE,
     SCHEMA_VERSION,
@@ -29,7 +30,6 @@ from sgstore.store import (
     subset_catalogs,
     write_parquet,
 )
-from sgstore.vocabulary import NAMES, natural
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

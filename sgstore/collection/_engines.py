@@ -19,6 +19,7 @@ from importlib import import_module
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Protocol, TextIO
 
+from sgstore.base.processes import command
 from sgstore.errors import (
     AbstractionError,
     ConfigError,
@@ -30,7 +31,6 @@ from sgstore.errors import (
     error_of,
     plain_error,
 )
-from sgstore.processes import command
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -11,9 +11,9 @@ from contextlib import contextmanager, nullcontext
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
-from sgstore.arrays import np
+from sgstore.base.arrays import np
+from sgstore.base.files import working_folder
 from sgstore.collection import _worker as worker
-from sgstore.files import working_folder
 from sgstore.lang import PARTS
 from sgstore.store import (
     PartFile,
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from sgstore.collection._catalogue import Snapshot
     from sgstore.lang import Catalog
+    from sgstore.model.world import Floats, Ints
     from sgstore.store import CodedClasses
-    from sgstore.world import Floats, Ints
 
     Parameters = Sequence[Any] | Mapping[str, Any]
     Words = Mapping[str, Sequence[str]]

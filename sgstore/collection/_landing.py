@@ -15,16 +15,18 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.files import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._pack import ATTEMPTS, Commit, groups, map_names, put_bundle
 from sgstore.collection._place import digest_of_file, place_at
-from sgstore.config import Config
 from sgstore.errors import SgstoreError, StoreError, TraceError, url_named
-from sgstore.files import working_folder
 from sgstore.ingest import BLOCK_FRAMES, Workers
-from sgstore.map_files import Maps
+from sgstore.maps.map_files import Maps
 from sgstore.mcap import digest_of, mark_of
-from sgstore.segments import Job, SegmentReader, TraceOutcome
+from sgstore.model.config import Config
+from sgstore.model.trace_parts import TracePart
+from sgstore.model.vocabulary import natural
+from sgstore.pipeline.segments import Job, SegmentReader, TraceOutcome
 from sgstore.store import (
     Sealed,
     StoreFile,
@@ -33,8 +35,6 @@ from sgstore.store import (
     split_segment,
     whole_segment,
 )
-from sgstore.trace_parts import TracePart
-from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -12,11 +12,12 @@ from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.files import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._cache import bundle_path
 from sgstore.collection._place import digest_of_file, place_at
 from sgstore.errors import SgstoreError, StoreError
-from sgstore.files import working_folder
+from sgstore.model.vocabulary import natural
 from sgstore.store import (
     CATALOGUE,
     StoreFile,
@@ -28,7 +29,6 @@ from sgstore.store import (
     verify_file,
     write_bundle,
 )
-from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from sgstore.base.files import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _worker as worker
 from sgstore.collection._engines import engine_named, fault_of_question
@@ -27,7 +28,6 @@ from sgstore.collection._frames import CollectionFrames
 from sgstore.collection._pack import refuse_others
 from sgstore.collection._place import place_at
 from sgstore.errors import QueryError, SqlError, StoreError
-from sgstore.files import working_folder
 from sgstore.lang import (
     CLASSES_GIVEN,
     PARTS,
@@ -46,6 +46,8 @@ from sgstore.lang import (
     union_parts,
 )
 from sgstore.matches import Interval, UnionMatches, merged, row_type
+from sgstore.model.vocabulary import natural
+from sgstore.model.world import Clip, tolerance_ns
 from sgstore.query import Store
 from sgstore.store import (
     SEQ_BITS,
@@ -63,8 +65,6 @@ from sgstore.store import (
     write_parquet,
 )
 from sgstore.temporal import TemporalMatches, kept_throughout
-from sgstore.vocabulary import natural
-from sgstore.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -74,8 +74,8 @@ if TYPE_CHECKING:
     from sgstore.collection._catalogue import Snapshot
     from sgstore.collection._engines import Engine
     from sgstore.lang import Catalog, CheckInCatalog, ClassQuestion, Compiled, Pattern, Triple
+    from sgstore.model.world import Floats, Ints
     from sgstore.temporal import Verdict
-    from sgstore.world import Floats, Ints
 
 _SHOWN: Final = 8
 """Number of bundles that a message names; further bundles are counted."""
@@ -623,7 +623,7 @@ class PartedMatches(Tabular):
 
     def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
         """Yield each match as a graph of its nodes and edges; see :meth:`sgstore.Matches.subgraphs`."""
-        from sgstore.graph import graph_of_records
+        from sgstore.model.graph import graph_of_records
 
         layout = Layout.of(self._ready.bound)
         for row in self._answered("subgraphs"):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shutil
 from typing import TYPE_CHECKING
 
+from sgstore.base.files import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._cache import bundle_path
 from sgstore.collection._pack import ATTEMPTS, put_bundle
 from sgstore.collection._place import place_at
 from sgstore.errors import StoreError
-from sgstore.files import working_folder
-from sgstore.rebuild import rebuild as rebuild_store
+from sgstore.pipeline.rebuild import rebuild as rebuild_store
 from sgstore.store import maps_of_traces, names_of_traces
 
 if TYPE_CHECKING:

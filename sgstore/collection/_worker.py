@@ -17,10 +17,10 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from sgstore.base.files import working_folder
 from sgstore.collection._cache import bundle_path
 from sgstore.collection._place import place_at
 from sgstore.errors import StoreError
-from sgstore.files import working_folder
 from sgstore.lang import Compiled, Type, parted
 from sgstore.matches import Interval
 from sgstore.query import Store, UserStatement, matches_of
@@ -262,7 +262,7 @@ def _values_of(verdict: Verdict) -> list[Any]:
 
 def as_verdict(values: list[Any]) -> Verdict:
     """Rebuild a verdict from its values."""
-    from sgstore.arrays import np
+    from sgstore.base.arrays import np
 
     check, trace, word, violations, witnesses, status, reason, margin, absent = values
     return Verdict(
@@ -323,7 +323,7 @@ def _features(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
     """Write features of the graphs of frames in an abstraction; frames are numbered as in the task."""
-    from sgstore.arrays import np
+    from sgstore.base.arrays import np
 
     def rows() -> Iterator[tuple[int, str, int]]:
         frame_id = np.array(task["frames"], np.int64)
@@ -343,7 +343,7 @@ def _margins(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
     """Write the margin of each frame, or of its trace, for a check."""
-    from sgstore.arrays import np
+    from sgstore.base.arrays import np
 
     run = CheckRun(file, catalog, task["text"], task["parameters"])
     found = ((ids, np.broadcast_to(margins, len(ids))) for ids, margins in run.margins())

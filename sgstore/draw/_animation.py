@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image
 from PIL.GifImagePlugin import getdata, getheader
 
+from sgstore.base.files import OutputFile
 from sgstore.draw._page import (
     COMMONEST,
     FURTHEST,
@@ -24,7 +25,6 @@ from sgstore.draw._page import (
     with_palette,
 )
 from sgstore.errors import ExportError, MissingExtraError
-from sgstore.files import OutputFile
 
 if TYPE_CHECKING:
     from collections.abc import Generator

@@ -31,15 +31,15 @@ from sgstore.draw._view import (
     sentences,
 )
 from sgstore.errors import ExportError
-from sgstore.vocabulary import ENTITY_KINDS, KINDS, MAP_KINDS, SIGNALS
+from sgstore.model.vocabulary import ENTITY_KINDS, KINDS, MAP_KINDS, SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from sgstore.draw._page import Page, Rect, Stage
     from sgstore.draw._scene import DrawnFrame
-    from sgstore.roads import RoadMap
-    from sgstore.world import Floats
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.world import Floats
 
 
 ROW: Final = 10.5

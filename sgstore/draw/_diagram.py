@@ -29,7 +29,7 @@ from sgstore.draw._view import (
     ego_lane,
     linked,
 )
-from sgstore.vocabulary import ENTITY_KINDS, PROXIMITY, SIGNALS
+from sgstore.model.vocabulary import ENTITY_KINDS, PROXIMITY, SIGNALS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from sgstore.draw._page import Page, Rect
     from sgstore.draw._scene import DrawnFrame, Point
     from sgstore.draw._view import Relations
-    from sgstore.graph import SceneGraph
-    from sgstore.world import Floats
+    from sgstore.model.graph import SceneGraph
+    from sgstore.model.world import Floats
 
 
 Tier = Literal["entity", "lane", "road", "junction"]

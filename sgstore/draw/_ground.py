@@ -14,16 +14,16 @@ from matplotlib.path import Path as Outline
 import sgstore.draw._page as layers
 import sgstore.draw._palette as palette
 from sgstore.draw._view import SCENERY
-from sgstore.roads import within
-from sgstore.vocabulary import KINDS
+from sgstore.maps.roads import within
+from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sgstore.draw._page import Rect, Stage
     from sgstore.draw._view import MapWindow
-    from sgstore.roads import MapNodes, RoadMap
-    from sgstore.world import Floats
+    from sgstore.maps.roads import MapNodes, RoadMap
+    from sgstore.model.world import Floats
 
 
 ARROW_SPACING: Final = 14.0

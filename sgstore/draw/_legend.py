@@ -12,8 +12,8 @@ from matplotlib.patches import Circle, Polygon, Rectangle, RegularPolygon
 import sgstore.draw._palette as palette
 from sgstore.draw._scene import ROUND_KINDS, lamps
 from sgstore.draw._view import ARROW_SECONDS, SCENERY, clean, ego_lane, seen_from_ego
-from sgstore.relations import relations
-from sgstore.vocabulary import KINDS, PROXIMITY, SIGNALS
+from sgstore.graphs.relations import relations
+from sgstore.model.vocabulary import KINDS, PROXIMITY, SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -21,10 +21,10 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from PIL import Image
 
+from sgstore.base.files import write_bytes
 from sgstore.draw._palette import FAINT_INK, GROUND, INK, PAPER, RULE
 from sgstore.draw._view import clean
 from sgstore.errors import ExportError
-from sgstore.files import write_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Hashable, Sequence
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.draw._view import MapWindow
-    from sgstore.world import Floats
+    from sgstore.model.world import Floats
 
     Pixels = NDArray[np.uint8]
     Colours = NDArray[np.float32]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from sgstore.vocabulary import PROXIMITY
+from sgstore.model.vocabulary import PROXIMITY
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

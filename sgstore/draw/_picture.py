@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.draw._view import Relations, clean, counted, number, view_of
 from sgstore.errors import ExportError, MissingExtraError
-from sgstore.world import seconds_of
+from sgstore.model.world import seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from sgstore.draw._legend import Entry
     from sgstore.draw._page import Page, Rect
     from sgstore.draw._scene import DrawnFrame
-    from sgstore.graph import SceneGraph
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import SceneGraph
 
 
 _MARGIN: Final = 14.0

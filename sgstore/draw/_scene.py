@@ -39,16 +39,16 @@ from sgstore.draw._view import (
     sentences,
     turned,
 )
-from sgstore.vocabulary import SIGNALS
+from sgstore.model.vocabulary import SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sgstore.draw._page import Rect, Stage
     from sgstore.draw._view import Body, DrawnLink, Family, MapWindow, Relations
-    from sgstore.graph import SceneGraph
-    from sgstore.roads import RoadMap
-    from sgstore.world import Floats
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import SceneGraph
+    from sgstore.model.world import Floats
 
 
 LABELLED_LINKS: Final = 10

@@ -31,7 +31,7 @@ from sgstore.draw._picture import (
 from sgstore.draw._scene import DrawnFrame
 from sgstore.draw._view import called, view_of
 from sgstore.errors import ExportError, StoreError
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 
     from sgstore.draw._legend import Entry
     from sgstore.draw._view import Names, Relations
-    from sgstore.graph import SceneGraph
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import SceneGraph
     from sgstore.query import Store
-    from sgstore.roads import RoadMap
     from sgstore.store import FrameRef, StoreFile
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from sgstore.vocabulary import (
+from sgstore.model.vocabulary import (
     DIRECTIONS,
     ENTITY_KINDS,
     MAP_KINDS,
@@ -26,8 +26,8 @@ from sgstore.vocabulary import (
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from sgstore.graph import SceneGraph
-    from sgstore.world import Floats
+    from sgstore.model.graph import SceneGraph
+    from sgstore.model.world import Floats
 
 
 SCENERY: Final = frozenset({"building", "pole", "barrier", "vegetation", "prop"})

@@ -18,8 +18,8 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.files import HeldFolder, sweep, sweep_temporary
 from sgstore.errors import ExportError
-from sgstore.files import HeldFolder, sweep, sweep_temporary
 from sgstore.mcap import digest_of
 
 if TYPE_CHECKING:

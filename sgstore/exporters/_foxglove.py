@@ -26,9 +26,9 @@ from google.protobuf import (
     timestamp_pb2,
 )
 
-from sgstore.json_text import finite
+from sgstore.base.json_text import finite
+from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY
 from sgstore.readers import add_fields, png
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
 
 _GOOGLE: Final = {"Timestamp": timestamp_pb2.DESCRIPTOR, "Duration": duration_pb2.DESCRIPTOR}

@@ -27,9 +27,9 @@ import numpy as np
 from sgstore.errors import ExportError, StoreError, TraceError
 from sgstore.exporters._clips import WrittenFile, clip_name, safe_name
 from sgstore.mcap import Loss
+from sgstore.model.vocabulary import natural, suggestion
+from sgstore.model.world import TraceReport
 from sgstore.readers import open_recording, picture_form, png, record_reader
-from sgstore.vocabulary import natural, suggestion
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator

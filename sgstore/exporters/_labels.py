@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ExportError, QueryError, TextSpan
+from sgstore.model.world import tolerance_ns
 from sgstore.store import SEQ_BITS, frame_ids, trace_of
-from sgstore.world import tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from sgstore.collection import Collection, PartedMatches, PartedUnion
     from sgstore.exporters._transforms import Mount
     from sgstore.matches import Matches
+    from sgstore.model.world import Clip, Ints
     from sgstore.query import Store
     from sgstore.store import StoredTrace
-    from sgstore.world import Clip, Ints
 
     AnyMatches = Matches | PartedMatches | PartedUnion
 

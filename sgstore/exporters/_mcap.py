@@ -31,13 +31,13 @@ from mcap.records import Attachment, Message, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+from sgstore.base.files import working_folder
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import ChannelCount, WrittenClip, clip_name, tool
 from sgstore.exporters._mcap_graphs import LAYOUT, Added, is_added, layout
-from sgstore.files import working_folder
 from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, OutOfOrder, digest_of, near
+from sgstore.model.world import Clip, TraceReport, tolerance_ns
 from sgstore.readers import channel_rank, open_recording
-from sgstore.world import Clip, TraceReport, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator
@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     from sgstore.exporters._labels import Export
     from sgstore.exporters._mcap_graphs import ClipMessage
     from sgstore.mcap import Messages
+    from sgstore.model.world import MessageRefs
     from sgstore.readers import RecordingFile
     from sgstore.store import StoredTrace
-    from sgstore.world import MessageRefs
 
 
 _COMPRESSION: Final = {

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, Final
 from mcap.records import Channel, Schema
 
 import sgstore.exporters._foxglove as foxglove_scene
+from sgstore.base.json_text import json_text
 from sgstore.errors import ExportError
 from sgstore.exporters._labels import FEW, ClipFrames
 from sgstore.exporters._nx import graphs_of
 from sgstore.exporters._transforms import FrameTransforms
-from sgstore.json_text import json_text
 from sgstore.readers import DERIVED
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from sgstore.exporters._clips import ChannelCount
     from sgstore.exporters._labels import Export
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
 
 GRAPH: Final = "/sgstore/graph"

@@ -19,19 +19,19 @@ from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 
-from sgstore.abstractions import abstraction_named, abstractions
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile, clip_name
 from sgstore.exporters._labels import FEW
-from sgstore.graph import named_graph
-from sgstore.vocabulary import RELATION_CODE, normalize_name
+from sgstore.graphs.abstractions import abstraction_named, abstractions
+from sgstore.model.graph import named_graph
+from sgstore.model.vocabulary import RELATION_CODE, normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.exporters._labels import ClipFrames, Export
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
     Graph = nx.MultiDiGraph[Any]
 

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
-from sgstore.abstractions import abstraction_named
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile
 from sgstore.exporters.graph_data import ABOUT, ENTITIES, FOLDER, FORMAT, VERSION, GraphData
-from sgstore.vocabulary import normalize_name
+from sgstore.graphs.abstractions import abstraction_named
+from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.abstractions import GraphColumns, Labelled
     from sgstore.exporters._labels import ClipFrames, Export
+    from sgstore.graphs.abstractions import GraphColumns, Labelled
 
 
 BY_ITSELF: Final = "roadscene2vec"

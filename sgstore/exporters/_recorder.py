@@ -19,13 +19,13 @@ from mcap.writer import Writer
 import sgstore.exporters._foxglove as foxglove
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import tool
+from sgstore.graphs.online import NUMBERS
+from sgstore.model.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS, VEHICLES
 from sgstore.readers import SensorCloud, SensorPicture, add_fields, descriptors
-from sgstore.step import NUMBERS
-from sgstore.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS, VEHICLES
 
 if TYPE_CHECKING:
+    from sgstore.graphs.online import Entity, Frame
     from sgstore.readers import SensorReading
-    from sgstore.step import Entity, Frame
 
 
 TRUTH: Final = "ground_truth"

@@ -12,9 +12,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore import plugins
+from sgstore.base import plugins
 from sgstore.errors import ExportError
-from sgstore.vocabulary import suggestion
+from sgstore.model.vocabulary import suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -30,16 +30,16 @@ from sgstore.exporters._frames import sensor_of
 from sgstore.exporters._labels import FEW
 from sgstore.exporters._nx import graphs_of
 from sgstore.exporters._transforms import EGO, FrameTransforms
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import drawn_outlines
 from sgstore.mcap import Loss
-from sgstore.opendrive import read_map
 from sgstore.readers import record_reader
-from sgstore.roads import drawn_outlines
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.exporters._labels import ClipFrames, Export
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
 APPLICATION: Final = "sgstore"
 _MESSAGES: Final = """

@@ -14,9 +14,9 @@ from __future__ import annotations
 import csv
 from typing import TYPE_CHECKING, Final
 
-from sgstore.abstractions import abstraction_named
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile
+from sgstore.graphs.abstractions import abstraction_named
 from sgstore.mcap import Loss
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
 EGO: Final = "ego"
 OWN_EGO: Final = "sgstore/ego"

@@ -19,8 +19,8 @@ from sgstore.exporters._clips import (
 from sgstore.exporters._labels import Export, Labels
 from sgstore.exporters._registry import exporter_named
 from sgstore.matches import merged
-from sgstore.vocabulary import natural
-from sgstore.world import Clip, tolerance_ns
+from sgstore.model.vocabulary import natural
+from sgstore.model.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

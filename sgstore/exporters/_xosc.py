@@ -28,9 +28,9 @@ import numpy as np
 
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile, clip_name, safe_name, tool
+from sgstore.maps.roads import is_lane_text
 from sgstore.mcap import Loss
-from sgstore.roads import is_lane_text
-from sgstore.vocabulary import VEHICLES
+from sgstore.model.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator, Sequence

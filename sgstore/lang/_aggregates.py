@@ -10,11 +10,11 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._catalog import Type
-from sgstore.records import dataclass
-from sgstore.vocabulary import normalize_name
+from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable

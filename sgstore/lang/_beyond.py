@@ -19,7 +19,7 @@ from sgstore.lang import ir as b
 from sgstore.lang._catalog import IN_GRAPH, NODE_ATTRIBUTES, RelationScope, Type
 from sgstore.lang._horizon import LINKS
 from sgstore.lang._needs import bounded, in_traces
-from sgstore.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
+from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping

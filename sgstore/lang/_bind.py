@@ -9,6 +9,7 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang import ir as o
@@ -33,8 +34,7 @@ from sgstore.lang._symbols import (
 )
 from sgstore.lang.syntax import CheckClause as WrittenCheck
 from sgstore.lang.syntax import Define, MatchClause
-from sgstore.records import dataclass
-from sgstore.vocabulary import (
+from sgstore.model.vocabulary import (
     RELATION_ALIASES,
     entity_kinds,
     kinds_labelled,

@@ -35,8 +35,8 @@ from sgstore.lang._symbols import (
     seen_in,
     text_test,
 )
-from sgstore.pair_numbers import COURSES
-from sgstore.vocabulary import (
+from sgstore.model.pair_numbers import COURSES
+from sgstore.model.vocabulary import (
     KINDS,
     LANE_TYPES,
     entity_kinds,

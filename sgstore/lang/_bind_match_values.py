@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
 from sgstore.lang._catalog import FRAME_ATTRIBUTES, Type
-from sgstore.vocabulary import normalize_name
+from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from sgstore.errors import TextSpan

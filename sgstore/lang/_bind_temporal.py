@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import field, replace
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang import ir as o
@@ -22,8 +23,7 @@ from sgstore.lang._parse import parse
 from sgstore.lang._renaming import names_written, own_names, renamed, values_given
 from sgstore.lang._symbols import RESERVED, ScopeBuilder, Session, Symbol, SymbolTable
 from sgstore.lang.library import patterns
-from sgstore.records import dataclass
-from sgstore.vocabulary import normalize_name
+from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping

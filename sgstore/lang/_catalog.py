@@ -17,10 +17,10 @@ from enum import StrEnum
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.criticality import RECORDED
-from sgstore.pair_numbers import PAIR_FUNCTIONS, UNEVEN
-from sgstore.records import dataclass
-from sgstore.vocabulary import (
+from sgstore.base.records import dataclass
+from sgstore.model.criticality import RECORDED
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS, UNEVEN
+from sgstore.model.vocabulary import (
     KINDS,
     LIGHT_STATES,
     MAP_KINDS,
@@ -613,7 +613,7 @@ PAIR_NAMES: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class RelationScope:
-    """Pairs of entities for which relations are computed, as in :class:`sgstore.config.Pairs`.
+    """Pairs of entities for which relations are computed, as in :class:`sgstore.model.config.Pairs`.
 
     Attributes
     ----------
@@ -621,7 +621,7 @@ class RelationScope:
     ego, static : bool
     kinds : tuple of pairs of str
     between : str
-        Points between which distances are measured: :attr:`sgstore.config.Proximity.between`.
+        Points between which distances are measured: :attr:`sgstore.model.config.Proximity.between`.
     rungs : tuple of (str, float)
         Distance relations, nearest first, and their upper bounds; m.
     near_kinds : tuple of pairs of str
@@ -682,7 +682,7 @@ def excluded_kinds(labels: Iterable[str], counted: Iterable[str]) -> frozenset[s
     Parameters
     ----------
     labels : iterable of str
-        Labels of kept nodes: :attr:`sgstore.config.Config.kinds`; empty means all.
+        Labels of kept nodes: :attr:`sgstore.model.config.Config.kinds`; empty means all.
     counted : iterable of str
         Kinds of the nodes that were left out.
     """
@@ -712,7 +712,7 @@ class TraceFacts:
     known : float
         Radius around the ego within which all recorded entities are known; m. Infinite if nothing was left out.
     uneven : int
-        Objects other than ordinary bodies that occur: bits of :data:`sgstore.pair_numbers.UNEVEN`.
+        Objects other than ordinary bodies that occur: bits of :data:`sgstore.model.pair_numbers.UNEVEN`.
     excluded : frozenset of str
         Kinds whose nodes the settings leave out, all or some of them.
     """

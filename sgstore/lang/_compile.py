@@ -16,6 +16,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import sgstore.lang._results as results
+from sgstore.base.logs import logger
+from sgstore.base.records import dataclass
 from sgstore.lang._bind import bind_checks, bind_query
 from sgstore.lang._catalog import (
     EDGE_ATTRIBUTES,
@@ -70,10 +72,8 @@ from sgstore.lang.ir import (
     is_passed_on,
 )
 from sgstore.lang.syntax import CheckClause, MatchClause
-from sgstore.logs import logger
-from sgstore.pair_numbers import as_written
-from sgstore.records import dataclass
-from sgstore.vocabulary import KINDS, RELATIONS, asking, entity_kinds, normalize_name
+from sgstore.model.pair_numbers import as_written
+from sgstore.model.vocabulary import KINDS, RELATIONS, asking, entity_kinds, normalize_name
 
 _log = logger("lang")
 

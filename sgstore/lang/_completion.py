@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from sgstore.lang._catalog import attributes_of
 from sgstore.lang._parse import keywords
 from sgstore.lang.library import patterns
-from sgstore.pair_numbers import PAIR_FUNCTIONS
-from sgstore.vocabulary import KINDS, RELATIONS, labels
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS
+from sgstore.model.vocabulary import KINDS, RELATIONS, labels
 
 if TYPE_CHECKING:
     from sgstore.lang._catalog import Catalog

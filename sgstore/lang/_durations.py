@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.records import dataclass
+from sgstore.base.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from sgstore.criticality import RECORDED
+from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, Type
 from sgstore.lang._operators import OPERATORS, Column
-from sgstore.pair_numbers import (
+from sgstore.model.criticality import RECORDED
+from sgstore.model.pair_numbers import (
     COLUMNS,
     COURSES,
     HUNG,
@@ -32,13 +33,12 @@ from sgstore.pair_numbers import (
     PairNumbers,
     low_and_high,
 )
-from sgstore.records import dataclass
-from sgstore.vocabulary import MAP_KINDS, SIGNALS
+from sgstore.model.vocabulary import MAP_KINDS, SIGNALS
 
 if TYPE_CHECKING:
-    from sgstore.graph import SceneGraph
     from sgstore.lang._catalog import Attribute
-    from sgstore.world import Bools, Floats
+    from sgstore.model.graph import SceneGraph
+    from sgstore.model.world import Bools, Floats
 
 
 ENTITY: Final = (*COLUMNS, *OPTIONAL)

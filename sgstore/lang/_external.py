@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.quoting import quoted
 from sgstore.lang._catalog import (
     NODE_ATTRIBUTES,
     TRACE_ATTRIBUTES,
@@ -47,8 +48,7 @@ from sgstore.lang.ir import (
     is_formula,
     with_operands,
 )
-from sgstore.quoting import quoted
-from sgstore.vocabulary import KINDS
+from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

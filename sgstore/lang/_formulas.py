@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import field
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.quoting import literal, quoted
+from sgstore.base.records import dataclass
 from sgstore.lang._aggregates import sql_of
 from sgstore.lang._catalog import DERIVED, Attribute, DisplayUnit, Home, Type
 from sgstore.lang._operators import COMPARISONS, COMPILER_SQL, OPERATORS
@@ -30,10 +32,8 @@ from sgstore.lang.ir import (
     TraceAttribute,
     Value,
 )
-from sgstore.pair_numbers import low_and_high_sql, pair_sql, stage_of
-from sgstore.quoting import literal, quoted
-from sgstore.records import dataclass
-from sgstore.vocabulary import MAP_KINDS, VEHICLE_LIGHTS
+from sgstore.model.pair_numbers import low_and_high_sql, pair_sql, stage_of
+from sgstore.model.vocabulary import MAP_KINDS, VEHICLE_LIGHTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -355,7 +355,7 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
 
 
 def seconds_text(ns: str) -> str:
-    """Return the SQL that converts nanoseconds to seconds, as :func:`sgstore.world.seconds_of`."""
+    """Return the SQL that converts nanoseconds to seconds, as :func:`sgstore.model.world.seconds_of`."""
     return f"round(CAST({ns} AS DOUBLE) / 1e3) / 1e6"
 
 

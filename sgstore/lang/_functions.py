@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from sgstore.criticality import RECORDED
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
@@ -18,8 +17,16 @@ from sgstore.lang._operators import EXTREMES, NUMERIC, OF_TEXT, OF_TWO
 from sgstore.lang._parse import parse
 from sgstore.lang._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
 from sgstore.lang.library import pattern_named, patterns, predicates
-from sgstore.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, OF_ONE, PAIR_FUNCTIONS, PART_DIST
-from sgstore.vocabulary import EVENT_KINDS, entity_kinds, normalize_name, relation_named
+from sgstore.model.criticality import RECORDED
+from sgstore.model.pair_numbers import (
+    COURSES,
+    LANE_DIST,
+    NEXT_PARTS,
+    OF_ONE,
+    PAIR_FUNCTIONS,
+    PART_DIST,
+)
+from sgstore.model.vocabulary import EVENT_KINDS, entity_kinds, normalize_name, relation_named
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -10,7 +10,7 @@ from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang._catalog import NODE_ATTRIBUTES, Type
-from sgstore.vocabulary import (
+from sgstore.model.vocabulary import (
     LANE_TYPES,
     OWN_KINDS,
     OWN_LIGHT_STATES,

@@ -16,9 +16,9 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
-from sgstore.records import dataclass
-from sgstore.vocabulary import PROXIMITY, SIGNALS, entity_kinds
+from sgstore.model.vocabulary import PROXIMITY, SIGNALS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import field
 from typing import TYPE_CHECKING
 
+from sgstore.base.records import dataclass
 from sgstore.lang._catalog import Attribute, Type
-from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from sgstore.errors import TextSpan
@@ -127,7 +127,7 @@ class Happened:
     Attributes
     ----------
     kind : str
-        Kind of the event, one of :data:`sgstore.vocabulary.EVENT_KINDS`; or the name of a user table.
+        Kind of the event, one of :data:`sgstore.model.vocabulary.EVENT_KINDS`; or the name of a user table.
     nodes : tuple of str
         Nodes that the event involves: none, one or two.
     table : tuple of str

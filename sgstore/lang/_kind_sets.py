@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from sgstore.records import dataclass
-from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
+from sgstore.base.records import dataclass
+from sgstore.model.vocabulary import KINDS, RELATIONS, entity_kinds
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.quoting import literal
 from sgstore.lang._catalog import DisplayUnit, Home
 from sgstore.lang._operators import COMPARISONS, OPERATORS
 from sgstore.lang.ir import Bound, Operation, PairNumber, Scope, any_relation
-from sgstore.pair_numbers import PART_DIST
-from sgstore.quoting import literal
-from sgstore.vocabulary import KINDS, RELATIONS, entity_kinds
+from sgstore.model.pair_numbers import PART_DIST
+from sgstore.model.vocabulary import KINDS, RELATIONS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from sgstore.criticality import RECORDED
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import (
     NODE_ATTRIBUTES,
@@ -39,8 +38,9 @@ from sgstore.lang.ir import (
     inverse,
     is_one_of,
 )
-from sgstore.pair_numbers import COURSES, TOUCH, WAYS, columns_needed
-from sgstore.vocabulary import (
+from sgstore.model.criticality import RECORDED
+from sgstore.model.pair_numbers import COURSES, TOUCH, WAYS, columns_needed
+from sgstore.model.vocabulary import (
     SIGNALS,
     VEHICLE_LIGHTS,
     VEHICLES,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang import ir as b
 from sgstore.lang._formulas import Select, nested
-from sgstore.vocabulary import entity_kinds
+from sgstore.model.vocabulary import entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

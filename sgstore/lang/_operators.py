@@ -13,14 +13,14 @@ import re
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.arrays import np
-from sgstore.json_text import float32
-from sgstore.records import dataclass
+from sgstore.base.arrays import np
+from sgstore.base.json_text import float32
+from sgstore.base.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from sgstore.world import Bools
+    from sgstore.model.world import Bools
 
     SqlOf = Callable[[Sequence[str]], str]
 

@@ -17,10 +17,10 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.records import dataclass
 from sgstore.errors import QuerySyntaxError, TextSpan
 from sgstore.lang._hints import bracket_hint, places, slip_hint
 from sgstore.lang._syntax_builder import BUILDERS, BuildError
-from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -14,6 +14,8 @@ from dataclasses import fields, replace
 from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.quoting import quoted
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
 from sgstore.lang._aggregates import PLACE, sql_of
 from sgstore.lang._catalog import FRAME_ATTRIBUTES, TRACE_ATTRIBUTES, Catalog, DisplayUnit, Type
@@ -56,8 +58,6 @@ from sgstore.lang.ir import (
     walk,
     with_operands,
 )
-from sgstore.quoting import quoted
-from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

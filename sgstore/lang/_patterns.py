@@ -12,7 +12,7 @@ from itertools import accumulate
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QueryError
-from sgstore.vocabulary import (
+from sgstore.model.vocabulary import (
     ENTITY_KINDS,
     RELATIONS,
     SUPER_KINDS,
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     import networkx as nx
 
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
 
 _NAME: Final = re.compile(r"[A-Za-z_]\w*")

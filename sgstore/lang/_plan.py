@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import field
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.quoting import quoted
+from sgstore.base.records import dataclass
 from sgstore.lang._catalog import DisplayUnit
 from sgstore.lang._formulas import Leaf, Select, leaves, nested
 from sgstore.lang._kinds import Profile
@@ -29,8 +31,6 @@ from sgstore.lang.ir import (
     nodes_of,
     walk,
 )
-from sgstore.quoting import quoted
-from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.quoting import quoted
 from sgstore.lang._catalog import (
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
@@ -60,7 +61,6 @@ from sgstore.lang.ir import (
     walk,
     with_operands,
 )
-from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -56,8 +56,8 @@ from sgstore.lang.ir import (
     walk,
     with_operands,
 )
-from sgstore.pair_numbers import PAIR_FUNCTIONS
-from sgstore.vocabulary import KINDS
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS
+from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang._evaluate import (
     Attributes,
@@ -21,7 +22,6 @@ from sgstore.lang._evaluate import (
     crowd_test,
     evaluator,
 )
-from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeGuard
 
+from sgstore.base.quoting import quoted
 from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit, Home
 from sgstore.lang._formulas import (
     Aliases,
@@ -75,9 +76,8 @@ from sgstore.lang.ir import (
     blocks_of,
     nodes_of,
 )
-from sgstore.pair_numbers import MARKS, STOREYS, UNEVEN, WAYS, needed_for, parts_of, stage_of
-from sgstore.quoting import quoted
-from sgstore.vocabulary import VEHICLES
+from sgstore.model.pair_numbers import MARKS, STOREYS, UNEVEN, WAYS, needed_for, parts_of, stage_of
+from sgstore.model.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -144,7 +144,7 @@ class Layers:
         Values needed by conditions or results.
     conditions : list of Bound
     without : frozenset of str
-        Marks that no pair of these traces needs (:data:`sgstore.pair_numbers.MARKS`).
+        Marks that no pair of these traces needs (:data:`sgstore.model.pair_numbers.MARKS`).
     users : frozenset of str
         Nodes that are road users.
     early : set of Part

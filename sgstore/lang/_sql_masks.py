@@ -10,6 +10,8 @@ from dataclasses import field, replace
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.quoting import quoted
+from sgstore.base.records import dataclass
 from sgstore.lang._catalog import Home
 from sgstore.lang._formulas import (
     Aliases,
@@ -55,9 +57,7 @@ from sgstore.lang.ir import (
     Scope,
     ego_kinds,
 )
-from sgstore.quoting import quoted
-from sgstore.records import dataclass
-from sgstore.vocabulary import entity_kinds
+from sgstore.model.vocabulary import entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

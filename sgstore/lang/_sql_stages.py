@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from sgstore.base.quoting import quoted
 from sgstore.lang._aggregates import PLACE
 from sgstore.lang._formulas import (
     Leaf,
@@ -39,7 +40,6 @@ from sgstore.lang.ir import (
     is_passed_on,
     walk,
 )
-from sgstore.quoting import quoted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from sgstore.criticality import KNOWN, RECORDED
+from sgstore.base.quoting import literal, quoted
 from sgstore.lang._kinds import kind_conditions
 from sgstore.lang._plan import TRACE_OF_FRAME
 from sgstore.lang._sql_masks import in_mask
 from sgstore.lang.ir import PairNumber
-from sgstore.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, PART_DIST, WAYS
-from sgstore.quoting import literal, quoted
-from sgstore.vocabulary import SIGNALS, entity_kinds
+from sgstore.model.criticality import KNOWN, RECORDED
+from sgstore.model.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, PART_DIST, WAYS
+from sgstore.model.vocabulary import SIGNALS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -37,7 +37,7 @@ class WayEnd:
 
 
 def way_text(function: str, frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
-    """Return the SQL of a number of :data:`sgstore.pair_numbers.WAYS`.
+    """Return the SQL of a number of :data:`sgstore.model.pair_numbers.WAYS`.
 
     Parameters
     ----------

@@ -15,6 +15,7 @@ from fnmatch import fnmatchcase
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang import ir as b
 from sgstore.lang import syntax as s
@@ -23,8 +24,7 @@ from sgstore.lang._hints import condition_hint, hint_at, variable_hint
 from sgstore.lang._needs import scopes_of
 from sgstore.lang.ir import Bound, Edge, Kinds, Node, Scope, ego_kinds
 from sgstore.lang.library import predicates
-from sgstore.records import dataclass
-from sgstore.vocabulary import normalize_name
+from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

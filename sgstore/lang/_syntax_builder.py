@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from sgstore.errors import TextSpan
 from sgstore.lang import syntax as s
 from sgstore.lang._hints import said_of
-from sgstore.vocabulary import normalize_name
+from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,9 +8,9 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
+from sgstore.base.quoting import quoted
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, TextSpan
-from sgstore.quoting import quoted
-from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Collection

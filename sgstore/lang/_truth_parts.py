@@ -11,13 +11,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryNameError
 from sgstore.lang import ir as b
 from sgstore.lang._catalog import NODE_ATTRIBUTES, Type
 from sgstore.lang._compile import value_text
 from sgstore.lang._why_not import Writer, label_written
-from sgstore.records import dataclass
-from sgstore.vocabulary import RELATIONS
+from sgstore.model.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

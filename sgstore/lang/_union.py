@@ -10,15 +10,15 @@ import re
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from sgstore.base.quoting import quoted
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, TextSpan
 from sgstore.lang import syntax as s
 from sgstore.lang._catalog import TRACE_ATTRIBUTES, Type
 from sgstore.lang._formulas import Select, nested
 from sgstore.lang._parse import parse
 from sgstore.lang.ir import TraceAttribute
-from sgstore.quoting import quoted
-from sgstore.records import dataclass
-from sgstore.vocabulary import normalize_name
+from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

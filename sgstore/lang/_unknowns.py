@@ -15,8 +15,8 @@ from sgstore.lang import ir as b
 from sgstore.lang._beyond import beyond_graph, bounded_in, holds
 from sgstore.lang._catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, RelationScope, Type
 from sgstore.lang._needs import MEASURED, MOTION, in_traces, related
-from sgstore.pair_numbers import columns_needed
-from sgstore.vocabulary import (
+from sgstore.model.pair_numbers import columns_needed
+from sgstore.model.vocabulary import (
     BEYOND,
     DIRECTIONS,
     MAP_ONLY,

@@ -20,8 +20,8 @@ from sgstore.lang._formulas import happened_in_frame, leaves, told_events
 from sgstore.lang._operators import INFIX, ROUNDINGS
 from sgstore.lang._plan import TRACE_OF_FRAME
 from sgstore.lang._search import ScopeSearch, expression
-from sgstore.pair_numbers import as_written
-from sgstore.vocabulary import EVENT_KINDS, KINDS, RELATIONS, SUPER_KINDS, entity_kinds
+from sgstore.model.pair_numbers import as_written
+from sgstore.model.vocabulary import EVENT_KINDS, KINDS, RELATIONS, SUPER_KINDS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

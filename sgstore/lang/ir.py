@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, Literal, TypeGuard
 
+from sgstore.base.records import dataclass
 from sgstore.lang._catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, RelationScope, Type
 from sgstore.lang._durations import (
     BoundHold,  # noqa: TC001  they are of this module
@@ -35,7 +36,6 @@ from sgstore.lang._kind_sets import any_kinds as any_kinds  # noqa: PLC0414
 from sgstore.lang._kind_sets import any_relation as any_relation  # noqa: PLC0414
 from sgstore.lang._kind_sets import ego_kinds as ego_kinds  # noqa: PLC0414
 from sgstore.lang._links import StepLink, StepWay
-from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping

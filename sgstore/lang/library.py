@@ -28,11 +28,11 @@ from itertools import takewhile
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang._parse import parse
 from sgstore.lang.syntax import Define
-from sgstore.records import dataclass
-from sgstore.vocabulary import LABEL_ALIASES, normalize_name, suggestion
+from sgstore.model.vocabulary import LABEL_ALIASES, normalize_name, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Literal
 
-from sgstore.records import dataclass
+from sgstore.base.records import dataclass
 
 if TYPE_CHECKING:
     from sgstore.errors import TextSpan

@@ -14,7 +14,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Sel
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.graphs.online import Frame, check_entities
 from sgstore.mcap import IDS, Findings, OutOfOrder, digest_of, read_and_digest
+from sgstore.model.vocabulary import KINDS, TypeMeaning
+from sgstore.model.world import POSE, Channel, MessageRefs, TraceInfo, TraceReport
 from sgstore.readers._blocks import (
     FIRST_STEPS,
     FrameRows,
@@ -25,18 +28,15 @@ from sgstore.readers._blocks import (
 )
 from sgstore.readers._roles import channel_rank
 from sgstore.readers._stamps import Stamps
-from sgstore.step import Frame, check_entities
-from sgstore.vocabulary import KINDS, TypeMeaning
-from sgstore.world import POSE, Channel, MessageRefs, TraceInfo, TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
+    from sgstore.graphs.online import Entity
     from sgstore.mcap import Messages, Recording
-    from sgstore.step import Entity
-    from sgstore.world import FrameBlock
+    from sgstore.model.world import FrameBlock
 
 
 Key = TypeVar("Key")
@@ -371,7 +371,7 @@ class MessageTrace:
     context : iterable of Ref
         Messages that later messages depend on.
     **more
-        Other attributes of :class:`~sgstore.world.TraceInfo`.
+        Other attributes of :class:`~sgstore.model.world.TraceInfo`.
 
     Attributes
     ----------
@@ -485,7 +485,7 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
     digest : str
         SHA-256 of the file if known; empty: the file is hashed.
     **more
-        Other attributes of :class:`~sgstore.world.TraceInfo`.
+        Other attributes of :class:`~sgstore.model.world.TraceInfo`.
 
     Raises
     ------

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, ClassVar, Final, Generic, NamedTuple, TypeAlia
 
 import numpy as np
 
-from sgstore.columns import chained, taken
+from sgstore.base.columns import chained, taken
 from sgstore.mcap import IDS, Loss
-from sgstore.vocabulary import KIND_CODE, KINDS
-from sgstore.world import (
+from sgstore.model.vocabulary import KIND_CODE, KINDS
+from sgstore.model.world import (
     FASTEST,
     HARDEST,
     INPUTS,
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.mcap import Messages
-    from sgstore.vocabulary import TypeMeaning
-    from sgstore.world import Bools, Event, Floats, Ints, TraceReport
+    from sgstore.model.vocabulary import TypeMeaning
+    from sgstore.model.world import Bools, Event, Floats, Ints, TraceReport
 
     Steps = tuple[Ints, Ints, Floats, Floats]
 
@@ -85,11 +85,11 @@ class FrameRows:
     ego : int
         Node id; -1 if absent.
     node, lights, light_state : (n,) int64
-        As in :class:`sgstore.world.States`.
+        As in :class:`sgstore.model.world.States`.
     values : (n, 16) float64
         Columns :data:`POSE`.
     controls : tuple of float
-        :data:`sgstore.world.INPUTS` of the ego; NaN for missing ones.
+        :data:`sgstore.model.world.INPUTS` of the ego; NaN for missing ones.
     driven : mapping
         Node id → the same inputs, of vehicles other than the ego.
     kinds : mapping
@@ -131,7 +131,7 @@ class FrameRows:
 
 
 class EntityRow(NamedTuple):
-    """Row of :class:`sgstore.world.Entities`."""
+    """Row of :class:`sgstore.model.world.Entities`."""
 
     ident: str
     kind: int
@@ -653,9 +653,9 @@ FIRST_STEPS: Final = 64
 class LifetimeTracker:
     """Assignment of node ids and time steps to frames, for ids that are reused by other entities.
 
-    Node ids depend on lifetimes, by the rule of :class:`~sgstore.world.Lives`. Most ids have the same entity in
-    all frames. They are compared as arrays; only the rows of possibly different entities are processed one by
-    one.
+    Node ids depend on lifetimes, by the rule of :class:`~sgstore.model.world.Lives`. Most ids have the same
+    entity in all frames. They are compared as arrays; only the rows of possibly different entities are
+    processed one by one.
 
     Parameters
     ----------

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from sgstore.model.world import Channel, FrameBlock, Ints
     from sgstore.readers.carla._live import Sensor, SensorPicture, Sensors
-    from sgstore.world import Channel, FrameBlock, Ints
 
 KEPT: Final = 3000
 """Number of recent frames with available pictures."""

@@ -12,9 +12,10 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from sgstore import plugins
+from sgstore.base import plugins
 from sgstore.errors import TraceError
 from sgstore.mcap import MAGIC, McapFile, messages_at, open_regular
+from sgstore.model.world import TraceReport
 from sgstore.readers.commonroad._file import ENDINGS as _SCENARIO_ENDINGS
 from sgstore.readers.commonroad._file import CommonRoadFile, is_scenario
 from sgstore.readers.commonroad._file import read_messages as _read_scenario_messages
@@ -24,14 +25,13 @@ from sgstore.readers.osi._file import read_message as _read_osi_message
 from sgstore.readers.sumo._file import ENDINGS as _SUMO_ENDINGS
 from sgstore.readers.sumo._file import SumoFile, is_fcd
 from sgstore.readers.sumo._file import read_messages as _read_steps
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Recording
     from sgstore.readers._base import MessageTrace
-    from sgstore.roads import RoadMap
 
 
 ENDINGS: Final = (
@@ -172,7 +172,7 @@ def _is_single_channel(path: Path) -> bool:
 def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
     """Return the data of one message of a recording, by its position as in ``MessageRefs``.
 
-    See :class:`~sgstore.world.MessageRefs`.
+    See :class:`~sgstore.model.world.MessageRefs`.
 
     Raises
     ------
@@ -194,8 +194,8 @@ def read_messages(
     path : Path
         A recording: a file, or the folder of a bag.
     places : iterable of (chunk_offset, offset, length)
-        As in :class:`sgstore.world.MessageRefs`. Group the messages of a chunk, because only the last chunk is
-        cached.
+        As in :class:`sgstore.model.world.MessageRefs`. Group the messages of a chunk, because only the last
+        chunk is cached.
 
     Raises
     ------

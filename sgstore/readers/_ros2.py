@@ -25,7 +25,7 @@ from sgstore.errors import TraceError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from sgstore.world import Floats
+    from sgstore.model.world import Floats
 
 
 MAX_TEXT: Final = 1 << 20

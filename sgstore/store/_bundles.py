@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 
 import sgstore.store._schema as shape
+from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
-from sgstore.quoting import literal, quoted
+from sgstore.model.vocabulary import NAMES
 from sgstore.store._columns import MASKS, ORDERS, REPEATED, STATES, types_of
 from sgstore.store._locking import Access, default_memory, spill_folder, translated
 from sgstore.store._packing import BUCKET_BITS, SEQ_BITS
@@ -25,7 +26,6 @@ from sgstore.store._rebuild import attach_empty
 from sgstore.store._rows import Rows, run
 from sgstore.store._staging import scratch
 from sgstore.store._traces import stored_traces
-from sgstore.vocabulary import NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -10,19 +10,19 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.abstractions import SUBSETS
+from sgstore.base.quoting import literal
+from sgstore.graphs.abstractions import SUBSETS
 from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, excluded_kinds, own_type
-from sgstore.quoting import literal
+from sgstore.model.vocabulary import BEYOND, NAMES, RELATIONS
 from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
-from sgstore.vocabulary import BEYOND, NAMES, RELATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.abstractions import Subset
+    from sgstore.graphs.abstractions import Subset
     from sgstore.lang import Triple
     from sgstore.store._derive import DerivedSet
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.abstractions import (
+from sgstore.base.records import dataclass
+from sgstore.graphs.abstractions import (
     AT_INGEST,
     Classes,
     GraphColumns,
@@ -22,13 +23,12 @@ from sgstore.abstractions import (
     found,
     lane_roles,
 )
-from sgstore.records import dataclass
+from sgstore.model.world import BUCKET_FRAMES
 from sgstore.store._graphs import Graphs
 from sgstore.store._packing import SEQ_BITS, frames_of, masks_of, texts, trace_bucket
 from sgstore.store._publish import add, note, writing
 from sgstore.store._staging import Staging
 from sgstore.store._traces import frame_named, trace_named
-from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -37,12 +37,12 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
-    from sgstore.abstractions import Labelled
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
+    from sgstore.graphs.abstractions import Labelled
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import Codes, Ints
     from sgstore.store._locking import Access
     from sgstore.store._packing import Columns
-    from sgstore.world import Codes, Ints
 
 
 _LATER: Final = "later_class"

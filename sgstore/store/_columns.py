@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.columns import ascending
+from sgstore.base.columns import ascending
+from sgstore.base.quoting import quoted
 from sgstore.errors import StoreError
-from sgstore.quoting import quoted
+from sgstore.model.vocabulary import NAMES
 from sgstore.store._packing import FRAME_BITS, MISSING, packed
 from sgstore.store._schema import INSIDE, code_sql, enums_of, expected, own_labels
-from sgstore.vocabulary import NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from sgstore.model.world import Bools, Ints
     from sgstore.store._file import StoreFile
-    from sgstore.world import Bools, Ints
 
     Words = NDArray[np.uint64]
 

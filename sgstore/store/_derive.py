@@ -14,17 +14,11 @@ import numpy as np
 
 import sgstore.store._packing as packing
 import sgstore.store._schema as shape
+from sgstore.base.records import dataclass
 from sgstore.errors import AbstractionError, StoreError
-from sgstore.graph import SceneGraph
-from sgstore.records import dataclass
-from sgstore.store._graphs import Graphs, filled
-from sgstore.store._packing import FRAME_BITS, NodeKinds, as_json, texts
-from sgstore.store._publish import add, note, widen, writing
-from sgstore.store._rows import run
-from sgstore.store._staging import Staging
-from sgstore.store._traces import trace_named
-from sgstore.vocabulary import normalize_name
-from sgstore.world import (
+from sgstore.model.graph import SceneGraph
+from sgstore.model.vocabulary import normalize_name
+from sgstore.model.world import (
     BUCKET_FRAMES,
     INPUTS,
     POSE,
@@ -34,6 +28,12 @@ from sgstore.world import (
     Origin,
     States,
 )
+from sgstore.store._graphs import Graphs, filled
+from sgstore.store._packing import FRAME_BITS, NodeKinds, as_json, texts
+from sgstore.store._publish import add, note, widen, writing
+from sgstore.store._rows import run
+from sgstore.store._staging import Staging
+from sgstore.store._traces import trace_named
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
-    from sgstore.abstractions import GraphColumns, Labelled
-    from sgstore.graph import GraphBlock
+    from sgstore.graphs.abstractions import GraphColumns, Labelled
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import Ints
     from sgstore.store._locking import Access
     from sgstore.store._packing import Columns
-    from sgstore.world import Ints
 
 
 TABLES: Final = ("derived", "derived_node", "derived_edge", "derived_gap")

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 from duckdb.func import FunctionNullHandling
 
-from sgstore.criticality import FIXED_KINDS, KNOWN, RECORDED, TRACKS, tracks_of
 from sgstore.errors import ConfigError
+from sgstore.model.criticality import FIXED_KINDS, KNOWN, RECORDED, TRACKS, tracks_of
 from sgstore.store._lease import stamp_of
 from sgstore.store._schema import INSIDE
 from sgstore.store._steps import interrupted
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.criticality import Track
+    from sgstore.model.criticality import Track
     from sgstore.store._lease import Stamp
 
 MOST_STATES: Final = 1 << 20
@@ -117,7 +117,7 @@ class _MeasuredQuestion:
         a, b = (self._track(nodes, trace, node) for node in (src, dst))
         if a is None or b is None:
             return None
-        from sgstore.criticality import Encounter  # with numpy
+        from sgstore.model.criticality import Encounter  # with numpy
 
         value = RECORDED[measure.removeprefix(KNOWN)].value(Encounter(a, b))
         return None if math.isnan(value) else value

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import sgstore.store._rows as rows
-from sgstore.arrays import np
+from sgstore.base.arrays import np
 from sgstore.errors import SgstoreError, StoreError, TraceError
+from sgstore.model.world import Channel, MessageRefs
 from sgstore.store._encounters import recorded_measures
 from sgstore.store._given import Given, give
 from sgstore.store._locking import (
@@ -40,7 +41,6 @@ from sgstore.store._traces import (
     trace_named,
     uri_of,
 )
-from sgstore.world import Channel, MessageRefs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -51,11 +51,12 @@ if TYPE_CHECKING:
     from mcap.records import Schema
     from numpy.typing import NDArray
 
-    from sgstore.config import Config
-    from sgstore.graph import SceneGraph
     from sgstore.lang import Catalog
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.config import Config
+    from sgstore.model.graph import SceneGraph
+    from sgstore.model.world import TraceInfo
     from sgstore.readers import Media
-    from sgstore.roads import RoadMap
     from sgstore.store._classes import Abstracted
     from sgstore.store._derive import Deriving
     from sgstore.store._graphs import Graphs
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
     from sgstore.store._staging import Sealed
     from sgstore.store._verify import Verification
     from sgstore.store._write import Segment
-    from sgstore.world import TraceInfo
 
 
 T = TypeVar("T")

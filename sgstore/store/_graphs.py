@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from sgstore.abstractions import GraphColumns, MapColumns
-from sgstore.graph import (
+from sgstore.base.quoting import literal
+from sgstore.graphs.abstractions import GraphColumns, MapColumns
+from sgstore.model.graph import (
     Edges,
     LaneDistances,
     MapRecords,
@@ -19,11 +20,10 @@ from sgstore.graph import (
     StaticPresence,
     edge_attributes,
 )
-from sgstore.quoting import literal
+from sgstore.model.vocabulary import MAP_KINDS, RELATION_CODE
 from sgstore.store._packing import FRAME_BITS, SEQ_BITS, frames_of, trace_of
 from sgstore.store._rows import run
 from sgstore.store._schema import codes_of
-from sgstore.vocabulary import MAP_KINDS, RELATION_CODE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
-    from sgstore.graph import SceneGraph
+    from sgstore.model.graph import SceneGraph
 
     Numbers = NDArray[np.unsignedinteger[Any]]
 

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
 
+from sgstore.base.files import temporary_folder
+from sgstore.base.quoting import literal
+from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
-from sgstore.files import temporary_folder
 from sgstore.lang import TableFacts, Type
-from sgstore.quoting import literal
-from sgstore.records import dataclass
 from sgstore.store._packing import TOLERANCE
 
 if TYPE_CHECKING:

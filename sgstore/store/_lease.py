@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from sgstore.quoting import literal, quoted
+from sgstore.base.quoting import literal, quoted
 
 try:
     import fcntl

@@ -20,10 +20,10 @@ from weakref import finalize
 import duckdb
 
 import sgstore.store._schema as shape
+from sgstore.base.files import HeldFolder, new_place, sweep
+from sgstore.base.logs import logger
+from sgstore.base.quoting import literal
 from sgstore.errors import SqlError, StoreError, one_store_needed, url_named
-from sgstore.files import HeldFolder, new_place, sweep
-from sgstore.logs import logger
-from sgstore.quoting import literal
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import AttachedFile, OpenFile, files, gate_of, stamp_of
 

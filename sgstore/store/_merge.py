@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import sgstore.store._schema as shape
+from sgstore.base.quoting import literal, quoted
+from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
-from sgstore.quoting import literal, quoted
-from sgstore.records import dataclass
+from sgstore.model.vocabulary import NAMES
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import shared_instance
 from sgstore.store._locking import default_memory, spill_folder, translated
@@ -25,7 +26,6 @@ from sgstore.store._packing import SEQ_BITS
 from sgstore.store._rows import Batches, arrays, write_parquet
 from sgstore.store._staging import scratch
 from sgstore.store._steps import interruptible
-from sgstore.vocabulary import NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Mapping, Sequence

@@ -10,17 +10,25 @@ import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from sgstore.arrays import np
-from sgstore.columns import ascending, taken
-from sgstore.world import BUCKET_FRAMES, GAP, KEPT, TOLERANCE_NS, TOLERANCE_SHARE, number, turned
+from sgstore.base.arrays import np
+from sgstore.base.columns import ascending, taken
+from sgstore.model.world import (
+    BUCKET_FRAMES,
+    GAP,
+    KEPT,
+    TOLERANCE_NS,
+    TOLERANCE_SHARE,
+    number,
+    turned,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from sgstore.graph import Edges, GraphBlock, WorldBlock
-    from sgstore.world import Bools, Codes, Entities, Ints, MessageRefs, Origin
+    from sgstore.model.graph import Edges, GraphBlock, WorldBlock
+    from sgstore.model.world import Bools, Codes, Entities, Ints, MessageRefs, Origin
 
 
 Whole: TypeAlias = "NDArray[np.signedinteger[Any]]"
@@ -44,9 +52,9 @@ SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
 """Bits of a frame id below the trace id."""
 
 TOLERANCE: Final = f"greatest({TOLERANCE_NS}, coalesce(period_ns, 0) // {TOLERANCE_SHARE})"
-"""SQL: :func:`sgstore.world.tolerance_ns` of a trace's ``period_ns``."""
+"""SQL: :func:`sgstore.model.world.tolerance_ns` of a trace's ``period_ns``."""
 LONGEST_STEP: Final = f"{GAP} * period_ns + {TOLERANCE}"
-"""SQL: :func:`sgstore.world.longest_step_ns` of a trace's ``period_ns``."""
+"""SQL: :func:`sgstore.model.world.longest_step_ns` of a trace's ``period_ns``."""
 
 
 @dataclass(slots=True)

@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.errors import StoreError
+from sgstore.model.vocabulary import suggestion
+from sgstore.model.world import nearest_frames
 from sgstore.store._columns import chained
 from sgstore.store._packing import frame_ids, texts
-from sgstore.vocabulary import suggestion
-from sgstore.world import nearest_frames
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.config import Payloads
+    from sgstore.model.config import Payloads
+    from sgstore.model.world import Channel, Event, FrameBlock, Ints
     from sgstore.store._packing import Columns
     from sgstore.store._traces import FrameRef
-    from sgstore.world import Channel, Event, FrameBlock, Ints
 
 
 _SAMPLE: Final = 8192

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 import sgstore.store._schema as shape
+from sgstore.base.quoting import literal, quoted
 from sgstore.errors import SgstoreError, StoreError
-from sgstore.quoting import literal, quoted
+from sgstore.model.vocabulary import NAMES
+from sgstore.model.world import BUCKET_FRAMES
 from sgstore.store._columns import (
     MASKS,
     ORDERS,
@@ -32,8 +34,6 @@ from sgstore.store._locking import spill_folder, transaction, translated
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, MISSING, plain
 from sgstore.store._staging import FILE, PIECE_ROWS, Staging, TableFile, scratch
 from sgstore.store._traces import already_stored, free_name, id_of, place_below, stored_name
-from sgstore.vocabulary import NAMES
-from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence

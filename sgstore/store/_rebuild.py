@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 
 import sgstore.store._schema as shape
+from sgstore.base.quoting import literal, quoted
+from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
-from sgstore.quoting import literal, quoted
-from sgstore.records import dataclass
 from sgstore.store._locking import (
     BLOCK_SIZE,
     STORAGE_VERSION,

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import duckdb
 
-from sgstore.files import temporary_folder, working_folder
-from sgstore.quoting import literal
+from sgstore.base.files import temporary_folder, working_folder
+from sgstore.base.quoting import literal
 from sgstore.store._locking import default_memory
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 import duckdb
 
-from sgstore.arrays import np
+from sgstore.base.arrays import np
+from sgstore.base.files import without_controls, working_folder, written_at, written_text
+from sgstore.base.json_text import shortest
+from sgstore.base.quoting import literal, quoted
 from sgstore.errors import ExportError, MissingExtraError, SqlError
-from sgstore.files import without_controls, working_folder, written_at, written_text
-from sgstore.json_text import shortest
-from sgstore.quoting import literal, quoted
 from sgstore.store._given import Given, give
 from sgstore.store._locking import EngineError, engine_fault, spill_fault
 from sgstore.store._schema import INSIDE, expected
@@ -203,7 +203,7 @@ class Rows(Tabular):
 
     def _repr_html_(self) -> str:
         """Return the first rows as an HTML table, for notebooks."""
-        from sgstore.display import html_table
+        from sgstore.base.display import html_table
 
         some = self._values[:IN_NOTEBOOK]
         more = self.truncated or len(self._values) > len(some)

@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Final
 
 import duckdb
 
-from sgstore.arrays import np
+from sgstore.base.arrays import np
+from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
-from sgstore.pair_numbers import pairs_view
-from sgstore.quoting import literal, quoted
-from sgstore.vocabulary import NAMES, learn
+from sgstore.model.pair_numbers import pairs_view
+from sgstore.model.vocabulary import NAMES, learn
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -108,7 +108,7 @@ def schema_version() -> str:
 
 
 TEXT: Final = (
-    "c4ef8af8b47110ce497451f3a336af2e903f6d7fa59c5abeb961dd8e24bdb895",
+    "b72b814976bd1e9c428727fabb90bbb2cd8ba84eccf994048d1c029d8089b2e6",
     "7535a0e47dd54aff42b430f36fcecb652340d281021f582733125e752a644a4c",
 )
 """Digests of the text and of the statements of ``schema.sql``. Parsing the statements takes 10 ms."""
@@ -320,7 +320,7 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 
 _MOST_COMPARED: Final = 64
 
-KNOWN: Final = "05836dad03946c1db5d515a5db874ded16623d29bc1b39d0124b746a1007120f"
+KNOWN: Final = "a107cc47b0e8b923fbce81b1087ea23639223e65a9159ac0cb3bc3320ed303b5"
 """Digest of a store's objects in DuckDB 2. A comparison of tokens takes 30 ms.
 
 Objects of other versions are compared token by token.

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.abstractions import (
+from sgstore.errors import AbstractionError
+from sgstore.graphs.abstractions import (
     Abstraction,
     Classes,
     GraphFeatures,
@@ -18,11 +19,7 @@ from sgstore.abstractions import (
     of_frames,
     without,
 )
-from sgstore.errors import AbstractionError
-from sgstore.store._graphs import Graphs
-from sgstore.store._locking import translated
-from sgstore.store._traces import FrameRef, frame_named, stored_traces
-from sgstore.vocabulary import (
+from sgstore.model.vocabulary import (
     RELATION_ALIASES,
     RELATIONS,
     kinds_labelled,
@@ -30,6 +27,9 @@ from sgstore.vocabulary import (
     natural,
     suggestion,
 )
+from sgstore.store._graphs import Graphs
+from sgstore.store._locking import translated
+from sgstore.store._traces import FrameRef, frame_named, stored_traces
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
-    from sgstore.abstractions import Labelled
+    from sgstore.graphs.abstractions import Labelled
     from sgstore.store._file import StoreFile
     from sgstore.store._traces import StoredTrace
 
@@ -53,7 +53,7 @@ class SimilarFrames:
     frames : int
         Number of frames.
     similarity : float
-        From 0 (no common feature) to 1 (all features equal); see :mod:`sgstore.abstractions._features`.
+        From 0 (no common feature) to 1 (all features equal); see :mod:`sgstore.graphs.abstractions._features`.
     same : bool or None
         True if the graphs are isomorphic, so of the same class. ``None`` means too symmetric.
     shared, missing, extra : dict of str to int
@@ -126,7 +126,7 @@ def example_of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str
     name : str
         Abstraction of the compared graphs.
     ignored : sequence of str
-        Labels and relations to ignore; see :func:`sgstore.abstractions._features.without`.
+        Labels and relations to ignore; see :func:`sgstore.graphs.abstractions._features.without`.
 
     Raises
     ------

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 import duckdb
 import numpy as np
 
+from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
-from sgstore.records import dataclass
+from sgstore.model.vocabulary import NAMES
 from sgstore.store._columns import (
     REPEATED,
     STATES,
@@ -36,7 +37,6 @@ from sgstore.store._columns import (
 from sgstore.store._locking import Folder, memory_setting, without_faults
 from sgstore.store._schema import enums_of, own_labels
 from sgstore.store._traces import Identity
-from sgstore.vocabulary import NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

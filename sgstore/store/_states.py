@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.arrays import np
+from sgstore.base.arrays import np
+from sgstore.base.quoting import quoted
 from sgstore.errors import StoreError
-from sgstore.quoting import quoted
 from sgstore.store._packing import frame_ids, seq_of
 
 if TYPE_CHECKING:

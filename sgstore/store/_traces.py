@@ -12,13 +12,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.records import dataclass
 from sgstore.errors import SgstoreError, StoreError, place_named, url_named
-from sgstore.pair_numbers import UNEVEN
-from sgstore.records import dataclass
+from sgstore.model.pair_numbers import UNEVEN
+from sgstore.model.vocabulary import natural, suggestion
+from sgstore.model.world import tolerance_ns
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, as_json, plain
 from sgstore.store._rows import run
-from sgstore.vocabulary import natural, suggestion
-from sgstore.world import tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.config import Config, Payloads
-    from sgstore.roads import RoadMap
-    from sgstore.world import TraceInfo
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.config import Config, Payloads
+    from sgstore.model.world import TraceInfo
 
 
 _TRACE_BITS: Final = 63 - BUCKET_BITS - FRAME_BITS
@@ -103,7 +103,7 @@ class Identity:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Identity:
         """Restore an identity from plain values."""
-        from sgstore.config import Payloads  # many settings: not for who only reads a store
+        from sgstore.model.config import Payloads  # many settings: not for who only reads a store
 
         payloads: Any = Payloads(**values["payloads"])
         return cls(**(values | {"payloads": payloads}))
@@ -134,7 +134,7 @@ class StoredTrace:
     size, mtime_ns : int
         Size and modification time of the recording at ingest.
     digest, flavour, ego : str
-        As in :class:`sgstore.world.TraceInfo`.
+        As in :class:`sgstore.model.world.TraceInfo`.
     since, until : float or None
         Part of the recording, if not all; seconds since its first frame.
     map : str
@@ -145,11 +145,12 @@ class StoredTrace:
     period_ns : int
         Median difference of consecutive frames; ns.
     uneven : int
-        Special pairs of bodies: bits of :data:`sgstore.pair_numbers.UNEVEN`.
+        Special pairs of bodies: bits of :data:`sgstore.model.pair_numbers.UNEVEN`.
     answers : tuple of str
         Relations that the trace can answer.
     report : dict
-        Report of the ingest: :class:`sgstore.world.TraceReport`, and counts of entities, clock jumps and gaps.
+        Report of the ingest: :class:`sgstore.model.world.TraceReport`, and counts of entities, clock jumps and
+        gaps.
     settings : dict
         Config of the ingest.
     ingested_at : datetime

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import sgstore.store._schema as shape
-from sgstore.config import from_dict
 from sgstore.errors import SgstoreError, StoreError
+from sgstore.model.config import from_dict
+from sgstore.model.world import BUCKET_FRAMES
 from sgstore.store._columns import REPEATED, STATES, Checksum, expressions
 from sgstore.store._locking import Access, translated
 from sgstore.store._packing import LONGEST_STEP
 from sgstore.store._publish import SHARED, checksum_of, owned
 from sgstore.store._traces import stored_traces
-from sgstore.world import BUCKET_FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

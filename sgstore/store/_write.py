@@ -16,25 +16,25 @@ import numpy as np
 import sgstore.store._packing as packing
 import sgstore.store._payloads as payloads
 from sgstore.errors import StoreError
-from sgstore.graph import LeftOut
+from sgstore.model.graph import LeftOut
+from sgstore.model.vocabulary import KINDS
+from sgstore.model.world import BUCKET_FRAMES, Origin, longest_step_ns, origin_of, quantize
 from sgstore.store._classes import IngestedClasses
 from sgstore.store._packing import MAX_FRAMES, NodeKinds, texts
 from sgstore.store._payloads import FrameTimes, Happenings
 from sgstore.store._staging import Sealed, Staging
 from sgstore.store._traces import uri_of
-from sgstore.vocabulary import KINDS
-from sgstore.world import BUCKET_FRAMES, Origin, longest_step_ns, origin_of, quantize
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from sgstore.graph import GraphBlock
-    from sgstore.roads import RoadMap
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import Codes, FrameBlock, Ints, TraceInfo, TraceReport
     from sgstore.store._packing import Columns
     from sgstore.store._staging import StagedRows
     from sgstore.store._traces import Identity
-    from sgstore.world import Codes, FrameBlock, Ints, TraceInfo, TraceReport
 
 
 class OnMap:

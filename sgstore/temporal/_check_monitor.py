@@ -70,9 +70,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang.ir import BoundCheck, BoundQuantifier, OverMatch
+    from sgstore.model.world import Bools
     from sgstore.temporal._robustness import Robustness
     from sgstore.temporal._valuation import Key, Memory, QueryCache, StreamClock
-    from sgstore.world import Bools
 
     Keys = NDArray[np.int64]
     Span = tuple[FrameTime, FrameTime]

@@ -15,6 +15,7 @@ from dataclasses import field, replace
 from typing import TYPE_CHECKING, Final
 
 import sgstore.temporal._formula as f
+from sgstore.base.records import dataclass
 from sgstore.lang import (
     CONNECTIVES,
     Type,
@@ -30,7 +31,6 @@ from sgstore.lang import (
     within,
 )
 from sgstore.lang import ir as b
-from sgstore.records import dataclass
 from sgstore.temporal._plan import (
     FALSE,
     MARGINS,

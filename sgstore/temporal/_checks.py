@@ -25,6 +25,7 @@ from sgstore.lang import (
     value_text,
 )
 from sgstore.matches import Interval, notes_in
+from sgstore.model.vocabulary import natural
 from sgstore.store import IN_NOTEBOOK, scope_of, trace_of
 from sgstore.temporal._check_plan import (
     FAVOURABLE,
@@ -64,7 +65,6 @@ from sgstore.temporal._verdicts import (
     Violation,
     within_bounds,
 )
-from sgstore.vocabulary import natural
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -73,8 +73,8 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Catalog, CheckInCatalog, Window
     from sgstore.lang.ir import Bound, BoundCheck, BoundQuantifier, OverMatch
+    from sgstore.model.world import Bools, Floats, Ints
     from sgstore.store import StoreFile
-    from sgstore.world import Bools, Floats, Ints
 
     Codes = NDArray[np.int8]
     Keys = NDArray[np.int64]
@@ -351,7 +351,7 @@ class Verdict:
 
     def _repr_html_(self) -> str:
         """Return the verdict with its violations as an HTML table, for notebooks."""
-        from sgstore.display import html_table
+        from sgstore.base.display import html_table
 
         margin = self.robustness is not None
         rows = list(islice(verdict_rows(self, margin=margin), IN_NOTEBOOK + 1))
@@ -556,7 +556,7 @@ class CheckRun:
 
     def _repr_html_(self) -> str:
         """Evaluate the checks, and return verdicts and first violations as an HTML table for notebooks."""
-        from sgstore.display import html_table
+        from sgstore.base.display import html_table
 
         found = list(self)
         words = Counter(one.verdict for one in found)

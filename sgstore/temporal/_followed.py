@@ -11,15 +11,15 @@ import numpy as np
 
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of
-from sgstore.pair_numbers import PAIR_FUNCTIONS
-from sgstore.truth_lanes import TruthLane, TruthLanes
-from sgstore.world import INPUTS, POSE
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS
+from sgstore.model.world import INPUTS, POSE
+from sgstore.temporal.truth_lanes import TruthLane, TruthLanes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from sgstore.graph import SceneGraph
     from sgstore.lang.ir import Query
+    from sgstore.model.graph import SceneGraph
     from sgstore.temporal._sequence_monitor import FrameTime
 
 MOST_EDGES: Final = 100_000

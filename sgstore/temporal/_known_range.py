@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.records import dataclass
 from sgstore.lang import Horizon, excluded_kinds, horizon, spoken_kinds
-from sgstore.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.json_text import shortest
+from sgstore.base.json_text import shortest
 from sgstore.lang import Column, expression
 from sgstore.lang import ir as b
 from sgstore.temporal._windows import exact, rounded
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.world import Bools, Ints
+    from sgstore.model.world import Bools, Ints
 
     Objects = NDArray[np.object_]
 

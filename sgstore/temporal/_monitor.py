@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
-from sgstore.config import Config
 from sgstore.errors import QueryError, TraceError
+from sgstore.graphs.online import GcPaused, replayed
 from sgstore.lang import (
     MOTION,
     Catalog,
@@ -32,28 +32,28 @@ from sgstore.lang import (
     recorded_events,
 )
 from sgstore.lang.syntax import CheckClause, Define, MatchClause, Parameter
-from sgstore.map_files import Maps, lost_lanes
+from sgstore.maps.map_files import Maps, lost_lanes
+from sgstore.model.config import Config
+from sgstore.model.world import seconds_of
 from sgstore.readers import on_map, open_trace
 from sgstore.sgg import SceneGraphGenerator
-from sgstore.step import GcPaused, replayed
 from sgstore.temporal._check_monitor import CheckMonitor
 from sgstore.temporal._checks import Verdict, within_range
 from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._known_range import SeenRange
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
 from sgstore.temporal._valuation import NodeNames, QueryCache, StreamClock
-from sgstore.world import seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
-    from sgstore.graph import SceneGraph
+    from sgstore.graphs.online import Frame
     from sgstore.lang import Need
     from sgstore.lang.ir import BoundCheck, Query
     from sgstore.lang.syntax import Statement
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import SceneGraph
     from sgstore.readers import Cameras, Sensor
-    from sgstore.roads import RoadMap
-    from sgstore.step import Frame
     from sgstore.temporal._robustness import Robustness
 
 

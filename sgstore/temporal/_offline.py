@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
 from sgstore.lang import (
     BUCKETS,
@@ -27,15 +28,14 @@ from sgstore.lang import (
     traces_of,
 )
 from sgstore.matches import TooMuchError, Windows
-from sgstore.records import dataclass
+from sgstore.model.vocabulary import RELATIONS
+from sgstore.model.world import JUMP_NS, longest_step_ns, seconds_of, tolerance_ns
 from sgstore.store import trace_of
 from sgstore.temporal._check_plan import FAVOURABLE, SIGNS, CheckPlan
 from sgstore.temporal._formula import Formula, propositions, tolerant
 from sgstore.temporal._plan import Ask, ask_text
 from sgstore.temporal._robustness import MARGIN_CELLS, MarginTable, margin_columns
 from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows
-from sgstore.vocabulary import RELATIONS
-from sgstore.world import JUMP_NS, longest_step_ns, seconds_of, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Catalog
     from sgstore.lang.ir import Bound, Query, SignalCall
+    from sgstore.model.world import Bools, Floats, Ints
     from sgstore.store import StoreFile
     from sgstore.temporal._plan import Plan, Test
-    from sgstore.world import Bools, Floats, Ints
 
     Keys = NDArray[np.int64]
 
@@ -608,7 +608,7 @@ def ascending(times: Ints) -> Ints:
     """Return strictly ascending times. Repeated times and backward jumps are corrected.
 
     A repeated time becomes a nanosecond later. After a backward jump, all times are shifted by
-    :data:`sgstore.world.JUMP_NS` after the last one. So the jump is a gap that no time bound spans.
+    :data:`sgstore.model.world.JUMP_NS` after the last one. So the jump is a gap that no time bound spans.
     """
     steps = np.diff(times, prepend=times[:1])
     if np.any(steps < 0):

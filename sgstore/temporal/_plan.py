@@ -31,10 +31,10 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import sgstore.temporal._formula as f
+from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
 from sgstore.lang import CONNECTIVES, Type, relation, unnumbered_text, value_text
 from sgstore.lang import ir as b
-from sgstore.records import dataclass
 from sgstore.temporal._formula import formula_text
 
 if TYPE_CHECKING:

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Column
+    from sgstore.model.world import Bools, Floats, Ints
     from sgstore.temporal._plan import Plan, Test
-    from sgstore.world import Bools, Floats, Ints
 
     Places = NDArray[np.int32 | np.int64]
 

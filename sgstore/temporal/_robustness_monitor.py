@@ -62,11 +62,11 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Column
     from sgstore.lang.ir import BoundCheck
+    from sgstore.model.world import Bools, Floats, Ints
     from sgstore.temporal._checks import Level
     from sgstore.temporal._formula import Tick
     from sgstore.temporal._plan import Test
     from sgstore.temporal._valuation import Partial, QueryCache, StreamClock
-    from sgstore.world import Bools, Floats, Ints
 
     Margins = NDArray[Any]
 

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.records import dataclass
 from sgstore.lang import Column, extents
 from sgstore.lang import ir as b
 from sgstore.matches import Windows
-from sgstore.records import dataclass
+from sgstore.model.world import BUCKET_FRAMES, longest_step_ns, tolerance_ns
 from sgstore.store import BUCKET_BITS, seq_of, trace_of
 from sgstore.temporal._match_values import over_rows, picked
 from sgstore.temporal._offline import (
@@ -31,7 +32,6 @@ from sgstore.temporal._offline import (
 )
 from sgstore.temporal._signals import Clock, SignalValues
 from sgstore.temporal._windows import over_columns
-from sgstore.world import BUCKET_FRAMES, longest_step_ns, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Catalog, Window
+    from sgstore.model.world import Bools, Ints
     from sgstore.store import StoreFile
     from sgstore.temporal._plan import Ask, Plan, Test
-    from sgstore.world import Bools, Ints
 
     Keys = NDArray[np.int64]
 

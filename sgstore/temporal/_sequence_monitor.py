@@ -18,12 +18,12 @@ from sgstore.lang.ir import (
     StepWay,
     walk,
 )
+from sgstore.model.world import seconds_of
 from sgstore.temporal._formula import And, Formula, Past, Progression, ProgressionFrame, Term
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues
 from sgstore.temporal._match_values_monitor import MatchValues
 from sgstore.temporal._plan import asks_of_steps, plan_of_steps, tied_in_steps
 from sgstore.temporal._valuation import BindingTable, Partial, Valuation
-from sgstore.world import seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

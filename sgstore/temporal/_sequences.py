@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.records import dataclass
 from sgstore.lang import Column, ExternalRelation, Window, relation, value_text
 from sgstore.lang.ir import Bound, OverMatch, Query, SignalCall, StepTime, is_formula
 from sgstore.matches import TooMuchError
-from sgstore.records import dataclass
+from sgstore.model.world import JUMP_NS, seconds_of
 from sgstore.store import BUCKET_BITS
 from sgstore.temporal._formula import formula_text
 from sgstore.temporal._match_values import Stretches, picked
@@ -34,7 +35,6 @@ from sgstore.temporal._plan import (
     way_text,
 )
 from sgstore.temporal._runs import RunFinder
-from sgstore.world import JUMP_NS, seconds_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
 
     from sgstore.lang import Catalog
     from sgstore.lang.ir import BoundHold, Length, StepWay
+    from sgstore.model.world import Bools, Ints
     from sgstore.store import StoreFile
     from sgstore.temporal._formula import Formula
     from sgstore.temporal._plan import Ask
     from sgstore.temporal._signals import Clock
-    from sgstore.world import Bools, Ints
 
     Keys = NDArray[np.int64]
 

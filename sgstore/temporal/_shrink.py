@@ -27,10 +27,10 @@ from sgstore.lang import (
 )
 from sgstore.lang.ir import Tense, walk
 from sgstore.lang.syntax import CheckClause
+from sgstore.model.world import Clip
 from sgstore.temporal._checks import StoreCheck
 from sgstore.temporal._matches import TemporalMatches
 from sgstore.temporal._sequences import Finder
-from sgstore.world import Clip
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.records import dataclass
 from sgstore.lang import Column, all_known, column_evaluator
 from sgstore.lang import ir as b
-from sgstore.records import dataclass
 from sgstore.temporal._formula import (
     TRUE,
     And,
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang import Columns
+    from sgstore.model.world import Bools, Floats, Ints
     from sgstore.temporal._plan import Ask, Test
-    from sgstore.world import Bools, Floats, Ints
 
     Places = NDArray[np.int32 | np.int64]
     Array = NDArray[Any]

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
+from sgstore.base.json_text import shortest
 from sgstore.errors import QueryError
-from sgstore.json_text import shortest
 from sgstore.lang import (
     FUTURE,
     Binding,
@@ -30,6 +30,8 @@ from sgstore.lang import (
     value_text,
 )
 from sgstore.lang import ir as b
+from sgstore.model.vocabulary import RELATIONS
+from sgstore.model.world import JUMP_NS, longest_step_ns, tolerance_ns
 from sgstore.temporal._check_plan import CheckPlan
 from sgstore.temporal._formula import (
     Next,
@@ -44,15 +46,13 @@ from sgstore.temporal._formula import (
 from sgstore.temporal._robustness import MarginTable, margin_columns
 from sgstore.temporal._signals import NS, Clock, SignalValues, wrapped
 from sgstore.temporal._windows import next_window, window_value
-from sgstore.vocabulary import RELATIONS
-from sgstore.world import JUMP_NS, longest_step_ns, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.lang import FrameView
+    from sgstore.model.world import Bools, Floats
     from sgstore.temporal._plan import Ask, Plan, Test
-    from sgstore.world import Bools, Floats
 
 
 Partial = tuple["int | None", ...]

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from sgstore.model.world import Bools, Ints
     from sgstore.temporal._signals import Places
-    from sgstore.world import Bools, Ints
 
 
 class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way

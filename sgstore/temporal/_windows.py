@@ -19,8 +19,8 @@ from sgstore.lang import Column
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from sgstore.model.world import Floats
     from sgstore.temporal._formula import Tick
-    from sgstore.world import Floats
 
     Places = NDArray[np.int32 | np.int64]
 

@@ -1,4 +1,4 @@
-// What the editor uses of CodeMirror: tests/vendor.py makes sgstore/serve/page/vendor/codemirror.js of it.
+// What the editor uses of CodeMirror: tests/vendor.py makes sgstore/apps/explorer/page/vendor/codemirror.js of it.
 export { Compartment, EditorState, StateEffect } from "@codemirror/state";
 export {
   drawSelection, EditorView, highlightSpecialChars, hoverTooltip, keymap, placeholder, tooltips,

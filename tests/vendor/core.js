@@ -1,4 +1,4 @@
-// What the page uses of Preact, its signals and htm: tests/vendor.py makes sgstore/serve/page/vendor/core.js of it.
+// What the page uses of Preact, its signals and htm: tests/vendor.py makes sgstore/apps/explorer/page/vendor/core.js of it.
 export { h, render, Fragment } from "preact";
 export { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
 export { batch, computed, effect, signal, untracked, useComputed, useSignal, useSignalEffect } from "@preact/signals";

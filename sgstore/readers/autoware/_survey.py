@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
     from sgstore.mcap import Messages, Recording
+    from sgstore.model.world import Floats
     from sgstore.readers._base import Ref
     from sgstore.readers._ros2 import Struct
-    from sgstore.world import Floats
 
 OBJECTS: Final = "objects"
 POSE_OF_EGO: Final = "pose"

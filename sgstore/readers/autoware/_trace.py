@@ -28,6 +28,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.model.vocabulary import KINDS, LIGHT_STATE_CODE, VEHICLE_LIGHTS, TypeMeaning
+from sgstore.model.world import POSE
 from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import FAR, NAN, FrameRows, MessageDecoder
 from sgstore.readers._ros2 import ColumnReader, decode, ident_of, number, records, text
@@ -49,17 +51,15 @@ from sgstore.readers.autoware._survey import (
 )
 from sgstore.readers.foxglove._mapping import Ego, mapping_for
 from sgstore.readers.foxglove._messages import Axes, Pose, normed, product, rotated
-from sgstore.vocabulary import KINDS, LIGHT_STATE_CODE, VEHICLE_LIGHTS, TypeMeaning
-from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
 
+    from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Messages, Recording
+    from sgstore.model.world import Bools, Floats, Ints, TraceReport
     from sgstore.readers._blocks import Called
-    from sgstore.roads import RoadMap
-    from sgstore.world import Bools, Floats, Ints, TraceReport
 
 _KINDS: Final = {
     "pedestrian": TypeMeaning("person"),
@@ -542,7 +542,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
 def _numbers(objects: Floats, base: Pose | None) -> tuple[Floats, Bools]:
     """Return the poses (n, 16) of objects, and a mask of the usable ones.
 
-    The columns are :data:`sgstore.world.POSE`. ``objects``: columns of the objects after their classes;
+    The columns are :data:`sgstore.model.world.POSE`. ``objects``: columns of the objects after their classes;
     ``base``: the pose of their axes.
     """
     values = np.full((len(objects), len(POSE)), np.nan)

@@ -32,11 +32,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ConfigError, MissingExtraError, TraceError
-from sgstore.opendrive import read_map
+from sgstore.graphs.online import Frame
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, SIGNALS, VEHICLES
 from sgstore.readers.carla._signals import AtOnce, Light, light_state, shared_signals, signals_of
 from sgstore.readers.carla._survey import EGO_ROLES, meaning_of
-from sgstore.step import Frame
-from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.roads import RoadMap
-    from sgstore.vocabulary import TypeMeaning
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.vocabulary import TypeMeaning
 
 
 ENTITIES: Final = ("vehicle.", "walker.", "traffic.", "static.")

@@ -25,20 +25,20 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from sgstore.maps.roads import lanes_ref
+from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
+from sgstore.model.world import POSE
 from sgstore.readers._blocks import FAR, NAN
 from sgstore.readers._ros2 import ident_of, number, records
-from sgstore.roads import lanes_ref
-from sgstore.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
-from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.world import Bools, Floats, Ints
     from sgstore.readers._blocks import EntityTable
-    from sgstore.roads import RoadMap
-    from sgstore.world import Bools, Floats, Ints
 
     Rows = NDArray[np.intp]
 
@@ -461,7 +461,7 @@ class AtOnce:
         self.frames: dict[str, int] = {} if before is None else before.frames
 
     def see(self, states: Ints) -> None:
-        """Check the light states of a frame: codes of :data:`sgstore.vocabulary.LIGHT_STATES`."""
+        """Check the light states of a frame: codes of :data:`sgstore.model.vocabulary.LIGHT_STATES`."""
         if states is not self._last:
             self._last = states
             self._bad = self._contradicting(states)

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.model.vocabulary import TypeMeaning, type_meanings, vague_kind
+from sgstore.model.world import Event
 from sgstore.readers._base import Lead, Survey, ref_of
 from sgstore.readers._ros2 import (
     MAX_IDENT,
@@ -29,8 +31,6 @@ from sgstore.readers._ros2 import (
 )
 from sgstore.readers._stamps import Stamps
 from sgstore.readers.carla._signals import read_places
-from sgstore.vocabulary import TypeMeaning, type_meanings, vague_kind
-from sgstore.world import Event
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
     from mcap.records import Channel, Schema
 
     from sgstore.mcap import Messages, Recording
+    from sgstore.model.world import Floats
     from sgstore.readers._base import Ref
     from sgstore.readers._ros2 import Struct
     from sgstore.readers.carla._signals import Light
-    from sgstore.world import Floats
 
 
 EGO_ROLES: Final = ("hero", "ego_vehicle", *(f"hero{i}" for i in range(10)))

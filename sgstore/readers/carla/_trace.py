@@ -30,7 +30,9 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 
 from sgstore.errors import MapError, TraceError
-from sgstore.opendrive import read_map
+from sgstore.maps.opendrive import read_map
+from sgstore.model.vocabulary import KINDS
+from sgstore.model.world import LARGEST, POSE
 from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import FAR, NAN, NO_INPUTS, UPRIGHT, FrameRows, MessageDecoder
 from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, decode
@@ -53,16 +55,14 @@ from sgstore.readers.carla._survey import (
     stamp_from,
     stamp_of,
 )
-from sgstore.vocabulary import KINDS
-from sgstore.world import LARGEST, POSE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Messages, Recording
+    from sgstore.model.world import Bools, Floats, Ints, TraceReport
     from sgstore.readers._blocks import Called
-    from sgstore.roads import RoadMap
-    from sgstore.world import Bools, Floats, Ints, TraceReport
 
 
 COLUMNS: Final = (
@@ -97,10 +97,10 @@ MAX_JSON: Final = 1 << 20
 _ID, _CLASS, _SHAPE, _POSITION, _TURN, _MOTION, _SIZE = 0, 1, 2, 3, 6, 10, 17
 _SPHERE, _CYLINDER, _CONE = 2, 3, 4
 _CARLA_LIGHTS: Final = (5, 4, 3, 6, 0, 1, 2, 7, 8, 9, 10)
-"""Bit in :data:`sgstore.vocabulary.VEHICLE_LIGHTS` → bit of ``carla.VehicleLightState``. These are: position 0,
+"""Bit in ``VEHICLE_LIGHTS`` → bit of ``carla.VehicleLightState``. These are: position 0,
 low beam 1, high beam 2, brake 3, right 4, left 5, reverse 6, fog 7, interior 8, special 9 and 10."""
 Controls = tuple[float, ...]
-""":data:`sgstore.world.INPUTS`; NaN means unknown."""
+""":data:`sgstore.model.world.INPUTS`; NaN means unknown."""
 
 
 @dataclass(slots=True)
@@ -117,9 +117,9 @@ class CarlaRawFrame:
     light_states : (m,) int64
         Of the traffic lights.
     controls : dict
-        Actor id → :data:`sgstore.world.INPUTS`.
+        Actor id → :data:`sgstore.model.world.INPUTS`.
     vehicle_lights : mapping
-        Actor id → mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`.
+        Actor id → mask of :data:`sgstore.model.vocabulary.VEHICLE_LIGHTS`.
     odometry : (11,) float64 or None
         Columns :data:`ODOMETRY_COLUMNS` of the ego, if it is not among the objects.
     kinds : dict
@@ -436,7 +436,7 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
     Returns
     -------
     values : (n, 16) float64
-        Columns :data:`sgstore.world.POSE`.
+        Columns :data:`sgstore.model.world.POSE`.
     usable : (n,) bool
         True with a valid position and a valid quaternion.
     """
@@ -590,7 +590,7 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
 
 
 def _inputs(told: Sequence[float], *, applied: bool) -> Controls:
-    """Convert columns :data:`CONTROLS` into :data:`sgstore.world.INPUTS`.
+    """Convert columns :data:`CONTROLS` into :data:`sgstore.model.world.INPUTS`.
 
     An applied control contains the actual gear. A requested control contains a gear only for manual shifting.
     Otherwise, the simulator chooses the gear, and only the reverse direction is known.

@@ -1,9 +1,9 @@
 """Parser of CommonRoad scenarios (XML, 2018b and 2020a) into obstacles, lights, signs and lanelets.
 
 Each part of the document (an obstacle, a lanelet, …) becomes a small tree, which is read and freed at the end
-of the part. :mod:`sgstore.markup` limits the untrusted features of XML. Texts, parts and states are limited,
-too. An invalid part is dropped and reported as a loss. Of an obstacle with invalid states, the valid ones are
-used.
+of the part. :mod:`sgstore.base.markup` limits the untrusted features of XML. Texts, parts and states are
+limited, too. An invalid part is dropped and reported as a loss. Of an obstacle with invalid states, the valid
+ones are used.
 
 Source: CommonRoad: XML format documentation, versions 2018b and 2020a (Technical University of Munich).
 """
@@ -14,8 +14,8 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from sgstore.base.markup import MarkupError, MarkupParser
 from sgstore.errors import TraceError
-from sgstore.markup import MarkupError, MarkupParser
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.roads import (
+from sgstore.maps.roads import (
     END,
     MAX_POINTS,
     START,
@@ -33,6 +33,8 @@ from sgstore.roads import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from sgstore.maps.roads import PlainLane
+    from sgstore.model.world import Floats
     from sgstore.readers.commonroad._document import (
         Lanelet,
         Place,
@@ -40,8 +42,6 @@ if TYPE_CHECKING:
         ScenarioSign,
         TrafficScenario,
     )
-    from sgstore.roads import PlainLane
-    from sgstore.world import Floats
 
 _TYPES: Final = {
     "busLane": "bus",

@@ -10,14 +10,14 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.graphs.online import Frame
+from sgstore.maps.roads import OF_LANES
 from sgstore.readers._base import FramesTrace, TraceMessage
 from sgstore.readers.commonroad._file import MAP, NAME, STEP
-from sgstore.roads import OF_LANES
-from sgstore.step import Frame
 
 if TYPE_CHECKING:
     from sgstore.mcap import Recording
-    from sgstore.world import Channel
+    from sgstore.model.world import Channel
 
 _KINDS: Final[dict[str, dict[str, str]]] = {
     "car": {"kind": "car"},

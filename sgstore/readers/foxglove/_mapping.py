@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import TraceError
-from sgstore.vocabulary import (
+from sgstore.model.vocabulary import (
     ENTITY_KINDS,
     SPECIALS,
     TypeMeaning,
@@ -80,7 +80,7 @@ class EntityMapping:
     velocity, acceleration : tuple of str
         Three numbers, m/s and m/s², along the entity's own axes of reference (``frame_id``).
     light_state : str
-        State of a traffic light: one of :data:`sgstore.vocabulary.LIGHT_STATES`.
+        State of a traffic light: one of :data:`sgstore.model.vocabulary.LIGHT_STATES`.
     """
 
     id: str = "id"

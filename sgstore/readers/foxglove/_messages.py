@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mcap.records import Schema
 
     from sgstore.mcap import Recording
-    from sgstore.world import Floats
+    from sgstore.model.world import Floats
 
 
 MAX_AXES: Final = 10_000

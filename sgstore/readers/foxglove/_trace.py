@@ -25,6 +25,8 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.model.vocabulary import KINDS, LIGHT_STATE_CODE, normalize_name
+from sgstore.model.world import POSE
 from sgstore.readers._base import Lead, Ref, Survey, SurveyedTrace, count_ref, ref_of
 from sgstore.readers._blocks import FAR, NAN, FrameRows, LossTally, MessageDecoder
 from sgstore.readers._stamps import NO_TIME, Stamps
@@ -41,17 +43,15 @@ from sgstore.readers.foxglove._messages import (
     product,
     rotated,
 )
-from sgstore.vocabulary import KINDS, LIGHT_STATE_CODE, normalize_name
-from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.mcap import Messages, Recording
+    from sgstore.model.world import TraceReport
     from sgstore.readers._blocks import Called
     from sgstore.readers.foxglove._mapping import Ego
     from sgstore.readers.foxglove._messages import Box, Deletion, Pose, SceneUpdate, Transform
-    from sgstore.world import TraceReport
 
 
 MAX_STANDING: Final = 100_000

@@ -22,16 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from sgstore.errors import MapError
-from sgstore.readers.osi._schema import (
-    DECODE_ERRORS,
-    SENSOR_VIEW,
-    enum_name,
-    ground_truth_of,
-    has_field,
-    identifiers,
-    message_class,
-)
-from sgstore.roads import (
+from sgstore.maps.roads import (
     END,
     MAX_NAME,
     MAX_POINTS,
@@ -51,13 +42,22 @@ from sgstore.roads import (
     run_of,
     with_shared_borders,
 )
+from sgstore.readers.osi._schema import (
+    DECODE_ERRORS,
+    SENSOR_VIEW,
+    enum_name,
+    ground_truth_of,
+    has_field,
+    identifiers,
+    message_class,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from mcap.records import Schema
 
-    from sgstore.world import Floats
+    from sgstore.model.world import Floats
 
 
 FIELDS: Final = ("lane", "lane_boundary", "logical_lane", "logical_lane_boundary")
@@ -157,7 +157,7 @@ _FAR: Final = 1e8
 class LaneSignal:
     """Traffic light or sign that is assigned to lanes.
 
-    ``pose``: columns of :data:`sgstore.world.POSE`; ``lanes``: ids of physical or logical lanes.
+    ``pose``: columns of :data:`sgstore.model.world.POSE`; ``lanes``: ids of physical or logical lanes.
     """
 
     name: str

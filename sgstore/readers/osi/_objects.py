@@ -24,7 +24,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.opendrive import kind_of_object
+from sgstore.maps.opendrive import kind_of_object
+from sgstore.model.vocabulary import (
+    ENTITY_KINDS,
+    LIGHT_STATE_CODE,
+    SIGNALS,
+    TypeMeaning,
+    type_meanings,
+)
+from sgstore.model.world import POSE
 from sgstore.readers._blocks import FAR, NAN
 from sgstore.readers.osi._lanes import OWN, LaneSignal
 from sgstore.readers.osi._schema import (
@@ -36,16 +44,14 @@ from sgstore.readers.osi._schema import (
     map_ref,
     static_pose,
 )
-from sgstore.vocabulary import ENTITY_KINDS, LIGHT_STATE_CODE, SIGNALS, TypeMeaning, type_meanings
-from sgstore.world import POSE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from numpy.typing import NDArray
 
+    from sgstore.model.world import Bools, Floats, Ints
     from sgstore.readers._blocks import EntityTable
-    from sgstore.world import Bools, Floats, Ints
 
     Bytes = NDArray[np.uint8]
 
@@ -74,7 +80,7 @@ _LIGHTS: Final = {
     "emergency_vehicle_illumination": 9,
     "service_vehicle_illumination": 10,
 }
-"""Fields of ``LightState`` → bit in :data:`sgstore.vocabulary.VEHICLE_LIGHTS`."""
+"""Fields of ``LightState`` → bit in :data:`sgstore.model.vocabulary.VEHICLE_LIGHTS`."""
 _STATES: Final = 64
 """Upper limit of light states. Greater states are unknown to the recording's version of OSI."""
 
@@ -150,12 +156,13 @@ class MovingObjects:
         Returns
         -------
         values : (n, 16) float64
-            Columns :data:`sgstore.world.POSE`; NaN if the sub-message is missing, 0 if only the number is
+            Columns :data:`sgstore.model.world.POSE`; NaN if the sub-message is missing, 0 if only the number is
             missing.
         usable : (n,) bool
             True with a valid position, and a valid orientation or none. False for a malformed object.
         lights : (n,) int64
-            Mask of :data:`sgstore.vocabulary.VEHICLE_LIGHTS`; -1 if the object does not contain light states.
+            Mask of :data:`sgstore.model.vocabulary.VEHICLE_LIGHTS`; -1 if the object does not contain light
+            states.
         codes : (n,) int64
             Type code of each object, as in :func:`code_of`.
         """
@@ -579,9 +586,9 @@ def lit(mode: int, colour: int) -> int:
 def shown(bulbs: Iterable[int]) -> int:
     """Return the code of the light state that lit bulbs show together.
 
-    The codes are those of :data:`sgstore.vocabulary.LIGHT_STATES`. Flashing has priority. Red with yellow is
-    ``red_yellow``. For other combinations, the most restrictive colour counts (a red light with a green arrow
-    is red). Without a lit bulb, the state is ``off``.
+    The codes are those of :data:`sgstore.model.vocabulary.LIGHT_STATES`. Flashing has priority. Red with yellow
+    is ``red_yellow``. For other combinations, the most restrictive colour counts (a red light with a green
+    arrow is red). Without a lit bulb, the state is ``off``.
     """
     together = 0
     for bulb in bulbs:

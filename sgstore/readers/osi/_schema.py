@@ -661,7 +661,7 @@ def assigned_lanes(classification: Any) -> list[int]:
 def static_pose(base: Any) -> tuple[float, ...] | None:
     """Return the pose and size of a static object, or ``None`` without a usable position.
 
-    The columns are those of :data:`sgstore.world.POSE`. A missing orientation or dimension is NaN.
+    The columns are those of :data:`sgstore.model.world.POSE`. A missing orientation or dimension is NaN.
     """
     place, turn, size = base.position, base.orientation, base.dimension
     position = (place.x, place.y, place.z)

@@ -16,6 +16,8 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.errors import MapError, TraceError
+from sgstore.maps.roads import OF_LANES
+from sgstore.model.world import TraceReport
 from sgstore.readers._base import Lead, Ref, Survey, ref_of
 from sgstore.readers._blocks import EntityTable
 from sgstore.readers._stamps import Stamps
@@ -37,8 +39,6 @@ from sgstore.readers.osi._schema import (
     parse,
     time_of,
 )
-from sgstore.roads import OF_LANES
-from sgstore.world import TraceReport
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -20,6 +20,8 @@ import numpy as np
 from google.protobuf import message_factory
 
 from sgstore.mcap import Loss
+from sgstore.model.vocabulary import KINDS, TypeMeaning, type_meanings
+from sgstore.model.world import POSE, Event
 from sgstore.readers._base import SurveyedTrace
 from sgstore.readers._blocks import NAN, NO_INPUTS, FrameRows, LossTally, MessageDecoder
 from sgstore.readers._stamps import NO_TIME
@@ -36,13 +38,11 @@ from sgstore.readers.osi._schema import (
     time_of,
 )
 from sgstore.readers.osi._survey import OsiSurvey, is_key, keys_of, schema_name
-from sgstore.vocabulary import KINDS, TypeMeaning, type_meanings
-from sgstore.world import POSE, Event
 
 if TYPE_CHECKING:
     from sgstore.mcap import Messages, Recording
+    from sgstore.model.world import Bools, Floats, Ints, TraceReport
     from sgstore.readers._blocks import Called, EntityTable
-    from sgstore.world import Bools, Floats, Ints, TraceReport
 
 
 TYPE: Final = "osi3.EnvironmentalConditions"
@@ -519,8 +519,9 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
 def controls_of(data: Any) -> tuple[float, ...]:
     """Return the control inputs in an ``osi3.HostVehicleData``; NaN for missing ones.
 
-    The columns are :data:`sgstore.world.INPUTS`. Steering is always NaN, because the angle of the steering
-    wheel is not normalised and its range is unknown. The hand brake is always NaN, because OSI has none.
+    The columns are :data:`sgstore.model.world.INPUTS`. Steering is always NaN, because the angle of the
+    steering wheel is not normalised and its range is unknown. The hand brake is always NaN, because OSI has
+    none.
     """
     return (
         NAN,

@@ -1,7 +1,7 @@
 """Traffic light states from a separate SUMO output file (``tlsStates``).
 
 A state is a text with a letter for each link of a traffic light. A signal of the road map is one or more links
-that always change together (:mod:`sgstore.sumo_net`). It has the number of the first link.
+that always change together (:mod:`sgstore.maps.sumo_net`). It has the number of the first link.
 
 Source: SUMO documentation, "Traffic Lights: Signal state definitions" and "Output: Traffic Lights" (Eclipse,
 EPL-2.0).
@@ -14,8 +14,8 @@ import zlib
 from bisect import bisect_right
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.markup import MarkupError, MarkupParser
 from sgstore.errors import TraceError
-from sgstore.markup import MarkupError, MarkupParser
 from sgstore.readers.sumo._file import ENDINGS, opened, seconds_of
 
 if TYPE_CHECKING:

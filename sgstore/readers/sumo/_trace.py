@@ -16,19 +16,19 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from sgstore.markup import MarkupError, MarkupParser
+from sgstore.base.markup import MarkupError, MarkupParser
+from sgstore.graphs.online import Frame
 from sgstore.mcap import digest_of
+from sgstore.model.vocabulary import KINDS, TypeMeaning, type_meanings
+from sgstore.model.world import LARGEST
 from sgstore.readers._base import FramesTrace, TraceMessage
 from sgstore.readers.sumo._file import STEP, time_ns
 from sgstore.readers.sumo._lights import LightStates, lights_beside
-from sgstore.step import Frame
-from sgstore.vocabulary import KINDS, TypeMeaning, type_meanings
-from sgstore.world import LARGEST
 
 if TYPE_CHECKING:
+    from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Recording
-    from sgstore.roads import RoadMap
-    from sgstore.world import Channel
+    from sgstore.model.world import Channel
 
 MAX_ENTITIES: Final = 1_000_000
 

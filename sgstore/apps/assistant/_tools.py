@@ -1,0 +1,510 @@
+"""Tools of an assistant: each runs one query on a store, or makes one picture.
+
+Patterns, rules and SQL of an assistant run only in the sandbox: a process that sees only the store
+and has a deadline. This process itself draws named frames, reads camera pictures, and, with a
+folder for it, exports clips found by the sandbox.
+
+The docstring of a tool is its description for the assistant.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import tempfile
+import threading
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from textwrap import indent
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
+
+from pydantic import Field
+
+from sgstore.apps.assistant._vocabulary import Topic, topic_text
+from sgstore.apps.sandbox import TIMEOUT_S, Sandbox
+from sgstore.base.display import cell
+from sgstore.base.json_text import finite
+from sgstore.errors import ExportError, StoreError
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from PIL.Image import Image
+
+    from sgstore.store import FrameRef
+
+ROWS: Final = 20
+"""Default number of rows of a result."""
+
+MOST_ROWS: Final = 1_000
+"""Default for the greatest number of rows of a result."""
+
+MOST_BYTES: Final = 2 << 20
+"""Greatest size of a result; bytes. A model reads a small part of it, a program more."""
+
+MOST_TEXT: Final = 30_000
+"""Greatest number of characters of rows in one result; about ten thousand tokens."""
+
+LONGEST: Final = 400
+"""Greatest number of characters of one value; longer than a notebook's table for queries."""
+
+SIDE: Final = 1_024
+"""Longest side of a camera picture; pixels: models use no larger ones."""
+
+FrameName = Annotated[str, Field(description="'town#120' (trace and number) or 'town@12.3s'")]
+Pattern = Annotated[
+    str, Field(description="MATCH …; or the name of a pattern of the library, such as cut_in")
+]
+Values = Annotated[
+    dict[str, Any] | None, Field(description="values of $name in it, or of the named pattern")
+]
+Limit = Annotated[int, Field(ge=1, description="rows at most")]
+
+
+@dataclass(frozen=True)
+class ToolAnswer:
+    """Result of a tool.
+
+    Attributes
+    ----------
+    text : str
+        Text for the model.
+    data : dict
+        The same result for programs, as JSON values.
+    image : bytes
+        A picture, or empty.
+    image_type : str
+        Type of the picture: ``image/png``.
+    """
+
+    text: str
+    data: dict[str, Any] = field(default_factory=dict[str, Any])
+    image: bytes = b""
+    image_type: str = "image/png"
+
+
+@dataclass(frozen=True)
+class KnownBindings:
+    """Bindings of a query in a frame from the sandbox, for a picture."""
+
+    found: list[dict[str, int]]
+
+    def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
+        """Return node ids by variable name, for each match."""
+        del frame
+        return self.found
+
+
+class StoreTools:
+    """Tools for one store.
+
+    Parameters
+    ----------
+    store : str or Path
+    write_to : str or Path, optional
+        Folder for clips; without it there is no export.
+    timeout_s : float
+        Time limit of a query; s.
+    most_rows : int
+        Greatest number of rows of a result.
+    tables : mapping of str to path, optional
+        As in :class:`sgstore.apps.sandbox.Sandbox`.
+
+    Raises
+    ------
+    StoreError
+        The file is missing, or is not a store.
+    """
+
+    def __init__(
+        self,
+        store: str | Path,
+        *,
+        write_to: str | Path | None = None,
+        timeout_s: float = TIMEOUT_S,
+        most_rows: int = MOST_ROWS,
+        tables: Mapping[str, str | Path] | None = None,
+    ) -> None:
+        self._write_to = None if write_to is None else Path(write_to)
+        self._box = Sandbox(
+            store,
+            timeout_s=timeout_s,
+            max_rows=most_rows,
+            max_bytes=MOST_BYTES,
+            tables=tables,
+            worker="sgstore.apps.assistant._worker",
+        )
+        self._store = Store(store)
+        self._turn = threading.Lock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the sandbox process and close the store."""
+        self._box.close()
+        self._store.close()
+
+    def tools(self) -> dict[str, Callable[..., ToolAnswer]]:
+        """Return the tools by name, in the recommended reading order."""
+        reading = (
+            *(self.list_traces, self.vocabulary, self.patterns_search, self.find, self.why_not),
+            *(self.sql, self.check, self.timeline, self.show, self.picture, self.coverage_missing),
+        )
+        found = {tool.__name__: tool for tool in reading}
+        return found if self._write_to is None else found | {"export_clips": self.export_clips}
+
+    def _ask(self, ask: str, **about: Any) -> dict[str, Any]:
+        return self._box.ask({"ask": ask, "with": about})
+
+    def _rows(self, ask: str, **about: Any) -> ToolAnswer:
+        reply = self._ask(ask, **about)
+        return ToolAnswer(_rows_text(reply), finite(reply))
+
+    # What there is ----------------------------------------------------------------------------
+
+    def list_traces(self, limit: Limit = 100) -> ToolAnswer:
+        """List the recordings (traces) of the store: frames, seconds, map, losses."""
+        return self._rows("traces", limit=limit)
+
+    def vocabulary(
+        self,
+        about: Annotated[
+            Topic,
+            Field(
+                description="here: kinds and relations in this store; language: how to write a query, in one"
+                " page; others: what a query may name"
+            ),
+        ] = "here",
+    ) -> ToolAnswer:
+        """Describe the words of queries. Read 'language' once before your first query."""
+        text = self.topic(about)
+        return ToolAnswer(text, {"about": about, "text": text})
+
+    def topic(self, about: Topic) -> str:
+        """Return the text on a topic of the vocabulary."""
+        if about == "language":
+            return self._language
+        return topic_text(about, self._ask("views" if about == "views" else "vocabulary"))
+
+    @cached_property
+    def _language(self) -> str:
+        place = resources.files("sgstore.apps.assistant").joinpath("language.md")
+        return place.read_text(encoding="utf-8")
+
+    def patterns_search(
+        self,
+        words: Annotated[str, Field(description="such as 'pedestrian crossing'; empty: all")] = "",
+        kind: Annotated[
+            Literal["", "predicate", "concept", "scenario", "property"],
+            Field(description="property: a rule for check; predicate: a condition for WHERE"),
+        ] = "",
+        limit: Limit = 8,
+    ) -> ToolAnswer:
+        """Search the library of named patterns and rules: try this before writing a query."""
+        from sgstore.lang.library import patterns, search
+
+        every = [one for one in patterns().values() if not kind or one.kind == kind]
+        found = search(words, [kind] if kind else []) if words.strip() else every
+        listed = [
+            {
+                "name": one.name,
+                "kind": one.kind,
+                "sentence": one.sentence,
+                "parameters": {
+                    p.name: f"{p.default}: {p.meaning}" for p in one.parameters.values()
+                },
+                "query": one.query,
+            }
+            for one in found[:limit]
+        ]
+        lines = [
+            f"{one.name} ({one.kind}): {one.sentence}\n{indent(one.query, '  ')}"
+            for one in found[:limit]
+        ]
+        if len(found) > limit:
+            lines.append(f"({len(found) - limit} more; raise limit, or add words)")
+        return ToolAnswer(
+            "\n".join(lines) or "nothing in the library has these words", {"patterns": listed}
+        )
+
+    # Questions --------------------------------------------------------------------------------
+
+    def find(
+        self,
+        query: Pattern,
+        form: Annotated[
+            Literal["intervals", "rows", "frames", "count"],
+            Field(
+                description="intervals: when it holds, and who; rows: one a match and frame, or what RETURN"
+                " says; frames: each once; count: number of frames"
+            ),
+        ] = "rows",
+        limit: Limit = ROWS,
+        parameters: Values = None,
+    ) -> ToolAnswer:
+        """Find scenes by a pattern of their scene graphs."""
+        return self._rows("find", query=query, form=form, limit=limit, parameters=parameters or {})
+
+    def why_not(self, frame: FrameName, query: Pattern, parameters: Values = None) -> ToolAnswer:
+        """Explain why a pattern does not match a frame: the first failing condition, and its margin."""
+        reply = self._ask("why_not", frame=frame, query=query, parameters=parameters or {})
+        return ToolAnswer(reply["text"], finite(reply))
+
+    def sql(
+        self,
+        statement: Annotated[str, Field(description="SELECT … FROM frames, nodes, edges, …")],
+        limit: Limit = ROWS,
+    ) -> ToolAnswer:
+        """Run a read-only SQL statement of DuckDB; vocabulary 'views' lists tables and columns."""
+        return self._rows("sql", statement=statement, limit=limit)
+
+    def check(
+        self,
+        rule: Annotated[
+            str,
+            Field(description="'CHECK name: ALWAYS …', or the name of a property of the library"),
+        ],
+        limit: Limit = ROWS,
+        parameters: Values = None,
+    ) -> ToolAnswer:
+        """Check a rule over time: for each trace true, false or unknown, and each violation."""
+        reply = self._ask("check", text=rule, limit=limit, parameters=parameters or {})
+        tally = ", ".join(f"{number} {word}" for word, number in reply["verdicts"].items())
+        return ToolAnswer(f"{_rows_text(reply)}\n({tally or 'no trace'})", finite(reply))
+
+    def timeline(
+        self,
+        queries: Annotated[
+            list[str],
+            Field(min_length=1, description="each MATCH …, CHECK …, or a name of the library"),
+        ],
+        traces: Annotated[list[str] | None, Field(description="only these")] = None,
+        picture: Annotated[bool, Field(description="as a picture, too")] = False,  # noqa: FBT002
+    ) -> ToolAnswer:
+        """Show over time when patterns match and rules are violated: one lane per entity."""
+        from sgstore.draw import Lane, Timeline, draw_timelines, lines_of
+
+        reply = self._ask("timeline", queries=queries, traces=traces or [], limit=TRACES_DRAWN)
+        found = [
+            Timeline(one["trace"], one["seconds"], [Lane(**lane) for lane in one["lanes"]])
+            for one in reply["timelines"]
+        ]
+        lines = [line for one in found for line in lines_of(one)]
+        if reply["truncated"]:
+            lines.append(f"(the first {TRACES_DRAWN} traces; name others in traces)")
+        unknown = {one.trace: lane.reason for one in found for lane in one.lanes if lane.reason}
+        text = "\n".join([*map(_one_line, lines), *_remarks({"left_out": unknown})])
+        image = self._drawn(lambda to: draw_timelines(found, to)) if picture and found else b""
+        return ToolAnswer(text, finite(reply), image)
+
+    # Pictures ---------------------------------------------------------------------------------
+
+    def show(
+        self,
+        frame: FrameName,
+        query: Annotated[str, Field(description="marks what it matches there")] = "",
+        relations: Annotated[
+            Literal["ego", "all", "none"], Field(description="which edges are drawn")
+        ] = "ego",
+        camera: Annotated[bool, Field(description="beside it what a camera saw")] = True,  # noqa: FBT002
+        graph: Annotated[bool, Field(description="beside it the graph instead")] = False,  # noqa: FBT002
+        radius: Annotated[float | None, Field(gt=0, description="half the side; m")] = None,
+    ) -> ToolAnswer:
+        """Draw a frame from above, the ego in the middle."""
+        from sgstore.draw import frame_image
+
+        known, text = None, f"{frame} from above"
+        if query.strip():
+            reply = self._ask("bindings", frame=frame, query=query, parameters={})
+            known = KnownBindings(reply["bindings"])
+            names = ", ".join(known.found[0]) if known.found else ""
+            marked = f"marked: {names}" if names else "the query does not match here: see why_not"
+            text = "\n".join([f"{text}; {marked}", *_remarks(reply)])
+        with self._turn:
+            image = frame_image(
+                self._store,
+                frame,
+                known,
+                relations=relations,
+                camera=None if camera else "none",
+                diagram=graph,
+                radius=radius,
+            )
+        return ToolAnswer(text, {"frame": frame}, _encoded(image, "PNG"))
+
+    def picture(
+        self,
+        frame: FrameName,
+        channel: Annotated[str, Field(description="topic of a camera; empty: the first")] = "",
+    ) -> ToolAnswer:
+        """Fetch the camera picture of a frame."""
+        from sgstore.draw import camera_of
+
+        with self._turn:
+            ref = self._store.file.frame(frame)
+            topic = channel or camera_of(self._store, ref.trace)
+            if not topic:
+                topics = ", ".join(one.topic for one in self._store.file.channels(ref.trace_id))
+                raise StoreError(f"{ref.trace} has no camera; its channels: {topics or 'none'}")
+            image = self._store.picture(ref, topic)
+        size = f"{image.width} x {image.height} pixels"
+        if max(image.size) > SIDE:
+            image.thumbnail((SIDE, SIDE))
+            size += f", shown {image.width} x {image.height}"
+        about = {"frame": f"{ref.trace}#{ref.seq}", "channel": topic}
+        image = _encoded(image.convert("RGB"), "JPEG")
+        return ToolAnswer(f"{about['frame']}, {topic}: {size}", about, image, "image/jpeg")
+
+    def _drawn(self, draw: Callable[[Path], None]) -> bytes:
+        """Return a picture that a function draws into a file."""
+        with self._turn, tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "drawn.png"
+            draw(file)
+            return file.read_bytes()
+
+    # Coverage and clips -----------------------------------------------------------------------
+
+    def coverage_missing(
+        self,
+        frames: Annotated[str, Field(description="MATCH … that chooses frames; empty: all")] = "",
+        reference: Annotated[
+            str, Field(description="MATCH … that chooses what to compare with; empty: all frames")
+        ] = "",
+        cells: Annotated[
+            str, Field(description="MATCH … RETURN a, b: each combination of values is a cell")
+        ] = "",
+        abstraction: Annotated[
+            Literal["RSV", "ER", "EL", "E", "junction"],
+            Field(description="without cells: of features"),
+        ] = "RSV",
+        k: Annotated[int, Field(ge=1, le=3, description="features in a combination")] = 2,
+        of_ego: Annotated[bool, Field(description="only features of the ego")] = True,  # noqa: FBT002
+        limit: Limit = ROWS,
+    ) -> ToolAnswer:
+        """List combinations that are missing in some frames: values of a query, or k features."""
+        reply = self._ask(
+            "missing",
+            frames=frames,
+            reference=reference,
+            cells=cells,
+            abstraction=abstraction,
+            k=k,
+            of_ego=of_ego,
+            limit=limit,
+        )
+        share = reply["share"]
+        head = f"{share['part']} of {share['of']} covered; of: {share['denominator']}. Missing:"
+        return ToolAnswer("\n".join([*reply["said"], head, _rows_text(reply)]), finite(reply))
+
+    def export_clips(
+        self,
+        query: Pattern,
+        name: Annotated[str, Field(description="of a new folder for them: letters, digits, - _ .")],
+        before: Annotated[float, Field(ge=0, le=600, description="before each match; s")] = 2.0,
+        after: Annotated[float, Field(ge=0, le=600, description="after each match; s")] = 2.0,
+        form: Annotated[
+            str, Field(description="mcap, parquet, frames, nx, pyg, s3c, xosc, rrd")
+        ] = "mcap",
+        with_graph: Annotated[bool, Field(description="mcap: with the scene graphs")] = False,  # noqa: FBT002
+        limit: Annotated[int, Field(ge=1, description="clips at most")] = ROWS,
+        parameters: Values = None,
+    ) -> ToolAnswer:
+        """Export the matches of a pattern as clips, into the folder of the user."""
+        from sgstore.exporters import Export, exporter_named, write_export
+        from sgstore.model.world import Clip
+
+        if self._write_to is None:
+            raise ExportError("nothing may be written: the server was started without --write-to")
+        if not _NAME.fullmatch(name):
+            raise ExportError(f"{name!r} is no name of a folder; expected such as 'cut-ins_1'")
+        exporter_named(form)  # before the search starts
+        reply = self._ask(
+            "clips",
+            query=query,
+            before=before,
+            after=after,
+            limit=limit,
+            parameters=parameters or {},
+        )
+        clips = tuple(Clip(*row) for row in reply["rows"])
+        if not clips:
+            return ToolAnswer(_rows_text(reply), {"files": []})
+        with self._turn:
+            order = Export(self._store, clips, with_graph=with_graph, provenance={"query": query})
+            written = write_export(order, self._write_to / name, form)
+        rows = [one.as_row() for one in written]
+        losses = [f"{one.file.name}: lost: {loss.reason}" for one in written for loss in one.losses]
+        listed = {"columns": [*rows[0]], "rows": [[*row.values()] for row in rows]}
+        about = {**listed, "truncated": reply["truncated"], "left_out": reply["left_out"]}
+        about["notes"] = [*reply["notes"], *losses]
+        return ToolAnswer(_rows_text(about), finite(about))
+
+
+TRACES_DRAWN: Final = 12
+"""Greatest number of traces in one timeline."""
+
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
+
+
+def _one_line(text: str) -> str:
+    return text if text.isprintable() else "".join(c if c.isprintable() else " " for c in text)
+
+
+def _encoded(image: Image, form: str) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, form)
+    return buffer.getvalue()
+
+
+# Answers as they are read in a prompt: few characters, and nothing left out that is not told ----------------
+
+
+def _rows_text(reply: Mapping[str, Any]) -> str:
+    """Return rows as lines with ``|`` between the values, followed by notes.
+
+    Parameters
+    ----------
+    reply : mapping
+        ``columns``, ``rows``, ``truncated``; optionally ``notes`` and ``left_out``.
+    """
+    rows = reply["rows"]
+    lines, shown = _lines(reply["columns"], rows)
+    told = lines if rows else ["nothing"]
+    if shown < len(rows):
+        told.append(
+            f"({shown} of {len(rows)} rows: more have no room in an answer; return less of each)"
+        )
+    elif reply["truncated"]:
+        told.append(
+            f"(the first {len(rows)} rows; there are more: raise limit, count, or narrow it)"
+        )
+    return "\n".join([*told, *_remarks(reply)])
+
+
+def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], int]:
+    """Return a header and the rows that fit, with their number."""
+    lines = [" | ".join(columns)]
+    left = MOST_TEXT
+    for number, row in enumerate(rows):
+        line = " | ".join(cell(value, LONGEST) for value in row)
+        left -= len(line) + 1
+        if left < 0 and number:
+            return lines, number
+        lines.append(line)
+    return lines, len(rows)
+
+
+def _remarks(reply: Mapping[str, Any]) -> list[str]:
+    """Return sentences about traces that cannot answer, and about likely mistakes."""
+    of: dict[str, list[str]] = {}
+    for name, reason in reply.get("left_out", {}).items():
+        of.setdefault(reason, []).append(name)
+    left_out = [f"(cannot answer: {', '.join(names)}: {reason})" for reason, names in of.items()]
+    return [*left_out, *(f"(note: {note})" for note in reply.get("notes", ()))]

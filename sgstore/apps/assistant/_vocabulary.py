@@ -1,0 +1,143 @@
+"""Names for queries, as texts for a prompt."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from sgstore.lang import (
+    EDGE_ATTRIBUTES,
+    ENV_ATTRIBUTES,
+    FRAME_ATTRIBUTES,
+    FUNCTIONS,
+    NODE_ATTRIBUTES,
+    TRACE_ATTRIBUTES,
+    Attribute,
+)
+from sgstore.lang.library import patterns
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS
+from sgstore.model.vocabulary import LABEL_ALIASES, LIGHT_STATES, SUPER_KINDS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+Topic = Literal["here", "language", "relations", "attributes", "functions", "predicates", "views"]
+
+TOPICS: Final[tuple[Topic, ...]] = (
+    *("here", "language", "relations"),
+    *("attributes", "functions", "predicates", "views"),
+)
+
+_SIGNATURE: Final = re.compile(r"PREDICATE\s+(\w+\s*\([^)]*\))")
+
+
+def topic_text(about: Topic, known: Mapping[str, Any]) -> str:
+    """Return the text on a topic.
+
+    Parameters
+    ----------
+    about : Topic
+        Any topic except ``language``, which is a page.
+    known : mapping
+        Facts about the store from the sandbox; see :mod:`sgstore.apps.assistant._worker`.
+    """
+    match about:
+        case "relations":
+            return _relations()
+        case "attributes":
+            return _attributes(known)
+        case "functions":
+            return _functions()
+        case "predicates":
+            return _predicates()
+        case "views":
+            return _views(known)
+        case _:
+            return _here(known)
+
+
+def _here(known: Mapping[str, Any]) -> str:
+    kinds = ", ".join(f"{kind} ({number})" for kind, number in known["kinds"].items())
+    several = "; ".join(
+        f"{name}: {', '.join(of)}" for name, of in SUPER_KINDS.items() if name != "entity"
+    )
+    aliases = ", ".join(f"{word} = {kind}" for word, kind in LABEL_ALIASES.items())
+    lines = [
+        f"Kinds of entities here (how many): {kinds or 'none'}",
+        f"Parts of the map: {', '.join(known['map_kinds']) or 'none'}",
+        f"Labels for several kinds: {several}. Other words: {aliases}",
+        "Relations here, source → destination:",
+        *_ends(known["relations"]),
+    ]
+    lines += [f"Unknown of {trace}: {', '.join(of)}" for trace, of in known["unknown"].items()]
+    lines += [f"Table {name}: {', '.join(columns)}" for name, columns in known["tables"].items()]
+    return "\n".join(lines)
+
+
+def _ends(relations: Mapping[str, tuple[list[str], list[str]]]) -> list[str]:
+    """Return source and target kinds of relations; relations with equal kinds share a line."""
+    alike: dict[str, list[str]] = {}
+    for name, (sources, targets) in relations.items():
+        alike.setdefault(f"{', '.join(sources)} → {', '.join(targets)}", []).append(name)
+    return [f"  {', '.join(names)}: {ends}" for ends, names in alike.items()]
+
+
+def _relations() -> str:
+    from sgstore.graphs.relations import relations
+
+    found = (
+        f"{one.name}: {one.doc}{' (needs a map)' if one.needs_map else ''}" for one in relations()
+    )
+    return "\n".join(found)
+
+
+def _attributes(known: Mapping[str, Any]) -> str:
+    own = [f"{name}: {kind}, of the recordings' own" for name, kind in known["own"].items()]
+    return "\n".join(
+        [
+            "Of a node (x.NAME):",
+            *_listed(NODE_ATTRIBUTES.values()),
+            *own,
+            "Of an edge (r.NAME):",
+            *_listed(EDGE_ATTRIBUTES.values()),
+            "Of the frame (frame.NAME):",
+            *_listed(FRAME_ATTRIBUTES.values()),
+            "Of the trace (trace.NAME):",
+            *_listed(TRACE_ATTRIBUTES.values()),
+            "Weather and light:",
+            *_listed(ENV_ATTRIBUTES.values()),
+        ]
+    )
+
+
+def _listed(attributes: Iterable[Attribute]) -> list[str]:
+    return [f"  {one.name}: {one.meaning}{_values(one)}" for one in attributes]
+
+
+def _values(attribute: Attribute) -> str:
+    if attribute.enum == "kind":
+        return ""
+    values = LIGHT_STATES if attribute.enum == "light_state" else attribute.values
+    return f" [{', '.join(values)}]" if values else ""
+
+
+def _functions() -> str:
+    numbers = [f"  {name}(a, b): {one.meaning}" for name, one in PAIR_FUNCTIONS.items()]
+    others = sorted(FUNCTIONS - PAIR_FUNCTIONS.keys())
+    return "\n".join(["Of two entities:", *numbers, f"Others: {', '.join(others)}"])
+
+
+def _predicates() -> str:
+    lines: list[str] = []
+    for one in patterns().values():
+        if one.kind == "predicate":
+            found = _SIGNATURE.search(one.query)
+            lines.append(f"{found[1] if found else one.name}: {one.sentence}")
+    return "\n".join(lines)
+
+
+def _views(known: Mapping[str, Any]) -> str:
+    return "\n".join(
+        f"{name}({', '.join(one['columns'])}): {one['meaning']}"
+        for name, one in known["views"].items()
+    )

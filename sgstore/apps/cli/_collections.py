@@ -1,0 +1,176 @@
+"""The verbs of collections: collection commit, pack, unpack, verify, rebuild, gc."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+from typer import Argument, Option
+
+from sgstore.apps.cli._options import (
+    ERROR,
+    Jobs,
+    LookIn,
+    PrintedRows,
+    StorePath,
+    Verbs,
+    app,
+    jobs_of,
+    seconds_of,
+)
+from sgstore.apps.cli._output import count_bar, number_of, say
+from sgstore.apps.cli._places import url_of
+from sgstore.errors import place_named
+
+if TYPE_CHECKING:
+    from sgstore.collection import Commit
+
+PANEL: Final = "More than one machine"
+
+Place = Annotated[
+    Path, Argument(metavar="URL", help="The collection: a folder, or s3://bucket/prefix.")
+]
+
+
+def _say(url: Path, told: str) -> None:
+    say(f"{place_named(url)}: {told}")
+
+
+def _statuses(done: Commit) -> list[tuple[str, str]]:
+    """Return the status of each trace after a commit."""
+    from sgstore.model.vocabulary import natural
+
+    present = sorted(done.present, key=natural)
+    return [(name, "added") for name in done.added] + [(name, "present") for name in present]
+
+
+def _new_in(done: Commit) -> str:
+    """Return a summary of a commit."""
+    if not done.added:
+        return f"nothing new; the last snapshot is {done.number}"
+    told = f"{number_of(len(done.added), 'trace')} in {number_of(len(done.bundles), 'bundle')}"
+    return f"{told}, snapshot {done.number}"
+
+
+collection = Verbs(no_args_is_help=True)
+app.add_typer(
+    collection,
+    name="collection",
+    help="Collections of stores, in a folder or an object store: make and look after them.",
+    rich_help_panel=PANEL,
+)
+
+
+@collection.command()
+def pack(
+    store: StorePath,
+    url: Place,
+    bundle_traces: Annotated[
+        int | None,
+        Option("--bundle-traces", min=1, help="Most traces of a bundle.", show_default="1000"),
+    ] = None,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Bring the traces of a store into a collection, which is made if there is none."""
+    from sgstore.collection import pack as pack_store
+
+    with count_bar("packing", "bundles") as on_bundle:
+        done = pack_store(
+            store, url_of(url) or url, bundle_traces=bundle_traces, on_bundle=on_bundle
+        )
+    out.write(("trace", "status"), _statuses(done))
+    for old, new in done.renamed.items():
+        say(f"{old}: the collection has another trace of this name, so it is {new!r} there")
+    _say(url, _new_in(done))
+    return 0
+
+
+@collection.command()
+def commit(url: Place, *, out: PrintedRows) -> int:
+    """Make bundles of all that 'ingest URL … --shard' has landed, and a snapshot that has them."""
+    from sgstore.collection import commit as commit_landed
+
+    done = commit_landed(url_of(url) or url)
+    out.write(("trace", "status"), _statuses(done))
+    for reason in done.refused:
+        say(f"not committed: {reason}")
+    _say(url, _new_in(done))
+    return ERROR if done.refused else 0
+
+
+@collection.command()
+def unpack(
+    url: Place,
+    store: Annotated[Path, Argument(metavar="STORE", help="The store that is made.")],
+) -> int:
+    """Put all traces of a collection into one new store."""
+    from sgstore.collection import unpack as unpack_all
+
+    names = unpack_all(url_of(url) or url, store)
+    say(f"{store}: {number_of(len(names), 'trace')}")
+    return 0
+
+
+@collection.command()
+def verify(url: Place, *, out: PrintedRows) -> int:
+    """Verify that all bundles are as they were committed, and the catalogue true; list every fault."""
+    from sgstore.collection import verify as verify_all
+
+    found = verify_all(url_of(url) or url)
+    out.write(("what", "check", "detail"), found.faults)
+    wrong = number_of(len(found.faults), "fault") if found.faults else "no fault"
+    held = f"{number_of(found.bundles, 'bundle')}, {number_of(found.traces, 'trace')}"
+    _say(url, f"snapshot {found.number}, {held}: {wrong}")
+    return ERROR if found.faults else 0
+
+
+@collection.command()
+def rebuild(
+    url: Place,
+    look_in: LookIn = None,
+    everything: Annotated[
+        bool, Option("--all", help="Also bundles of this version of the schema.")
+    ] = False,
+    jobs: Jobs = 1,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Make the bundles of another version anew from their recordings, one after another."""
+    from sgstore.collection import rebuild as make_anew
+
+    with count_bar("rebuilding", "bundles") as on_bundle:
+        made = make_anew(
+            url_of(url) or url,
+            look_in=look_in or (),
+            jobs=jobs_of(jobs),
+            everything=everything,
+            on_bundle=on_bundle,
+        )
+    out.write(("bundle", "is now"), made.items())
+    _say(url, f"{number_of(len(made), 'bundle')} made anew")
+    return 0
+
+
+@collection.command()
+def gc(
+    url: Place,
+    keep: Annotated[int, Option("--keep", min=1, help="Snapshots that stay, the last ones.")] = 1,
+    older: Annotated[
+        str,
+        Option("--older", metavar="TIME", help="Remove only files that were written so long ago."),
+    ] = "86400s",
+    dry_run: Annotated[bool, Option("--dry-run", help="Only say what would be removed.")] = False,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Remove old snapshots, and files that no snapshot speaks of."""
+    from sgstore.collection import gc as collect
+
+    seconds = seconds_of(older, "--older")
+    found = collect(url_of(url) or url, keep=keep, older_s=seconds, dry_run=dry_run)
+    out.write(("file",), [(name,) for name in found.names])
+    verb = "would be removed" if dry_run else "removed"
+    files = number_of(len(found.names), "file")
+    _say(url, f"{files}, {found.size} bytes {verb}; {found.young} too young")
+    return 0

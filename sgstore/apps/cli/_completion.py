@@ -1,0 +1,172 @@
+"""Completion in a shell: patterns, traces, frames, formats, presets, abstractions.
+
+Typer calls these functions when the user presses Tab after one of their arguments or options. They
+must be fast: names of the package need no database; only names of a store open it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import typer  # noqa: TC002  typer looks the types of these functions up
+
+from sgstore.errors import SgstoreError
+
+if TYPE_CHECKING:
+    from sgstore.store import StoredTrace, StoreFile
+
+Offers = Iterator[tuple[str, str]]
+"""Possible values, each with a description."""
+
+STORE: Final = "SGSTORE_STORE"
+"""Environment variable with the default store."""
+
+STORE_ENDINGS: Final = (".sgstore", ".duckdb", ".db")
+_ASKED: Final = "_SGSTORE_COMPLETE"
+"""Environment variable by which a shell requests completions."""
+
+_KEPT: Final = "_SGSTORE_KEPT"
+"""Environment variable with the part of the typed word that bash keeps."""
+
+
+def words_before() -> list[str] | None:
+    """Return the words before the completed word of a command line, or ``None``.
+
+    Each shell passes them in its own variables, as in typer's scripts.
+    """
+    if not os.environ.get(_ASKED, "").startswith("complete"):
+        return None
+    os.environ[_KEPT] = ""
+    if (bash := os.environ.get("COMP_WORDS")) is not None:
+        return _words_of_bash(bash.split("\n"), int(os.environ.get("COMP_CWORD", "0") or 0))
+    other = os.environ.get("_TYPER_COMPLETE_ARGS", "")
+    words = other.split()[1:]
+    return words if other[-1:].isspace() else words[:-1]
+
+
+def _words_of_bash(words: list[str], at: int) -> list[str]:
+    """Return the words before a position; words that bash split at ``@`` are joined again, also for typer.
+
+    Bash splits ``town@7`` into three words, and replaces the last two by the completion. Therefore
+    the word for typer is ``@7``, and ``town`` is kept.
+    """
+    typed = words[: at + 1]
+    if "@" in typed:
+        broken = "@" in typed[-2:]
+        typed = re.sub(r"\n@(\n|$)", "@", "\n".join(typed)).split("\n")
+        if broken:
+            os.environ[_KEPT], _, rest = typed[-1].rpartition("@")
+            typed[-1] = f"@{rest}"
+        os.environ.update(COMP_WORDS="\n".join(typed), COMP_CWORD=str(len(typed) - 1))
+    return typed[1:-1]
+
+
+def stores(ctx: typer.Context, incomplete: str) -> Offers:
+    """Yield stores in the folder; with a default store, also the possible next arguments."""
+    folder, _, start = incomplete.rpartition("/")
+    with suppress(OSError):
+        for path in sorted(Path(folder or ("/" if incomplete[:1] == "/" else ".")).iterdir()):
+            name = f"{folder}/{path.name}" if "/" in incomplete else path.name
+            if path.name.startswith(start) and (start[:1] == "." or path.name[:1] != "."):
+                if path.is_dir():
+                    yield f"{name}/", "folder"
+                elif path.suffix in STORE_ENDINGS:
+                    yield name, "store"
+    if os.environ.get(STORE):
+        later: list[Any] = [one for one in ctx.command.params if one.param_type_name == "argument"]
+        for item in later[1].shell_complete(ctx, incomplete) if later[1:] else ():
+            if item.type == "plain":
+                yield item.value, item.help or ""
+
+
+def patterns(ctx: typer.Context) -> Offers:
+    """Yield names of the library; predicates only for ``show``, because they cannot be run."""
+    from sgstore.lang import patterns as every
+
+    for one in every().values():
+        if one.kind != "predicate" or ctx.info_name == "show":
+            yield one.name, f"{one.kind}: {one.sentence}"
+
+
+def traces(ctx: typer.Context) -> Offers:
+    """Yield the names of the traces of the store."""
+    for one in _traces(ctx):
+        yield one.name, _about(one)
+
+
+def frames(ctx: typer.Context, incomplete: str) -> Offers:
+    """Yield completions of a frame name: the typed digits plus one more digit."""
+    kept = os.environ.get(_KEPT, "")
+    typed = f"{kept}{incomplete}"
+    for one in _traces(ctx):
+        head = next((h for h in (f"{one.name}#", f"{one.name}@") if typed.startswith(h)), "")
+        digits = typed[len(head) :]
+        if not head:
+            for number in sorted({0, one.frames - 1}):
+                yield f"{one.name}#{number}", f"of {_about(one)}; or {one.name}@12.3s"
+        elif not digits or digits.isdecimal():
+            by_time = head[-1] == "@"
+            last = (one.end_ns - one.start_ns) // 10**9 if by_time else one.frames - 1
+            for number in filter(None, (digits, *(f"{digits}{digit}" for digit in range(10)))):
+                if number == str(int(number)) and int(number) <= last:
+                    shown = f"{head}{number}{'s' * by_time}"
+                    yield shown.removeprefix(kept), f"of 0 … {last}{' s' * by_time}"
+
+
+def presets() -> Offers:
+    """Yield the names of presets."""
+    from sgstore.model.config import PRESETS
+
+    for name, one in PRESETS.items():
+        yield name, one.summary
+
+
+def formats() -> Offers:
+    """Yield the formats of exports."""
+    from sgstore.base import plugins
+    from sgstore.exporters import EXPORTERS
+
+    for name in (*(one.name for one in EXPORTERS), *plugins.EXPORTERS.others()):
+        yield name, ""
+
+
+def abstractions() -> Offers:
+    """Yield the abstractions of graphs."""
+    from sgstore.base.plugins import ABSTRACTIONS
+
+    for name in (*ABSTRACTIONS.own, *ABSTRACTIONS.others()):
+        yield name, ""
+
+
+def channels(ctx: typer.Context) -> Offers:
+    """Yield the channels of the recordings of the store."""
+    sql = "SELECT DISTINCT channel, schema FROM payloads ORDER BY channel"
+    with suppress(SgstoreError, OSError):
+        file = _store(ctx)
+        yield from file.rows(sql).values if file is not None else ()
+
+
+def _about(trace: StoredTrace) -> str:
+    return f"{trace.frames} frames, {(trace.end_ns - trace.start_ns) / 1e9:g} s"
+
+
+def _traces(ctx: typer.Context) -> list[StoredTrace]:
+    """Return the traces of the store on the command line; empty if it cannot be read."""
+    with suppress(SgstoreError, OSError):
+        file = _store(ctx)
+        return [] if file is None else [*file.traces()]
+    return []
+
+
+def _store(ctx: typer.Context) -> StoreFile | None:
+    named = ctx.params.get("store") or os.environ.get(STORE)
+    if not named or not Path(named).is_file():
+        return None
+    from sgstore.store import StoreFile
+
+    return StoreFile(Path(named))

@@ -1,0 +1,394 @@
+"""Verbs that draw and write: show, export, shrink."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import typer
+from typer import Argument, Option
+
+from sgstore.apps.cli import _completion as completion
+from sgstore.apps.cli._options import (
+    LOSS,
+    AsJson,
+    PrintedRows,
+    QueryLimits,
+    Question,
+    StorePath,
+    app,
+    form_of,
+    lines_of,
+    parameters_of,
+    say_left_out,
+    say_unknown,
+    seconds_of,
+)
+from sgstore.apps.cli._output import Format, count_bar, say, write_rows
+from sgstore.exporters import EXPORTERS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from sgstore.exporters import Export, WrittenClip, WrittenFile
+    from sgstore.matches import Matches
+    from sgstore.model.world import Clip
+    from sgstore.query import Store
+
+PANEL: Final = "Pictures and exports"
+
+
+def _formats(option: str = "") -> str:
+    """Return the built-in formats, or those that support an option, for help."""
+    return ", ".join(one.name for one in EXPORTERS if not option or option in one.options)
+
+
+@dataclass(frozen=True)
+class ClipOptions:
+    """Options for the content of clips."""
+
+    before: Annotated[
+        str, Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
+    ] = "2s"
+    after: Annotated[str, Option("--after", metavar="TIME", help="Time after each match.")] = "2s"
+    labels: Annotated[
+        list[str] | None,
+        Option(
+            "--label",
+            metavar="NAME=TEXT",
+            help="A value for each frame: an expression, or a query that is true where it matches.",
+        ),
+    ] = None
+    with_graph: Annotated[
+        bool,
+        Option(
+            "--with-graph",
+            help=f"{_formats('with_graph')}: with the scene graphs, as JSON and to draw.",
+        ),
+    ] = False
+    mounts: Annotated[
+        list[str] | None,
+        Option(
+            "--mount",
+            metavar="AXES=X,Y,Z[,YAW]",
+            help=f"{_formats('mounts')}, with graphs: where a sensor sits on the ego, by the frame_id of its"
+            " messages; m, degrees; repeatable.",
+        ),
+    ] = None
+    rebase_context: Annotated[
+        bool,
+        Option(
+            "--rebase-context",
+            help=f"{_formats('rebase_context')}: put the map and the like, which stand before a clip,"
+            " right beside it.",
+        ),
+    ] = False
+    abstraction: Annotated[
+        str,
+        Option("--abstraction", help=f"{_formats('abstraction')}: abstraction of the graphs."),
+    ] = ""
+    graphml: Annotated[
+        bool,
+        Option("--graphml", help=f"{_formats('graphml')}: each frame as GraphML, too, for Gephi."),
+    ] = False
+    channels: Annotated[
+        list[str] | None,
+        Option(
+            "--channel",
+            metavar="TOPIC",
+            help=f"{_formats('channels')}: only of this sensor; repeatable.",
+        ),
+    ] = None
+    clouds: Annotated[
+        Literal["pcd", "npy", "bin"],
+        Option("--clouds", help=f"{_formats('clouds')}: format of point clouds."),
+    ] = "pcd"
+
+    def order(self, store: Store, clips: Sequence[Clip], **about: Any) -> Export:
+        """Return the export of these options."""
+        from sgstore.exporters import Export, parse_mounts
+
+        return Export(
+            store,
+            tuple(clips),
+            abstraction=self.abstraction,
+            with_graph=self.with_graph,
+            mounts=parse_mounts(self.mounts or ()),
+            rebase_context=self.rebase_context,
+            graphml=self.graphml,
+            channels=tuple(self.channels or ()),
+            clouds=self.clouds,
+            **about,
+        )
+
+
+@app.command(rich_help_panel=PANEL)
+def export(
+    store: StorePath,
+    question: Question,
+    to: Annotated[
+        Path, Option("--to", metavar="DIR", help="Folder to write into; nothing is overwritten.")
+    ] = Path("clips"),
+    frames: Annotated[
+        Path | None,
+        Option("--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."),
+    ] = None,
+    lock: Annotated[
+        Path | None,
+        Option(
+            "--lock", metavar="FILE", help="Instead of a query: each case of a lock, a clip each."
+        ),
+    ] = None,
+    form: Annotated[
+        str,
+        Option(
+            "--format",
+            help=f"{_formats()}, or of a package.",
+            autocompletion=completion.formats,
+        ),
+    ] = "mcap",
+    as_json: AsJson = False,
+    *,
+    clip: ClipOptions,
+    bounds: QueryLimits,
+) -> int:
+    """Cut matches out of their recordings, as clips with the original messages.
+
+    Other formats: tables (parquet), pictures and clouds (frames), scenarios to drive
+    again (xosc), labels (openlabel), recordings for Rerun (rrd), graphs for networkx (nx), PyTorch
+    Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s) in the query wins over
+    --before and --after.
+    """
+    from sgstore.exporters import (
+        check_folder,
+        exporter_named,
+        labelled,
+        parse_labels,
+        write_export,
+    )
+
+    exporter_named(form)  # before the search starts
+    check_folder(to)
+    texts = parse_labels(clip.labels or [])
+    opened = bounds.opened(store)
+    values = parameters_of(question.parameters)
+    margins = seconds_of(clip.before, "--before"), seconds_of(clip.after, "--after")
+    if sum((frames is not None, lock is not None, bool(question))) > 1:
+        raise typer.BadParameter("give one of: a QUERY, --frames, --lock")
+    text, held = "", {}
+    if frames is None and lock is None:
+        text, held = question.asked()
+    clips = _clips(opened, (frames, lock), text, held, margins)
+    if not clips:
+        say("nothing matches: nothing to export")
+        return 0
+    with count_bar(to.name or "export", "clips") as progress:
+        told = {"query": text} if text else {"lock": lock.name} if lock else {}
+        order = clip.order(opened, clips, provenance=told, progress=progress)
+        written = write_export(labelled(order, texts, **values), to, form)
+    _write(written, form_of(Format.table, as_json=as_json))
+    return LOSS if any(one.losses for one in written) else 0
+
+
+def _write(written: Sequence[WrittenClip | WrittenFile], form: Format) -> None:
+    """Report losses, and print one row per written file."""
+    _say_lost(written)
+    rows = [one.as_row() for one in written]
+    write_rows(tuple(rows[0]), [tuple(row.values()) for row in rows], form)
+
+
+def _say_lost(written: Sequence[WrittenClip | WrittenFile]) -> None:
+    for one in written:
+        for loss in one.losses:
+            say(f"{one.file.name}: lost: {loss.reason}")
+
+
+def _clips(
+    store: Store,
+    named: tuple[Path | None, Path | None],
+    text: str,
+    parameters: Mapping[str, Any],
+    margins: tuple[float, float],
+) -> list[Clip]:
+    """Return clips around matches or given frames; or the unchanged cases of a lock."""
+    frames, lock = named
+    if lock is not None:
+        from sgstore.model.world import Clip
+        from sgstore.testsets.locks import cases_of
+
+        return [Clip(*case[:3]) for case in cases_of(lock, store)]
+    if frames is not None:
+        from sgstore.exporters import around_frames
+
+        return around_frames(store, lines_of(frames), *margins)
+    matches = store.find(text, **parameters)
+    say_left_out(matches)
+    return list(matches.clips(*margins))
+
+
+# The verb that cuts clips to what matters ---------------------------------------------------------
+
+
+@app.command(rich_help_panel=PANEL)
+def shrink(
+    store: StorePath,
+    question: Question,
+    clip: Annotated[
+        str | None,
+        Option(
+            "--clip",
+            metavar="CLIP",
+            help="A clip to cut: TRACE@12s..18s or TRACE#120..180; by default every whole trace.",
+        ),
+    ] = None,
+    to: Annotated[
+        Path | None,
+        Option(
+            "--to",
+            metavar="DIR",
+            help="Folder to write the clips into, with the original messages; nothing is overwritten.",
+        ),
+    ] = None,
+    *,
+    out: PrintedRows,
+    bounds: QueryLimits,
+) -> int:
+    """Cut traces, or a clip, to the fewest frames that still match, or violate a check.
+
+    One row for each trace, and for each check. What is cut out is asked as if it were the
+    whole recording.
+    """
+    from sgstore.exporters import check_folder
+    from sgstore.testsets.diff import has_checks
+
+    if to is not None:
+        check_folder(to)  # before the search starts
+    opened = bounds.opened(store)
+    text, values = question.asked()
+    found = list(opened.shrink(text, clip, **values))
+    checks = has_checks(text)
+    if checks:
+        unknown = opened.check(text, **values).unknown()
+        say_unknown((one.check, one.trace, one.reason) for one in unknown)
+    else:
+        say_left_out(opened.find(text, **values))
+    if not found:
+        say(f"nothing {'violates' if checks else 'matches'}: nothing to cut")
+    written: dict[Clip, WrittenClip | WrittenFile] = {}
+    if to is not None and found:
+        written = _cut_out(opened, list(dict.fromkeys(one.clip for one in found)), text, to)
+    head = [*(["file"] if written else []), *(["check"] if checks else [])]
+    rows = [
+        (
+            *([str(written[one.clip].file)] if written else []),
+            *([one.check] if checks else []),
+            *(one.trace, f"{one.trace}#{one.start_seq}", f"{one.trace}#{one.end_seq}"),
+            *(round(one.start, 3), round(one.end, 3), one.frames, one.of),
+        )
+        for one in found
+    ]
+    out.write((*head, "trace", "from", "to", "start", "end", "frames", "of"), rows)
+    lost = any(one.losses for one in written.values())
+    return LOSS if lost else 0
+
+
+def _cut_out(
+    store: Store, clips: list[Clip], text: str, to: Path
+) -> dict[Clip, WrittenClip | WrittenFile]:
+    """Write clips from their recordings, and report losses."""
+    from sgstore.exporters import Export, write_export
+
+    with count_bar(to.name or "shrink", "clips") as progress:
+        order = Export(store, tuple(clips), provenance={"query": text}, progress=progress)
+        written = write_export(order, to)
+    _say_lost(written)
+    return dict(zip(clips, written, strict=True))
+
+
+# Verbs that draw --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """Options for a picture."""
+
+    relations: Annotated[
+        Literal["ego", "all", "none"], Option("--relations", help="Which edges are drawn.")
+    ] = "ego"
+    camera: Annotated[
+        str | None,
+        Option("--camera", help="Channel of a picture to put beside it; 'none' for no picture."),
+    ] = None
+    radius: Annotated[
+        float | None, Option("--radius", help="Half the side of the window, in metres.")
+    ] = None
+    north_up: Annotated[bool, Option("--north-up", help="North is up, not the ego's heading.")] = (
+        False
+    )
+    graph: Annotated[bool, Option("--graph", help="Beside it the graph as nodes and edges.")] = (
+        False
+    )
+    names: Annotated[
+        Literal["number", "ident", "type"],
+        Option("--names", help="What entities are called: by number, the simulator's id or type."),
+    ] = "number"
+    fps: Annotated[
+        float, Option("--fps", min=0.1, max=50.0, help="Pictures a second of an animation.")
+    ] = 10.0
+
+    def options(self, matches: Matches | None) -> dict[str, Any]:
+        """Return the parameters of the drawing functions."""
+        return {
+            "matches": matches,
+            "camera": self.camera,
+            "relations": self.relations,
+            "radius": self.radius,
+            "north_up": self.north_up,
+            "diagram": self.graph,
+            "names": self.names,
+        }
+
+
+@app.command(rich_help_panel=PANEL)
+def show(
+    store: StorePath,
+    frame: Annotated[
+        str,
+        Argument(
+            metavar="FRAME",
+            help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s.",
+            autocompletion=completion.frames,
+        ),
+    ],
+    question: Question,
+    output: Annotated[
+        Path | None,
+        Option(
+            "--output",
+            "-o",
+            help="The picture: .png or .svg; of a clip: .gif, .mp4 or .webm.",
+            show_default="frame.png, clip.gif",
+        ),
+    ] = None,
+    *,
+    drawn: DrawOptions,
+    bounds: QueryLimits,
+) -> int:
+    """Draw a frame from above, or a clip as an animation; with a QUERY, what it matches is marked."""
+    from sgstore.draw import draw_clip, draw_stored, range_of
+
+    opened = bounds.opened(store)
+    text, values = question.asked() if question else ("", {})
+    clip = range_of(frame)
+    output = output or Path("clip.gif" if clip else "frame.png")
+    options = drawn.options(opened.find(text, **values) if text else None)
+    if clip is None:
+        marked = int(draw_stored(opened, frame, output, **options))
+    else:
+        with count_bar(output.name, "pictures") as bar:
+            marked = draw_clip(opened, clip, output, fps=drawn.fps, on_frame=bar, **options)
+    if text and not marked:
+        say(f"the query does not match in {frame}: nothing is marked")
+    typer.echo(output)
+    return 0

@@ -1,0 +1,857 @@
+"""The application, shared arguments of verbs, and groups of options."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+import sys
+from collections import Counter
+from dataclasses import fields, is_dataclass
+from functools import partial, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args, get_type_hints
+
+import typer
+from typer import Argument, Option
+from typer.core import TyperCommand, TyperGroup
+
+import sgstore.apps.cli._completion as completion
+from sgstore.apps.cli._completion import STORE
+from sgstore.apps.cli._output import LONG_TABLE, Format, say, say_json, talk, write_rows
+from sgstore.apps.cli._process import set_deadline
+from sgstore.base.records import dataclass
+from sgstore.errors import ConfigError, url_named
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.apps.sandbox import Answer
+    from sgstore.collection import PartedMatches, PartedRows
+    from sgstore.matches import Matches
+    from sgstore.model.config import Config
+    from sgstore.query import Store, UserStatement
+    from sgstore.testsets.coverage import ChosenFrames, ReportTable
+
+
+class Verb(TyperCommand):
+    """Verb that rejects repeated options, unless they collect values."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse a command line; return the remaining arguments."""
+        if ctx.resilient_parsing:  # completion of an unfinished command line
+            # the value of this option is being typed
+            whole = args[:-1] if args and args[-1].startswith("-") else args
+            return super().parse_args(ctx, _with_store(self, ctx, whole))
+        try:
+            args = _with_store(self, ctx, args)
+            _, _, order = self.make_parser(ctx).parse_args(args=list(args))
+            given: Counter[Any] = Counter(order)
+            for parameter, times in given.items():
+                if times > 1 and _says_one_thing(parameter):
+                    raise typer.BadParameter(
+                        f"given {times} times, but it takes one value", ctx=ctx, param=parameter
+                    )
+            _spare(self.get_params(ctx))
+            rest = super().parse_args(ctx, args)
+        except Exception as error:
+            _advise(error, self)
+            raise
+        _refuse_late_store(self, ctx)
+        return rest
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write help, followed by examples."""
+        super().format_help(ctx, formatter)
+        _write_examples(ctx)
+
+
+def _write_examples(ctx: Any) -> None:
+    from sgstore.apps.cli._examples import examples_of
+
+    typer.echo(examples_of(ctx.command_path.partition(" ")[2]), nl=False)
+
+
+def _with_store(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
+    """Insert the store of ``SGSTORE_STORE`` into a command line without a store.
+
+    The first argument is a store if it looks like one, or if the number of arguments is complete.
+    """
+    named = os.environ.get(STORE)
+    arguments = [one for one in verb.params if one.param_type_name == "argument"]
+    if not named or not arguments or arguments[0].envvar != STORE:
+        return args
+    values, _, _ = verb.make_parser(ctx).parse_args(args=list(args))
+    given = [text for one in arguments for text in _texts(values.get(one.name))]
+    places = [one.nargs for one in arguments]
+    if not given or _looks_like_store(given[0]) or (-1 not in places and len(given) == sum(places)):
+        return args
+    needed = sum(one.required for one in arguments[1:])
+    whole = url_named(given[0]) is not None and len(given) > needed
+    return args if whole else [named, *args]
+
+
+def _texts(value: Any) -> list[str]:
+    several = value if isinstance(value, list | tuple) else [value]
+    return [one for one in several if isinstance(one, str)]
+
+
+def _looks_like_store(place: str) -> bool:
+    path = Path(place)
+    try:
+        whole = (path / COLLECTION_FILE).is_file()
+    except (OSError, ValueError):  # a query is not a file name
+        return False
+    return whole or path.suffix in completion.STORE_ENDINGS or _is_database(path)
+
+
+_LIMITED: Final = {"find": "the query", "sql": "the SQL"}
+"""Verbs whose text limits the rows itself."""
+
+
+def _advise(error: Any, verb: Verb) -> None:
+    """Add advice to a usage error, independent of the typer version."""
+    if getattr(error, "option_name", "") == "--limit" and verb.name in _LIMITED:
+        error.possibilities = None
+        error.message = f"{error.message}; write LIMIT 10 at the end of {_LIMITED[verb.name]}"
+    places = _places(verb)
+    if type(error).__name__ == "MissingParameter" and error.param.name in places[1:]:
+        error.message = "The store comes first."
+
+
+def _places(verb: Verb) -> list[str]:
+    """Return the names of the arguments of a verb with a store as its first; else an empty list."""
+    names = [one.name or "" for one in verb.params if one.param_type_name == "argument"]
+    return names if names[:1] == ["store"] else []
+
+
+def _refuse_late_store(verb: Verb, ctx: Any) -> None:
+    """Reject swapped arguments: a store in the place of another argument."""
+    values = [ctx.params[name] for name in _places(verb)]
+    if not values or _is_database(values[0]):
+        return
+    later = [one for v in values[1:] for one in (v if isinstance(v, list | tuple) else [v])]
+    found = next((one for one in later if one is not None and _is_database(one)), None)
+    if found is not None:
+        raise typer.BadParameter(
+            f"{values[0]} is no store, but {found} is: the store comes first", ctx=ctx
+        )
+
+
+def _is_database(place: str | Path) -> bool:
+    try:
+        path = Path(place)
+        if not path.is_file():  # opening a pipe would block
+            return False
+        with path.open("rb") as file:
+            return file.read(12)[8:] == b"DUCK"
+    except (OSError, ValueError):  # a query is not a file name
+        return False
+
+
+class Application(TyperGroup):
+    """Verbs of an application; see :func:`_spare`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse a command line up to the verb."""
+        _spare(self.get_params(ctx))
+        return super().parse_args(ctx, args)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write help, followed by examples."""
+        super().format_help(ctx, formatter)
+        _write_examples(ctx)
+
+
+def _spare(parameters: Iterable[Any]) -> None:
+    """Let parameters accept plain values without validation by pydantic.
+
+    From 0.29 on typer validates every value with pydantic, whose import takes longer than many
+    queries.
+    """
+    for one in parameters:
+        if hasattr(one, "type_descriptor") and "process_value" not in vars(one):
+            one.process_value = partial(_taken, one, one.process_value)
+
+
+def _taken(parameter: Any, ask: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
+    found = _plain(parameter, value)
+    if found is _NOT_PLAIN:
+        return ask(context, value)
+    return found if parameter.callback is None else parameter.callback(context, parameter, found)
+
+
+_NOT_PLAIN: Final = object()
+"""Neither a default nor a plain text: the value needs validation."""
+
+
+def _plain(parameter: Any, value: Any) -> Any:
+    """Return the value of a parameter, or :data:`_NOT_PLAIN` if it needs validation."""
+    about, several = parameter.type_descriptor, parameter.multiple or parameter.nargs == -1
+    kind = about.annotation
+    if value is None:
+        return _NOT_PLAIN if parameter.required else () if several else None
+    if several:
+        kinds = get_args(kind)
+        found = [_plain_text(kinds[0], one) for one in value] if len(kinds) == 1 else [_NOT_PLAIN]
+        return _NOT_PLAIN if _NOT_PLAIN in found else found
+    if about.is_choice:
+        return next((one for one in about.choices if one == value), _NOT_PLAIN)
+    same = value == parameter.default and isinstance(kind, type) and isinstance(value, kind)
+    return value if same else _plain_text(kind, value)
+
+
+def _plain_text(kind: Any, value: Any) -> Any:
+    fits = kind in {str, Path} and isinstance(value, str) and value.isprintable()
+    return kind(value) if fits else _NOT_PLAIN
+
+
+def _says_one_thing(parameter: Any) -> bool:
+    """True if an option takes one value, so that a second value would replace it."""
+    if parameter.param_type_name != "option" or parameter.multiple or parameter.count:
+        return False
+    return not parameter.is_flag or bool(parameter.secondary_opts)  # a repeated flag has no effect
+
+
+class Verbs(typer.Typer):
+    """Application, or a part of one, whose commands are :class:`Verb` objects.
+
+    Verbs are registered first and built later, because the options of all take longer than many
+    queries.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(cls=Application, **options)
+        self._verbs: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {}
+        self._built: set[str] = set()
+
+    def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
+        """Return a decorator that makes a function a verb; see :meth:`typer.Typer.command`.
+
+        A parameter with a dataclass type represents the options of its fields.
+        """
+
+        def noted(function: Callable[..., Any]) -> Callable[..., Any]:
+            self._verbs[name or function.__name__] = options, function
+            return function
+
+        return noted
+
+    def build(self, only: Collection[str] = (), *, options: bool = True) -> None:
+        """Build the verbs of these names (default all), with or without their options."""
+        built = [one for one in self.registered_commands if one.name in self._built]
+        self.registered_commands = built
+        for name, (about, function) in self._verbs.items():
+            if name in self._built or (only and name not in only):
+                continue
+            verb = _unbundled(function) if options else _without_options(function)
+            super().command(name, cls=Verb, **about)(verb)
+            self._built |= {name} if options else set()
+
+
+def _without_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    def verb() -> None: ...
+
+    verb.__module__, verb.__doc__ = function.__module__, function.__doc__
+    return verb
+
+
+def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Convert a function with dataclass parameters to one with their fields as parameters."""
+    hints = get_type_hints(function, include_extras=True)
+    bundles: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+    parameters: list[inspect.Parameter] = []
+    for one in inspect.signature(function).parameters.values():
+        bundle = bundles.get(one.name)
+        if bundle is None:
+            parameters.append(one.replace(annotation=hints[one.name], kind=one.KEYWORD_ONLY))
+            continue
+        own = get_type_hints(bundle, include_extras=True)
+        for field in fields(bundle):
+            option = inspect.Parameter(field.name, one.KEYWORD_ONLY, default=field.default)
+            parameters.append(option.replace(annotation=own[field.name]))
+
+    parameters += (
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=about)
+        for name, about in _TALK.items()
+    )
+
+    @wraps(function)
+    def verb(**values: Any) -> Any:
+        talk(**{name: values.pop(name) for name in _TALK})
+        for name, bundle in bundles.items():
+            values[name] = bundle(**{one.name: values.pop(one.name) for one in fields(bundle)})
+        return function(**values)
+
+    verb.__annotations__ = {one.name: one.annotation for one in parameters}
+    vars(verb)["__signature__"] = inspect.Signature(parameters)
+    return verb
+
+
+# The application, the arguments that verbs share, and how their texts become values -------------
+
+app = Verbs(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
+"""Exit codes; 0 means success."""
+
+IN_TABLE: Final = 40
+"""Default number of report rows on a terminal."""
+
+COLLECTION_FILE: Final = "COLLECTION.json"
+"""The file that marks a folder as a collection."""
+
+StorePath = Annotated[
+    Path,
+    Argument(
+        metavar="STORE",
+        envvar=STORE,
+        help="The store: one DuckDB file.",
+        autocompletion=completion.stores,
+    ),
+]
+AskedPath = Annotated[
+    Path,
+    Argument(
+        metavar="STORE",
+        envvar=STORE,
+        help="The store: one DuckDB file; or a collection of them.",
+        autocompletion=completion.stores,
+    ),
+]
+FrameName = Annotated[
+    str,
+    Argument(
+        metavar="FRAME",
+        help="A frame_id, TRACE#SEQ, or TRACE@12.3s.",
+        autocompletion=completion.frames,
+    ),
+]
+Parameters = Annotated[
+    list[str] | None,
+    Option(
+        "--param",
+        metavar="NAME=VALUE",
+        help="Value of $NAME in the query, a list as [1, 2]; repeatable.",
+    ),
+]
+With = Annotated[
+    list[str] | None,
+    Option(
+        "--with",
+        metavar="[NAME=]FILE",
+        help="Join a table of your own (Parquet, CSV, JSON): by frame_id, or by trace and seq, time_ns"
+        " or t; repeatable.",
+    ),
+]
+QueryText = Annotated[str | None, Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")]
+QueryFile = Annotated[
+    Path | None, Option("--file", "-f", help="Read the query from a file; - is stdin.")
+]
+
+
+def pattern_option(about: str) -> Any:
+    """Return the option ``-p NAME`` for a pattern of the library."""
+    names = ("--pattern", "-p")
+    return Option(*names, metavar="NAME", help=about, autocompletion=completion.patterns)
+
+
+PatternNames = Annotated[list[str] | None, pattern_option("One of the library; repeatable.")]
+Budget = Annotated[str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")]
+CaseUnit = Annotated[
+    Literal["frame", "clip", "trace"], Option("--unit", help="Frames, clips, or whole traces.")
+]
+LongestClip = Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")]
+Abstraction = Annotated[
+    str,
+    Option(
+        "--abstraction",
+        metavar="NAME",
+        help="Abstraction: E, EL, ER, RSV, …",
+        autocompletion=completion.abstractions,
+    ),
+]
+Picture = Annotated[
+    Path | None, Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
+]
+Traces = Annotated[
+    list[str] | None,
+    Option("--trace", help="Only this trace; repeatable.", autocompletion=completion.traces),
+]
+LookIn = Annotated[
+    list[Path] | None,
+    Option(
+        "--look-in",
+        metavar="FOLDER",
+        help="Folder to look in for recordings that were moved; repeatable.",
+    ),
+]
+Jobs = Annotated[
+    int, Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core.")
+]
+ROWS: Final = "Rows"
+LIMITS: Final = "Limits"
+MESSAGES: Final = "Messages"
+Quiet = Annotated[
+    bool,
+    Option("--quiet", help="Only results and errors, no remarks.", rich_help_panel=MESSAGES),
+]
+Verbose = Annotated[
+    bool,
+    Option("--verbose", help="Also what is done, and when, on stderr.", rich_help_panel=MESSAGES),
+]
+_TALK: Final = {"quiet": Quiet, "verbose": Verbose}
+"""Options of every verb."""
+AsJson = Annotated[bool, Option("--json", help="Short for --format json.", rich_help_panel=ROWS)]
+Output = Annotated[
+    Path | None,
+    Option("--output", "-o", help="Write to this file instead of stdout.", rich_help_panel=ROWS),
+]
+
+
+@dataclass(frozen=True)
+class PrintedRows:
+    """Options for the format of rows, and the writer of rows."""
+
+    form: Annotated[
+        Format, Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
+    ] = Format.table
+    as_json: AsJson = False
+
+    def __post_init__(self) -> None:
+        _ = self.chosen  # reject inconsistent options early
+
+    @property
+    def file(self) -> Path | None:
+        """Return the output file of the rows; ``None`` means stdout."""
+        return getattr(self, "output", None)
+
+    @property
+    def chosen(self) -> Format:
+        """Return the format that results from the options."""
+        return form_of(self.form, self.file, as_json=self.as_json)
+
+    @property
+    def for_people(self) -> bool:
+        """True if the rows are a table."""
+        return self.chosen is Format.table
+
+    def write(
+        self,
+        columns: Sequence[str],
+        rows: Iterable[Sequence[Any]],
+        types: Sequence[str] | None = None,
+        totals: Mapping[str, str] | None = None,
+    ) -> int:
+        """Write rows, and return their number; see :func:`sgstore.apps.cli._output.write_rows`.
+
+        A long table on a terminal ends with the number of rows, and sums of the columns in
+        ``totals`` (column → unit).
+        """
+        if not on_terminal(self):
+            return write_rows(columns, rows, self.chosen, self.file, types)
+        sums = dict.fromkeys(totals or (), 0)
+        places = [(name, columns.index(name)) for name in sums]
+
+        def counted() -> Iterator[Sequence[Any]]:
+            for row in rows:
+                for name, place in places:
+                    sums[name] += row[place] or 0
+                yield row
+
+        number = write_rows(columns, counted(), self.chosen, self.file, types)
+        if number >= LONG_TABLE:
+            said = [f"{round(sums[name], 3):,} {unit}" for name, unit in (totals or {}).items()]
+            say(", ".join([f"{number:,} rows", *said]))
+        return number
+
+    def report(self, table: ReportTable, limit: int | None = 0) -> None:
+        """Write a table and its notes; ``limit`` 0 means all rows, ``None`` some rows on a terminal."""
+        if limit is None:
+            limit = IN_TABLE if self.for_people and self.file is None else 0
+        rows = table.rows[:limit] if limit else table.rows
+        self.write(table.columns, rows)
+        if len(rows) < len(table.rows):
+            say(f"{len(table.rows) - len(rows)} more rows; --limit 0 shows all")
+        for text in table.said:
+            say(text)
+
+
+def on_terminal(out: PrintedRows) -> bool:
+    """True if rows are shown on a terminal."""
+    return out.for_people and out.file is None and sys.stdout.isatty()
+
+
+@dataclass(frozen=True)
+class RowOptions(PrintedRows):
+    """Options for the format of rows and their file."""
+
+    output: Output = None
+
+
+@dataclass(frozen=True)
+class QueryLimits:
+    """Limits for the time and disk space of a query."""
+
+    timeout: Annotated[
+        str | None,
+        Option(
+            "--timeout",
+            metavar="TIME",
+            help="Stop after this time, such as 30s.",
+            rich_help_panel=LIMITS,
+        ),
+    ] = None
+    max_spill: Annotated[
+        str | None,
+        Option(
+            "--max-spill",
+            metavar="SIZE",
+            help="Most disk space for what does not fit into memory: 500MB, 50GB.",
+            show_default="10GB",
+            rich_help_panel=LIMITS,
+        ),
+    ] = None
+
+    def spill(self) -> int:
+        """Set the time limit; return the disk limit.
+
+        Returns
+        -------
+        int
+            Greatest disk space of a query, in bytes; 0 means the store's default.
+        """
+        spill = 0 if self.max_spill is None else bytes_of(self.max_spill, "--max-spill")
+        if self.timeout is not None:
+            set_deadline(seconds_of(self.timeout, "--timeout"))
+        return spill
+
+    def opened(self, store: Path, tables: Mapping[str, Path] | None = None) -> Store:
+        """Open a store with these limits and user tables.
+
+        Rows without a matching frame are reported.
+        """
+        from sgstore.query import Store
+
+        opened = Store(store, tables=tables, max_spill=self.spill())
+        for name, joined in opened.file.joined().items():
+            if joined.matched < joined.rows:
+                lost = joined.rows - joined.matched
+                say(f"{name}: {lost} of {joined.rows} rows belong to no frame of the store")
+        return opened
+
+
+@dataclass(frozen=True)
+class AskOptions(QueryLimits, RowOptions):
+    """Options of a verb with queries: format of the rows, their file, and limits."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """A query: a text, a file, or a pattern of the library; with parameter values."""
+
+    query: QueryText = None
+    file: QueryFile = None
+    name: Annotated[
+        str | None, pattern_option("A pattern of the library, in place of a query.")
+    ] = None
+    parameters: Parameters = None
+
+    def __bool__(self) -> bool:
+        """True if a query is given."""
+        return bool(self.query or self.file or self.name)
+
+    def asked(self) -> tuple[str, Mapping[str, Any]]:
+        """Return the text of the query, and the values for its remaining parameters."""
+        return asked_of(self.query, self.file, self.name, parameters_of(self.parameters))
+
+
+@dataclass(frozen=True)
+class Statements:
+    """Statements of the library and of the command line, combined with those of files."""
+
+    names: PatternNames = None
+    texts: Annotated[
+        list[str] | None,
+        Option("--expression", "-e", metavar="TEXT", help="'CHECK ALWAYS …'; repeatable."),
+    ] = None
+    parameters: Parameters = None
+    sgsm_compat: Annotated[
+        bool,
+        Option(
+            "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
+        ),
+    ] = False
+
+    def asked(self, files: Sequence[Path] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
+        """Return texts of files, library and command line; and the values for their remaining parameters.
+
+        Returns
+        -------
+        asked : dict
+            Name of a pattern → texts: its name in the library, else ``pattern``.
+        values : dict
+            Library patterns take the values of their own parameters; all others belong to the
+            texts.
+        """
+        from sgstore.lang.library import pattern_named
+
+        values, texts = parameters_of(self.parameters), self.texts or []
+        if not (files or self.names or texts):
+            raise typer.BadParameter("give a FILE, -p NAME or -e TEXT; several are asked together")
+        found = {one.name: one for one in map(pattern_named, self.names or ())}
+        taken = {name for one in found.values() for name in one.parameters}
+        rest = {name: value for name, value in values.items() if name not in taken}
+        if rest and not (files or texts):
+            found[next(iter(found))].written(**rest)  # raises an error with the known parameters
+        asked = {"pattern": [*map(text_of, files or ()), *texts]} if files or texts else {}
+        for name, one in found.items():
+            own = {key: value for key, value in values.items() if key in one.parameters}
+            asked[name] = [one.written(**own)]
+        return asked, rest
+
+
+@dataclass(frozen=True)
+class GraphOptions:
+    """Options for the settings of the scene graphs."""
+
+    config: Annotated[
+        Path | None, Option("--config", help="TOML file with settings of the scene graphs.")
+    ] = None
+    preset: Annotated[
+        str | None,
+        Option(
+            "--preset",
+            metavar="NAME",
+            help="Settings with a name: see config --list.",
+            autocompletion=completion.presets,
+        ),
+    ] = None
+
+    def settings(self) -> Config | None:
+        """Return the settings of ``--config`` or ``--preset``, or ``None``."""
+        from sgstore.model.config import load
+        from sgstore.model.config import preset as preset_named
+
+        if self.config and self.preset:
+            raise typer.BadParameter("give --config or --preset; a file may name a preset itself")
+        if self.preset:
+            return preset_named(self.preset)
+        return load(self.config) if self.config else None
+
+
+@dataclass(frozen=True)
+class ReadingOptions(GraphOptions):
+    """Options for reading a recording: its road map, and the settings of the scene graphs."""
+
+    road_map: Annotated[
+        Path | None,
+        Option(
+            "--map",
+            help="OpenDRIVE or Lanelet2 file, or folder of them, for recordings without a map of their own.",
+        ),
+    ] = None
+
+
+@app.callback(invoke_without_command=True)
+def sgstore(
+    context: typer.Context,
+    version: Annotated[bool, Option("--version", help="Print the version.")] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Find the driving scenes that matter.
+
+    Recordings go in (ingest), frames are found by what happens in them (find, sql), looked at (show), and
+    exported as clips (export). SGSTORE_STORE names the store of verbs that are given none.
+    """
+    talk(quiet=quiet, verbose=verbose)
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"sgstore {version_of('sgstore')}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+_ENDINGS: Final = {
+    ".csv": Format.csv,
+    ".json": Format.json,
+    ".ndjson": Format.ndjson,
+    ".jsonl": Format.ndjson,
+    ".parquet": Format.parquet,
+    ".arrow": Format.arrow,
+    ".feather": Format.arrow,
+    ".txt": Format.table,
+    "": Format.table,
+}
+
+
+def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Format:
+    """Return the format by ``--format`` and ``--json``, or by the file name."""
+    if as_json and form not in {Format.table, Format.json}:
+        raise typer.BadParameter(f"give one of --json and --format {form}")
+    if as_json or form is not Format.table or output is None:
+        return Format.json if as_json else form
+    found = _ENDINGS.get(output.suffix.lower())
+    if found is None:
+        known = ", ".join(filter(None, _ENDINGS))
+        raise typer.BadParameter(
+            f"--output {output}: nothing is written as '{output.suffix}'; expected one of {known}"
+        )
+    return found
+
+
+def tables_of(given: list[str] | None) -> dict[str, Path]:
+    """Parse ``--with`` into files by table name: ``NAME=FILE``, or the name of the file."""
+    tables: dict[str, Path] = {}
+    for text in given or []:
+        name, equals, path = text.partition("=")
+        file = Path(path if equals else text)
+        name = name if equals else re.sub(r"\W", "_", file.stem)
+        if not name.isidentifier():
+            raise typer.BadParameter(f"--with {text!r}: expected NAME=FILE, such as labels={file}")
+        if name in tables:
+            raise typer.BadParameter(f"--with: two tables are called {name!r}; write NAME=FILE")
+        tables[name] = file
+    return tables
+
+
+def query_of(text: str | None, file: Path | None) -> str:
+    """Return the query of an argument or of a file."""
+    if (text is None) == (file is None):
+        raise typer.BadParameter("give a query as an argument, or a file with -f FILE")
+    return text if text is not None else text_of(file or Path("-"))
+
+
+def asked_of(
+    text: str | None, file: Path | None, name: str | None, values: Mapping[str, Any]
+) -> tuple[str, Mapping[str, Any]]:
+    """Return a query (text, file, or library name), and the values for its remaining parameters."""
+    if sum(source is not None for source in (text, file, name)) != 1:
+        raise typer.BadParameter("give one of: a query as a text, a file with it, -p NAME")
+    if name is None:
+        return query_of(text, file), values
+    from sgstore.lang.library import pattern_named
+
+    return pattern_named(name).written(**values), {}
+
+
+def text_of(file: Path) -> str:
+    """Return the text in a file; ``-`` is stdin."""
+    try:
+        return sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        written = re.match(r"\s*(MATCH|CHECK|DEFINE|USING)\b", str(file))
+        hint = "; this is a query, and no file of that name" if written else ""
+        raise ConfigError(f"{file}: {getattr(error, 'strerror', None) or error}{hint}") from error
+
+
+def lines_of(file: Path) -> list[str]:
+    """Return the non-empty lines of a file."""
+    return [line.strip() for line in text_of(file).splitlines() if line.strip()]
+
+
+def parameters_of(pairs: list[str] | None) -> dict[str, Any]:
+    """Parse ``NAME=VALUE``: numbers, ``true`` and ``false``, JSON lists, else texts."""
+    values: dict[str, Any] = {}
+    for pair in pairs or []:
+        name, equals, value = pair.partition("=")
+        if not equals or not name.isidentifier():
+            raise typer.BadParameter(f"--param {pair!r}: expected NAME=VALUE")
+        if name in values:
+            raise typer.BadParameter(f"--param {pair!r}: {name} has a value already")
+        values[name] = _listed(pair, value) if value.startswith("[") else _parameter(value)
+    return values
+
+
+def _listed(pair: str, value: str) -> Any:
+    import json  # rarely needed
+
+    try:
+        return json.loads(value)
+    except (ValueError, RecursionError):
+        hint = """expected a list as in JSON: '["car", "bus"]'"""
+        raise typer.BadParameter(f"--param {pair!r}: {hint}") from None
+
+
+def _parameter(value: str) -> Any:
+    if value.lower() in {"true", "false"}:
+        return value.lower() == "true"
+    for number in (int, float):
+        try:
+            return number(value)
+        except ValueError:
+            continue
+    return value
+
+
+_TIME: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min)?")
+_UNIT: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, None: 1.0}
+
+
+def jobs_of(number: int) -> int:
+    """Return the number of processes for ``--jobs``; 0 means one per core."""
+    return number or os.cpu_count() or 1
+
+
+def seconds_of(text: str, option: str) -> float:
+    """Parse a time such as ``2s`` to seconds."""
+    match = _TIME.fullmatch(text.strip())
+    if match is None:
+        raise typer.BadParameter(f"{option} {text!r}: expected a time such as 2s, 500ms or 1min")
+    return float(match[1]) * _UNIT[match[2]]
+
+
+_SIZE: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([kMGT]?)B", re.IGNORECASE)
+
+
+def bytes_of(text: str, option: str) -> int:
+    """Parse a size such as ``20GB`` to bytes."""
+    match = _SIZE.fullmatch(text.strip())
+    size = round(float(match[1]) * 1000 ** "_kmgt".find(match[2].lower() or "_")) if match else 0
+    if match is None or not 1000 <= size < 1 << 62:
+        raise typer.BadParameter(f"{option} {text!r}: expected a size such as 500MB or 20GB")
+    return size
+
+
+def say_left_out(
+    matches: Matches | Answer | ChosenFrames | UserStatement | PartedMatches | PartedRows,
+) -> None:
+    """Report the traces that cannot answer a query, with reasons, and likely mistakes in it."""
+    of: dict[str, list[str]] = {}
+    for name, reason in matches.reasons.items():
+        of.setdefault(reason, []).append(name)
+    for reason, names in of.items():
+        say(f"left out, because they cannot answer this query ({reason}): {', '.join(names)}")
+    say_notes(getattr(matches, "notes", ()))
+
+
+def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
+    """Report in one line what settings omitted; as JSON if the results are JSON."""
+    from sgstore.store import scope_text
+
+    if not found:
+        return
+    if chosen in {Format.json, Format.ndjson}:
+        say_json({"scope": found})
+    else:
+        say(scope_text(found))
+
+
+def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
+    """Report unknown values by name, trace and reason; entries without a reason are skipped."""
+    from sgstore.temporal import unknown_notes
+
+    for note in unknown_notes((f"{name} is unknown", trace, why) for name, trace, why in told):
+        say(note)
+
+
+def say_notes(notes: Iterable[str]) -> None:
+    """Report likely mistakes in a query."""
+    for note in notes:
+        say(f"note: {note}")

@@ -1,0 +1,258 @@
+"""The verbs criticality and prioritize: recorded measures, and orders of test cases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+from typer import Option
+
+from sgstore.apps.cli._coverage import PANEL, NoPayloads, chosen_frames, say_made
+from sgstore.apps.cli._options import (
+    Budget,
+    CaseUnit,
+    LongestClip,
+    Parameters,
+    PrintedRows,
+    QueryLimits,
+    QueryText,
+    RowOptions,
+    StorePath,
+    app,
+    parameters_of,
+    say_scope,
+    seconds_of,
+)
+from sgstore.apps.cli._output import count_bar, say
+
+if TYPE_CHECKING:
+    from sgstore.testsets.selection import Prioritized, PrioritySpec
+
+
+@app.command(rich_help_panel=PANEL)
+def criticality(
+    store: StorePath,
+    measures: Annotated[
+        list[str] | None,
+        Option("--measure", "-m", metavar="NAME", help="Such as pet; by default all; repeatable."),
+    ] = None,
+    most: Annotated[
+        float | None,
+        Option(
+            "--most", metavar="X", help="Only pairs whose first measure is known, and at most X."
+        ),
+    ] = None,
+    *,
+    out: RowOptions,
+    bounds: QueryLimits,
+) -> None:
+    """List measures of what was recorded: PET, TET, CPI, the closest encounter.
+
+    A row is the ego of a trace and one of those that it could meet: the view
+    encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.
+    """
+    from sgstore.model.criticality import RECORDED, recorded
+    from sgstore.testsets.coverage import ChosenFrames, ReportTable
+
+    opened = bounds.opened(store)
+    found = recorded(opened, tuple(measures or RECORDED))
+    say_scope(ChosenFrames(str(store), opened).scope(world=True), out.chosen)
+    rows = found.values
+    if most is not None:
+        first = found.columns.index("kind") + 1
+        rows = [row for row in rows if row[first] is not None and row[first] <= most]
+    out.report(ReportTable(found.columns, rows))
+
+
+@dataclass(frozen=True)
+class OrderOptions:
+    """Options for an order of cases: the rule, and the unit of a case."""
+
+    by: Annotated[
+        Literal["risk", "diverse", "both", "learned"],
+        Option(
+            "--by",
+            help="The most critical first, one of each class first, both, or the likeliest to fail.",
+        ),
+    ] = "risk"
+    measures: Annotated[
+        list[str] | None,
+        Option(
+            "--measure",
+            "-m",
+            metavar="NAME",
+            help="Rank by this measure of criticality, or by an expression, least first; may be repeated.",
+            show_default="closing_time, ttc_mild",
+        ),
+    ] = None
+    budget: Budget = ""
+    unit: CaseUnit = "frame"
+    clip: LongestClip = "2s"
+    abstraction: Annotated[
+        str,
+        Option(
+            "--abstraction",
+            metavar="NAME",
+            help="Classes that are told apart: situations of the ego, or those of an abstraction.",
+        ),
+    ] = "situation"
+    seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
+
+    def spec(self) -> PrioritySpec:
+        """Return the specification of these options."""
+        from sgstore.testsets.selection import (
+            MEASURES,
+            Budget,
+            Priority,
+            PrioritySpec,
+            SelectionUnit,
+        )
+
+        return PrioritySpec(
+            Priority(self.by),
+            tuple(self.measures or MEASURES),
+            SelectionUnit(self.unit),
+            seconds_of(self.clip, "--clip"),
+            None,
+            self.abstraction,
+            Budget.parse(self.budget) if self.budget else None,
+            self.seed,
+        )
+
+
+@dataclass(frozen=True)
+class OutcomeOptions:
+    """Options for known outcomes: for learning, and for rating an order."""
+
+    outcomes: Annotated[
+        Path | None,
+        Option(
+            "--outcomes",
+            metavar="CSV",
+            help="Known outcomes: tell how soon failures come; and learn from them.",
+        ),
+    ] = None
+    learn_outcomes: Annotated[
+        Path | None,
+        Option(
+            "--learn-outcomes",
+            metavar="CSV",
+            help="Outcomes to learn from; by default those of --outcomes.",
+        ),
+    ] = None
+    learn_from: Annotated[
+        Path | None,
+        Option(
+            "--learn-from",
+            metavar="STORE",
+            help="Store of the runs of --learn-outcomes; by default STORE.",
+        ),
+    ] = None
+    picture: Annotated[
+        Path | None,
+        Option("--picture", metavar="FILE", help="Draw the failures found: .png or .svg."),
+    ] = None
+
+    def check(self, by: str) -> None:
+        """Reject options without their required partner.
+
+        Raises
+        ------
+        typer.BadParameter
+        """
+        if by != "learned" and (self.learn_outcomes or self.learn_from):
+            raise typer.BadParameter("--learn-outcomes and --learn-from belong to --by learned")
+        if self.learn_from is not None and self.learn_outcomes is None:
+            raise typer.BadParameter("--learn-from needs --learn-outcomes: those of its runs")
+        if by == "learned" and self.outcomes is None and self.learn_outcomes is None:
+            raise typer.BadParameter("--by learned needs --outcomes or --learn-outcomes")
+        if self.picture is not None and self.outcomes is None:
+            raise typer.BadParameter(
+                "--picture needs --outcomes: it draws how soon failures are found"
+            )
+
+
+@app.command(rich_help_panel=PANEL)
+def prioritize(
+    store: StorePath,
+    order: OrderOptions,
+    given: OutcomeOptions,
+    query: QueryText = None,
+    parameters: Parameters = None,
+    output: Annotated[
+        Path | None, Option("--output", "-o", metavar="FILE", help="Write a lock.")
+    ] = None,
+    no_payloads: NoPayloads = False,
+    *,
+    out: PrintedRows,
+    bounds: QueryLimits,
+) -> None:
+    """Order frames, clips or traces so that failures are found soon, with reasons.
+
+    The risk of a case is the sum of its ranks by measures of criticality of the
+    ego and others that move. With --by learned it is the probability that it
+    fails, as the outcomes of other cases teach.
+    """
+    from sgstore.testsets.coverage import ChosenFrames, read_outcomes
+    from sgstore.testsets.locks import ENDING
+    from sgstore.testsets.selection import locked_order
+    from sgstore.testsets.selection import prioritize as put_in_order
+
+    spec = order.spec()
+    if output is not None and output.suffix != ENDING:  # before the search starts
+        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
+    given.check(order.by)
+    known = None if given.outcomes is None else read_outcomes(given.outcomes)
+    lessons = known if given.learn_outcomes is None else read_outcomes(given.learn_outcomes)
+    others = None
+    if given.learn_from is not None:
+        others = ChosenFrames(str(given.learn_from), bounds.opened(given.learn_from))
+    chosen = chosen_frames(bounds.opened(store), str(store), query, parameters)
+    say_scope(chosen.scope(world=True), out.chosen)
+    found = put_in_order(chosen, spec, lessons, others)
+    for text in found.said:
+        say(text)
+    if known is not None:
+        _fault_detection(found, known, given.picture)
+    rows = found.rows()  # the store is read before the lock is made
+    if output is not None:
+        values = parameters_of(parameters)
+        with count_bar(output.name, "cases") as progress:
+            made = locked_order(
+                found,
+                query or "",
+                parameters=values,
+                payloads=not no_payloads,
+                progress=progress,
+            )
+        say_made(made, output)
+    # Last, so that the lock exists even if the reader stops after the first rows.
+    out.write(found.columns, rows, found.types)
+
+
+def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:
+    """Report, and draw, how soon the order finds failures."""
+    from sgstore.testsets.selection import failed_in_order, failure_curve, fault_detection
+
+    failed = failed_in_order(order, known)
+    if not failed.any():
+        say(f"none of the {len(failed):,} cases with a known outcome failed")
+        return
+    told = fault_detection(failed, order.spec.seed)
+    say(told.said)
+    if picture is None:
+        return
+    from sgstore.draw import draw_curve
+
+    draw_curve(
+        failure_curve(failed),
+        told.failures,
+        picture,
+        unit="case",
+        title=f"Failures found by an order ({order.spec.by})",
+        below=f"APFD {told.apfd:.3f} ({told.low:.3f} to {told.high:.3f})",
+        words=("failures found", "in order"),
+    )
+    say(f"drawn: {picture}")

@@ -1,0 +1,601 @@
+"""Verbs that find: find, why-not, like, translate, sql, patterns."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import typer
+from typer import Argument, Option
+
+from sgstore.apps.cli import _completion as completion
+from sgstore.apps.cli._options import (
+    NO_MATCH,
+    Abstraction,
+    AsJson,
+    AskedPath,
+    AskOptions,
+    FrameName,
+    Output,
+    QueryFile,
+    QueryLimits,
+    Question,
+    RowOptions,
+    Statements,
+    StorePath,
+    Verbs,
+    With,
+    app,
+    on_terminal,
+    parameters_of,
+    query_of,
+    say_left_out,
+    say_scope,
+    seconds_of,
+    tables_of,
+    text_of,
+)
+from sgstore.apps.cli._output import (
+    BINARY,
+    Format,
+    number_of,
+    say,
+    write_binary,
+    write_document,
+    write_text,
+)
+from sgstore.apps.cli._places import COLLECTIONS, CollectionOptions, url_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from sgstore.apps.sandbox import Answer, Sandbox
+    from sgstore.collection import Collection, PartedMatches
+    from sgstore.lang.library import NamedPattern
+    from sgstore.matches import Interval, Matches
+
+PANEL: Final = "Questions"
+
+
+Safe = Annotated[
+    bool,
+    Option("--safe", help="Run in a separate process with bounded time (5s), memory and rows."),
+]
+MaxRows = Annotated[int, Option("--max-rows", min=0, help="With --safe: maximum number of rows.")]
+
+
+@app.command(rich_help_panel=PANEL)
+def find(
+    store: AskedPath,
+    question: Question,
+    count: Annotated[
+        bool, Option("--count", help="Print the number of distinct frames and nothing else.")
+    ] = False,
+    explain: Annotated[
+        bool, Option("--explain", help="Print the stages of the query, and its SQL.")
+    ] = False,
+    require: Annotated[
+        bool, Option("--require", help="End with exit code 4 if nothing matches.")
+    ] = False,
+    safe: Safe = False,
+    max_rows: MaxRows = 10_000,
+    tables: With = None,
+    each_frame: Annotated[
+        bool, Option("--rows", help="On a terminal too, one row for each match in each frame.")
+    ] = False,
+    *,
+    whole: CollectionOptions,
+    ask: AskOptions,
+) -> int:
+    """Find frames by a pattern of their scene graphs.
+
+    One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
+    Without RETURN, a terminal shows stretches of frames in which a match lasts.
+    """
+    text, values = question.asked()
+    if (url := url_of(store)) is not None:
+        with whole.collection_at(url, ask, tables, safe=safe) as opened:
+            return _found_in(
+                opened, text, values, ask, count=count, explain=explain, require=require
+            )
+    if safe:
+        if count or explain:
+            raise typer.BadParameter("--safe gives rows: not with --count or --explain")
+        with _sandbox(store, ask, max_rows, tables) as box:
+            answer = box.find(text, **values)
+        _say_all(answer)
+        number = ask.write(*_as_shown(answer, answer.rows, ask.chosen))
+        return _ended(number, ask, require=require)
+    opened = ask.opened(store, tables_of(tables))
+    with opened.file.snapshot():  # open the store once
+        matches = opened.find(text, **values)
+        if explain:
+            typer.echo(matches.explain())
+            return 0
+        say_left_out(matches)
+        if count:
+            number = matches.count()
+            typer.echo(number)
+            return NO_MATCH if require and not number else 0
+        say_scope(getattr(matches, "scope", {}), ask.chosen)
+        if ask.chosen in BINARY and not matches.graphs:
+            number = write_binary(matches.parquet, ask.chosen, ask.output)
+        elif not each_frame and on_terminal(ask) and _returns_nothing(text):
+            number = _write_stretches(matches.intervals(), ask)
+        else:
+            number = ask.write(*_as_shown(matches, matches, ask.chosen))
+    return _ended(number, ask, require=require)
+
+
+def _returns_nothing(text: str) -> bool:
+    """True if a query has no ``RETURN``: one row per match and frame."""
+    from sgstore.lang import each_match, parse
+    from sgstore.lang.syntax import MatchClause
+
+    asked = each_match(parse(text))
+    return all(one.returns is None for one in asked if isinstance(one, MatchClause))
+
+
+def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
+    """Print intervals, then their totals."""
+    traces: set[str] = set()
+    frames, seconds = 0, 0.0
+
+    def counted() -> Iterator[Interval]:
+        nonlocal frames, seconds
+        for one in intervals:
+            traces.add(one.trace)
+            frames, seconds = frames + one.frames, seconds + one.end - one.start
+            yield one
+
+    number = _write_intervals(counted(), ask)
+    if number:
+        parts = (
+            number_of(number, "stretch", "es"),
+            number_of(frames, "frame"),
+            f"{seconds:,.1f} s",
+        )
+        say(f"{', '.join(parts)} in {number_of(len(traces), 'trace')}; --rows shows each frame")
+    return number
+
+
+def _found_in(
+    whole: Collection,
+    text: str,
+    values: Mapping[str, Any],
+    ask: AskOptions,
+    *,
+    count: bool,
+    explain: bool,
+    require: bool,
+) -> int:
+    """Print the results of a collection for a query; return the exit code."""
+    matches = whole.find(text, **values)
+    if explain:
+        typer.echo(matches.explain())
+        return 0
+    if count:
+        number = matches.count()
+        typer.echo(number)
+    else:
+        say_scope(matches.scope, ask.chosen)
+        number = ask.write(*_as_shown(matches, matches, ask.chosen))
+    say_left_out(matches)
+    if count:
+        return NO_MATCH if require and not number else 0
+    return _ended(number, ask, require=require)
+
+
+def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
+    """Report missing rows on a terminal; return the exit code."""
+    if not number and ask.for_people:
+        say("nothing matches")
+    return NO_MATCH if require and not number else 0
+
+
+def _as_shown(
+    answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Return columns and rows for a format: readable names in tables; graphs for networkx in JSON."""
+    from sgstore.lang import for_people
+
+    if form is Format.table:
+        return for_people(answer.columns, rows, graphs=answer.graphs)
+    return _node_link(answer, rows, form) if answer.graphs else (answer.columns, rows)
+
+
+def _node_link(
+    answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Return rows with graphs at the end, in JSON as for networkx."""
+    if form not in {Format.json, Format.ndjson}:
+        return answer.columns, rows
+    columns = ("directed", "multigraph", *answer.columns)
+    return columns, (
+        (True, True, *row[:-1], [{**edge, "key": edge["relation"]} for edge in row[-1]])
+        for row in rows
+    )
+
+
+@app.command("why-not", rich_help_panel=PANEL)
+def why_not(
+    store: StorePath,
+    frame: FrameName,
+    question: Question,
+    bounds: QueryLimits,
+    as_json: AsJson = False,
+) -> int:
+    """Explain why a pattern does not match a frame: the first condition that fails, and by how much."""
+    text, values = question.asked()
+    answer = bounds.opened(store).why_not(frame, text, **values)
+    if as_json:
+        write_document(answer.as_dict(), Format.json)
+    else:
+        typer.echo(str(answer))
+    return 0
+
+
+@app.command(rich_help_panel=PANEL)
+def like(
+    store: AskedPath,
+    frame: FrameName,
+    ignore: Annotated[
+        list[str] | None,
+        Option("--ignore", metavar="NAME", help="Ignore a relation or a kind; repeatable."),
+    ] = None,
+    abstraction: Abstraction = "RSV",
+    limit: Annotated[int, Option("--limit", min=1, help="Number of runs of frames.")] = 10,
+    every: Annotated[
+        bool,
+        Option(
+            "--all", help="All runs of a trace, and frames beside this one, not the best of each."
+        ),
+    ] = False,
+    pattern: Annotated[
+        bool, Option("--pattern", help="Print a pattern that describes the frame instead.")
+    ] = False,
+    *,
+    whole: CollectionOptions,
+    out: RowOptions,
+    bounds: QueryLimits,
+) -> int:
+    """Find frames like another: of the same class, or the most like by what they have in common.
+
+    One row for each trace: its best run of consecutive frames that are as like as each other. It says how
+    many, how like, whether the graphs are the same, and what only the example has, or only they.
+    Frames less than 5 s from the example are left out; --all takes them, and every run, too.
+    """
+    opened = whole.opened_at(store, bounds)
+    if pattern:
+        write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", out.output)
+        return 0
+    found = opened.like(
+        frame, abstraction=abstraction, ignore=ignore or (), limit=limit, each_trace=not every
+    )
+    if out.for_people:
+        columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
+        rows = (
+            (
+                f"{one.frame.trace}#{one.frame.seq}",
+                round(one.frame.t, 3),
+                one.frames,
+                round(one.similarity, 3),
+                one.same,
+                _differing(one.missing),
+                _differing(one.extra),
+            )
+            for one in found
+        )
+        out.write(columns, rows)
+        return 0
+    columns = ("frame_id", "trace", "seq", "time_ns", "t", "frames", "similarity", "same")
+    columns += ("shared", "missing", "extra")
+    rows = (
+        (
+            *(getattr(one.frame, name) for name in columns[:5]),
+            *(getattr(one, name) for name in columns[5:]),
+        )
+        for one in found
+    )
+    out.write(columns, rows)
+    return 0
+
+
+_FEATURES_SHOWN: Final = 3
+"""Number of features shown per table row; further ones are counted, or complete in machine formats."""
+
+
+def _differing(features: dict[str, int]) -> str:
+    """Return the first features with counts as text, and the number of others."""
+    shown = [f"{n} x {text}" if n > 1 else text for text, n in features.items()]
+    more = shown[_FEATURES_SHOWN:]
+    return ", ".join([*shown[:_FEATURES_SHOWN], *([f"… {len(more)} more"] if more else [])])
+
+
+@app.command(rich_help_panel=PANEL)
+def translate(
+    file: Annotated[Path, Argument(metavar="FILE", help="What to translate; - is stdin.")],
+    language: Annotated[
+        Literal["sgl"], Option("--from", help="sgl: properties of SGSM, as Python.")
+    ] = "sgl",
+    output: Output = None,
+) -> int:
+    """Translate properties of other tools into the query language; nothing of the file is run."""
+    from sgstore.lang.contrib.sgsm import translated
+
+    write_text(translated(text_of(file)), output)
+    return 0
+
+
+@app.command(rich_help_panel=PANEL)
+def sql(
+    store: AskedPath,
+    statement: Annotated[
+        str | None, Argument(metavar="SQL", help="'SELECT … FROM frames, nodes, edges …'")
+    ] = None,
+    file: QueryFile = None,
+    safe: Safe = False,
+    max_rows: MaxRows = 10_000,
+    tables: With = None,
+    each: Annotated[
+        bool,
+        Option(
+            "--each",
+            help="Of a collection: run it in every bundle, with a column 'bundle'.",
+            rich_help_panel=COLLECTIONS,
+        ),
+    ] = False,
+    *,
+    whole: CollectionOptions,
+    ask: AskOptions,
+) -> int:
+    """Ask a store in SQL, read only.
+
+    Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
+    What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …').
+    """
+    if (url := url_of(store)) is not None:
+        with whole.collection_at(url, ask, tables, safe=safe) as opened:
+            rows = opened.sql(query_of(statement, file), each=each)
+            ask.write(rows.columns, rows)
+            say_left_out(rows)
+            return 0
+    if safe:
+        with _sandbox(store, ask, max_rows, tables) as box:
+            answer = box.sql(query_of(statement, file))
+        _say_all(answer)
+        ask.write(answer.columns, answer.rows)
+        return 0
+    from sgstore.query import UserStatement
+
+    opened = ask.opened(store, tables_of(tables))
+    with opened.file.snapshot():
+        asked = UserStatement(opened.find, opened.catalog().tables, query_of(statement, file))
+        say_left_out(asked)
+        if (form := ask.chosen) in BINARY:
+            write_binary(
+                lambda to: opened.file.user_parquet(asked.sql, to, given=asked.given),
+                form,
+                ask.output,
+            )
+            return 0
+        with opened.file.user_batches(asked.sql, given=asked.given) as batches:
+            rows = chain.from_iterable(batch.values for batch in batches)
+            ask.write(batches.columns, rows, batches.types)
+    return 0
+
+
+def _sandbox(store: Path, bounds: QueryLimits, max_rows: int, tables: list[str] | None) -> Sandbox:
+    from sgstore.apps.sandbox import Sandbox
+
+    if bounds.max_spill is not None:
+        raise typer.BadParameter("--max-spill: with --safe nothing is put on disk")
+    return Sandbox(
+        store,
+        timeout_s=seconds_of(bounds.timeout or "5s", "--timeout"),
+        max_rows=max_rows,
+        tables=tables_of(tables),
+    )
+
+
+def _say_all(answer: Answer) -> None:
+    """Report omissions of a result."""
+    say_left_out(answer)
+    if answer.truncated:
+        say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
+
+
+# Verbs about the library of named patterns: list, search, show, run -----------------------------
+
+library = Verbs(no_args_is_help=True)
+app.add_typer(
+    library,
+    name="patterns",
+    help="The library of named patterns: list, search, show, run them.",
+    rich_help_panel=PANEL,
+)
+
+LibraryName = Annotated[
+    str,
+    Argument(
+        metavar="NAME",
+        help="Of a pattern, such as cut_in or ParkingExit.",
+        autocompletion=completion.patterns,
+    ),
+]
+
+
+class Kind(StrEnum):
+    """Kinds of patterns."""
+
+    predicate = "predicate"
+    concept = "concept"
+    scenario = "scenario"
+    property = "property"
+
+
+PatternKinds = Annotated[list[Kind] | None, Option("--kind", help="Only of this kind; repeatable.")]
+
+
+@library.command("list")
+def list_patterns(
+    kinds: PatternKinds = None,
+    *,
+    out: RowOptions,
+) -> int:
+    """Name the patterns of the library, with what they find.
+
+    Predicates are conditions that every query may use; concepts and scenarios are found by their
+    names; properties are rules that a trace keeps or violates.
+    """
+    from sgstore.lang.library import patterns
+
+    _write_patterns([p for p in patterns().values() if not kinds or p.kind in kinds], out)
+    return 0
+
+
+def _write_patterns(found: list[NamedPattern], out: RowOptions) -> None:
+    if out.for_people:
+        columns = ("name", "kind", "from", "sentence")
+        rows = [(p.name, p.kind, p.library, p.sentence) for p in found]
+    else:
+        columns = ("name", "kind", "library", "sentence", "parameters", "source", "query")
+        rows = [(*_told(p).values(),) for p in found]
+    out.write(columns, rows)
+
+
+@library.command("search")
+def search_patterns(
+    words: Annotated[
+        list[str], Argument(metavar="WORD…", help="Such as: pedestrian crossing; in any order.")
+    ],
+    kinds: PatternKinds = None,
+    *,
+    out: RowOptions,
+) -> int:
+    """Find patterns of the library by words, the best first."""
+    from sgstore.lang.library import search
+
+    _write_patterns(search(" ".join(words), [*(kinds or ())]), out)
+    return 0
+
+
+@library.command("show")
+def show_pattern(name: LibraryName, as_json: AsJson = False, output: Output = None) -> int:
+    """Print a pattern: its text, its parameters, where it comes from, and a scene that it holds in.
+
+    What is printed is a query, its remarks being comments: it can be changed and asked with find -f.
+    """
+    from sgstore.lang.library import pattern_named
+
+    found = pattern_named(name)
+    if as_json:
+        write_document({**_told(found), "example": found.example}, Format.json)
+    else:
+        write_text(_for_people(found), output)
+    return 0
+
+
+@library.command("run")
+def run_pattern(
+    store: StorePath,
+    name: LibraryName,
+    chosen: Annotated[
+        list[str] | None,
+        Argument(metavar="NAME=VALUE", help="Parameters of the pattern, such as within=2s."),
+    ] = None,
+    clips: Annotated[
+        bool, Option("--clips", help="Print clips (trace, start_ns, end_ns) in log time.")
+    ] = False,
+    before: Annotated[
+        str, Option("--before", metavar="TIME", help="With --clips: time before each match.")
+    ] = "0s",
+    after: Annotated[
+        str, Option("--after", metavar="TIME", help="With --clips: time after each match.")
+    ] = "0s",
+    require: Annotated[
+        bool,
+        Option(
+            "--require",
+            help="End with exit code 4 if nothing matches, or if the property is violated.",
+        ),
+    ] = False,
+    *,
+    ask: AskOptions,
+) -> int:
+    """Find a pattern of the library in a store: when it holds, and who takes part.
+
+    Of a property: whether each trace keeps it, and where it does not.
+    """
+    from sgstore.lang.library import pattern_named
+
+    found = pattern_named(name)
+    if found.kind == "predicate":
+        hint = f"a condition: ask 'sgstore find STORE \"MATCH … WHERE {found.name}(…)\"'"
+        raise typer.BadParameter(f"{found.name} is {hint}")
+    if found.is_check:
+        if clips:
+            raise typer.BadParameter(f"{found.name} is a property, which has verdicts and no clips")
+        statements = Statements([found.name], parameters=chosen)
+        return _check(store, statements=statements, require=require, ask=ask)
+    text = found.written(**parameters_of(chosen))
+    matches = ask.opened(store).find(text)
+    say_left_out(matches)
+    if clips:
+        offsets = seconds_of(before, "--before"), seconds_of(after, "--after")
+        rows = ((c.trace, c.start_ns, c.end_ns) for c in matches.clips(*offsets))
+        number = ask.write(("trace", "start_ns", "end_ns"), rows)
+    else:
+        number = _write_intervals(matches.intervals(), ask)
+    return _ended(number, ask, require=require)
+
+
+def _check(store: Path, **options: Any) -> int:
+    from sgstore.apps.cli._checks import check  # only here: the verb is none of this module's
+
+    return check(store, whole=CollectionOptions(), **options)
+
+
+def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:
+    """Write intervals as rows; tables have names of the participants instead of node ids."""
+    from sgstore.matches import intervals_for_people
+
+    if ask.for_people:
+        return ask.write(*intervals_for_people(intervals))
+    first = next(intervals, None)
+    if first is None:
+        return ask.write((), [])
+    columns = ("trace", "start_seq", "end_seq", "start", "end", "frames", *first.values)
+    rows = (
+        (i.trace, i.start_seq, i.end_seq, i.start, i.end, i.frames, *i.values.values())
+        for i in chain([first], intervals)
+    )
+    return ask.write(columns, rows)
+
+
+def _told(found: NamedPattern) -> dict[str, Any]:
+    """Return a pattern as data."""
+    parameters = [
+        {"name": p.name, "type": p.type, "default": p.default, "meaning": p.meaning}
+        for p in found.parameters.values()
+    ]
+    return {
+        "name": found.name,
+        "kind": found.kind,
+        "library": found.library,
+        "sentence": found.sentence,
+        "parameters": parameters,
+        "source": found.source,
+        "query": found.query,
+    }
+
+
+def _for_people(found: NamedPattern) -> str:
+    """Return a pattern as a query with default parameters and explanatory comments."""
+    head = [f"{found.name}: {found.sentence}", f"source: {found.source}"]
+    head += [f"param {p.name} = {p.default}: {p.meaning}" for p in found.parameters.values()]
+    head += ["", *found.example.splitlines()] if found.example else []
+    comments = [f"-- {line}".rstrip() for line in head]
+    return "\n".join([*comments, found.text, ""])

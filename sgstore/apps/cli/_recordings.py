@@ -1,0 +1,501 @@
+"""Verbs about recordings: ingest, info, doctor, record, import."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import typer
+from typer import Argument, Option
+
+from sgstore.apps.cli import _completion as completion
+from sgstore.apps.cli._options import (
+    ERROR,
+    LOSS,
+    AsJson,
+    AskedPath,
+    Jobs,
+    PrintedRows,
+    ReadingOptions,
+    StorePath,
+    app,
+    jobs_of,
+    lines_of,
+    say_scope,
+    seconds_of,
+)
+from sgstore.apps.cli._output import Format, complain, quiet, say, write_document, write_report
+from sgstore.apps.cli._places import note_asked, url_of
+from sgstore.errors import StoreError, place_named
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+
+    from sgstore.pipeline.segments import TraceOutcome
+    from sgstore.store import StoreFile
+
+PANEL: Final = "Recordings"
+
+
+Recordings = Annotated[
+    list[str],
+    Argument(
+        metavar="TRACE…",
+        help="Recordings, folders of them, patterns ('drives/**/day?.mcap'); - reads a list from stdin.",
+    ),
+]
+Force = Annotated[
+    bool, Option("--force", help="Read again and replace what is in the store already.")
+]
+
+
+@app.command(rich_help_panel=PANEL)
+def ingest(
+    store: StorePath,
+    traces: Recordings,
+    reading: ReadingOptions,
+    ego: Annotated[
+        list[str] | None,
+        Option(
+            "--ego",
+            help="Id, role or name of the ego; repeatable, each makes a trace; all: every vehicle.",
+        ),
+    ] = None,
+    jobs: Jobs = 1,
+    since: Annotated[
+        str | None, Option("--since", help="Start at this time of a recording: 10s.")
+    ] = None,
+    until: Annotated[str | None, Option("--until", help="Stop at this time: 1min.")] = None,
+    rate: Annotated[
+        float | None, Option("--rate", min=0, help="Frames per second to keep; 0: all.")
+    ] = None,
+    force: Force = False,
+    dry_run: Annotated[
+        bool, Option("--dry-run", help="Report what would be done, and do nothing.")
+    ] = False,
+    shard: Annotated[
+        str | None,
+        Option(
+            "--shard",
+            metavar="I/N",
+            help="Into a collection: land share I of N of the recordings; then 'collection commit'.",
+        ),
+    ] = None,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Read recordings into a store; those that are in it already are skipped."""
+    from sgstore.apps.cli._output import ingest_bar
+    from sgstore.ingest import ingest as ingest_traces
+    from sgstore.ingest import recordings
+
+    how: dict[str, Any] = {
+        "road_map": reading.road_map,
+        "config": reading.settings(),
+        "egos": ego or (),
+        "jobs": jobs_of(jobs),
+        "since": None if since is None else seconds_of(since, "--since"),
+        "until": None if until is None else seconds_of(until, "--until"),
+        "rate": rate,
+    }
+    if shard is not None or url_of(store) is not None:
+        outcomes = _landed(store, recordings(_names(traces)), shard, how, alone=force or dry_run)
+    else:
+        with ingest_bar() as on_progress:
+            outcomes = ingest_traces(
+                store,
+                recordings(_names(traces)),
+                force=force,
+                dry_run=dry_run,
+                on_progress=on_progress,
+                **how,
+            )
+    return _told(outcomes, out)
+
+
+def _told(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
+    """Print the status of recordings; return the exit code."""
+    from sgstore.store import scope_of
+
+    for outcome in outcomes:
+        _say_what_was_odd(outcome)
+    reports = [{"scope": outcome.scope} if outcome.scope else {} for outcome in outcomes]
+    say_scope(scope_of(reports, world=None), out.chosen)
+    columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
+    rows = map(_outcome_row, outcomes)
+    totals = {"frames": "frames", "losses": "losses"}
+    out.write(*_with_scopes(columns, rows, reports, out), totals=totals)
+    if any(outcome.error for outcome in outcomes):
+        return ERROR
+    return LOSS if any(outcome.losses for outcome in outcomes) else 0
+
+
+def _with_scopes(
+    columns: tuple[str, ...],
+    rows: Iterable[tuple[Any, ...]],
+    reports: Iterable[Mapping[str, Any]],
+    out: PrintedRows,
+) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
+    """Add a column with counts of omissions by settings, for machine formats."""
+    if out.chosen not in {Format.json, Format.ndjson}:
+        return columns, rows
+    scopes = (one.get("scope") for one in reports)
+    return (*columns, "scope"), ((*row, its) for row, its in zip(rows, scopes, strict=True))
+
+
+def _landed(
+    store: Path, paths: list[Path], shard: str | None, how: dict[str, Any], *, alone: bool
+) -> list[TraceOutcome]:
+    """Land a share of recordings in a collection; ``alone``: an option for stores was given."""
+    if alone:
+        raise typer.BadParameter("--force and --dry-run are for a store, not for a collection")
+    from sgstore.collection import land
+
+    number, stroke, of = (shard or "1/1").partition("/")
+    if not (stroke and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
+        raise typer.BadParameter(f"--shard {shard}: expected I/N, such as 3/16; I is 1 to N")
+    outcomes = land(url_of(store) or store, paths, shard=(int(number), int(of)), **how)
+    if not outcomes:
+        say(f"share {shard} has none of {len(paths)} recordings")
+    return outcomes
+
+
+def _names(traces: list[str]) -> list[str]:
+    """Return the given names, with names from stdin in place of ``-``."""
+    return [name for one in traces for name in (lines_of(Path("-")) if one == "-" else [one])]
+
+
+def _say_what_was_odd(outcome: TraceOutcome) -> None:
+    if outcome.error:
+        complain(str(outcome.error))
+    for name, number in outcome.unknown_types.items():
+        say(f"{place_named(outcome.path)}: {number} entities of type {name!r}, {_no_kind(name)}")
+    for warning in outcome.warnings:
+        say(f"{place_named(outcome.path)}: {warning}")
+    for loss in outcome.losses:
+        say(f"{place_named(outcome.path)}: lost: {loss.reason}")
+
+
+def _no_kind(type_name: str) -> str:
+    """Return advice about a type name without a mapping."""
+    name = json.dumps(type_name, ensure_ascii=False)
+    return (
+        "of which nothing says what kind it is; to say it, write into a file for --config:"
+        f' [types] {name} = {{ kind = "…" }}'
+    )
+
+
+def _outcome_row(outcome: TraceOutcome) -> tuple[Any, ...]:
+    return (
+        outcome.name,
+        outcome.status,
+        outcome.ego,
+        outcome.frames,
+        sum(outcome.entities.values()),
+        round(outcome.seconds, 2),
+        len(outcome.losses),
+        place_named(outcome.path),
+    )
+
+
+@app.command(rich_help_panel=PANEL)
+def info(
+    store: AskedPath,
+    traces: Annotated[
+        list[str] | None,
+        Option(
+            "--trace",
+            help="A trace in full: a name, id, or beginning of one; repeatable.",
+            autocompletion=completion.traces,
+        ),
+    ] = None,
+    *,
+    out: PrintedRows,
+) -> int:
+    """List the traces of a store, or describe one in full; of a collection, list them."""
+    if (url := url_of(store)) is not None:
+        _tell_of_collection(url, traces or [], out)
+        return 0
+    from sgstore.store import StoreFile, scope_of
+
+    file = StoreFile(store)
+    if traces:
+        _tell_all_of(file, traces, out)
+        return 0
+    columns = ("trace", "frames", "seconds", "ego", "map", "flavour", "losses", "trace_id", "file")
+    stored = file.traces()
+    reports = [one.report for one in stored]
+    say_scope(scope_of(reports, world=None), out.chosen)
+    for one in stored:
+        jumps, gaps = one.report.get("clock_jumps", 0), one.report.get("gaps", 0)
+        if jumps or gaps:
+            say(f"{one.name}: clock jumps: {jumps}, gaps: {gaps}; info --trace lists them")
+    rows = (
+        (
+            *(one.name, one.frames, round((one.end_ns - one.start_ns) / 1e9, 3)),
+            *(one.ego, one.map, one.flavour, len(one.report["losses"])),
+            *(one.trace_id, str(one.path)),
+        )
+        for one in stored
+    )
+    totals = {"frames": "frames", "seconds": "s", "losses": "losses"}
+    out.write(*_with_scopes(columns, rows, reports, out), totals=totals)
+    return 0
+
+
+def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
+    """Print the catalogue entries of traces; without names, of all."""
+    from sgstore.collection import Collection
+
+    whole = Collection(url)
+    note_asked(whole)
+    found = whole.traces()
+    known = {row["name"] for row in found}
+    for name in names:
+        if name not in known:
+            raise StoreError(f"{url}: no trace {name!r}")
+    columns = ("trace", "frames", "seconds", "ego", "map", "trace_id", "bundle", "file")
+    digits = 12 if out.for_people else None
+    rows = (
+        (
+            *(row["name"], row["frames"], round((row["end_ns"] - row["start_ns"]) / 1e9, 3)),
+            *(row["ego"], row["map"], row["trace_id"], row["bundle"][:digits], row["uri"]),
+        )
+        for row in found
+        if not names or row["name"] in names
+    )
+    out.write(columns, rows, totals={"frames": "frames", "seconds": "s"})
+
+
+def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:
+    """Print all facts about traces: one as a document, several as rows."""
+    with file.snapshot():
+        found = [file.trace(name) for name in names]
+        channels = [[asdict(one) for one in file.channels(trace.trace_id)] for trace in found]
+    documents = [
+        one.as_dict() | {"channels": its} for one, its in zip(found, channels, strict=True)
+    ]
+    if out.for_people:
+        for number, (one, about) in enumerate(zip(found, documents, strict=True)):
+            sys.stdout.write("\n" if number else "")
+            write_report(about | one.report | {"frames": one.frames})
+    elif len(documents) == 1:
+        write_document(documents[0], out.chosen)
+    else:
+        out.write(tuple(documents[0]), [tuple(one.values()) for one in documents])
+
+
+@app.command(rich_help_panel=PANEL)
+def doctor(traces: Recordings, reading: ReadingOptions, out: PrintedRows) -> int:
+    """Check recordings: report what can be read, and any damage. Needs no store."""
+    from sgstore.ingest import recordings
+    from sgstore.pipeline.doctor import Examination, examine
+
+    settings = reading.settings()
+    found = (
+        examine(path, config=settings, road_map=reading.road_map)
+        for path in recordings(_names(traces))
+    )
+    codes: set[int] = set()
+
+    def seen() -> Iterator[dict[str, Any]]:
+        for one in found:
+            codes.add(ERROR if one.error else LOSS if one.losses else 0)
+            yield one.as_dict()
+
+    if out.for_people:
+        for number, values in enumerate(seen()):
+            sys.stdout.write("\n" if number else "")
+            write_report(values)
+    else:
+        columns = [column.name for column in fields(Examination)]
+        out.write(columns, (tuple(values.values()) for values in seen()))
+    return ERROR if ERROR in codes else max(codes, default=0)
+
+
+# Verbs that need a running simulator ------------------------------------------------------------
+
+PORT: Final = 2000
+"""Default port of a CARLA server."""
+
+
+@app.command(rich_help_panel=PANEL)
+def record(
+    output: Annotated[
+        Path, Argument(metavar="FILE", help="The recording: FILE.mcap; nothing is overwritten.")
+    ],
+    host: Annotated[str, Option("--host", help="Host of the CARLA server.")] = "localhost",
+    port: Annotated[int, Option("--port", help="Its port.")] = PORT,
+    ego: Annotated[
+        str, Option("--ego", help="Id or role name of the ego; by default hero, ego_vehicle.")
+    ] = "",
+    sensors: Annotated[
+        Path | None,
+        Option("--sensors", help="A TOML file with a table [[sensor]] for each sensor."),
+    ] = None,
+    duration: Annotated[
+        str | None,
+        Option("--duration", metavar="TIME", help="Simulation time: 60s; else until Ctrl-C."),
+    ] = None,
+    step: Annotated[
+        str | None,
+        Option("--step", metavar="TIME", help="Drive the world in steps: 50ms; else follow it."),
+    ] = None,
+    scenery: Annotated[
+        bool, Option("--scenery/--no-scenery", help="Include buildings, poles, … of the level.")
+    ] = True,
+) -> int:
+    """Record a running CARLA into an MCAP file: frames, road map and sensors of the ego."""
+    from sgstore.apps.record import record as record_world
+    from sgstore.readers import connect, load_sensors
+
+    attached = load_sensors(sensors) if sensors else []
+    duration_s = seconds_of(duration, "--duration") if duration else None
+    step_s = seconds_of(step, "--step") if step else None
+    world = connect(host, port).get_world()
+    with _counter() as count:
+        done = record_world(
+            world,
+            output,
+            ego=ego,
+            sensors=attached,
+            duration_s=duration_s,
+            step_s=step_s,
+            scenery=scenery,
+            on_frame=count,
+        )
+    for warning in done.warnings:
+        say(warning)
+    written = done.written
+    seconds = (written.end_ns - written.start_ns) / 1e9
+    say(f"{written.frames} frames, {seconds:.2f} s; sgstore ingest STORE {written.path}")
+    typer.echo(written.path)
+    return LOSS if done.dropped else 0
+
+
+@contextmanager
+def _counter() -> Generator[Callable[[int, float], None] | None]:
+    """Yield a function that counts frames on stderr; ``None`` without a terminal."""
+    if quiet() or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status("waiting for the first frame") as line:
+        yield lambda frames, seconds: line.update(
+            f"{frames} frames, {seconds:.1f} s of simulation; Ctrl-C ends the recording"
+        )
+
+
+# Verbs about graphs that other tools made -------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Options for the meaning of names in graphs."""
+
+    kind: Annotated[
+        list[str] | None,
+        Option("--kind", metavar="LABEL=KIND", help="Kind of a label; repeatable."),
+    ] = None
+    relation: Annotated[
+        list[str] | None,
+        Option("--relation", metavar="NAME=RELATION", help="Relation for a name; repeatable."),
+    ] = None
+    unknown_as: Annotated[
+        str,
+        Option(
+            "--unknown-as",
+            metavar="KIND",
+            help="Take labels that nobody knows for this kind ('other': unknown), leave out relations; "
+            "'own': labels become kinds, names relations.",
+        ),
+    ] = ""
+    new_kind: Annotated[
+        list[str] | None,
+        Option("--new-kind", metavar="KIND", help="A kind that --kind may name; repeatable."),
+    ] = None
+    answers: Annotated[
+        list[str] | None,
+        Option(
+            "--answers",
+            metavar="RELATION",
+            help="A relation that the graphs can hold, even if none of them does; repeatable.",
+        ),
+    ] = None
+    period: Annotated[
+        str,
+        Option("--period", metavar="TIME", help="Time between frames, where the file has none."),
+    ] = "1s"
+
+
+@app.command("import", rich_help_panel=PANEL)
+def import_(
+    store: StorePath,
+    files: Annotated[
+        list[Path],
+        Argument(metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."),
+    ],
+    form_of_graphs: Annotated[
+        Literal["s3c", "nodelink", "csv", "openlabel"],
+        Option(
+            "--format",
+            help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx;"
+            " openlabel: ASAM OpenLABEL 1.0.",
+        ),
+    ],
+    force: Force = False,
+    form: Annotated[Format, Option("--rows", help="Format of the rows.")] = Format.table,
+    as_json: AsJson = False,
+    *,
+    meaning: ImportOptions,
+) -> int:
+    """Import graphs of other tools into a store: each becomes a frame."""
+    from sgstore.model.vocabulary import relation_named
+    from sgstore.pipeline.importing import Words, import_graphs
+
+    pairs = _pairs(meaning.kind, "--kind"), _pairs(meaning.relation, "--relation")
+    words = Words(*pairs, meaning.unknown_as, meaning.new_kind or ())
+    answers = {name: relation_named(name) for name in meaning.answers or ()}
+    for name, known in answers.items():
+        if known is None:
+            raise typer.BadParameter(f"--answers {name}: no such relation")
+    seconds = seconds_of(meaning.period, "--period")
+    if seconds <= 0:
+        raise typer.BadParameter("--period: expected more than 0s")
+    done = import_graphs(
+        store,
+        files,
+        form_of_graphs,
+        words=words,
+        relations=[name for name in answers.values() if name is not None],
+        period_s=seconds,
+        force=force,
+    )
+    for one in done:
+        if one.error is not None:
+            complain(str(one.error))
+        for what, often in sorted(one.lost.items()):
+            say(f"{one.path.name}: {what}: {often} times, cannot be kept")
+    columns = ("file", "status", "trace", "frames", "entities", "edges")
+    rows = ((str(o.path), o.status, o.name, o.frames, o.entities, o.edges) for o in done)
+    PrintedRows(form, as_json).write(columns, rows)
+    if any(one.error is not None for one in done):
+        return ERROR
+    return LOSS if any(one.lost for one in done) else 0
+
+
+def _pairs(texts: list[str] | None, option: str) -> dict[str, str]:
+    pairs: dict[str, str] = {}
+    for text in texts or []:
+        name, equals, value = text.rpartition("=")
+        if not (name and equals and value):
+            raise typer.BadParameter(f"{option} {text!r}: expected NAME=VALUE")
+        if name in pairs:
+            raise typer.BadParameter(f"{option} {text!r}: {name} means {pairs[name]} already")
+        pairs[name] = value
+    return pairs

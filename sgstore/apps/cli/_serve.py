@@ -1,0 +1,141 @@
+"""Verbs that serve a store, to people and to assistants: serve, report, mcp."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+from typer import Option
+
+from sgstore.apps.cli._options import (
+    QueryLimits,
+    Question,
+    StorePath,
+    With,
+    app,
+    seconds_of,
+    tables_of,
+)
+from sgstore.apps.cli._output import say
+from sgstore.errors import MissingExtraError
+
+PANEL: Final = "Pictures and exports"
+
+
+@app.command(rich_help_panel=PANEL)
+def serve(
+    store: StorePath,
+    compare: Annotated[
+        Path | None, Option("--compare", metavar="STORE", help="A second store, side by side.")
+    ] = None,
+    write_to: Annotated[
+        Path | None,
+        Option("--write-to", metavar="DIR", help="Let the page write locks and clips below DIR."),
+    ] = None,
+    host: Annotated[
+        str, Option("--host", help="Address to listen on; by default only this machine.")
+    ] = "127.0.0.1",
+    port: Annotated[int, Option("--port", min=0, max=65535, help="0: any that is free.")] = 0,
+    browse: Annotated[bool, Option("--open/--no-open", help="Open the page in a browser.")] = False,
+) -> int:
+    """Explore a store in a browser: search, watch matches, see why a frame matches or not.
+
+    Prints an address with a token, for this machine alone. Needs the extra ui. Ends with Ctrl-C.
+    """
+    from sgstore.apps.explorer import serve as run
+
+    if write_to is not None and not write_to.is_dir():
+        raise typer.BadParameter(f"--write-to {write_to}: no such folder")
+    if host not in {"127.0.0.1", "localhost", "::1"}:
+        say(f"{host}: whoever on the network has the address with its token sees the store")
+
+    def tell(address: str) -> None:
+        typer.echo(address)
+        say("Ctrl-C ends it")
+
+    run(
+        store,
+        host=host,
+        port=port,
+        other=compare,
+        write_to=write_to.resolve() if write_to else None,
+        browse=browse,
+        on_start=tell,
+    )
+    return 0
+
+
+@app.command(rich_help_panel=PANEL)
+def report(
+    store: StorePath,
+    question: Question,
+    output: Annotated[
+        Path, Option("--output", "-o", help="The page: FILE.html.", show_default="report.html")
+    ] = Path("report.html"),
+    limit: Annotated[
+        int, Option("--limit", min=1, help="Most matches, or violations, in the page.")
+    ] = 100,
+    around: Annotated[
+        str, Option("--around", metavar="TIME", help="Time before and after each match.")
+    ] = "2s",
+    pictures: Annotated[
+        bool,
+        Option("--pictures/--no-pictures", help="A camera picture for each second of a match."),
+    ] = False,
+    *,
+    bounds: QueryLimits,
+) -> int:
+    """Write the matches of a query as one page, to be watched without a server and without a network.
+
+    Of checks it shows the violations.
+    """
+    from sgstore.apps.report import report as write
+
+    if not question:
+        raise typer.BadParameter("give a QUERY, -f FILE or -p NAME")
+    text, values = question.asked()
+    many, more = write(
+        bounds.opened(store),
+        text,
+        output,
+        parameters=values,
+        most=limit,
+        around_s=seconds_of(around, "--around"),
+        pictures=pictures,
+    )
+    if more:
+        say(f"there are more matches: the first {many} are in the page (--limit)")
+    typer.echo(output)
+    return 0
+
+
+@app.command(rich_help_panel="Questions")
+def mcp(
+    store: StorePath,
+    write_to: Annotated[
+        Path | None,
+        Option("--write-to", metavar="DIR", help="Let clips be exported into this folder."),
+    ] = None,
+    question_timeout: Annotated[
+        str, Option("--timeout", metavar="TIME", help="Longest time for a question.")
+    ] = "10s",
+    max_rows: Annotated[int, Option("--max-rows", min=1, help="Rows of an answer at most.")] = 1000,
+    tables: With = None,
+) -> None:
+    """Serve a store to an assistant: a server of the Model Context Protocol on stdin and stdout.
+
+    For the settings of an assistant: {"command": "sgstore", "args": ["mcp", "/path/to/drives.sgstore"]}.
+    Queries run in a separate process that sees nothing but the store; files are written with --write-to only.
+    """
+    try:
+        from sgstore.apps.assistant import StoreTools, serve
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in {"mcp", "pydantic"}:
+            raise
+        raise MissingExtraError("serving an assistant", "mcp") from error
+    seconds, joined = seconds_of(question_timeout, "--timeout"), tables_of(tables)
+    with StoreTools(
+        store, write_to=write_to, timeout_s=seconds, most_rows=max_rows, tables=joined
+    ) as tools:
+        serve(tools)

@@ -1,0 +1,368 @@
+"""Verbs about stores (verify, remove, rebuild, derive, payload), maps and settings, and the demo."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from typer import Argument, Option
+
+from sgstore.apps.cli import _completion as completion
+from sgstore.apps.cli._options import (
+    ERROR,
+    LOSS,
+    FrameName,
+    GraphOptions,
+    Jobs,
+    LookIn,
+    Output,
+    PrintedRows,
+    StorePath,
+    Traces,
+    app,
+    jobs_of,
+)
+from sgstore.apps.cli._output import say
+from sgstore.base.files import write_bytes
+from sgstore.errors import ExportError
+
+if TYPE_CHECKING:
+    from sgstore.maps.roads import RoadMap
+    from sgstore.pipeline.derive import Derivation
+    from sgstore.store import StoreFile
+
+PANEL: Final = "Stores and maps"
+
+
+@app.command(rich_help_panel=PANEL)
+def verify(
+    store: StorePath,
+    payloads: Annotated[bool, Option("--payloads", help="Also hash the recordings again.")] = False,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Verify that a store is as it was published; list every fault."""
+    from sgstore.store import verify_file
+
+    found = verify_file(store, recordings=payloads)
+    rows = [(fault.trace, fault.check, fault.detail) for fault in found.faults]
+    out.write(("trace", "check", "detail"), rows)
+    hashed = f", {found.recordings} recordings" if payloads else ""
+    wrong = f"{len(rows)} faults" if rows else "no fault"
+    if found.others:
+        say(f"{store}: none of sgstore's, so not looked at: {', '.join(found.others)}")
+    say(f"{store}: {found.traces} traces, {found.rows} rows{hashed}: {wrong}")
+    return ERROR if rows else 0
+
+
+@app.command(rich_help_panel=PANEL)
+def remove(
+    store: StorePath,
+    traces: Annotated[
+        list[str] | None,
+        Argument(
+            metavar="TRACE…",
+            help="Names, ids, or beginnings of names.",
+            autocompletion=completion.traces,
+        ),
+    ] = None,
+    compact: Annotated[
+        bool, Option("--compact", help="Rewrite the file to free its space; also without a TRACE.")
+    ] = False,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Remove traces from a store, all or none; the recordings are not touched."""
+    from sgstore.store import StoreFile
+
+    if not traces and not compact:
+        raise typer.BadParameter("say which traces, or --compact")
+    file = StoreFile(store)
+    if compact:
+        file.refuse_others()
+    gone = file.remove(*traces) if traces else ()
+    if compact:
+        file.compact()
+    rows = [(trace.name, trace.frames, str(trace.path)) for trace in gone]
+    out.write(("trace", "frames", "file"), rows)
+    return 0
+
+
+@app.command(rich_help_panel=PANEL)
+def rebuild(
+    store: StorePath,
+    look_in: LookIn = None,
+    leave_out: Annotated[
+        list[str] | None,
+        Option(
+            "--leave-out",
+            metavar="TRACE",
+            help="Leave out a trace that cannot be rebuilt; repeatable.",
+            autocompletion=completion.traces,
+        ),
+    ] = None,
+    jobs: Jobs = 1,
+    *,
+    out: PrintedRows,
+) -> None:
+    """Rebuild a store from its recordings; the old one stays until the new one is complete."""
+    from sgstore.apps.cli._output import ingest_bar
+    from sgstore.pipeline.rebuild import rebuild as make_anew
+
+    with ingest_bar() as on_progress:
+        made = make_anew(
+            store,
+            look_in=look_in or (),
+            leave_out=leave_out or (),
+            jobs=jobs_of(jobs),
+            on_progress=on_progress,
+        )
+    rows = [(one.trace, one.status, one.frames, str(one.path)) for one in made]
+    out.write(("trace", "status", "frames", "file"), rows)
+
+
+# Verbs about graphs: other relations from the states of a store ---------------------------------
+
+
+@app.command(rich_help_panel=PANEL)
+def derive(
+    store: StorePath,
+    name: Annotated[
+        str | None, Option("--as", metavar="NAME", help="Name of the set: USING ABSTRACTION NAME.")
+    ] = None,
+    abstraction: Annotated[
+        str | None,
+        Option(
+            "--abstraction",
+            metavar="NAME",
+            help="Keep what this makes of the graphs: roadscene2vec.",
+        ),
+    ] = None,
+    trace: Traces = None,
+    force: Annotated[
+        bool, Option("--force", help="Replace a set of this name with other settings.")
+    ] = False,
+    remove: Annotated[
+        str | None, Option("--remove", metavar="NAME", help="Delete a set instead.")
+    ] = None,
+    *,
+    graphs: GraphOptions,
+    out: PrintedRows,
+) -> int:
+    """Derive another set of relations from the stored states; without --as, list the sets."""
+    from sgstore.model.config import Config
+    from sgstore.pipeline.derive import derive as derive_set
+    from sgstore.pipeline.derive import keep_abstraction
+    from sgstore.store import StoreFile
+
+    given = graphs.config or graphs.preset
+    if abstraction is not None:
+        if name is not None or remove is not None or given or force:
+            raise typer.BadParameter("--abstraction NAME stands alone, or with --trace")
+        kept = keep_abstraction(store, abstraction, trace or ())
+        return _write_derived(kept, out)
+    if name is None or remove is not None:
+        if name is not None or given or (remove is None and (trace or force)):
+            raise typer.BadParameter("give --as NAME with settings, --remove NAME, or nothing")
+        deriving = StoreFile(store).deriving
+        if remove is not None:
+            say(f"removed {remove} of {', '.join(deriving.remove(remove))}")
+            return 0
+        rows = ((one.name, one.trace, len(one.answers)) for one in deriving.sets())
+        out.write(("name", "trace", "relations"), rows)
+        return 0
+    settings = graphs.settings() or Config()
+    done = derive_set(store, settings, name, trace or (), replace_old=force)
+    return _write_derived(done, out)
+
+
+def _write_derived(done: list[Derivation], out: PrintedRows) -> int:
+    rows = ((one.trace, one.status, one.frames, one.edges) for one in done)
+    out.write(("trace", "status", "frames", "edges"), rows)
+    for one in done:
+        for loss in one.losses:
+            say(f"{one.trace}: {loss}")
+    return LOSS if any(one.losses for one in done) else 0
+
+
+# Verbs about road maps --------------------------------------------------------------------------
+
+
+@app.command("map", rich_help_panel=PANEL)
+def map_(
+    file: Annotated[
+        Path,
+        Argument(
+            metavar="FILE",
+            help="OpenDRIVE (.xodr), Lanelet2 (.osm), or a recording that carries roads.",
+        ),
+    ],
+    picture: Annotated[
+        Path | None, Option("--output", "-o", help="Draw it there, north up: .png or .svg.")
+    ] = None,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Summarize a road map: lanes by type, junctions, signals, and problems."""
+    from sgstore.maps.roads import summary
+
+    road_map = _road_map(file)
+    if picture is not None:
+        from sgstore.draw import draw_map
+
+        draw_map(road_map, picture)
+        say(f"drawn: {picture}")
+    rows = [
+        (one.part, one.kind, one.count, None if one.length is None else round(one.length, 1))
+        for one in summary(road_map)
+    ]
+    if out.for_people:  # a table has no room for sentences
+        for _, text, _, _ in (row for row in rows if row[0] == "warning"):
+            say(text)
+        rows = [row for row in rows if row[0] != "warning"]
+    columns = ("part", "kind", "count", "length_m")
+    types = ("VARCHAR", "VARCHAR", "BIGINT", "DOUBLE")
+    out.write(columns, rows, types)
+    return 0
+
+
+def _road_map(file: Path) -> RoadMap:
+    """Return the road map in a file or a recording."""
+    from sgstore.errors import MapError
+    from sgstore.maps.map_files import read_map_file
+    from sgstore.maps.opendrive import read_map
+    from sgstore.readers import open_trace
+
+    try:
+        with file.open("rb") as stream:
+            start = stream.read(64)
+    except OSError as error:
+        raise MapError(f"{file}: {error.strerror or error}") from error
+    # Texts begin with a bracket, or a byte order mark; recordings do not.
+    if start.lstrip()[:1] in {b"<", b"{"} or start[:2] in {b"\xff\xfe", b"\xfe\xff", b"\xef\xbb"}:
+        return read_map_file(file)
+    with open_trace(file) as trace:
+        if not trace.info.map_text:
+            raise MapError(f"{file}: the recording carries neither a road map nor lanes")
+        return read_map(trace.info.map_text, trace.info.map_name)
+
+
+# The verb that fetches sensor messages ----------------------------------------------------------
+
+
+@app.command(rich_help_panel=PANEL)
+def payload(
+    store: StorePath,
+    frame: FrameName,
+    channel: Annotated[
+        str | None,
+        Argument(
+            metavar="CHANNEL",
+            help="Topic; without it, list those there are.",
+            autocompletion=completion.channels,
+        ),
+    ] = None,
+    output: Output = None,
+    message: Annotated[
+        bool, Option("--message", help="The message as it was recorded, not the picture in it.")
+    ] = False,
+    *,
+    out: PrintedRows,
+) -> int:
+    """Fetch the sensor data of a frame: a picture, a video up to it, or the message."""
+    from sgstore.store import StoreFile
+
+    file = StoreFile(store)
+    if channel is None:
+        _list_channels(file, frame, out)
+        return 0
+    if output is None and sys.stdout.isatty():
+        raise ExportError(
+            "a payload is not for a terminal: name a file with -o, or redirect stdout"
+        )
+    if message:
+        data, what = file.payload(frame, channel), "message"
+    else:
+        carried = file.carried(frame, channel)
+        data, what = carried.data, carried.form
+        if carried.messages > 1:
+            what += f", {carried.messages} messages from the key frame on"
+    if output is None:
+        sys.stdout.buffer.write(data)
+    else:
+        write_bytes(output, data)
+    say(f"{output or 'stdout'}: {len(data)} bytes ({what})")
+    return 0
+
+
+def _list_channels(file: StoreFile, frame: str, out: PrintedRows) -> None:
+    with file.snapshot():
+        wanted = file.frame(frame)
+        found = file.rows(
+            "SELECT channel, schema, offset_s, log_time_ns, length FROM payloads"
+            " WHERE frame_id = ? ORDER BY channel",
+            [wanted.frame_id],
+        )
+    out.write(found.columns, found)
+
+
+# The verb about settings: print them, with what each means --------------------------------------
+
+
+@app.command(rich_help_panel=PANEL)
+def config(
+    file: Annotated[
+        Path | None, Argument(metavar="FILE", help="A TOML file: check it, and print it whole.")
+    ] = None,
+    preset: Annotated[
+        str | None,
+        Option(
+            "--preset",
+            metavar="NAME",
+            help="Settings of this preset.",
+            autocompletion=completion.presets,
+        ),
+    ] = None,
+    every: Annotated[bool, Option("--list", help="List the presets.")] = False,
+    page: Annotated[
+        bool, Option("--page", help="Print the page docs/parameters.md instead.")
+    ] = False,
+    *,
+    out: PrintedRows,
+) -> None:
+    """Print all settings as commented TOML, to be changed and given to ingest."""
+    from sgstore.model.config import PRESETS, Config, as_markdown, as_toml, load
+    from sgstore.model.config import preset as preset_named
+
+    if sum((file is not None, preset is not None, every, page)) > 1:
+        raise typer.BadParameter("give one of FILE, --preset, --list and --page")
+    if every:
+        rows = ((name, one.summary) for name, one in PRESETS.items())
+        out.write(("preset", "what it is"), rows)
+        return
+    if page:
+        typer.echo(as_markdown(PRESETS), nl=False)
+        return
+    settings = preset_named(preset) if preset else load(file) if file else Config()
+    typer.echo(as_toml(settings), nl=False)
+
+
+# The verb for newcomers -------------------------------------------------------------------------
+
+
+@app.command(rich_help_panel=PANEL)
+def demo(
+    folder: Annotated[
+        Path, Argument(metavar="DIR", help="Folder for its store, pictures and clips.")
+    ] = Path("sgstore-demo"),
+    recording: Annotated[
+        Path | None, Option("--recording", help="The sample recording; by default the package's.")
+    ] = None,
+) -> int:
+    """Run the main job on the bundled recording: ingest, find, show, export."""
+    from sgstore.apps.demo import run_demo
+
+    run_demo(folder, typer.echo, recording)
+    return 0

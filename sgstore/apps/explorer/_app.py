@@ -1,0 +1,427 @@
+"""Application: the endpoints of the page."""
+
+from __future__ import annotations
+
+import asyncio
+import mimetypes
+import os
+import threading
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+from dataclasses import astuple
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from starlette.applications import Starlette
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from sgstore.apps.explorer._guard import Guard
+from sgstore.apps.explorer._reads import READS, Reads
+from sgstore.apps.explorer._requests import RequestError, fields_of, one_of, taken
+from sgstore.apps.explorer._wire import PAGE, as_json
+from sgstore.apps.sandbox import Errand, SandboxPool
+from sgstore.base.quoting import is_statement
+from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
+from sgstore.model.notes import Note, NotesFile, write_table
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Mapping
+
+    from starlette.requests import Request
+    from starlette.types import Receive, Scope, Send
+
+    Endpoint = Callable[[Request], Awaitable[Response]]
+    Replies = AsyncGenerator[dict[str, Any]]
+
+T = TypeVar("T")
+
+MOST_QUESTIONS: Final = 8
+"""Greatest number of running queries; further ones are rejected with 503."""
+
+TIMEOUT_S: Final = 60.0
+"""Time limit of a query of a user; s."""
+
+LONGEST_S: Final = 86_400.0
+"""Time limit of a lock, an export, or a comparison of stores; s."""
+
+MOST_MATCHES: Final = 50_000
+"""Greatest number of matches and rows of a query; the page shows that there are more."""
+
+WORKER: Final = "sgstore.apps.explorer._worker"
+FIRST: Final = {"ask": "rows", "text": "MATCH (e:Ego) RETURN e.id LIMIT 1", "parameters": {}}
+"""First query of each sandbox: loads the language, the catalogue and the database."""
+
+_NONCE: Final = "{{nonce}}"
+_SCRIPT: Final = "js/main.js"
+
+
+async def _lines(replies: Replies) -> AsyncGenerator[bytes]:
+    """Yield replies as lines of JSON on arrival."""
+    async for reply in replies:
+        yield as_json(reply) + b"\n"
+
+
+async def _last(replies: Replies) -> AsyncGenerator[bytes]:
+    """Yield the last reply: the complete result of a query with one result."""
+    *_, last = [reply async for reply in replies]
+    yield as_json(last)
+
+
+class _Answer(StreamingResponse):
+    """Streamed response; its end, for any reason, cancels the query.
+
+    Parameters
+    ----------
+    pool : function
+        Function that returns the sandboxes or an errand; it may be slow.
+    question : mapping
+    key : str
+        Key for cancelling.
+    told : function
+        Function that converts the replies to bytes.
+    media_type : str
+    """
+
+    def __init__(
+        self,
+        pool: Callable[[], SandboxPool | Errand],
+        question: Mapping[str, Any],
+        key: str,
+        told: Callable[[Replies], AsyncGenerator[bytes]] = _lines,
+        media_type: str = "application/x-ndjson",
+    ) -> None:
+        super().__init__(told(self._replies()), media_type=media_type)
+        self._pool, self._question, self._key = pool, question, key
+        self._asked: SandboxPool | Errand | None = None
+        self._gone = threading.Event()
+        self._loop = asyncio.get_running_loop()
+        self._found: asyncio.Queue[dict[str, Any] | None] = asyncio.Queue()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self.end()
+
+    def ask(self) -> None:
+        """Run the query in its own thread; an error becomes a reply."""
+        tell = partial(self._loop.call_soon_threadsafe, self._found.put_nowait)
+        try:
+            self._asked = self._pool()
+            if self._gone.is_set():
+                return
+            for reply in self._asked.ask(self._question, self._key):
+                tell(reply)
+        except SgstoreError as error:
+            tell({"error": error.as_dict()})
+        except BaseException:
+            tell({"error": {"error": "SgstoreError", "reason": "the question failed"}})
+            raise
+        finally:
+            tell(None)
+
+    async def _replies(self) -> Replies:
+        while (reply := await self._found.get()) is not None:
+            yield reply
+
+    def end(self) -> None:
+        """Cancel the query if it still runs."""
+        self._gone.set()  # it may not have begun
+        if self._asked is not None:
+            self._asked.cancel(self._key)
+
+
+class Explorer:
+    """Shared state of the endpoints of one store.
+
+    Parameters
+    ----------
+    path : Path
+        Path of the store.
+    other : Path, optional
+        A second store for comparison.
+    write_to : Path, optional
+        Folder for locks and clips; without it only tags are written.
+
+    Attributes
+    ----------
+    busy : set
+        Responses with running queries.
+
+    Raises
+    ------
+    StoreError
+        The store is missing.
+    """
+
+    def __init__(
+        self, path: Path, *, other: Path | None = None, write_to: Path | None = None
+    ) -> None:
+        self.stores = {"a": Store(path)}
+        if other is not None:
+            self.stores["b"] = Store(other)
+        self.write_to = write_to
+        self.notes = NotesFile(Path(path))
+        self.reads = {side: Reads(store) for side, store in self.stores.items()}
+        self._stamp = self.notes.stamp()
+        self._folder = TemporaryDirectory(prefix="sgstore-notes-")
+        self._pools = {side: self._pool(side) for side in self.stores}
+        self._threads = ThreadPoolExecutor(MOST_QUESTIONS + 4, "sgstore question")
+        self._ended = threading.Event()
+        self.busy = set[_Answer]()
+
+    def warm(self) -> None:
+        """Read maps in a background thread before the first request."""
+        for reads in self.reads.values():
+            self._threads.submit(reads.warm, self._ended)
+
+    def close(self) -> None:
+        """Stop the sandboxes, wait for running reads, and close the stores."""
+        self._ended.set()
+        for answer in tuple(self.busy):
+            answer.end()
+        for pool in self._pools.values():
+            pool.close()
+        # The process must not end while a thread is in the database.
+        self._threads.shutdown(cancel_futures=True)
+        self._folder.cleanup()
+        for store in self.stores.values():
+            store.close()
+
+    def _pool(self, side: str) -> SandboxPool:
+        return SandboxPool(
+            self.stores[side].file.path,
+            timeout_s=TIMEOUT_S,
+            max_rows=MOST_MATCHES,
+            tables=self._tables() if side == "a" else {},
+            worker=WORKER,
+            small=("parts", "why"),
+            first=FIRST,
+        )
+
+    def _tables(self) -> dict[str, Path]:
+        """Return the tags as a table for queries."""
+        found = self.notes.read()
+        if not found:
+            return {}
+        table = Path(self._folder.name) / "notes.csv"
+        write_table(found, table)
+        return {"notes": table}
+
+    def pool(self, side: str, text: str) -> SandboxPool:
+        """Return the sandboxes of a store; a query about tags gets sandboxes with the current tags."""
+        if side == "a" and "notes" in text.lower() and self._stamp != self.notes.stamp():
+            self._stamp = self.notes.stamp()
+            old, self._pools["a"] = self._pools["a"], self._pool("a")
+            self._threads.submit(old.close)
+        return self._pools[side]
+
+    def _side(self, fields: Mapping[str, Any]) -> str:
+        """Return the requested store: ``a`` or ``b``."""
+        return one_of(*self.stores)(fields.get("side"), "side")
+
+    # What somebody typed -------------------------------------------------------------------------
+
+    def _answer(self, pool: Callable[[], SandboxPool | Errand], *asked: Any) -> _Answer:
+        """Start a query in a thread and return its response.
+
+        Raises
+        ------
+        RequestError
+            Too many queries are running.
+        """
+        if len(self.busy) >= MOST_QUESTIONS:
+            raise RequestError(f"{MOST_QUESTIONS} questions are under way; try again later", 503)
+        answer = _Answer(pool, *asked)
+        self.busy.add(answer)
+        asking = self._threads.submit(answer.ask)
+        asking.add_done_callback(lambda _: self.busy.discard(answer))
+        return answer
+
+    async def find(self, request: Request) -> Response:
+        """Stream matches of a pattern, or rows of SQL, as lines of JSON."""
+        fields = await fields_of(request)
+        question = taken(fields, "ask", "text", "parameters")
+        if is_statement(question["text"]):
+            question["ask"] = "sql"
+        key, side = taken(fields, "id")["id"] or uuid.uuid4().hex, self._side(fields)
+        return self._answer(partial(self.pool, side, question["text"]), question, key)
+
+    async def cancel(self, request: Request) -> Response:
+        """Stop a query."""
+        key = str(request.path_params["key"])
+        done = any(pool.cancel(key) for pool in self._pools.values())
+        return JSONResponse({"cancelled": done})
+
+    async def one(self, request: Request, ask: str) -> Response:
+        """Return the complete result of a query (truth lanes, why not, verdicts) or its error."""
+        fields = await fields_of(request)
+        side = self._side(fields)
+        question = {"ask": ask, **taken(fields, *_QUESTIONS[ask])}
+        if "seq" in question:
+            where = question["trace"], question["seq"]
+            question["frame"] = await self.threaded(self.reads[side].frame_id, *where)
+        pool = partial(self.pool, side, str(question.get("text", "")))
+        return self._answer(pool, question, uuid.uuid4().hex, _last, "application/json")
+
+    # What the page reads by trace and frame --------------------------------------------------------
+
+    async def threaded(self, ask: Callable[..., T], *arguments: Any) -> T:
+        """Return the result of a slow function, run in a thread."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, ask, *arguments)
+
+    async def read(self, request: Request, name: str) -> Response:
+        """Read from a store: columns as bytes, a picture, or plain values."""
+        fields = await fields_of(request)
+        reads = self.reads[self._side(fields)]
+        ask = partial(getattr(reads, name), **taken(fields, *READS[name]))
+        return answered(await self.threaded(ask))
+
+    async def about(self, _: Request) -> Response:
+        """Return the stores with their traces, and the permissions of the page."""
+        sides = {side: await self.threaded(reads.about) for side, reads in self.reads.items()}
+        writing = self.write_to is not None
+        return JSONResponse({**sides["a"], "other": sides.get("b"), "writing": writing})
+
+    # Tags, measures, files ---------------------------------------------------------------------------
+
+    async def tags(self, request: Request) -> Response:
+        """Return all tags; POST adds or removes a tag."""
+        fields = await fields_of(request)
+        if request.method == "POST":
+            told = taken(fields, "trace", "seq", "tag", "note", "do")
+            gone = told.pop("do") == "remove"
+            await self.threaded(self.reads["a"].frame_id, told["trace"], told["seq"])
+            await self.threaded(partial(self.notes.add, Note(**told), gone=gone))
+        found = await self.threaded(self.notes.read)
+        notes = [astuple(note) for note in found]
+        return JSONResponse({"notes": notes, "file": self.notes.path.name})
+
+    async def work(self, request: Request, name: str) -> Response:
+        """Run a longer task; stream its progress as lines of JSON, then its result or error."""
+        fields = await fields_of(request)
+        question = {"ask": name, **taken(fields, *_WORK[name])}
+        if "name" in question:
+            question["to"] = str(self.target(question.pop("name")))
+        else:
+            if "b" not in self.stores:
+                told = "there is no second store; start 'sgstore serve STORE' with --compare OTHER"
+                raise RequestError(told, 404)
+            question["other"] = str(self.stores["b"].file.path.absolute())
+        path = self.stores["a"].file.path
+        errand = Errand(path, timeout_s=LONGEST_S, memory=1 << 30, worker=WORKER)
+        return self._answer(lambda: errand, question, "")
+
+    def target(self, name: str) -> Path:
+        """Return a path in the writable folder.
+
+        Raises
+        ------
+        RequestError
+            Writing is disabled, or the name is not a file name.
+        """
+        if self.write_to is None:
+            raise RequestError("start 'sgstore serve' with --write-to DIR to write files", 403)
+        fits = name and name == Path(name).name and not name.startswith(".") and name.isprintable()
+        if not fits or len(name) > 100 or os.sep in name:
+            raise RequestError("name: expected the name of a file, without a folder")
+        return self.write_to / name
+
+
+async def page_of(request: Request, script: str = "main.js") -> Response:
+    """Return a page by its first script, with the nonce of the response's policy."""
+    text = (PAGE / "index.html").read_text(encoding="utf-8").replace(_SCRIPT, f"js/{script}")
+    nonce = request.scope["state"]["nonce"]
+    return Response(text.replace(_NONCE, nonce), media_type="text/html")
+
+
+_QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("parts", "why"), ("text", "parameters", "trace", "seq", "binding")),
+    "check": ("text", "parameters"),
+    "coverage": ("what", "abstraction"),
+    "select": ("clips", "abstraction"),
+}
+_WORK: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("lock", "export"), ("clips", "name", "format")),
+    "diff": ("abstraction",),
+}
+"""Fields of each query and of each longer task, by name."""
+
+
+_METHODS: Final = {name: "POST" if "frames" in told else "GET" for name, told in READS.items()}
+
+
+def answered(found: Any) -> Response:
+    """Return a response with columns as bytes, a picture with its type, or plain values."""
+    if isinstance(found, bytes):
+        return Response(found, media_type="application/octet-stream")
+    if isinstance(found, tuple):
+        headers = {"cache-control": "private, max-age=3600"}
+        return Response(found[0], media_type=found[1], headers=headers)
+    return JSONResponse(found)
+
+
+def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
+    """Return the ASGI application of a store, behind a token.
+
+    Parameters
+    ----------
+    explorer : Explorer
+    token : str
+    hosts : tuple of str
+        Permitted hosts, with ports.
+    cookie : str
+        Name of the cookie with the token.
+    """
+    table: list[tuple[str, Endpoint]] = [
+        ("GET /", page_of),
+        ("GET /api/store", explorer.about),
+        ("POST /api/find", explorer.find),
+        ("DELETE /api/find/{key}", explorer.cancel),
+        ("GET /api/notes", explorer.tags),
+        ("POST /api/notes", explorer.tags),
+        *((f"{_METHODS[name]} /api/{name}", partial(explorer.read, name=name)) for name in READS),
+        *((f"POST /api/{name}", partial(explorer.one, ask=name)) for name in _QUESTIONS),
+        *((f"POST /api/{name}", partial(explorer.work, name=name)) for name in _WORK),
+    ]
+
+    @asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncGenerator[None]:
+        yield
+        await asyncio.get_running_loop().run_in_executor(None, explorer.close)
+
+    return Guard(application_of(table, lifespan), token, hosts, cookie)
+
+
+class _PageFiles(StaticFiles):
+    """Modules, styles and licences of the page; browsers must revalidate them."""
+
+    def file_response(self, *args: Any, **kwargs: Any) -> Response:
+        response = super().file_response(*args, **kwargs)
+        response.headers["cache-control"] = "no-cache"
+        return response
+
+
+def application_of(
+    table: Iterable[tuple[str, Endpoint]], lifespan: Callable[[Any], Any] | None = None
+) -> Starlette:
+    """Return an application from endpoints (method and path) and the files of the page."""
+    mimetypes.add_type("text/javascript", ".js")  # some systems map it to another type
+    pairs = ((*where.split(), endpoint) for where, endpoint in table)
+    routes = [Route(path, endpoint, methods=[method]) for method, path, endpoint in pairs]
+    files = Mount("/static", _PageFiles(directory=PAGE, follow_symlink=True))
+    handlers = {SgstoreError: _refusal}
+    return Starlette(routes=[*routes, files], exception_handlers=handlers, lifespan=lifespan)
+
+
+async def _refusal(_: Request, error: Any) -> Response:
+    """Return an error of sgstore as a response with its status."""
+    is_query = isinstance(error, QueryError | SqlError)
+    usual = 404 if isinstance(error, StoreError) and not is_query else 422
+    return JSONResponse(error.as_dict(), getattr(error, "status", usual))

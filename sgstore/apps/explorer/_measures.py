@@ -1,0 +1,137 @@
+"""Longer tasks of the page: coverage, marked clips as a test set, comparison of two stores.
+
+Each function implements the task of its name, with the fields as parameters.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.apps.sandbox import tell
+from sgstore.base.json_text import finite
+from sgstore.errors import StoreError
+from sgstore.exporters import Export, write_export
+from sgstore.model.world import Clip
+from sgstore.query import Store
+from sgstore.store import frame_ids, lengths_of_messages
+from sgstore.testsets.coverage import ChosenFrames, classed, classes, combos, covered, growth
+from sgstore.testsets.diff import by_frame, scenes
+from sgstore.testsets.locks import lock_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from sgstore.testsets.coverage import ReportTable
+
+    Clips = Sequence[tuple[str, int, int]]
+
+MOST_ROWS: Final = 2000
+"""Greatest number of table rows that are sent; the total is sent too."""
+
+
+def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
+    """Return a coverage table of a store: classes by rank, growth, or missing pairs of features.
+
+    Parameters
+    ----------
+    store : Store
+    what : str
+        ``classes``, ``growth`` or ``combos``.
+    abstraction : str
+    """
+    of = classed(ChosenFrames(store.file.path.name, store), abstraction)
+    if what == "growth":
+        return _table(growth(of, "frame", 80))
+    if what == "classes":
+        return _table(classes(of))
+    found = combos(of, abstraction, 2)
+    return {"shares": _table(found.shares), "missing": _table(found.missing)} | {
+        "covered": _table(found.covered())
+    }
+
+
+def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
+    """Return the size of clips, and the share of the store's classes that they keep.
+
+    Returns
+    -------
+    dict
+        ``clips``, ``frames``, ``seconds``, ``bytes``; ``kept``: a table of shares.
+    """
+    with store.file.snapshot():
+        parts = list(_frames(store, clips))
+        frame_id = np.sort(np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _ in parts)]))
+        sizes = (lengths for _, lengths in lengths_of_messages(store.file, frame_id))
+        size = sum(int(lengths.sum()) for lengths in sizes) if len(frame_id) else 0
+        whole = classed(ChosenFrames("the store", store), abstraction)
+        some = classed(ChosenFrames("the selection", store, frame_id), abstraction)
+        kept = _table(covered(whole, some))
+    seconds = sum((lasts for *_, lasts in parts), 0.0)
+    about = {"clips": len(clips), "frames": len(frame_id), "seconds": seconds}
+    return {**about, "bytes": size, "kept": kept}
+
+
+def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
+    """Write a lock of clips."""
+    path = Path(to if to.endswith(".lock") else f"{to}.lock")
+    with store.file.snapshot():
+        found = _frames(store, clips)
+        parts = [(ids, store.file.log_times(*clip), "") for clip, ids, _ in found]
+        made = lock_of(store, parts, {"chosen": "in the explorer"}, progress=_done)
+    made.write(path)
+    return {"result": {"file": str(path), "cases": len(made.cases)}}
+
+
+def export(store: Store, clips: Clips, to: str, format: str) -> dict[str, Any]:
+    """Export clips in a format."""
+    with store.file.snapshot():
+        times = [(clip[0], store.file.log_times(*clip)) for clip in clips]
+    cut = tuple(Clip(trace, int(log.min()), int(log.max())) for trace, log in times)
+    written = write_export(Export(store, cut, progress=_done), Path(to), format)
+    losses = [f"{one.file.name}: {loss.reason}" for one in written for loss in one.losses]
+    files = [one.file.name for one in written]
+    return {"result": {"folder": to, "files": files, "losses": losses}}
+
+
+def diff(store: Store, other: str, abstraction: str) -> dict[str, Any]:
+    """Return the differing scenes and frames of two stores."""
+    with Store(other) as second:
+        a, b = (classed(ChosenFrames(s.file.path.name, s), abstraction) for s in (store, second))
+        return {"result": {"scenes": _table(scenes(a, b)), "frames": _table(by_frame(a, b))}}
+
+
+def _done(done: int, whole: int) -> None:
+    tell({"progress": [done, whole]})
+
+
+def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], Any, float]]:
+    """Yield separate clips, each with the ids of its frames and its length in seconds."""
+    traces = {one.name: one for one in store.traces()}
+    for trace, first, last in _apart(clips):
+        of = traces.get(trace) or store.file.trace(
+            trace
+        )  # raises an error that lists the known traces
+        if last >= of.frames:
+            raise StoreError(f"no frame #{last} in {trace!r}; it has #0 … #{of.frames - 1}")
+        ids = frame_ids(of.trace_id, np.arange(first, last + 1))
+        yield (trace, first, last), ids, len(ids) * of.period_ns / 1e9
+
+
+def _apart(clips: Clips) -> list[tuple[str, int, int]]:
+    """Sort clips by trace and time, and merge overlapping or adjacent ones."""
+    found: list[tuple[str, int, int]] = []
+    for trace, first, last in sorted(clips):
+        if found and found[-1][0] == trace and first <= found[-1][2] + 1:
+            found[-1] = trace, found[-1][1], max(found[-1][2], last)
+        else:
+            found.append((trace, first, last))
+    return found
+
+
+def _table(of: ReportTable) -> dict[str, Any]:
+    """Return a table for the page, with the total number of rows."""
+    rows = finite(of.rows[:MOST_ROWS])
+    return {"columns": of.columns, "rows": rows, "of": len(of.rows), "said": of.said}

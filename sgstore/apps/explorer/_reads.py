@@ -1,0 +1,218 @@
+"""Reads of a store by trace and frame: columns of states, maps, pictures, graphs, words.
+
+:data:`READS` has their fields.
+"""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+
+from sgstore.apps.explorer._requests import RequestError
+from sgstore.apps.explorer._wire import packed
+from sgstore.base.json_text import finite
+from sgstore.errors import ExportError, SgstoreError, StoreError
+from sgstore.lang import patterns, words
+from sgstore.maps.opendrive import read_map
+from sgstore.maps.roads import drawn_outlines
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from sgstore.lang import Catalog
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import SceneGraph
+    from sgstore.query import Store
+    from sgstore.readers import Media
+    from sgstore.store import StoredTrace
+
+T = TypeVar("T")
+
+MOST_THUMBS: Final = 400
+"""Greatest number of frames per request of thumbnails."""
+
+READS: Final[Mapping[str, tuple[str, ...]]] = {
+    "words": (),
+    "library": (),
+    "states": ("trace", "first", "last"),
+    "static": ("trace",),
+    "map": ("trace",),
+    "frame": ("trace", "seq"),
+    "picture": ("trace", "seq", "channel"),
+    "series": ("trace", "attribute", "node", "other"),
+    "thumbs": ("frames",),
+}
+"""Methods of :class:`Reads` for the page, each with its fields."""
+
+_PICTURES: Final = "jpeg", "png", "webp", "bmp"
+"""Picture formats that browsers can show."""
+
+
+class Reads:
+    """Reader of one store for the page.
+
+    Parameters
+    ----------
+    store : Store
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._known: tuple[Catalog, dict[str, StoredTrace], dict[str, Any]] | None = None
+        self._maps: dict[str, bytes] = {}
+        self._reading, self._looking = threading.Lock(), threading.Lock()
+
+    def _traces(self) -> tuple[dict[str, StoredTrace], dict[str, Any]]:
+        """Return traces by name, and the page's store description; cached while the file stays."""
+        with self._looking:  # after a change one thread reads, and the others wait
+            catalog = self._store.catalog()
+            if self._known is None or self._known[0] is not catalog:
+                with self._store.file.snapshot():
+                    traces = {one.name: one for one in self._store.traces()}
+                    self._known = catalog, traces, self._told(traces)
+            return self._known[1], self._known[2]
+
+    def _told(self, traces: dict[str, StoredTrace]) -> dict[str, Any]:
+        file, places = self._store.file, self._store.file.places()
+        listed: list[dict[str, Any]] = []
+        for name, one in traces.items():
+            x, y, digest, cameras = places[name]
+            about = {"name": name, "frames": one.frames, "period": one.period_ns / 1e9}
+            about |= {"seconds": (one.end_ns - one.start_ns) / 1e9, "map": one.map}
+            listed.append(about | {"map_key": digest[:16], "origin": (x, y), "cameras": cameras})
+        return {"store": file.path.name, "traces": listed, "codes": file.codes()}
+
+    def about(self) -> dict[str, Any]:
+        """Return the traces of the store, and the names of codes in columns."""
+        return self._traces()[1]
+
+    def frame_id(self, trace: str, seq: int) -> int:
+        """Return the id of a frame.
+
+        Raises
+        ------
+        StoreError
+            The trace or frame is unknown.
+        """
+        self._trace(trace)
+        return self._store.file.frame(f"{trace}#{seq}").frame_id
+
+    def _trace(self, name: str) -> StoredTrace:
+        """Return a trace by its full name."""
+        return _among(self._traces()[0], name)
+
+    # Columns -------------------------------------------------------------------------------------
+
+    def thumbs(self, frames: Sequence[tuple[str, int]]) -> bytes:
+        """Return states in some frames, for thumbnails."""
+        if len(frames) > MOST_THUMBS:
+            raise RequestError(f"frames: expected at most {MOST_THUMBS}")
+        traces = self._traces()[0]  # read once, because the store may change
+        of = [(_among(traces, trace).trace_id, seq) for trace, seq in frames]
+        return packed({}, self._store.file.states_at(of))
+
+    def states(self, trace: str, first: int, last: int) -> bytes:
+        """Return states in a window of frames: ``frame.…`` columns per frame, the others per state."""
+        frames, states = self._store.file.states(self._trace(trace).trace_id, first, last)
+        # Start of the states of each frame, so that the page need not search.
+        start = np.searchsorted(states.pop("seq"), [*frames["seq"].tolist(), 1 << 31])
+        columns = {f"frame.{name}": column for name, column in frames.items()}
+        columns["frame.start"] = start.astype(np.uint32)
+        return packed({"trace": trace, "first": first, "last": last}, columns | states)
+
+    def static(self, trace: str) -> bytes:
+        """Return static entities of a trace, and the names of all entities, as bytes."""
+        of = self._trace(trace).trace_id
+        with self._store.file.snapshot():
+            names = self._store.file.entity_names(of)
+            columns = self._store.file.scenery(of)
+        return packed({"trace": trace, "names": names}, columns)
+
+    def map(self, trace: str) -> bytes:
+        """Return the outlines of the road map of a trace; empty without a map."""
+        key = _among(self._store.file.places(), trace)[2]
+        with self._reading:  # one map at a time, so that it is not read twice
+            if key not in self._maps:
+                found = self._store.file.road_map_text(trace)
+                self._maps[key] = drawn_map(None if found is None else read_map(found[1], found[0]))
+            return self._maps[key]
+
+    def warm(self, ended: threading.Event) -> None:
+        """Read the maps before the first request, until ``ended`` is set."""
+        with suppress(SgstoreError):
+            for trace in self._traces()[0]:
+                if ended.is_set():
+                    return
+                self.map(trace)
+
+    def series(self, trace: str, attribute: str, node: int, other: int | None) -> bytes:
+        """Return an attribute over time."""
+        columns = self._store.file.series(self._trace(trace).trace_id, attribute, node, other)
+        return packed({"trace": trace, "attribute": attribute}, columns)
+
+    # Plain values, pictures --------------------------------------------------------------------------
+
+    def frame(self, trace: str, seq: int) -> dict[str, Any]:
+        """Return the scene graph of a frame: all attributes of its nodes and edges."""
+        return told_graph(self._store.file.graph(self.frame_id(trace, seq)))
+
+    def picture(self, trace: str, seq: int, channel: str) -> tuple[bytes, str]:
+        """Return the recorded camera picture of a frame, and its type.
+
+        Raises
+        ------
+        ExportError
+            The message has no picture that browsers can show.
+        """
+        return shown_picture(self._store.file.carried(self.frame_id(trace, seq), channel), channel)
+
+    def words(self) -> dict[str, Any]:
+        """Return the words of the language for completion."""
+        return words(self._store.catalog())
+
+    def library(self) -> list[dict[str, Any]]:
+        """Return the named patterns with their drawings."""
+        names = ("name", "kind", "text", "sentence", "library")
+        return [
+            {name: getattr(one, name) for name in names} | {"drawing": one.example}
+            for one in patterns().values()
+        ]
+
+
+def _among(traces: Mapping[str, T], name: str) -> T:
+    """Return the entry of a trace by its full name."""
+    if name not in traces:
+        raise StoreError(f"no trace {name!r} in the store")
+    return traces[name]
+
+
+def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
+    """Return a picture that browsers can show, with its type; empty without a picture."""
+    if media is None:
+        return b"", "application/octet-stream"
+    if media.form not in _PICTURES:
+        raise ExportError(f"{channel}: the message holds {media.form}, no picture")
+    return media.data, f"image/{media.form}"
+
+
+def drawn_map(road_map: RoadMap | None) -> bytes:
+    """Return the outlines of a map; empty without a map."""
+    if road_map is None:
+        return packed({"origin": [0, 0], "words": []}, {})
+    drawn = drawn_outlines(road_map)
+    names = ("x", "y", "start", "node", "word", "closed")
+    columns = {name: getattr(drawn, name) for name in names}
+    return packed({"origin": drawn.origin, "words": drawn.words}, columns)
+
+
+def told_graph(graph: SceneGraph) -> dict[str, Any]:
+    """Return all attributes of the nodes and edges of a scene graph, as JSON values."""
+    nodes = [{"id": node, **about} for node, about in graph.nodes.items()]
+    edges = [
+        {"src": src, "relation": relation, "dst": dst, **about}
+        for src, relation, dst, about in graph.edges
+    ]
+    return finite({"nodes": nodes, "edges": edges})

@@ -1,0 +1,52 @@
+"""Binary columns, which the page uses as typed arrays without copying; and JSON for browsers.
+
+``u32 length of the header, u32 0``, the header as JSON padded to 8 bytes, then each column, little-endian,
+padded to 8 bytes. The header names the columns with their types and lengths under ``columns``.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.base.json_text import json_text
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+PAGE: Final = Path(__file__).parent / "page"
+"""Files of the page."""
+
+
+def packed(header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> bytes:
+    """Pack a header and columns into bytes.
+
+    Parameters
+    ----------
+    header : mapping
+        JSON values.
+    columns : mapping of str to array
+        Numbers, one dimension each.
+    """
+    listed = [[name, column.dtype.str[1:], len(column)] for name, column in columns.items()]
+    text = json.dumps({**header, "columns": listed}).encode()
+    parts = [struct.pack("<II", len(text), 0), text, _padding(text)]
+    for column in columns.values():
+        data = np.ascontiguousarray(column, column.dtype.newbyteorder("<")).tobytes()
+        parts += [data, _padding(data)]
+    return b"".join(parts)
+
+
+def _padding(data: bytes) -> bytes:
+    return bytes(-len(data) % 8)
+
+
+def as_json(value: object) -> bytes:
+    """Return a value as JSON for browsers; infinite numbers become texts, such as ``inf``."""
+    return json_text(value, str).encode(errors="replace")

@@ -1,0 +1,133 @@
+"""Queries of the explorer's page, run in a sandbox process.
+
+A query has ``ask``, a key of :data:`QUESTIONS`, and its parameters: ``text``, ``parameters``,
+``frame``, …. Replies are sent when they are ready; a reply with ``more`` is followed by others.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from itertools import islice
+from typing import Any, Final
+
+from sgstore.apps.sandbox import plain, rows_found, serve
+from sgstore.errors import QueryError
+from sgstore.lang import WhyNotSteps
+from sgstore.query import Store
+from sgstore.temporal import margin_cells
+
+Reply = dict[str, Any]
+Asked = Callable[[Store, dict[str, Any], int], Iterator[Reply]]
+
+BATCH_S: Final = 0.1
+"""Time to collect matches for one message; s."""
+
+BATCH_ROWS: Final = 500
+"""Greatest number of matches per message."""
+
+
+def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
+    """Yield the columns and the traces that cannot answer, then intervals with bindings in batches."""
+    with store.file.snapshot():
+        matches = store.find(question["text"], **question["parameters"])
+        names, found = tuple[str, ...](), list[list[Any]]()
+        many, sent = 0, time.monotonic()
+        yield {"more": True, "reasons": matches.reasons, "columns": matches.columns}
+        for interval in islice(matches.intervals(bound=True), most + 1):
+            many += 1
+            if many > most:
+                break
+            if names != tuple(interval.values):  # each part of a union has its own variables
+                if found:
+                    yield {"more": True, "matches": found}
+                names, found = tuple(interval.values), []
+                yield {"more": True, "names": names}
+            times = (interval.start_seq, interval.end_seq, interval.start, interval.end)
+            found.append([interval.trace, *times, *map(plain, interval.values.values())])
+            if len(found) >= BATCH_ROWS or time.monotonic() - sent > BATCH_S:
+                yield {"more": True, "matches": found}
+                found, sent = [], time.monotonic()
+        yield {"more": True, "matches": found}
+        yield {"count": min(many, most), "truncated": many > most, "notes": matches.notes}
+
+
+def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
+    """Yield rows of a pattern or of an SQL statement, as JSON values."""
+    key = "sql" if question["ask"] == "sql" else "find"
+    told = rows_found(store, {key: question["text"], "parameters": question["parameters"]}, most)
+    for row in told["rows"]:  # frame ids exceed the exact integers of a browser
+        row[:] = [str(v) if isinstance(v, int) and abs(v) > 2**53 else v for v in row]
+    yield told
+
+
+def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """Yield truth lanes."""
+    text, values, binding = question["text"], question["parameters"], question["binding"]
+    yield store.parts(text, question["frame"], binding, **values).as_dict()
+
+
+def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """Yield the first part that fails in a frame, and parameter values that would match."""
+    text, values, frame = question["text"], question["parameters"], question["frame"]
+    answer = store.why_not(frame, text, **values)
+    steps = answer.steps if isinstance(answer, WhyNotSteps) else (answer,)
+    changes: list[dict[str, Any]] = []
+    for number, step in enumerate(steps):
+        for start, end, number_text in step.relaxed(text):
+            other = f"{text[:start]}{number_text}{text[end:]}"
+            try:
+                again = store.why_not(frame, other, **values)
+            except QueryError:
+                continue
+            now = again.steps[number] if isinstance(again, WhyNotSteps) else again
+            if now.failed != step.failed:
+                changes.append({"start": start, "end": end, "text": number_text})
+                break
+    yield {**answer.as_dict(), "relax": changes}
+
+
+def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
+    """Yield verdicts of checks, with the violations of each trace."""
+    run = store.check(question["text"], **question["parameters"])
+    many, verdicts = 0, list[Reply]()
+    for verdict in run:
+        spans = [
+            [one.start_seq, one.end_seq, one.start, one.end, dict(one.values)]
+            for one in verdict.violations[: max(most - many, 0)]
+        ]
+        many += len(spans)
+        about = {"check": verdict.check, "trace": verdict.trace, "verdict": verdict.verdict}
+        about |= {"reason": verdict.reason, "violations": len(verdict.violations), "spans": spans}
+        about["absent_frames"] = verdict.absent_frames
+        about["robustness"] = " · ".join(filter(None, margin_cells(verdict)))
+        verdicts.append(about)
+    yield {"verdicts": verdicts, "count": many, "truncated": many >= most, "notes": run.notes}
+
+
+def _measured(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """Yield the result of coverage, a selection, or a clip task, after its progress."""
+    from sgstore.apps.explorer import _measures  # not needed by the others
+
+    yield getattr(_measures, question.pop("ask"))(store, **question)
+
+
+QUESTIONS: Final[Mapping[str, Asked]] = {
+    "matches": _told_matches,
+    "rows": _told_rows,
+    "sql": _told_rows,
+    "parts": _told_parts,
+    "why": _told_why,
+    "check": _told_check,
+    **dict.fromkeys(("coverage", "select", "lock", "export", "diff"), _measured),
+}
+"""Functions by ``ask``; each gets the store, the query, and the limit of matches or rows."""
+
+
+def answer(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
+    """Yield replies to a query."""
+    return QUESTIONS[question["ask"]](store, question, most)
+
+
+if __name__ == "__main__":
+    serve(answer)

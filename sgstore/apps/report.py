@@ -1,0 +1,379 @@
+"""Matches of a query as one HTML file that plays without a server and without a network.
+
+The file contains the page's modules as one script, and the data that they would request from a
+server: matches, truth lanes, states around each match, outlines of maps and optionally camera
+pictures. A policy in the file permits only that script, and no requests.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import html
+import json
+import re
+from dataclasses import astuple, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.apps.explorer import PAGE, Reads, answer, as_json, packed
+from sgstore.base.files import write_bytes
+from sgstore.errors import SgstoreError
+from sgstore.model.notes import NotesFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from sgstore.query import Store
+
+CHUNK: Final = 300
+"""Frames per states request of the page (``CHUNK`` of ``data.js``)."""
+
+POLICY: Final = (
+    "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}';"
+    " base-uri 'none'; form-action 'none'; require-trusted-types-for 'script'"
+)
+
+Found = tuple[str, int, int, dict[str, int]]
+"""Match: trace, first and last frame, and nodes by variable."""
+Spans = dict[str, list[tuple[int, int]]]
+"""Trace → first and last frame of the stored ranges, ordered and disjoint."""
+
+
+def report(
+    store: Store,
+    text: str,
+    to: Path,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    most: int = 100,
+    around_s: float = 2.0,
+    pictures: bool = False,
+) -> tuple[int, bool]:
+    """Write the matches of a query as a page that needs no server.
+
+    Parameters
+    ----------
+    store : Store
+    text : str
+        A pattern; or checks, whose violations are shown.
+    to : Path
+        The output file.
+    parameters : mapping, optional
+        Values of ``$name``.
+    most : int
+        Greatest number of matches.
+    around_s : float
+        Additional time before and after each match; s.
+    pictures : bool
+        True to include a picture of the first camera for each second of a match.
+
+    Returns
+    -------
+    matches : int
+        Number of included matches.
+    truncated : bool
+        True if there are more.
+
+    Raises
+    ------
+    QueryError
+        The text is not a query.
+    """
+    title = Path(to).stem
+    page, many, truncated = _made(store, text, parameters, title, most, around_s, pictures)
+    write_bytes(to, page.encode())
+    return many, truncated
+
+
+@dataclass(frozen=True)
+class PlayableMatches:
+    """Matches that a notebook shows as a report, in an isolated frame.
+
+    Attributes
+    ----------
+    page : str
+        The report, as written by :func:`report`.
+    height : int
+        Height of the frame; points.
+    """
+
+    page: str = field(repr=False)
+    height: int
+
+    def _repr_html_(self) -> str:
+        style = f"width:100%;height:{self.height}px;border:1px solid #8886;border-radius:8px"
+        page = html.escape(self.page, quote=True)
+        return f'<iframe sandbox="allow-scripts" style="{style}" srcdoc="{page}"></iframe>'
+
+
+def inline(
+    store: Store,
+    text: str,
+    *,
+    parameters: Mapping[str, Any] | None = None,
+    height: int = 620,
+    most: int = 20,
+    around_s: float = 2.0,
+    pictures: bool = False,
+) -> PlayableMatches:
+    """Return matches of a query as an object that a notebook displays as a report.
+
+    Parameters
+    ----------
+    store, text, parameters, most, around_s, pictures
+        As in :func:`report`.
+    height : int
+        Height of the frame; points.
+
+    Raises
+    ------
+    QueryError
+        The text is not a query.
+    """
+    page, _, _ = _made(store, text, parameters, "sgstore", most, around_s, pictures)
+    return PlayableMatches(page, height)
+
+
+def _made(
+    store: Store,
+    text: str,
+    parameters: Mapping[str, Any] | None,
+    title: str,
+    most: int,
+    around_s: float,
+    pictures: bool,  # noqa: FBT001 - as report has it
+) -> tuple[str, int, bool]:
+    """Return a page, its number of matches, and True if there are more."""
+    with store.file.snapshot():
+        kept, found, truncated = _kept(store, text, dict(parameters or {}), most, around_s)
+        if pictures:
+            kept["pictures"] = _pictures(store, kept["about"]["traces"], found)
+    return _page(kept, title), len(found), truncated
+
+
+def _kept(
+    store: Store, text: str, values: dict[str, Any], most: int, around_s: float
+) -> tuple[dict[str, Any], list[Found], bool]:
+    """Return the page's data as JSON values, the matches, and True if there are more."""
+    is_check = re.match(r"\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b", text, re.IGNORECASE)
+    question = {"text": text, "parameters": values}
+    told = list(answer(store, {"ask": "check" if is_check else "matches", **question}, most))
+    check, found = None, list[Found]()
+    if is_check:
+        (check,) = told
+        spans = [(one["trace"], *span) for one in check["verdicts"] for span in one["spans"]]
+        found = [(trace, first, last, {}) for trace, first, last, *_ in spans]
+    else:
+        found = list(_found(told))
+    reads = Reads(store)
+    about = reads.about()
+    traces = {one["name"]: one for one in about["traces"] if one["name"] in {m[0] for m in found}}
+    for one in traces.values():
+        one |= {"cameras": []}
+    spans = _spans(found, traces, around_s)
+    kept: dict[str, Any] = {
+        "about": {**about, "traces": [*traces.values()], "around": around_s},
+        "query": text,
+        "parameters": values,
+        "made": datetime.now(UTC).isoformat(" ", "minutes")[:16] + " UTC",
+        "find": told,
+        "check": check,
+        "parts": {} if is_check else _parts(store, question, found),
+        "notes": [astuple(note) for note in _notes(store)],
+        "columns": dict(_columns(store, reads, traces, spans)),
+        "pictures": {},
+    }
+    return kept, found, bool(told[-1].get("truncated"))
+
+
+def _found(told: list[dict[str, Any]]) -> Iterator[Found]:
+    """Yield the matches among replies, in the page's form."""
+    names: tuple[str, ...] = ()
+    for reply in told:
+        names = reply.get("names", names)
+        for trace, first, last, _, _, *values in reply.get("matches", ()):
+            pairs = zip(names, values, strict=True)
+            yield (
+                trace,
+                first,
+                last,
+                {n: v for n, v in pairs if f"{n}.name" in names and v is not None},
+            )
+
+
+def _notes(store: Store) -> list[Any]:
+    try:
+        return NotesFile(store.file.path).read()
+    except SgstoreError:
+        return []
+
+
+def _key(*values: Any) -> str:
+    """Return the key of a data item, as written by ``JSON.stringify``."""
+    return json.dumps(values, separators=(",", ":"), ensure_ascii=False)
+
+
+def _spans(found: list[Found], traces: Mapping[str, Any], around_s: float) -> Spans:
+    """Return the frame ranges of the matches with their surroundings."""
+    spans: Spans = {}
+    for trace, first, last, _ in sorted(found, key=lambda match: match[:3]):
+        about = traces[trace]
+        around = int(around_s / (about["period"] or 0.1))
+        low, high = max(first - around, 0), min(last + around, about["frames"] - 1)
+        mine = spans.setdefault(trace, [])
+        if mine and low <= mine[-1][1] + 1:
+            mine[-1] = mine[-1][0], max(mine[-1][1], high)
+        else:
+            mine.append((low, high))
+    return spans
+
+
+def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dict[str, Any]:
+    """Return truth lanes by trace and nodes; matches of the same nodes share them."""
+    parts: dict[str, Any] = {}
+    for trace, first, _, binding in found:
+        key = _key(trace, binding or None)
+        if key not in parts:
+            frame = store.file.frame(f"{trace}#{first}").frame_id
+            asked = {"ask": "parts", **question, "frame": frame, "binding": binding or None}
+            (parts[key],) = answer(store, asked, 0)
+    return parts
+
+
+def _columns(
+    store: Store, reads: Reads, traces: Mapping[str, Any], spans: Spans
+) -> Iterator[tuple[str, str]]:
+    """Yield the page's columns by key: states in the ranges, static entities, maps."""
+    maps: set[str] = set()
+    for name, about in traces.items():
+        yield _key("api/static", name), _small(reads.static(name))
+        if about["map_key"] and about["map_key"] not in maps:
+            maps.add(about["map_key"])
+            yield _key("api/map", about["map_key"]), _small(reads.map(name))
+        numbers = sorted({k for a, z in spans[name] for k in range(a // CHUNK, z // CHUNK + 1)})
+        for number in numbers:
+            first = number * CHUNK
+            last = min(first + CHUNK, about["frames"]) - 1
+            data = _states(store, name, first, last, spans[name])
+            yield _key("api/states", name, first, last), _small(data)
+
+
+def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[int, int]]) -> bytes:
+    """Return states of frames in the ranges; other frames are empty."""
+    frames, states = store.file.states(trace, first, last)
+    seq = states.pop("seq")
+    inside = np.zeros(len(seq), bool)
+    for low, high in spans:
+        inside |= (low <= seq) & (seq <= high)
+    start = np.searchsorted(seq[inside], np.append(frames["seq"], last + 1)).astype(np.uint32)
+    columns = {f"frame.{name}": column for name, column in frames.items()} | {"frame.start": start}
+    # Positions to a centimetre, other numbers to three decimals: the file is a third smaller.
+    kept = {name: _rounded(column[inside]) for name, column in states.items()}
+    return packed({"trace": trace, "first": first, "last": last}, columns | kept)
+
+
+def _rounded(column: Any) -> Any:
+    """Round numbers to 1/128: trailing zero bits compress well."""
+    if column.dtype.kind != "f":
+        return column
+    return (np.round(column * 128) / 128).astype(column.dtype)
+
+
+def _small(data: bytes) -> str:
+    return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode()
+
+
+def _pictures(
+    store: Store, traces: list[dict[str, Any]], matches: list[Found]
+) -> dict[str, dict[str, str]]:
+    """Return pictures of each trace's first camera, one per second of a match; ``cameras`` has its name."""
+    reads, found = Reads(store), dict[str, dict[str, str]]()
+    cameras = {one["name"]: one["cameras"] for one in reads.about()["traces"]}
+    for about in traces:
+        trace, topics = about["name"], cameras[about["name"]][:1]
+        about["cameras"] = topics
+        every = max(round(1 / (about["period"] or 0.1)), 1)
+        mine = [match for match in matches if match[0] == trace]
+        wanted = {seq for _, first, last, _ in mine for seq in range(first, last + 1, every)}
+        for topic in topics:
+            kept = found[_key(trace, topic)] = {}
+            for seq in sorted(wanted):
+                try:
+                    data, _ = reads.picture(trace, seq, topic)
+                except SgstoreError:
+                    continue  # some frames have none
+                kept[str(seq)] = base64.b64encode(data).decode()
+    return found
+
+
+# One file -----------------------------------------------------------------------------------------------------
+
+_IMPORT: Final = re.compile(
+    r"""^import (?:\* as (?P<whole>\w+)|\{(?P<names>[^}]*)\}) from "(?P<file>[^"]+)";$""",
+    re.MULTILINE,
+)
+_EXPORT: Final = re.compile(
+    r"^export (?P<kind>const|class|function\*?|async function\*?) (?P<name>\w+)", re.MULTILINE
+)
+_MINIFIED: Final = re.compile(r"export\{([^}]*)\};?\s*$")
+
+
+def script() -> str:
+    """Return the modules of a report as one script: each module becomes a function."""
+    parts: list[str] = []
+    names: dict[Path, str] = {}
+
+    def add(file: Path) -> str:
+        if file.name == "api.js":
+            file = file.with_name("offline.js")
+        if file not in names:
+            text = file.read_text(encoding="utf-8")
+            text = _IMPORT.sub(
+                lambda found: _imported(found, add((file.parent / found["file"]).resolve())), text
+            )
+            names[file] = f"of_{file.stem}"
+            parts.append(f"const {names[file]} = (() => {{\n{_exported(text)}\n}})();\n")
+        return names[file]
+
+    add((PAGE / "js" / "report.js").resolve())
+    return "".join(parts)
+
+
+def _imported(found: re.Match[str], name: str) -> str:
+    if found["whole"]:
+        return f"const {found['whole']} = {name};"
+    return f"const {{{' '.join(found['names'].split())}}} = {name};"
+
+
+def _exported(text: str) -> str:
+    """Convert a module to the body of a function that returns its exports."""
+    minified = _MINIFIED.search(text)
+    if minified:
+        pairs = (one.split(" as ") for one in minified[1].split(","))
+        told = ", ".join(f"{pair[-1]}: {pair[0]}" for pair in pairs)
+        return f"{text[: minified.start()]}return {{ {told} }};"
+    exported = [found["name"] for found in _EXPORT.finditer(text)]
+    body = _EXPORT.sub(lambda found: f"{found['kind']} {found['name']}", text)
+    return f"{body}\nreturn {{ {', '.join(exported)} }};"
+
+
+def _page(kept: dict[str, Any], title: str) -> str:
+    code, style = script(), (PAGE / "style.css").read_text(encoding="utf-8")
+    digests = {
+        name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        for name, text in (("script", code), ("style", style))
+    }
+    told = {
+        "policy": POLICY.format(**digests),
+        "title": html.escape(title),
+        "style": style,
+        "kept": as_json(kept).decode().replace("<", "\\u003c"),
+        "script": code,
+    }
+    text = (PAGE / "report.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda place: told[place[1]], text)

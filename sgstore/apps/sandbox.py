@@ -1,0 +1,701 @@
+"""Sandbox: untrusted SQL and patterns, run in a separate process.
+
+The process can only read the store: the database is opened read-only without file access, and its
+settings are locked. The operating system forbids it to write files and limits its address space. A
+query has a deadline, after which the process is killed (stopping a query in the database can take
+long). Its result has a limited number of rows and bytes. The process lives on between queries,
+because its start takes a third of a second.
+
+Parent and child exchange JSON, one message per line. Other packages can run their own queries in
+such a process: the ``worker`` of a sandbox is a module that calls :func:`serve` with a function for
+its queries, and :meth:`Sandbox.ask` sends them.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, Self
+
+from sgstore.base.files import new_place
+from sgstore.base.processes import command
+from sgstore.errors import (
+    QueryError,
+    SgstoreError,
+    SqlError,
+    StoreError,
+    error_of,
+    plain_error,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping
+
+    from sgstore.query import Store
+
+    Answering = Callable[[Store, dict[str, Any], int], dict[str, Any] | Iterator[dict[str, Any]]]
+    """Reply to a question, or replies: of the store, the question, and the most rows; see :func:`plain`."""
+
+TIMEOUT_S: Final = 5.0
+MEMORY: Final = 512 << 20
+MAX_ROWS: Final = 10_000
+MAX_BYTES: Final = 64 << 20
+"""Greatest size of a result in transfer; bytes."""
+
+MAX_QUESTION: Final = 1 << 20
+"""Greatest length of a query with its values; characters."""
+
+START_S: Final = 120.0
+"""Time limit for the start of the process; s. It takes one second, or up to a minute on a very busy machine."""
+
+READ_S: Final = 60.0
+"""Additional time for each table that it reads first; s."""
+
+_TABLE_BYTES: Final = 4 << 30
+"""Largest file that it may write, only while it reads tables, in its own folder; bytes."""
+
+_ADDRESS_SPACE: Final = 4 << 30
+"""Address space for Python, its libraries and the database's threads, in addition to the query
+memory; bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Result of a query.
+
+    Attributes
+    ----------
+    columns : tuple of str
+    rows : list of tuple
+        Numbers, texts, truth values, ``None``, and lists and dicts of these; other values as text.
+    truncated : bool
+        True if there were more rows than allowed.
+    reasons : mapping of str to str
+        Traces that cannot answer the pattern, by name, with the reason.
+    graphs : bool
+        True if each row ends in a graph (``RETURN SUBGRAPHS``).
+    notes : tuple of str
+        Likely mistakes; see :attr:`sgstore.matches.Matches.notes`.
+    """
+
+    columns: tuple[str, ...]
+    rows: list[tuple[Any, ...]]
+    truncated: bool
+    reasons: Mapping[str, str] = field(default_factory=dict[str, str])
+    graphs: bool = False
+    notes: tuple[str, ...] = ()
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Return the traces that cannot answer the pattern."""
+        return tuple(self.reasons)
+
+
+class Sandbox:
+    """Process that runs queries on a store.
+
+    Queries of several threads run one after the other. A context manager; otherwise call
+    :meth:`close`.
+
+    Parameters
+    ----------
+    store : str or Path
+    timeout_s : float
+        Time limit of a query; s.
+    memory : int
+        Memory limit of a query; bytes.
+    max_rows : int
+        Greatest number of rows of a result.
+    max_bytes : int
+        Greatest size of a result; bytes.
+    tables : mapping of str to path, optional
+        User tables for joins: Parquet, CSV or JSON files. They are also read in that process.
+    worker : str
+        Module of the process, which calls :func:`serve`.
+
+    Raises
+    ------
+    StoreError
+        The file is missing, is not a store, or has another version; or a table cannot be read.
+    """
+
+    may_write: ClassVar[bool] = False
+    """True if the process may write files."""
+
+    def __init__(
+        self,
+        store: str | Path,
+        *,
+        timeout_s: float = TIMEOUT_S,
+        memory: int = MEMORY,
+        max_rows: int = MAX_ROWS,
+        max_bytes: int = MAX_BYTES,
+        tables: Mapping[str, str | Path] | None = None,
+        worker: str = "sgstore.apps.sandbox",
+    ) -> None:
+        self._store = Path(store)
+        self._worker = worker
+        self._timeout_s = timeout_s
+        self._memory = memory
+        self._max_rows = max_rows
+        self._max_bytes = max_bytes
+        self._tables = {name: str(Path(path).resolve()) for name, path in (tables or {}).items()}
+        self._folder: Path | None = None
+        self._turn = threading.Lock()
+        self._child: subprocess.Popen[bytes] | None = None
+        self._stopped = False
+        with self._turn:
+            self._ready()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the process."""
+        with self._turn:
+            self._kill()
+
+    @property
+    def folder(self) -> Path | None:
+        """Return the folder of the process's tables; ``None`` without a process."""
+        return self._folder
+
+    def sql(self, text: str) -> Answer:
+        """Return the rows of one read-only statement.
+
+        Raises
+        ------
+        SqlError
+            The statement is invalid, the database rejects it, or it exceeds the time or memory
+            limit.
+        QueryError
+            A pattern in it is invalid.
+        """
+        return _answer(self.ask({"sql": text}, SqlError))
+
+    def find(self, text: str, /, **parameters: object) -> Answer:
+        """Return the rows of a pattern.
+
+        Raises
+        ------
+        QueryError
+            The text is not a query.
+        SqlError
+            The query exceeds the time or memory limit.
+        """
+        return _answer(self.ask({"find": text, "parameters": parameters}))
+
+    def ask(
+        self, question: Mapping[str, object], error: type[SgstoreError] = QueryError
+    ) -> dict[str, Any]:
+        """Return the reply of the process to a query of its worker.
+
+        Parameters
+        ----------
+        question : mapping
+            JSON values.
+        error : type
+            Error class for a query that is too long.
+
+        Raises
+        ------
+        SgstoreError
+            An error of the worker.
+        SqlError
+            The query exceeds the time or memory limit.
+        """
+        line = _line(question, error)
+        with self._turn:
+            return _granted(self._exchange(self._ready(), line, self._timeout_s))
+
+    def replies(self, question: Mapping[str, object]) -> Iterator[dict[str, Any]]:
+        """Yield the replies to a query on arrival; ending the iteration early stops the process.
+
+        All replies except the last have ``more``.
+
+        Parameters
+        ----------
+        question : mapping
+            JSON values.
+
+        Raises
+        ------
+        SgstoreError
+            An error of the worker.
+        SqlError
+            The query exceeds the time or memory limit, or was stopped.
+        """
+        line, finished = _line(question, QueryError), False
+        until = time.monotonic() + self._timeout_s
+        with self._turn:
+            try:
+                reply = self._exchange(self._ready(), line, self._timeout_s)
+                while reply.pop("more", False):
+                    yield reply
+                    assert self._child is not None  # noqa: S101 - it has just answered
+                    reply = self._exchange(self._child, None, until - time.monotonic())
+                finished = True
+            finally:
+                if not finished:
+                    self._abandon()
+        yield _granted(reply)
+
+    def stop(self) -> None:
+        """Stop the current query of another thread by killing the process."""
+        child = self._child
+        if child is not None:
+            self._stopped = True
+            child.kill()
+
+    def start(self) -> None:
+        """Start the process for the next query."""
+        with self._turn:
+            self._ready()
+
+    @property
+    def is_ready(self) -> bool:
+        """True if a process is ready to answer."""
+        child = self._child
+        return child is not None and child.poll() is None
+
+    def _ready(self) -> subprocess.Popen[bytes]:
+        """Return the process, and start it if necessary."""
+        if self._child is None or self._child.poll() is not None:
+            self._kill()
+            self._stopped = False
+            self._child = subprocess.Popen(  # noqa: S603  a module of ours
+                command(self._worker),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+            )
+            self._folder = new_place("sandbox")
+            self._folder.mkdir(mode=0o700)
+            settings = {
+                "store": str(self._store.absolute()),
+                "memory": self._memory,
+                "rows": self._max_rows,
+                "tables": self._tables,
+                "folder": str(self._folder),
+                "may_write": self.may_write,
+            }
+            wait = START_S + READ_S * len(self._tables)
+            try:
+                reply = self._exchange(self._child, json.dumps(settings), wait)
+            except SqlError as error:
+                raise SqlError(f"the process that answers did not start: {error}") from None
+            if "error" in reply:
+                self._kill()
+            _granted(reply)
+        return self._child
+
+    def _exchange(self, child: subprocess.Popen[bytes], line: str | None, timeout_s: float) -> Any:
+        """Send a line, if there is one, and read one; kill the process at the deadline.
+
+        The caller does not wait for its end, because a process with much memory exits slowly.
+        """
+        replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        talk = threading.Thread(
+            target=_sent_and_read,
+            args=(child, None if line is None else line.encode(), replies, self._max_bytes),
+            daemon=True,
+        )
+        talk.start()
+        try:
+            reply = replies.get(timeout=max(timeout_s, 0))
+        except queue.Empty:
+            self._abandon()
+            told = self._timeout_s if line is None else timeout_s  # later parts have less time left
+            raise SqlError(f"stopped after {told:g} s") from None
+        except BaseException:
+            self._kill()
+            raise
+        if reply.endswith(b"\n"):
+            return json.loads(reply)
+        stopped = self._stopped
+        self._kill()
+        if stopped:
+            raise SqlError("stopped")
+        if len(reply) > self._max_bytes:
+            raise SqlError(f"stopped: the answer is longer than {self._max_bytes} bytes")
+        raise SqlError("stopped: it took more memory than is allowed")
+
+    def _abandon(self) -> None:
+        """Kill the process, and clean up after it in the background."""
+        child, folder = self._child, self._folder
+        self._child = self._folder = None
+        if child is not None:
+            child.kill()
+            threading.Thread(target=_bury, args=(child, folder)).start()
+
+    def _kill(self) -> None:
+        child, folder = self._child, self._folder
+        self._child = self._folder = None
+        if child is not None:
+            child.kill()
+            _bury(child, folder)
+
+
+def _bury(child: subprocess.Popen[bytes], folder: Path | None) -> None:
+    """Wait for the end of a process, and remove its folder."""
+    with child:  # closes the pipes, too
+        pass
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _sent_and_read(
+    child: subprocess.Popen[bytes],
+    line: bytes | None,
+    replies: queue.SimpleQueue[bytes],
+    most: int,
+) -> None:
+    """Put the reply line of a process into the queue; incomplete if it died or exceeded the limit."""
+    reply = b""
+    # A thread that kills the process may close its pipes during their use here.
+    with suppress(OSError, ValueError):
+        if child.stdin is not None and child.stdout is not None:
+            if line is not None:
+                child.stdin.write(line + b"\n")
+                child.stdin.flush()
+            reply = child.stdout.readline(most + 1)
+    replies.put(reply)
+
+
+def _line(question: Mapping[str, object], error: type[SgstoreError]) -> str:
+    line = json.dumps(question)
+    if len(line) > MAX_QUESTION:
+        raise error(f"the question has {len(line)} characters; {MAX_QUESTION} are allowed")
+    return line
+
+
+def _granted(reply: Any) -> dict[str, Any]:
+    """Return a reply, or raise the error in it."""
+    if "query" in reply or "error" in reply:
+        raise error_of(reply)
+    return reply
+
+
+def _answer(reply: dict[str, Any]) -> Answer:
+    rows = [tuple(row) for row in reply["rows"]]
+    columns, reasons = tuple(reply["columns"]), dict(reply["reasons"])
+    graphs, notes = reply.get("graphs", False), tuple(reply.get("notes", ()))
+    return Answer(columns, rows, reply["truncated"], reasons, graphs, notes)
+
+
+class Workshop(Sandbox):
+    """Sandbox for internal tasks that write files, with immediate cancelling."""
+
+    may_write: ClassVar[bool] = True
+
+
+class Errand:
+    """Longer task in its own :class:`Workshop`, with the interface of :class:`SandboxPool`.
+
+    Parameters
+    ----------
+    store : str or Path
+    **limits
+        As in :class:`Sandbox`.
+    """
+
+    def __init__(self, store: str | Path, **limits: Any) -> None:
+        self._make = lambda: Workshop(store, **limits)
+        self._box: Workshop | None = None
+        self._gone = False
+
+    def ask(self, question: Mapping[str, object], _key: str) -> Iterator[dict[str, Any]]:
+        """Yield the replies on arrival; none after an early cancel."""
+        with self._make() as self._box:
+            if not self._gone:
+                yield from self._box.replies(question)
+
+    def cancel(self, _key: str = "") -> bool:
+        """Stop the task."""
+        self._gone = True
+        if self._box is not None:
+            self._box.stop()
+        return True
+
+
+class SandboxPool:
+    """Pool of sandboxes of one store for parallel queries, with a spare one.
+
+    A query that is stopped, or takes too long, loses its process. The spare process takes its
+    place, and a new spare one is started in the background. A context manager; otherwise call
+    :meth:`close`.
+
+    Parameters
+    ----------
+    store : str or Path
+    size : int
+        Number of parallel queries; further ones wait.
+    small : collection of str
+        Kinds of short queries (``ask`` of a query) that never wait: the spare sandbox runs them.
+    first : mapping, optional
+        Warm-up query of each new process.
+    **limits
+        As in :class:`Sandbox`.
+
+    Raises
+    ------
+    StoreError
+        As in :class:`Sandbox`.
+    """
+
+    def __init__(
+        self,
+        store: str | Path,
+        *,
+        size: int = 2,
+        small: Collection[str] = (),
+        first: Mapping[str, object] | None = None,
+        **limits: Any,
+    ) -> None:
+        self._first = first
+        self._changed = threading.Condition()
+        self._turns = threading.BoundedSemaphore(size)
+        self._small = dict.fromkeys(small, threading.BoundedSemaphore(1))
+        self._free = [Sandbox(store, **limits)]
+        self._asked: dict[str, Sandbox | None] = {}
+        self._closed = False
+        self._make = lambda: Sandbox(store, **limits)
+        self._starting = [
+            threading.Thread(target=self._more, daemon=True, name="sgstore sandbox")
+            for _ in range(size)
+        ]
+        for thread in self._starting:
+            thread.start()
+
+    def __enter__(self) -> SandboxPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop all processes and running queries."""
+        with self._changed:
+            self._closed = True
+            boxes = [*self._free, *(box for box in self._asked.values() if box is not None)]
+            self._free.clear()
+        for box in boxes:
+            box.stop()
+        for thread in self._starting:
+            thread.join(START_S)
+        for box in boxes:
+            box.close()
+
+    def ask(self, question: Mapping[str, object], key: str) -> Iterator[dict[str, Any]]:
+        """Yield the replies to a query, as :meth:`Sandbox.replies`.
+
+        Parameters
+        ----------
+        question : mapping
+        key : str
+            Key for :meth:`cancel`, unique among running queries.
+        """
+        with self._changed:
+            if key in self._asked:
+                raise QueryError(f"a question {key!r} is under way")
+            self._asked[key] = None
+        try:
+            with self._small.get(str(question.get("ask")), self._turns):
+                box = self._taken(key)
+                try:
+                    yield from box.replies(question)
+                finally:
+                    self._give_back(box)
+        finally:
+            with self._changed:
+                self._asked.pop(key, None)
+
+    def cancel(self, key: str) -> bool:
+        """Stop a query; return False if no running query has this key."""
+        with self._changed:
+            box = self._asked.pop(key, None)
+            known = box is not None or key in self._asked
+        if box is not None:
+            box.stop()
+        return known
+
+    def _taken(self, key: str) -> Sandbox:
+        with self._changed:
+            self._changed.wait_for(lambda: self._free or self._closed)
+            if self._closed or key not in self._asked:
+                raise SqlError("stopped")
+            box = self._asked[key] = self._free.pop()
+        return box
+
+    def _give_back(self, box: Sandbox) -> None:
+        if box.is_ready:
+            self._put(box)
+            return
+        again = threading.Thread(target=self._again, args=(box,), daemon=True)
+        self._starting = [one for one in self._starting if one.is_alive()] + [again]
+        again.start()
+
+    def _more(self) -> None:
+        with suppress(SgstoreError):  # the first one started, so this fault is temporary
+            self._ready(self._make())
+
+    def _again(self, box: Sandbox) -> None:
+        with suppress(SgstoreError):
+            box.start()
+        self._ready(box)
+
+    def _ready(self, box: Sandbox) -> None:
+        """Add a newly started process to the pool."""
+        with suppress(SgstoreError):
+            if self._first is not None:
+                box.ask(self._first)
+        self._put(box)
+
+    def _put(self, box: Sandbox) -> None:
+        with self._changed:
+            closed = self._closed
+            if not closed:
+                self._free.append(box)
+                self._changed.notify()
+        if closed:
+            box.close()
+
+
+# The process ------------------------------------------------------------------------------------------------
+
+
+def serve(answering: Answering) -> None:
+    """Answer the queries on stdin until it ends, then exit the process.
+
+    Parameters
+    ----------
+    answering : callable
+        Function from a query to its reply (JSON values). Errors of sgstore are sent to the caller.
+    """
+    with suppress(KeyboardInterrupt, BrokenPipeError):
+        _serve(answering)
+    os._exit(0)
+
+
+def _serve(answering: Answering) -> None:
+    lines, replies = sys.stdin.buffer, sys.stdout.buffer
+    settings = json.loads(lines.readline())
+    tempfile.tempdir = settings["folder"]
+    free = settings["may_write"]
+    _limit(settings["memory"], files=None if free else _TABLE_BYTES)
+    from sgstore.query import Store
+    from sgstore.store import UserTables
+
+    path = Path(settings["store"])
+    try:
+        tables = UserTables(settings["tables"])
+        _limit(settings["memory"], files=None if free else 0)
+        os.chdir(path.parent)  # so that the database knows only the file name
+        store = Store(path.name, memory=settings["memory"], tables=tables)
+    except OSError as error:
+        _send(replies, _refusal(StoreError(f"{path}: {error.strerror}")))
+        return
+    except SgstoreError as error:
+        _send(replies, _refusal(error))
+        return
+    _send(replies, {"columns": [], "rows": [], "truncated": False, "reasons": {}})
+    for line in lines:
+        question = json.loads(line)
+        try:
+            reply = answering(store, question, settings["rows"])
+            for one in [reply] if isinstance(reply, dict) else reply:
+                _send(replies, one)
+        except SgstoreError as error:
+            _send(replies, _refusal(error))
+
+
+def tell(reply: Mapping[str, Any]) -> None:
+    """Send a partial reply from the sandbox process."""
+    _send(sys.stdout.buffer, {**reply, "more": True})
+
+
+def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
+    """Return rows of a statement ``sql``, or of a pattern ``find`` with ``parameters``."""
+    graphs, notes = False, ()
+    if "sql" in question:
+        rows = store.sql(question["sql"], max_rows=most)
+        values, columns, truncated = rows.values, rows.columns, rows.truncated
+        reasons = dict(rows.reasons)
+    else:
+        matches = store.find(question["find"], **question["parameters"])
+        values = list(islice(matches, most + 1))
+        truncated = len(values) > most
+        values, columns, reasons = values[:most], matches.columns, matches.reasons
+        graphs, notes = matches.graphs, matches.notes
+    rows = [[plain(value) for value in row] for row in values]
+    about = {"truncated": truncated, "reasons": reasons, "graphs": graphs, "notes": notes}
+    return {"columns": columns, "rows": rows, **about}
+
+
+def plain(value: Any) -> Any:
+    """Convert a value to JSON values."""
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, (bytes, bytearray)):
+        return value.hex()
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
+
+
+def _refusal(error: SgstoreError) -> dict[str, Any]:
+    if not isinstance(error, QueryError) and _spilled(error):
+        error = SqlError("stopped: it took more memory than is allowed")
+    return plain_error(error)
+
+
+def _spilled(error: SgstoreError) -> bool:
+    """True if an error comes from temporary files, which :func:`_limit` forbids."""
+    text = str(error)
+    return os.strerror(errno.EFBIG) in text and "duckdb_temp" in text
+
+
+def _send(to: IO[bytes], reply: object) -> None:
+    to.write(json.dumps(reply).encode() + b"\n")
+    to.flush()
+
+
+def _limit(memory: int, *, files: int | None) -> None:
+    """Limit the resources of this process permanently, if the system supports it.
+
+    ``files``: largest file that it may write; bytes. ``None`` means no limit.
+    """
+    try:
+        import resource
+    except (
+        ImportError
+    ):  # not on Windows: there only the database's own limits and the deadline apply
+        return
+    for limit, most in (
+        (resource.RLIMIT_AS, _ADDRESS_SPACE + 2 * memory),
+        (resource.RLIMIT_FSIZE, files),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        _, hard = resource.getrlimit(limit)
+        if most is not None:
+            bound = most if hard == resource.RLIM_INFINITY else min(most, hard)
+            resource.setrlimit(limit, (bound, bound))
+
+
+if __name__ == "__main__":
+    serve(rows_found)

@@ -1,0 +1,57 @@
+"""Tables as dataclasses with one field per column: row selection, concatenation and sorting.
+
+A column is an array or a tuple. Any other field is constant for all rows; concatenation takes it from the first
+table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from itertools import chain
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from sgstore.base.arrays import np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+Table = TypeVar("Table")
+
+
+def taken(table: Table, rows: NDArray[Any]) -> Table:
+    """Return rows of a table in the given order. ``rows`` is an index array or a mask."""
+    columns = (getattr(table, name) for name in _names(table))
+    return type(table)(*(_taken(column, rows) for column in columns))
+
+
+def _names(table: Any) -> list[str]:
+    return [field.name for field in fields(table)]
+
+
+def _taken(column: Any, rows: NDArray[Any]) -> Any:
+    if isinstance(column, tuple):
+        return tuple(column[row] for row in rows.tolist())
+    return column[rows] if isinstance(column, np.ndarray) else column
+
+
+def chained(tables: Sequence[Table]) -> Table:
+    """Concatenate tables of one type."""
+    columns = ([getattr(one, name) for one in tables] for name in _names(tables[0]))
+    return type(tables[0])(*map(_chained, columns))
+
+
+def _chained(parts: list[Any]) -> Any:
+    if isinstance(parts[0], tuple):
+        return tuple(chain(*parts))
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else parts[0]
+
+
+def ascending(numbers: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Return the stable sort order of non-negative integers, by a radix sort of 16 bits per pass."""
+    order = np.argsort(numbers.astype(np.uint16), kind="stable")
+    for shift in range(16, int(numbers.max(initial=0)).bit_length(), 16):
+        digits = (numbers[order] >> shift).astype(np.uint16)
+        order = order[np.argsort(digits, kind="stable")]
+    return order

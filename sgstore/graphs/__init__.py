@@ -1,0 +1,1 @@
+"""Scene graphs from states: relations, abstractions, and the online mode."""

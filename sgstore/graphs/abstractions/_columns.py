@@ -1,0 +1,770 @@
+"""Input and output of abstractions: graphs of many frames as columns, with lane roles.
+
+An abstraction is a function from :class:`GraphColumns`, the nodes and edges of scene graphs, to
+:class:`Labelled`, one directed multigraph per frame with labels on nodes and edges.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, OrderedDict, defaultdict
+from dataclasses import field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgstore.base.records import dataclass
+from sgstore.graphs.abstractions._subsets import BETWEEN_ENTITIES, SCENERY
+from sgstore.model.vocabulary import (
+    DRIVING,
+    KIND_CODE,
+    MOST_KINDS,
+    MOST_RELATIONS,
+    RELATION_CODE,
+    RELATIONS,
+    are_entities,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import Bools, Codes, Floats, Ints
+
+
+Labels = NDArray[np.int32]
+
+Part = tuple[NDArray[Any], ...]
+"""Columns of nodes or of edges."""
+
+EGO: Final = "ego"
+"""Label of the ego in every abstraction, as in the literature."""
+
+EGOS: Final = (EGO, "ego_car")
+"""Labels of the single ego node; they serve as its name."""
+
+_SMALL: Final = np.zeros(MOST_KINDS, np.bool_)
+_SMALL[[KIND_CODE[kind] for kind in SCENERY]] = True
+_BETWEEN: Final = np.zeros(MOST_RELATIONS, np.bool_)
+_BETWEEN[[RELATION_CODE[name] for name in BETWEEN_ENTITIES]] = True
+_LANE: Final = KIND_CODE["lane"]
+
+
+@dataclass(frozen=True, eq=False)
+class MapColumns:
+    """Parts of a road map, and the edges among them: row i has node id -1 - i.
+
+    Attributes
+    ----------
+    kind : (K,) int8
+        Codes of :data:`sgstore.model.vocabulary.KINDS`.
+    name, lane_type, road, junction : (K,) str
+        As in :class:`sgstore.maps.roads.MapNodes`; empty if there is none.
+    lane : (K,) int64
+        Number of the lane in its road; 0 for other parts.
+    relation : (M,) int8
+        Codes of :data:`sgstore.model.vocabulary.RELATIONS`.
+    src, dst : (M,) int64
+        Node ids, negative.
+    """
+
+    kind: Codes
+    name: NDArray[Any]
+    lane_type: NDArray[Any]
+    road: NDArray[Any]
+    junction: NDArray[Any]
+    lane: Ints
+    relation: Codes
+    src: Ints
+    dst: Ints
+
+    @classmethod
+    def of(cls, road_map: RoadMap) -> MapColumns:
+        """Return the columns of a road map's nodes and edges, cached while the map is in use."""
+        if (known := _MAPS.get(road_map)) is not None:
+            return known
+        nodes, edges = road_map.nodes, road_map.edges
+        name, lane_type, road, junction = (
+            np.array(column, object)
+            for column in (nodes.name, nodes.lane_type, nodes.road, nodes.junction)
+        )
+        _MAPS[road_map] = columns = cls(
+            nodes.kind,
+            name,
+            lane_type,
+            road,
+            junction,
+            nodes.lane,
+            edges.relation,
+            edges.src,
+            edges.dst,
+        )
+        return columns
+
+    @cached_property
+    def strands(self) -> Strands:
+        """Return the strands of its lanes."""
+        return Strands(self)
+
+    @cached_property
+    def driving(self) -> Bools:
+        """Return a mask (K,) of the driving lanes."""
+        return (self.kind == _LANE) & np.array([of in DRIVING for of in self.lane_type], np.bool_)
+
+
+_MAPS: Final[WeakKeyDictionary[RoadMap, MapColumns]] = WeakKeyDictionary()
+"""Cached columns of road maps; removed with the map."""
+
+
+@dataclass(frozen=True, eq=False)
+class GraphColumns:
+    """Nodes and edges of the scene graphs of many frames.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames.
+    node_frame, node : (N,) int64
+        Frame, counted from 0, and node id; ascending.
+    kind : (N,) int8
+        Codes of :data:`sgstore.model.vocabulary.KINDS`.
+    is_ego : (N,) bool
+    x, y, z, heading : (N,) float64
+        Poses of moving or changing nodes; m, rad. NaN for static nodes and for missing values.
+    frame : (E,) int64
+    relation : (E,) int8
+        Codes of :data:`sgstore.model.vocabulary.RELATIONS`.
+    src, dst : (E,) int64
+        Node ids. Edges among parts of the map are excluded: see :meth:`lasting`.
+    ego_lane : (frames,) int64
+        Node id of the ego's primary lane, or 0.
+    grounds : MapColumns or None
+        The road map; ``None`` without one.
+    """
+
+    frames: int
+    node_frame: Ints
+    node: Ints
+    kind: Codes
+    is_ego: Bools
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    frame: Ints
+    relation: Codes
+    src: Ints
+    dst: Ints
+    ego_lane: Ints
+    grounds: MapColumns | None
+
+    @classmethod
+    def sorted(cls, frames: int, nodes: Mapping[str, Any], **columns: Any) -> GraphColumns:
+        """Sort nodes in any order (``node_frame, node, kind, is_ego, x, y, z, heading``) into columns."""
+        order = np.lexsort((nodes["node"], nodes["node_frame"]))
+        return cls(frames, **{name: of[order] for name, of in nodes.items()}, **columns)
+
+    @classmethod
+    def of(cls, graph: GraphBlock, kinds: Codes, grounds: MapColumns | None) -> GraphColumns:
+        """Convert a block of scene graphs to columns.
+
+        Parameters
+        ----------
+        graph : GraphBlock
+        kinds : int8
+            Kinds of all entities of the trace so far, by node id.
+        grounds : MapColumns or None
+        """
+        frames, states, presence = graph.frames, graph.frames.states, graph.presence
+        of_map = np.zeros(0, np.int8) if grounds is None else grounds.kind
+        row, still = frames.frame_of, len(presence.node)
+        entity = presence.node >= 0
+        kind = np.empty(still, np.int8)
+        kind[entity] = kinds[presence.node[entity]]
+        kind[~entity] = of_map[-1 - presence.node[~entity]]
+        nodes = {
+            "node_frame": np.concatenate([row, presence.frame]),
+            "node": np.concatenate([states.node, presence.node]),
+            "kind": np.concatenate([kinds[states.node], kind]),
+            "is_ego": np.append(states.node == frames.ego[row], np.zeros(still, np.bool_)),
+        } | {
+            name: np.append(getattr(states, name), np.full(still, np.nan))
+            for name in ("x", "y", "z", "heading")
+        }
+        edges, lanes = graph.edges, graph.lanes
+        own = lanes.primary & (lanes.node == frames.ego[lanes.frame])
+        ego_lane = np.zeros(len(frames), np.int64)
+        ego_lane[lanes.frame[own]] = lanes.lane[own]
+        return cls.sorted(
+            len(frames),
+            nodes,
+            frame=edges.frame,
+            relation=edges.relation,
+            src=edges.src,
+            dst=edges.dst,
+            ego_lane=ego_lane,
+            grounds=grounds,
+        )
+
+    def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
+        """Return edges among parts of the map, for each frame that contains both ends.
+
+        Returns
+        -------
+        frame, relation, src, dst : (K,)
+        """
+        none = np.zeros(0, np.int64)
+        grounds = self.grounds
+        rows = np.flatnonzero(self.node < 0)
+        if grounds is None or not len(rows):
+            return none, none.astype(np.int8), none, none
+        here, column = np.unique(-1 - self.node[rows], return_inverse=True)
+        place = np.full(len(grounds.kind), -1)
+        place[here] = np.arange(len(here))
+        src, dst = place[-1 - grounds.src], place[-1 - grounds.dst]
+        wanted = np.flatnonzero((src >= 0) & (dst >= 0) & np.isin(grounds.relation, relations))
+        present = np.zeros((self.frames, len(here)), np.bool_)
+        present[self.node_frame[rows], column] = True
+        frame, edge = np.nonzero(present[:, src[wanted]] & present[:, dst[wanted]])
+        edge = wanted[edge]
+        return frame, grounds.relation[edge], grounds.src[edge], grounds.dst[edge]
+
+    @cached_property
+    def is_traffic(self) -> Bools:
+        """Return a mask (N,) of traffic entities, without scenery."""
+        return are_entities(self.kind) & ~_SMALL[self.kind]
+
+    @cached_property
+    def pairs(self) -> tuple[Ints, Ints, Ints, Ints]:
+        """Return ordered pairs of traffic entities, each once per frame, with all their relations.
+
+        Returns
+        -------
+        frame, src, dst : (K,)
+        relations : (K,)
+            Bit i represents the relation with code i.
+        """
+        kept = np.flatnonzero(self.is_traffic)
+        node_frame, node = self.node_frame[kept], self.node[kept]
+        rows = np.flatnonzero(_BETWEEN[self.relation])
+        frame, bit = self.frame[rows], self.relation[rows].astype(np.int64)
+        ends = np.concatenate([self.src[rows], self.dst[rows]])
+        a, b = found(node_frame, node, np.tile(frame, 2), ends).reshape(2, -1)
+        both = np.flatnonzero((a >= 0) & (b >= 0))
+        frame, bit, a, b = frame[both], bit[both], a[both], b[both]
+        starts = np.searchsorted(node_frame, np.arange(self.frames + 1))
+        most = int(np.diff(starts).max(initial=0))
+        cell = (frame * most + (a - starts[frame])) * most + (b - starts[frame])
+        cells, bits = _united(cell, bit, self.frames * most * most)
+        frame, pair = np.divmod(cells, max(most * most, 1))
+        a, b = np.divmod(pair, max(most, 1))
+        return frame, node[starts[frame] + a], node[starts[frame] + b], bits
+
+    def taken(self, frames: Ints) -> GraphColumns:
+        """Return these frames, in ascending order."""
+        if len(frames) == self.frames:
+            return self
+        number = np.full(self.frames, -1)
+        number[frames] = np.arange(len(frames))
+        nodes = np.flatnonzero(number[self.node_frame] >= 0)
+        edges = np.flatnonzero(number[self.frame] >= 0)
+        of_nodes = ("node", "kind", "is_ego", "x", "y", "z", "heading")
+        some = GraphColumns(
+            frames=len(frames),
+            node_frame=number[self.node_frame[nodes]],
+            **{name: getattr(self, name)[nodes] for name in of_nodes},
+            frame=number[self.frame[edges]],
+            **{name: getattr(self, name)[edges] for name in ("relation", "src", "dst")},
+            ego_lane=self.ego_lane[frames],
+            grounds=self.grounds,
+        )
+        if self in _FOUND:
+            _FOUND[some] = _FOUND[self].taken(number)
+        return some
+
+    def row_of(self, frame: Ints, node: Ints) -> Ints:
+        """Return rows of nodes in frames; -1 for nodes outside the graph."""
+        return found(self.node_frame, self.node, frame, node)
+
+
+def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
+    """Return the distinct cells, ascending, and the union of each cell's bits."""
+    if bound <= _CELLS:
+        sums = np.bincount(cell, weights=np.exp2(bit))
+        cells = np.flatnonzero(sums)
+        bits = sums[cells].astype(np.int64)
+    else:
+        cells, number = np.unique(cell, return_inverse=True)
+        bits = np.bincount(number, weights=np.exp2(bit)).astype(np.int64)
+    if int(np.bitwise_count(bits).sum()) == len(cell):
+        return cells, bits
+    once = np.unique(np.stack([cell, bit]), axis=1)  # sums are unions if each value occurs once
+    return _united(once[0], once[1], bound)
+
+
+def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
+    """Return the row of each (frame, node) in sorted columns, or -1."""
+    if not len(nodes):
+        return np.full(len(node), -1)
+    low, span = int(nodes.min()), int(nodes.max()) - int(nodes.min()) + 1
+    here = int(frames.max()) + 1
+    if here * span <= _TABLE:
+        table = np.full((here + 1, span + 1), -1)  # values outside the table use its edges
+        table[frames, nodes - low] = np.arange(len(nodes))
+        at = node - low
+        return table[np.minimum(frame, here), np.where((at < 0) | (at > span), span, at)]
+    ids, column = np.unique(nodes, return_inverse=True)
+    place = np.full((here, len(ids)), -1)
+    place[frames, column] = np.arange(len(nodes))
+    if span <= _TABLE:
+        table = np.zeros(span, np.int64)
+        table[ids - low] = np.arange(len(ids))
+        at = table[np.clip(node - low, 0, span - 1)]
+    else:
+        at = np.minimum(np.searchsorted(ids, node), len(ids) - 1)
+    row = place[np.minimum(frame, len(place) - 1), at]
+    return np.where((ids[at] == node) & (frame < len(place)), row, -1)
+
+
+_TABLE: Final = 1 << 18
+"""Greatest size of a look-up table, which is faster than a binary search."""
+
+_CELLS: Final = 1 << 23
+"""Greatest number of ordered pairs that are counted in a table."""
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Directed multigraph of each frame, with labels on nodes and edges.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames; a frame without nodes has the empty graph.
+    labels : tuple of str
+        All distinct labels of nodes and edges.
+    node_frame, node : (N,) int64
+        Frame, counted from 0, and a number that is unique in the frame: a node id, or a number made
+        by the abstraction. Ascending.
+    node_label : (N,) int32
+        Index into ``labels``.
+    frame, src, dst : (E,) int64
+        Edges; both ends are nodes of the same frame. An edge may occur more than once.
+    label : (E,) int32
+        Index into ``labels``, or -1 minus an index into ``bundles`` for several edges with the same
+        ends.
+    bundles : tuple of tuple of int
+        Indices into ``labels``.
+    names : mapping of int to str
+        Names of nodes that are not named by their label: parts of the map.
+    """
+
+    frames: int
+    labels: tuple[str, ...]
+    node_frame: Ints
+    node: Ints
+    node_label: Labels
+    frame: Ints
+    src: Ints
+    label: Labels
+    dst: Ints
+    names: Mapping[int, str] = field(default_factory=dict[int, str])
+    bundles: tuple[tuple[int, ...], ...] = ()
+
+    @classmethod
+    def assembled(
+        cls,
+        frames: int,
+        nodes: Sequence[Part],
+        edges: Sequence[Part],
+        labels: Sequence[str],
+        names: Mapping[int, str] | None = None,
+        bundles: Sequence[Sequence[int]] = (),
+    ) -> Labelled:
+        """Build graphs from parts: nodes ``(frame, node, label)``, edges ``(frame, src, label, dst)``.
+
+        Labels are indices into ``labels``, which may repeat texts; a negative one represents a
+        bundle. Nodes may have any order. A node that occurs twice in a frame is merged.
+        """
+        table = tuple(dict.fromkeys(labels))
+        index = {text: i for i, text in enumerate(table)}
+        renumbered = np.array([index[text] for text in labels] or [0], np.int32)
+        frame, node, label = _columns(nodes, 3)
+        order = np.lexsort((node, frame))
+        frame, node, label = frame[order], node[order], label[order]
+        fresh = np.ones(len(node), np.bool_)
+        fresh[1:] = (frame[1:] != frame[:-1]) | (node[1:] != node[:-1])
+        edge_frame, src, edge_label, dst = _columns(edges, 4)
+        return cls(
+            frames,
+            table,
+            frame[fresh],
+            node[fresh],
+            renumbered[label[fresh]],
+            edge_frame,
+            src,
+            np.where(edge_label < 0, edge_label, renumbered[np.maximum(edge_label, 0)]).astype(
+                np.int32
+            ),
+            dst,
+            names or {},
+            tuple(tuple(int(renumbered[label]) for label in bundle) for bundle in bundles),
+        )
+
+    def related(self) -> tuple[Ints, Ints, Ints, Ints]:
+        """Return edges whose label is a relation, one row each: frame, source, relation code, destination."""
+        code = {name: i for i, name in enumerate(RELATIONS)}
+        parts = [(code.get(text, -1),) for text in self.labels]
+        bundles = [tuple(parts[label][0] for label in bundle) for bundle in self.bundles]
+        several = parts + bundles[::-1]  # a negative label counts from the end
+        many = np.array([len(of) for of in several] or [0])
+        starts = np.cumsum(many) - many
+        flat = np.array([one for of in several for one in of] or [-1], np.int64)
+        index = np.where(self.label < 0, len(several) + self.label, self.label)
+        count = many[index]
+        edge = np.repeat(np.arange(len(index)), count)
+        within = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+        relation = flat[starts[index[edge]] + within] if len(edge) else edge
+        known = relation >= 0
+        edge = edge[known]
+        return self.frame[edge], self.src[edge], relation[known], self.dst[edge]
+
+    def named(self, number: int) -> tuple[dict[str, str], list[tuple[str, str, str]]]:
+        """Return one frame by names: nodes ``name → label``, and edges ``(name, label, name)``.
+
+        The ego and unique nodes are named by their label, parts of the map by their name, and all
+        others ``label_node``, such as ``car_12``.
+        """
+        rows = np.flatnonzero(self.node_frame == number)
+        labels = [self.labels[code] for code in self.node_label[rows].tolist()]
+        often = Counter(labels)
+        called = {
+            node: self.names.get(node)
+            or (label if node < 0 and often[label] == 1 else f"{label}_{abs(node)}")
+            for node, label in zip(self.node[rows].tolist(), labels, strict=True)
+        }
+        egos = {n: t for n, t in zip(called, labels, strict=True) if t in EGOS and often[t] == 1}
+        called |= egos
+        edges = np.flatnonzero(self.frame == number)
+        columns = (self.src[edges].tolist(), self.label[edges].tolist(), self.dst[edges].tolist())
+        return (
+            dict(zip(called.values(), labels, strict=True)),
+            [
+                (called[a], self.labels[label], called[b])
+                for a, r, b in zip(*columns, strict=True)
+                for label in ((r,) if r >= 0 else self.bundles[-1 - r])
+            ],
+        )
+
+
+def _columns(parts: Iterable[Part], count: int) -> list[NDArray[Any]]:
+    none = np.zeros(0, np.int64)
+    columns = zip(*parts, (none,) * count, strict=True)
+    return [np.concatenate(column).astype(np.int64) for column in columns]
+
+
+def repeated(columns: Part) -> Bools:
+    """Return a mask of the rows that repeat an earlier row."""
+    again = np.zeros(len(columns[0]), np.bool_)
+    if len(again):
+        order = np.lexsort(columns)
+        same = np.ones(len(order) - 1, np.bool_)
+        for column in columns:
+            same &= column[order][1:] == column[order][:-1]
+        again[order[1:]] = same
+    return again
+
+
+# Lanes relative to the ego: ``Ego Lane``, ``Left 1 of Ego Lane``, ``Opposing Lane 0`` and so on. A
+# *strand* is a chain of lanes: a lane and its only successor, if that has no other predecessor.
+# Strands end at the borders of junctions. They depend on the map only, and are computed once.
+
+OPPOSING: Final = 1 << 16
+"""Roles from here on: ``Opposing Lane 0``, ``1``, …"""
+
+_MOST: Final = 1000
+"""Greatest number of named lanes on one side of the ego's lane."""
+
+UNNAMED: Final = -(1 << 21)
+"""Role code for names without a role."""
+
+
+class Strands:
+    """Strands of a map, and their neighbours.
+
+    Attributes
+    ----------
+    of : (K,) int64
+        For each part of the map the node id that represents its strand: the greatest one among its
+        lanes. 0 for other parts than driving lanes.
+    named : (K,) int64
+        For each part of the map the role in its name, as in graphs from other sources;
+        :data:`UNNAMED` without a role.
+    """
+
+    def __init__(self, grounds: MapColumns) -> None:
+        self.of = _strands(grounds)
+        self.named = np.array([_role_named(name) for name in grounds.name], np.int64)
+        self._left = self._beside(grounds, "toLeftOf")
+        self._right = self._beside(grounds, "toRightOf")
+        self._roles: OrderedDict[int, dict[int, int]] = OrderedDict()
+
+    def roles(self, ego: int) -> dict[int, int]:
+        """Map strands to roles: 0 the ego's, n the n-th on its left, -n the n-th on its right."""
+        if ego not in self._roles:
+            roles = {ego: 0}
+            for beside, sign in ((self._left, 1), (self._right, -1)):
+                edge = {ego}
+                for step in range(1, _MOST):
+                    edge = {s for one in edge for s in beside[one]} - roles.keys()
+                    if not edge:
+                        break
+                    roles |= dict.fromkeys(edge, sign * step)
+            self._roles[ego] = roles
+        return self._roles[ego]
+
+    def _beside(self, grounds: MapColumns, relation: str) -> defaultdict[int, set[int]]:
+        """Map each strand to the strands next to it on one side with the same direction."""
+        against = grounds.relation == RELATION_CODE["opposes"]
+        pairs = set(zip(grounds.src[against].tolist(), grounds.dst[against].tolist(), strict=True))
+        rows = np.flatnonzero(grounds.relation == RELATION_CODE[relation])
+        found: defaultdict[int, set[int]] = defaultdict(set)
+        for src, dst in zip(grounds.src[rows].tolist(), grounds.dst[rows].tolist(), strict=True):
+            one, other = int(self.of[-1 - dst]), int(self.of[-1 - src])
+            if one and other and (src, dst) not in pairs:
+                found[one].add(other)
+        return found
+
+
+def _strands(grounds: MapColumns) -> Ints:
+    """Compute :attr:`Strands.of`."""
+    on = grounds.relation == RELATION_CODE["travelsTo"]
+    src, dst = -1 - grounds.src[on], -1 - grounds.dst[on]
+    driven = grounds.driving
+    both = driven[src] & driven[dst]
+    src, dst = src[both], dst[both]
+    only = (np.bincount(src, minlength=len(driven))[src] == 1) & (
+        np.bincount(dst, minlength=len(driven))[dst] == 1
+    )
+    only &= (grounds.junction[src] == grounds.junction[dst]).astype(np.bool_)
+    src, dst = src[only], dst[only]
+    least = np.arange(len(driven))
+    while True:
+        before = least.copy()
+        low = np.minimum(least[src], least[dst])
+        np.minimum.at(least, src, low)
+        np.minimum.at(least, dst, low)
+        least = least[least]
+        if np.array_equal(before, least):
+            break
+    return np.where(driven, -1 - least, 0)
+
+
+def role_name(role: int) -> str:
+    """Return the name of a lane's role in the literature."""
+    if role == 0:
+        return "Ego Lane"
+    if role >= OPPOSING:
+        return f"Opposing Lane {role - OPPOSING}"
+    return f"{'Left' if role > 0 else 'Right'} {abs(role)} of Ego Lane"
+
+
+_BESIDE: Final = re.compile(r"(left|right) (\d{1,4}) of ego lane")
+_OPPOSING: Final = re.compile(r"opposing lane (\d{1,4})")
+_ROLES: Final = {
+    "ego lane": 0,
+    "middle lane": 0,
+    "left lane": 1,
+    "right lane": -1,
+    "lane_middle": 0,
+    "lane_left": 1,
+    "lane_right": -1,
+}
+"""Lane names of S3C and CARLASGG, and of RoadScene2Vec, whose ego is always in the middle lane."""
+
+
+def _role_named(name: str) -> int:
+    """Parse a role name; the inverse of :func:`role_name`."""
+    text = name.lower()
+    if beside := _BESIDE.fullmatch(text):
+        return int(beside[2]) * (1 if beside[1] == "left" else -1)
+    if opposing := _OPPOSING.fullmatch(text):
+        return OPPOSING + int(opposing[1])
+    return _ROLES.get(text, UNNAMED)
+
+
+# The lanes of each frame as its ego has them ------------------------------------------------------
+
+OFF_ROAD: Final = -1
+"""Node id of the off-road node."""
+NAMELESS: Final = -(1 << 20)
+"""Role of a lane without a known place relative to the ego."""
+
+_IS_IN: Final = RELATION_CODE["isIn"]
+_NONE: Final = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class EgoLanes:
+    """Lanes of many frames, relative to the ego of each frame.
+
+    Attributes
+    ----------
+    frame, strand, role : (L,) int64
+        Present lanes: lanes with traffic, lanes next to the ego's in range, and lanes with a role
+        in their name. ``role`` as in :func:`sgstore.graphs.abstractions._columns.role_name`, or
+        :data:`NAMELESS`.
+    inside : tuple of (I,) int64
+        Frame, traffic entity, and its strand; each once.
+    inside_lane : tuple of (J,) int64
+        Frame, and a lane with traffic.
+    off_road : tuple of (O,) int64
+        Frame, and an off-road entity.
+    """
+
+    frame: Ints
+    strand: Ints
+    role: Ints
+    inside: Part
+    inside_lane: Part
+    off_road: Part
+
+    def taken(self, number: Ints) -> EgoLanes:
+        """Return the lanes of selected frames; ``number`` has each frame's new number, or -1."""
+
+        def some(frame: Ints, *columns: Ints) -> Part:
+            rows = np.flatnonzero(number[frame] >= 0)
+            return number[frame[rows]], *(column[rows] for column in columns)
+
+        frame, strand, role = some(self.frame, self.strand, self.role)
+        inside, inside_lane = some(*self.inside), some(*self.inside_lane)
+        return EgoLanes(frame, strand, role, inside, inside_lane, some(*self.off_road))
+
+
+_FOUND: Final[WeakKeyDictionary[GraphColumns, EgoLanes]] = WeakKeyDictionary()
+
+
+def ego_lanes(seen: GraphColumns) -> EgoLanes:
+    """Return the lanes relative to the ego of each frame; empty without a map."""
+    if seen not in _FOUND:
+        _FOUND[seen] = _found(seen)
+    return _FOUND[seen]
+
+
+def _found(seen: GraphColumns) -> EgoLanes:
+    if seen.grounds is None:
+        return EgoLanes(_NONE, _NONE, _NONE, (_NONE,) * 3, (_NONE,) * 2, (_NONE,) * 2)
+    strands = seen.grounds.strands
+    frame, src, dst = _inside(seen)
+    off = dst == OFF_ROAD
+    strand = strands.of[-1 - dst]
+    on = np.flatnonzero(strand != 0)
+    once = on[~repeated((frame[on], src[on], strand[on]))]
+    inside = (frame[once], src[once], strand[once])
+    return EgoLanes(
+        *_roles(seen, strands, inside), inside, (frame[on], dst[on]), (frame[off], src[off])
+    )
+
+
+def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
+    """Return roles of the lanes of each frame, relative to the ego, in ``RSV``; without unnamed lanes.
+
+    Returns
+    -------
+    frame, node : (N,) int64
+        Frame, counted from 0, and a lane in range or with traffic. Ascending.
+    role : list of str
+        ``Ego Lane``, ``Left 1 of Ego Lane``, ``Opposing Lane 0`` and so on.
+    """
+    if seen.grounds is None:
+        return _NONE, _NONE, []
+    of = seen.grounds.strands.of
+    lanes = ego_lanes(seen)
+    said = lanes.role != NAMELESS
+    span = len(of) + 1  # node ids of lanes are negative, and above -span
+    known = lanes.frame[said] * span - lanes.strand[said]
+    order = np.argsort(known)
+    known, role = known[order], lanes.role[said][order]
+    present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
+    in_range = seen.node_frame[present] * span - seen.node[present]
+    frame, lane = lanes.inside_lane
+    lane_frame, lane = np.divmod(np.union1d(in_range, frame * span - lane), span)
+    wanted = lane_frame * span - of[lane - 1]
+    at = np.searchsorted(known, wanted)
+    hit = np.flatnonzero(np.append(known, -1)[at] == wanted)
+    names = [role_name(one) for one in role[at[hit]].tolist()]
+    return lane_frame[hit], -lane[hit], names
+
+
+def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
+    """Return frames, traffic entities, and their lanes."""
+    rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
+    entity = seen.row_of(seen.frame[rows], seen.src[rows])
+    rows = rows[(entity >= 0) & seen.is_traffic[entity]]
+    return seen.frame[rows], seen.src[rows], seen.dst[rows]
+
+
+def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints]:
+    """Return the lanes of each frame and their roles: ``(frame, strand, role)``."""
+    frame, src, strand = inside
+    ego = np.where(seen.ego_lane < 0, strands.of[-1 - seen.ego_lane], 0)
+    present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
+    here_frame = np.concatenate([seen.node_frame[present], frame])
+    here = np.concatenate([strands.of[-1 - seen.node[present]], strand])
+    reached = np.append(np.zeros(len(present), np.bool_), np.ones(len(frame), np.bool_))
+    role = np.full(len(here), OPPOSING)
+    own = ego[here_frame]
+    for one in np.unique(own[own != 0]).tolist():
+        roles = strands.roles(one)
+        known = np.array(sorted(roles))
+        values = np.array([roles[s] for s in known.tolist()])
+        of = np.flatnonzero(own == one)
+        at = np.minimum(np.searchsorted(known, here[of]), len(known) - 1)
+        role[of] = np.where(known[at] == here[of], values[at], OPPOSING)
+    named = strands.named[-1 - here]
+    keep = (here != 0) & (reached | (role != OPPOSING) | (named != UNNAMED))
+    fresh = np.flatnonzero(keep)
+    fresh = fresh[~repeated((here_frame[fresh], here[fresh]))]
+    here_frame, here, role, named = here_frame[fresh], here[fresh], role[fresh], named[fresh]
+    role = _numbered(seen, (frame, src, strand), (here_frame, here, role))
+    return here_frame, here, np.where(named != UNNAMED, named, role)
+
+
+def _numbered(seen: GraphColumns, inside: Part, lanes: Part) -> Ints:
+    """Return roles of lanes; opposing lanes are numbered by the distance of their nearest entity."""
+    here_frame, here, role = lanes
+    distance, has_ego = _from_ego(seen)
+    rows = np.flatnonzero(role == OPPOSING)
+    if not len(rows) or not len(inside[0]):  # then all lanes come from names
+        return role
+    order = rows[np.lexsort((here[rows], here_frame[rows]))]
+    frame, src, strand = inside
+    low = int(strand.min())
+    span = 1 - low
+    keys = here_frame[order] * span + (here[order] - low)
+    wanted = frame * span + (strand - low)
+    at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    hit = keys[at] == wanted
+    nearest = np.full(len(order), np.inf)
+    np.minimum.at(nearest, at[hit], distance[seen.row_of(frame[hit], src[hit])])
+    ranked = np.lexsort((-here[order], nearest, here_frame[order]))
+    sorted_frame = here_frame[order][ranked]
+    starts = np.searchsorted(sorted_frame, sorted_frame)
+    numbers = OPPOSING + np.arange(len(order)) - starts
+    numbers[~(has_ego & (seen.ego_lane < 0))[sorted_frame]] = NAMELESS
+    role = role.copy()
+    role[order[ranked]] = numbers
+    return role
+
+
+def _from_ego(seen: GraphColumns) -> tuple[NDArray[np.float64], Bools]:
+    """Return plane distances of nodes from the ego (infinite if unknown), and a mask of frames with ego."""
+    x, y = (np.full(seen.frames, np.nan) for _ in range(2))
+    ego = np.flatnonzero(seen.is_ego)
+    x[seen.node_frame[ego]], y[seen.node_frame[ego]] = seen.x[ego], seen.y[ego]
+    away = np.hypot(seen.x - x[seen.node_frame], seen.y - y[seen.node_frame])
+    return np.where(np.isfinite(away), away, np.inf), np.isfinite(x + y)

@@ -1,0 +1,178 @@
+"""Features of labelled graphs: counts of nodes by label, and of edges by the labels of edge and ends.
+
+The weighted Jaccard index (Ruzicka's similarity) compares two graphs as multisets of features:
+``sum(min) / sum(max)`` over the counts. It is 1 for isomorphic graphs, and for few others; 0
+without common features.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.graphs.abstractions._columns import Labelled, found
+from sgstore.model.vocabulary import kinds_labelled, normalize_name, relation_named
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.model.world import Bools, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class GraphFeatures:
+    """Features of the graphs of many frames, one row per frame and feature.
+
+    Attributes
+    ----------
+    frames : int
+    texts : tuple of str
+        The features, such as ``car`` and ``(car)-[near]->(ego)``.
+    frame, feature, count : (K,) int64
+        Frame, index into ``texts``, and count.
+    """
+
+    frames: int
+    texts: tuple[str, ...]
+    frame: Ints
+    feature: Ints
+    count: Ints
+
+    @classmethod
+    def of(cls, graphs: Labelled) -> GraphFeatures:
+        """Compute the features of labelled graphs."""
+        label = graphs.node_label.astype(np.int64)
+        frame, src, edge, dst = _single(graphs)
+        ends = [label[found(graphs.node_frame, graphs.node, frame, end)] for end in (src, dst)]
+        many = len(graphs.labels)
+        codes = (ends[0] * many + edge) * many + ends[1] + many  # above the codes of nodes
+        cells = np.concatenate([graphs.node_frame, frame]), np.concatenate([label, codes])
+        kinds, feature = np.unique(cells[1], return_inverse=True)
+        cell, count = np.unique(cells[0] * max(len(kinds), 1) + feature, return_counts=True)
+        at, feature = np.divmod(cell, max(len(kinds), 1))
+        texts = tuple(_text(code, graphs.labels) for code in kinds.tolist())
+        return cls(graphs.frames, texts, at, feature, count)
+
+    def counts(self, number: int) -> Counter[str]:
+        """Return the features of one frame."""
+        rows = np.flatnonzero(self.frame == number)
+        names = (self.texts[i] for i in self.feature[rows].tolist())
+        return Counter(dict(zip(names, self.count[rows].tolist(), strict=True)))
+
+    def likeness(self, example: Counter[str]) -> NDArray[np.float64]:
+        """Return the weighted Jaccard index of each frame and an example, (frames,); 1 if both are empty."""
+        wanted = np.array([example[text] for text in self.texts] or [0])
+        both = np.minimum(self.count, wanted[self.feature])
+        shared = np.bincount(self.frame, both, self.frames)
+        either = example.total() + np.bincount(self.frame, self.count, self.frames) - shared
+        return np.divide(shared, either, out=np.ones(self.frames), where=either > 0)
+
+    def digests(self) -> NDArray[np.uint64]:
+        """Return a hash per frame, (frames,): equal for frames with equal features (except for collisions)."""
+        mixed = np.array([_hash(text) for text in self.texts] or [0], np.uint64)
+        sums = np.zeros(self.frames, np.uint64)
+        np.add.at(sums, self.frame, mixed[self.feature] * self.count.astype(np.uint64))
+        return sums
+
+
+def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
+    """Remove labels from graphs: nodes with their edges, and edges.
+
+    Parameters
+    ----------
+    graphs : Labelled
+    ignored : iterable of str
+        Labels, kinds, words for several kinds (``vehicle``), relations; case-insensitive. ``lane``
+        represents all labels that contain it (``Ego Lane``).
+    """
+    names = list(ignored)
+    dropped = np.array([_ignored(label, names) for label in graphs.labels] or [False])
+    if not dropped.any():
+        return graphs
+    kept = ~dropped[graphs.node_label]
+    nodes = graphs.node_frame[kept], graphs.node[kept]
+    frame, src, label, dst = _single(graphs)
+    ends = [found(*nodes, frame, end) >= 0 for end in (src, dst)]
+    there = ends[0] & ends[1] & ~dropped[label]
+    return replace(
+        graphs,
+        node_frame=nodes[0],
+        node=nodes[1],
+        node_label=graphs.node_label[kept],
+        frame=frame[there],
+        src=src[there],
+        label=label[there].astype(np.int32),
+        dst=dst[there],
+        bundles=(),
+    )
+
+
+def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
+    """Empty the graphs of the frames outside ``chosen``."""
+    nodes, edges = chosen[graphs.node_frame], chosen[graphs.frame]
+    return replace(
+        graphs,
+        node_frame=graphs.node_frame[nodes],
+        node=graphs.node[nodes],
+        node_label=graphs.node_label[nodes],
+        frame=graphs.frame[edges],
+        src=graphs.src[edges],
+        label=graphs.label[edges],
+        dst=graphs.dst[edges],
+    )
+
+
+def _single(graphs: Labelled) -> tuple[Ints, Ints, Ints, Ints]:
+    """Return edges with one label per row: frame, source, label, destination."""
+    label = graphs.label.astype(np.int64)
+    if not graphs.bundles:
+        return graphs.frame, graphs.src, label, graphs.dst
+    flat = np.array([one for bundle in graphs.bundles for one in bundle], np.int64)
+    many = np.array([len(bundle) for bundle in graphs.bundles])
+    starts = np.cumsum(many) - many
+    bundle = np.where(label < 0, -1 - label, 0)
+    count = np.where(label < 0, many[bundle], 1)
+    edge = np.repeat(np.arange(len(label)), count)
+    within = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+    bundled = label[edge] < 0
+    single = label[edge]
+    single[bundled] = flat[(starts[bundle[edge]] + within)[bundled]]
+    return graphs.frame[edge], graphs.src[edge], single, graphs.dst[edge]
+
+
+def _text(code: int, labels: Sequence[str]) -> str:
+    many = len(labels)
+    if code < many:
+        return labels[code]
+    code, dst = divmod(code - many, many)
+    src, edge = divmod(code, many)
+    return f"({labels[src]})-[{labels[edge]}]->({labels[dst]})"
+
+
+def _hash(text: str) -> int:
+    return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little")
+
+
+def _ignored(label: str, names: list[str]) -> bool:
+    whole, words = (
+        normalize_name(label.replace(" ", "_")),
+        {normalize_name(word) for word in label.split()},
+    )
+    for name in names:
+        meant = {normalize_name(one) for one in (name, *(kinds_labelled(name) or ()))}
+        meant |= {normalize_name(relation_named(name) or name)}
+        if whole in meant or (whole not in _EXACT and words & meant & _PLACES):
+            return True
+    return False
+
+
+_PLACES: Final = frozenset({"lane", "road", "junction", "crosswalk"})
+"""Words in labels of map parts, such as ``Left 1 of Ego Lane``."""
+
+_EXACT: Final = frozenset({"offroad"})

@@ -1,0 +1,421 @@
+"""Abstractions from the literature, including the one of RoadScene2Vec.
+
+They are ``E``, ``EL``, ``ER``, ``RSV``, ``junction`` and ``SG``.
+
+The names come from S3C (Woodlief et al., 2024) and CARLASGG. Except in ``SG``, entities are
+traffic, people, animals, signals and props, without scenery (buildings, poles, barriers,
+vegetation). An entity is labelled with its kind, the ego with ``ego``. Relations are proximity,
+direction, and left and right. The literature has no ``leads``, ``follows``, ``overlaps``, ``sees``
+and ``conflictsWith``.
+
+These rules apply where our graphs have more than those of the literature:
+
+* ``EL``, ``RSV``: lanes are driving strands (:mod:`sgstore.graphs.abstractions._columns`). ``Ego Lane`` is
+  the strand of the ego's primary lane. Strands next to it with the same direction are ``Left n``
+  and ``Right n of Ego Lane``, if they are in range. Any other strand with an entity is an
+  ``Opposing Lane k`` (CARLASGG's word, for both directions), ordered by the distance of its nearest
+  entity from the ego, then by node id. If the ego's place or lane is unknown, the label is
+  ``Lane``. All lanes are in ``Root Road``. Off-road entities are in ``Off Road``.
+* ``junction``: lanes, roads and junctions of the map. The sections of a road are merged, as in
+  CARLASGG: its lanes have names such as ``Lane 5_-1``. Names do not count for the class: a driving
+  lane is labelled ``Lane``, another lane with its type. Therefore the same scene in another place
+  has the same class.
+* ``SG``: the complete scene graph; with waypoints if ingest was configured for them.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.graphs.abstractions._columns import (
+    EGO,
+    NAMELESS,
+    OFF_ROAD,
+    UNNAMED,
+    Labelled,
+    ego_lanes,
+    repeated,
+    role_name,
+)
+from sgstore.graphs.abstractions._subsets import BETWEEN_ENTITIES, OF_JUNCTION
+from sgstore.model.vocabulary import (
+    KIND_CODE,
+    KINDS,
+    MOST_KINDS,
+    MOST_RELATIONS,
+    RELATION_CODE,
+    RELATIONS,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from sgstore.graphs.abstractions._columns import GraphColumns, MapColumns, Part
+    from sgstore.model.world import Bools, Ints
+
+
+ROOT_ROAD: Final = -(1 << 40)
+"""Node number of ``Root Road``."""
+
+_MAPS: Final = 4
+"""Number of maps with cached results."""
+
+_IS_IN: Final = RELATION_CODE["isIn"]
+_ON_ROADS: Final = np.zeros(MOST_RELATIONS, np.bool_)
+_ON_ROADS[[RELATION_CODE[r] for r in OF_JUNCTION if r not in BETWEEN_ENTITIES]] = True
+
+
+def _kind_labels() -> tuple[str, ...]:
+    """Return the labels of nodes: the kinds by their codes, then the ego."""
+    return (*KINDS, EGO)
+
+
+def entities(seen: GraphColumns) -> Labelled:
+    """Return ``E``: the entities."""
+    return Labelled.assembled(seen.frames, [_entities(seen)], [], _kind_labels())
+
+
+def related(seen: GraphColumns) -> Labelled:
+    """Return ``ER``: the entities and their relations."""
+    labels = (*_kind_labels(), *RELATIONS)
+    edges, bundles = _relations(seen)
+    return Labelled.assembled(seen.frames, [_entities(seen)], [edges], labels, bundles=bundles)
+
+
+def in_lanes(seen: GraphColumns) -> Labelled:
+    """Return ``EL``: the entities, and their lanes relative to the ego."""
+    return _with_lanes(seen, related=False)
+
+
+def road_scene(seen: GraphColumns) -> Labelled:
+    """Return ``RSV``: the entities with their relations, and their lanes relative to the ego."""
+    return _with_lanes(seen, related=True)
+
+
+def whole(seen: GraphColumns) -> Labelled:
+    """Return ``SG``: the complete scene graph."""
+    label = np.where(seen.is_ego, len(KINDS), seen.kind)
+    first = len(_kind_labels())
+    frame, relation, src, dst = seen.lasting(range(len(RELATIONS)))
+    edges = [
+        (seen.frame, seen.src, first + seen.relation.astype(np.int64), seen.dst),
+        (frame, src, first + relation.astype(np.int64), dst),
+    ]
+    labels = [*_kind_labels(), *RELATIONS]
+    if seen.grounds is not None:
+        label, more = _with_roles(seen, seen.grounds, label, len(labels))
+        labels += more
+    nodes = [(seen.node_frame, seen.node, label)]
+    return Labelled.assembled(seen.frames, nodes, edges, labels, _names(seen.grounds))
+
+
+def _with_roles(
+    seen: GraphColumns, grounds: MapColumns, label: Ints, first: int
+) -> tuple[Ints, list[str]]:
+    """Return node labels and label texts, with lanes labelled by the role in their name."""
+    named = grounds.strands.named
+    roles = np.unique(named[named != UNNAMED])
+    if not len(roles):
+        return label, []
+    part = np.clip(-1 - seen.node, 0, len(named) - 1)
+    role = np.where(seen.node < 0, named[part], UNNAMED)
+    at = np.minimum(np.searchsorted(roles, role), len(roles) - 1)
+    named_label = np.where(role == UNNAMED, label, first + at)
+    return named_label, [role_name(one) for one in roles.tolist()]
+
+
+def junction(seen: GraphColumns) -> Labelled:
+    """Return ``junction``: the entities with their relations; lanes, roads and junctions of the map."""
+    grounds = seen.grounds
+    first = len(_kind_labels())
+    wanted = [RELATION_CODE[name] for name in OF_JUNCTION]
+    nodes, kept = [_entities(seen)], seen.is_traffic
+    labels = [*_kind_labels(), *RELATIONS]
+    edges: list[Part] = []
+    if grounds is not None:
+        whose = _merged(grounds)
+        own = [KIND_CODE[name] for name in ("lane", "road", "junction", "off_road")]
+        rows = np.flatnonzero(np.isin(seen.kind, own))
+        label, more = _ground_labels(grounds, len(labels))
+        labels += more
+        nodes.append(
+            (
+                seen.node_frame[rows],
+                whose[-1 - seen.node[rows]],
+                label[-1 - seen.node[rows]],
+            )
+        )
+        kept = kept.copy()
+        kept[rows] = True
+        edges.append(_drawn(seen, kept, seen.lasting(wanted), whose))
+    moving = np.flatnonzero(_ON_ROADS[seen.relation])
+    columns = (seen.frame[moving], seen.relation[moving], seen.src[moving], seen.dst[moving])
+    edges.append(_drawn(seen, kept, columns, None if grounds is None else _merged(grounds)))
+    parts: list[Part] = [(frame, src, first + relation, dst) for frame, relation, src, dst in edges]
+    between, bundles = _relations(seen)
+    parts.append(between)
+    return Labelled.assembled(seen.frames, nodes, parts, labels, _names(grounds), bundles)
+
+
+def _drawn(seen: GraphColumns, kept: Bools, columns: Part, whose: Ints | None) -> Part:
+    """Return edges between representative nodes, each once and without loops."""
+    frame, relation, src, dst = columns
+    a, b = seen.row_of(frame, src), seen.row_of(frame, dst)
+    both = (a >= 0) & (b >= 0) & kept[a] & kept[b]
+    frame, relation, src, dst = frame[both], relation[both].astype(np.int64), src[both], dst[both]
+    if whose is None or not len(frame):
+        return frame, relation, src, dst
+    of_map = (src < 0) | (dst < 0)
+    src, dst = _standing_for(whose, src), _standing_for(whose, dst)
+    rows = np.flatnonzero(of_map)
+    again = repeated((frame[rows], relation[rows], src[rows], dst[rows]))
+    keep = np.ones(len(frame), np.bool_)
+    keep[rows[again]] = False
+    keep &= src != dst
+    return frame[keep], relation[keep], src[keep], dst[keep]
+
+
+def _standing_for(whose: Ints, node: Ints) -> Ints:
+    return np.where(node < 0, whose[np.clip(-1 - node, 0, len(whose) - 1)], node)
+
+
+@lru_cache(maxsize=_MAPS)
+def _merged(grounds: MapColumns) -> Ints:
+    """Map each part to its representative node id: for a lane in several sections, the greatest."""
+    found = -1 - np.arange(len(grounds.kind))
+    lanes = np.flatnonzero(grounds.kind == KIND_CODE["lane"])
+    first: dict[tuple[str, int, str], int] = {}
+    keys = zip(grounds.road[lanes], grounds.lane[lanes].tolist(), strict=True)
+    for row, (road, lane) in zip(lanes.tolist(), keys, strict=True):
+        if not road:  # only a name: a graph from another source
+            continue
+        key = (road, lane, "Lane" if grounds.driving[row] else grounds.lane_type[row])
+        found[row] = first.setdefault(key, -1 - row)
+    return found
+
+
+@lru_cache(maxsize=_MAPS)
+def _ground_labels(grounds: MapColumns, first: int) -> tuple[Ints, list[str]]:
+    """Return the label of each part of the map, counted from ``first``, and the label texts."""
+    words = {"road": "Road", "junction": "Junction", "off_road": "Off Road"}
+    text: list[str] = [
+        ("Lane" if driven else f"Lane ({kind_of_lane or 'none'})")
+        if KINDS[kind] == "lane"
+        else words.get(str(KINDS[kind]), str(KINDS[kind]))
+        for kind, kind_of_lane, driven in zip(
+            grounds.kind.tolist(), grounds.lane_type, grounds.driving.tolist(), strict=True
+        )
+    ]
+    named = grounds.strands.named
+    for row in np.flatnonzero(named != UNNAMED).tolist():
+        text[row] = role_name(int(named[row]))
+    table = {label: first + i for i, label in enumerate(dict.fromkeys(text))}
+    return np.array([table[label] for label in text], np.int64), list(table)
+
+
+@lru_cache(maxsize=_MAPS)
+def _names(grounds: MapColumns | None) -> dict[int, str]:
+    """Return names of parts of the map as in the literature, by node id."""
+    if grounds is None:
+        return {}
+    names: dict[int, str] = {}
+    columns = zip(
+        grounds.kind.tolist(), grounds.name, grounds.road, grounds.lane.tolist(), strict=True
+    )
+    for row, (kind, name, road, lane) in enumerate(columns):
+        match KINDS[kind]:
+            case "lane":
+                names[-1 - row] = f"Lane {road}_{lane:+d}" if road else str(name)
+            case "road":
+                names[-1 - row] = f"Road {name}"
+            case "junction":
+                names[-1 - row] = f"Junction {name}"
+            case "off_road":
+                names[-1 - row] = "Off Road"
+            case _:
+                pass
+    return names
+
+
+def _entities(seen: GraphColumns) -> Part:
+    rows = np.flatnonzero(seen.is_traffic)
+    label = np.where(seen.is_ego[rows], len(KINDS), seen.kind[rows])
+    return seen.node_frame[rows], seen.node[rows], label
+
+
+def _relations(seen: GraphColumns) -> tuple[Part, list[list[int]]]:
+    """Return edges between entities, and their bundles of relation labels."""
+    frame, src, dst, bits = seen.pairs
+    distinct, number = np.unique(bits, return_inverse=True)
+    first = len(_kind_labels())
+    bundles = [
+        [first + code for code in range(len(RELATIONS)) if one >> code & 1]
+        for one in distinct.tolist()
+    ]
+    return (frame, src, -1 - number, dst), bundles
+
+
+def _with_lanes(seen: GraphColumns, *, related: bool) -> Labelled:
+    labels = [*_kind_labels(), *RELATIONS]
+    between, bundles = _relations(seen) if related else (None, [])
+    nodes, edges = [_entities(seen)], [between] if between else []
+    if seen.grounds is not None:
+        lanes, inside, names = _lanes(seen, len(labels))
+        labels += names
+        nodes += lanes
+        edges += inside
+    return Labelled.assembled(seen.frames, nodes, edges, labels, bundles=bundles)
+
+
+def _lanes(seen: GraphColumns, first: int) -> tuple[list[Part], list[Part], list[str]]:
+    """Return nodes, ``isIn`` edges and labels of lanes relative to the ego; labels count from ``first``."""
+    is_in = len(_kind_labels()) + _IS_IN
+    lanes = ego_lanes(seen)
+    roots = np.unique(lanes.frame)
+    frame, src = lanes.off_road
+    off_frames = np.unique(frame)
+    names = ["Root Road", "Off Road", "Lane"]
+    present = np.unique(lanes.role)
+    label = first + len(names) + np.searchsorted(present, lanes.role)
+    label[lanes.role == NAMELESS] = first + 2
+    names += [role_name(one) if one != NAMELESS else "Lane" for one in present.tolist()]
+    nodes = [
+        (lanes.frame, lanes.strand, label),
+        (roots, np.full(len(roots), ROOT_ROAD), np.full(len(roots), first)),
+        (off_frames, np.full(len(off_frames), OFF_ROAD), np.full(len(off_frames), first + 1)),
+    ]
+    in_frame, inner, strand = lanes.inside
+    edges = [
+        (in_frame, inner, np.full(len(inner), is_in), strand),
+        (
+            lanes.frame,
+            lanes.strand,
+            np.full(len(lanes.frame), is_in),
+            np.full(len(lanes.frame), ROOT_ROAD),
+        ),
+        (frame, src, np.full(len(src), is_in), np.full(len(src), OFF_ROAD)),
+    ]
+    return nodes, edges, names
+
+
+# ``roadscene2vec``: graphs of the tool of that name (Malawade et al., 2022), with its own
+# thresholds. Its actors (``car`` for all large vehicles, ``moto``, ``bicycle``, ``ped``, ``light``,
+# ``sign``) are related to the ego, ``ego_car``, only. ``Root Road`` has three lanes. The middle
+# lane contains the ego and all actors with the centre within 6 m to its left and right; the others
+# are in the left or right lane. A distance gets the first of five names whose threshold it does not
+# exceed. Bins of direction include both ends, so that exactly 45° gives two relations. Static
+# entities have no relations. Errors of the tool are not imitated: its angle for CARLA is the
+# difference of yaws.
+
+ACTORS: Final[Mapping[str, str]] = {
+    **dict.fromkeys(("car", "truck", "van", "bus", "trailer", "vehicle"), "car"),
+    "motorcycle": "moto",
+    "bicycle": "bicycle",
+    "person": "ped",
+    "traffic_light": "light",
+    **dict.fromkeys(("stop_sign", "yield_sign", "speed_limit", "sign"), "sign"),
+}
+"""Our kinds → its actors; it has no other kinds."""
+
+PROXIMITY: Final = (
+    ("near_coll", 4.0),
+    ("super_near", 7.0),
+    ("very_near", 10.0),
+    ("near", 16.0),
+    ("visible", 25.0),
+)
+"""Names and thresholds; m, between centres in space."""
+
+DIRECTIONS: Final = (
+    ("inDFrontOf", 0.0, 45.0),
+    ("inSFrontOf", 45.0, 90.0),
+    ("atSRearOf", 90.0, 135.0),
+    ("atDRearOf", 135.0, 180.0),
+)
+"""Names and bins of the bearing, to both sides; degrees, both ends included."""
+
+LANE_THRESHOLD: Final = 6.0
+"""Half the width of the middle lane; m."""
+
+LANES: Final = ("Left Lane", "Middle Lane", "Right Lane")
+
+_NODES: Final = (*dict.fromkeys(ACTORS.values()), "ego_car", "Root Road", *LANES)
+_EDGES: Final = (
+    "isIn",
+    *(name for name, _ in PROXIMITY),
+    *(name for name, *_ in DIRECTIONS),
+    *("toLeftOf", "toRightOf"),
+)
+_LABELS: Final = (*_NODES, *_EDGES)
+_LABEL: Final = {text: i for i, text in enumerate(_LABELS)}
+_ACTOR: Final = np.full(MOST_KINDS, -1)
+_ACTOR[[KIND_CODE[kind] for kind in ACTORS]] = [_LABEL[actor] for actor in ACTORS.values()]
+_LANE_NODES: Final = ROOT_ROAD - 1 - np.arange(len(LANES))
+
+
+def roadscene2vec(seen: GraphColumns) -> Labelled:
+    """Return ``roadscene2vec``: actors, related to the ego, in three lanes."""
+    label = np.where(seen.is_ego, _LABEL["ego_car"], _ACTOR[seen.kind])
+    rows = np.flatnonzero(label >= 0)
+    frames = np.arange(seen.frames)
+    fixed = [(frames, np.full(seen.frames, ROOT_ROAD), np.full(seen.frames, _LABEL["Root Road"]))]
+    edges: list[Part] = []
+    for name, node in zip(LANES, _LANE_NODES.tolist(), strict=True):
+        lane = np.full(seen.frames, node)
+        fixed.append((frames, lane, np.full(seen.frames, _LABEL[name])))
+        edges.append((frames, lane, _all(frames, "isIn"), np.full(seen.frames, ROOT_ROAD)))
+    nodes = [(seen.node_frame[rows], seen.node[rows], label[rows]), *fixed]
+    return Labelled.assembled(
+        seen.frames,
+        nodes,
+        [*edges, *_of_ego(seen, rows)],
+        _LABELS,
+    )
+
+
+def _all(rows: NDArray[np.signedinteger], label: str) -> NDArray[np.signedinteger]:
+    return np.full(len(rows), _LABEL[label])
+
+
+def _of_ego(seen: GraphColumns, rows: NDArray[np.signedinteger]) -> list[Part]:
+    """Return the lanes of actors with a known place, and their relations to the ego."""
+    ego = np.full(seen.frames, -1)
+    own = np.flatnonzero(seen.is_ego)
+    ego[seen.node_frame[own]] = own
+    middle = int(_LANE_NODES[1])
+    edges = [(seen.node_frame[own], seen.node[own], _all(own, "isIn"), np.full(len(own), middle))]
+    rows = rows[(ego[seen.node_frame[rows]] >= 0) & ~seen.is_ego[rows]]
+    at = ego[seen.node_frame[rows]]
+    dx, dy, dz = (getattr(seen, axis)[rows] - getattr(seen, axis)[at] for axis in "xyz")
+    heading = seen.heading[at]
+    ahead = dx * np.cos(heading) + dy * np.sin(heading)
+    left = dy * np.cos(heading) - dx * np.sin(heading)
+    known = np.flatnonzero(np.isfinite(ahead) & np.isfinite(left))
+    rows, at, ahead, left = rows[known], at[known], ahead[known], left[known]
+    distance = np.sqrt(ahead**2 + left**2 + np.nan_to_num(dz[known]) ** 2)
+    bearing = np.abs(np.degrees(np.arctan2(left, ahead)))
+    frame, node, ego_node = seen.node_frame[rows], seen.node[rows], seen.node[at]
+    lane = 1 - (left > LANE_THRESHOLD).astype(np.int64) + (left < -LANE_THRESHOLD)
+    edges.append((frame, node, _all(node, "isIn"), _LANE_NODES[lane]))
+
+    def add(label: str, where: NDArray[np.signedinteger], *, both: bool = False) -> None:
+        ends = [(node, ego_node), (ego_node, node)][: 2 if both else 1]
+        for src, dst in ends:
+            part = (frame[where], src[where], _all(where, label), dst[where])
+            edges.append(part)
+
+    low = -1.0
+    for name, high in PROXIMITY:
+        add(name, np.flatnonzero((distance > low) & (distance <= high)), both=True)
+        low = high
+    near = distance <= PROXIMITY[-1][1]
+    for name, first, last in DIRECTIONS:
+        add(name, np.flatnonzero(near & (bearing >= first) & (bearing <= last)))
+    add("toLeftOf", np.flatnonzero(near & (lane == 0)))
+    add("toRightOf", np.flatnonzero(near & (lane == 2)))
+    return edges

@@ -1,0 +1,63 @@
+"""Abstractions that are subsets of the scene graph; queries use them by name, without arrays."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from sgstore.base.records import dataclass
+from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+SCENERY: Final = ("building", "pole", "barrier", "vegetation")
+"""Kinds of entities that only ``SG`` has."""
+
+BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
+"""Relations among entities in the literature."""
+
+OF_JUNCTION: Final = (
+    *BETWEEN_ENTITIES,
+    *("isIn", "travelsTo", "laneChange", "opposes", "controlsTrafficOf", "mayAffect"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Subset:
+    """Subset of the scene graph for queries under an abstraction without new nodes or edges.
+
+    Attributes
+    ----------
+    parts : frozenset of str or None
+        Kinds of map parts among its nodes, in addition to traffic; ``None`` means all kinds and
+        relations.
+    moving : frozenset of str
+        Relations of entities, to one another and to parts of the map.
+    lasting : frozenset of str
+        Relations among parts of the map.
+    """
+
+    parts: frozenset[str] | None
+    moving: frozenset[str] = frozenset()
+    lasting: frozenset[str] = frozenset()
+
+    @property
+    def kinds(self) -> frozenset[str] | None:
+        """Return the kinds of its nodes known so far; ``None`` means all."""
+        return None if self.parts is None else (entity_kinds() - {*SCENERY}) | self.parts
+
+
+_LANES: Final = frozenset({"lane", "off_road"})
+_RELATED: Final = frozenset(BETWEEN_ENTITIES)
+_PARTS: Final = frozenset({*_LANES, "road", "junction"})
+
+SUBSETS: Final[Mapping[str, Subset]] = {
+    "E": Subset(frozenset()),
+    "EL": Subset(_LANES, frozenset({"isIn"})),
+    "ER": Subset(frozenset(), _RELATED),
+    "RSV": Subset(_LANES, _RELATED | {"isIn"}),
+    "junction": Subset(_PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
+    "SG": Subset(None),
+}
+"""In queries lanes keep their names and sections of the map."""

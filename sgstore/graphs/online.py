@@ -1,0 +1,917 @@
+"""Online generation of scene graphs, frame by frame.
+
+Also the frame type, built from plain values by a client or from a recording.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+from collections import OrderedDict
+from dataclasses import replace
+from functools import cache, partial
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+
+import numpy as np
+
+from sgstore.base.columns import chained
+from sgstore.base.geometry import wrapped
+from sgstore.model.graph import (
+    Edges,
+    LaneDistances,
+    MapRecords,
+    SceneColumns,
+    StaticPresence,
+    edge_attributes,
+)
+from sgstore.model.vocabulary import (
+    ENTITY_KINDS,
+    EVENT_KINDS,
+    KIND_CODE,
+    KINDS,
+    LIGHT_STATE_CODE,
+    LIGHT_STATES,
+    MAP_KINDS,
+    SPECIALS,
+    VEHICLE_LIGHTS,
+    kind_named,
+    suggestion,
+)
+from sgstore.model.world import (
+    INPUTS,
+    POSE,
+    Entities,
+    FaultTally,
+    FrameBlock,
+    Life,
+    Lives,
+    MessageRefs,
+    Origin,
+    Sight,
+    States,
+    is_plausible,
+    nearest_frames,
+    number,
+    origin_of,
+    quantize,
+    without_implausible,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.graph import GraphBlock, LaneGaps, LaneStates, SceneGraph, Whole, WorldBlock
+    from sgstore.model.vocabulary import TypeMeaning
+    from sgstore.model.world import Codes, Event, Floats, Ints
+
+    Attributes = dict[str, Any]
+    Edge = tuple[int, str, int, Attributes]
+
+__all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper", "check_entities", "replayed"]
+
+
+_NAN: Final = math.nan
+_LIGHT: Final = 1
+NUMBERS: Final = (*POSE, *INPUTS)
+WHOLE: Final = ("lights", "light_state", "derived")
+"""Columns of :attr:`Entity.numbers` and :attr:`Entity.whole`, named as in ``States``."""
+_ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
+
+
+class Entity(NamedTuple):
+    """State of one entity in a frame: angles in radians, codes as in :class:`sgstore.model.world.States`."""
+
+    ident: str
+    kind: int
+    special: str
+    subkind: str
+    type_name: str
+    static: bool
+    map_ref: str
+    numbers: tuple[float, ...]
+    whole: tuple[int, ...]
+    trailer: str = ""
+
+    @property
+    def constants(self) -> tuple[int, str, str]:
+        """Attributes that must stay the same while the entity exists."""
+        return self.kind, self.special, self.subkind
+
+    def meant(self, told: TypeMeaning | None) -> Entity:
+        """Return the entity with the kind of its configured type meaning; unchanged for ``None``."""
+        if told is None:
+            return self
+        kind = KIND_CODE[told.kind]
+        return self._replace(kind=kind, special=told.special, subkind=told.subkind)
+
+
+class Frame:
+    """Instant of a scene. The caller adds its entities, lights and events.
+
+    Parameters
+    ----------
+    time_ns : int
+        Simulation time; ns. Any number: no result depends on it.
+    ego : str or int, optional
+        Id of the ego, which must be one of the added entities. ``None`` means a frame without an ego.
+
+    Attributes
+    ----------
+    time_ns : int
+    ego : str
+        Id of the ego; empty without an ego.
+    entities : list of Entity
+        In the order in which they were added.
+    events : list of (str, str, str)
+        Kind of the event, and the ids of its first and second entity. An empty id means no entity or an unknown
+        one.
+    recorded : frozenset of str
+        Kinds of events that the frame records. Events of other kinds are unknown.
+    losses : list of (str, str)
+        Id and fault of each implausible number, which is treated as missing: ``("7", "length is -4.5 m")``.
+    """
+
+    __slots__ = ("ego", "entities", "events", "losses", "recorded", "time_ns")
+
+    def __init__(self, time_ns: int, ego: str | int | None = None) -> None:
+        self.time_ns = int(time_ns)
+        self.ego = "" if ego is None else str(ego)
+        self.entities: list[Entity] = []
+        self.events: list[tuple[str, str, str]] = []
+        self.recorded = frozenset(EVENT_KINDS)
+        self.losses: list[tuple[str, str]] = []
+
+    def __len__(self) -> int:
+        return len(self.entities)
+
+    def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
+        """Return the frame with the configured kinds of its type names (lower case)."""
+        if not types:
+            return self
+        frame = Frame(self.time_ns, self.ego)
+        frame.events, frame.recorded, frame.losses = self.events, self.recorded, self.losses
+        frame.entities = [
+            entity.meant(types.get(entity.type_name.lower())) for entity in self.entities
+        ]
+        return frame
+
+    def __repr__(self) -> str:
+        return f"Frame({self.time_ns}, ego={self.ego!r}, {len(self)} entities)"
+
+    def happened(self, kind: str, ident: str | int = "", other: str | int = "") -> None:
+        """Add an event: ``HAPPENS kind(a, b)`` becomes true in this frame.
+
+        Parameters
+        ----------
+        kind : str
+            ``collision``, ``lane_invasion`` or ``environment``.
+        ident, other : str or int
+            Ids of the first and second entity of the event. Empty: no entity, or an unknown one.
+
+        Raises
+        ------
+        ValueError
+            The kind of event is unknown.
+        """
+        self.events.append(
+            (_one_of("kind of event", kind, tuple(EVENT_KINDS)), str(ident), str(other))
+        )
+
+    def add(  # noqa: PLR0913  one argument per property
+        self,
+        ident: str | int,
+        kind: str,
+        x: float,
+        y: float,
+        z: float = _NAN,
+        *,
+        heading: float = _NAN,
+        pitch: float = _NAN,
+        roll: float = _NAN,
+        length: float = _NAN,
+        width: float = _NAN,
+        height: float = _NAN,
+        vx: float = _NAN,
+        vy: float = _NAN,
+        vz: float = _NAN,
+        ax: float = _NAN,
+        ay: float = _NAN,
+        az: float = _NAN,
+        yaw_rate: float = _NAN,
+        light_state: str | None = None,
+        lights: Iterable[str] | None = None,
+        steer: float = _NAN,
+        throttle: float = _NAN,
+        brake: float = _NAN,
+        gear: float | None = None,
+        hand_brake: bool | None = None,
+        special: str = "",
+        subkind: str = "",
+        type_name: str = "",
+        static: bool = False,
+        map_ref: str = "",
+        trailer: str | int = "",
+    ) -> None:
+        """Add an entity.
+
+        Parameters
+        ----------
+        ident : str or int
+            The client's own id, unique in the frame and the same in all frames.
+        kind : str
+            One of :data:`sgstore.model.vocabulary.ENTITY_KINDS`, or another label of one: ``Pedestrian``.
+        x, y, z : float
+            Centre of its box, in the map's axes (x east, y north, z up); m.
+        heading, pitch, roll : float
+            Orientation, counter-clockwise from the x axis; degrees.
+        length, width, height : float
+            Full extents of its box; m.
+        vx, vy, vz, ax, ay, az : float
+            Velocity and acceleration, in the map's axes; m/s, m/s².
+        yaw_rate : float
+            degrees/s.
+        light_state : str, optional
+            State of a traffic light: one of :data:`sgstore.model.vocabulary.LIGHT_STATES`.
+        lights : iterable of str, optional
+            Active lights of a vehicle, of :data:`sgstore.model.vocabulary.VEHICLE_LIGHTS`. ``None`` means
+            unknown.
+        steer, throttle, brake : float
+            Control inputs; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
+        gear : int, optional
+            1, 2, …; 0: neutral; below 0: backwards.
+        hand_brake : bool, optional
+            True if the hand brake is on.
+        special, subkind, type_name : str
+            Special kind, subkind, the simulator's own type name; see :class:`sgstore.model.world.Entities`.
+        static : bool
+            True if the entity never moves. Add it once, in any frame; it stays for all later frames.
+        map_ref : str
+            Id of its signal or object in the OpenDRIVE map. For a traffic light, it determines the controlled
+            lanes.
+        trailer : str or int
+            Id of the trailer that it pulls when it is first added. Empty: no trailer, or an unknown one.
+
+        Raises
+        ------
+        ValueError
+            The kind, a light or a light state is unknown. The message lists the known ones.
+
+        Notes
+        -----
+        A missing or infinite number is unknown, not 0. An entity without a size is a point. An entity without a
+        heading has no front. Sizes below 0 or above 1 km and speeds above 150 m/s are unknown, too;
+        :attr:`losses` lists them.
+        """
+        pose = (x, y, z, heading, pitch, roll, vx, vy, vz, ax, ay, az, yaw_rate)
+        pose = self._plausible(str(ident), (*pose, length, width, height))
+        gears = _NAN if gear is None else gear, _NAN if hand_brake is None else float(hand_brake)
+        numbers = (*pose, steer, throttle, brake, *gears)
+        self.entities.append(
+            Entity(
+                ident=str(ident),
+                kind=_kind_code(kind),
+                special=_one_of("special kind", special, SPECIALS) if special else "",
+                subkind=subkind,
+                type_name=type_name,
+                static=static,
+                map_ref=map_ref,
+                numbers=tuple(map(_inside, NUMBERS, numbers)),
+                whole=(_mask_of(lights), _light_code(light_state), 0),
+                trailer=str(trailer),
+            )
+        )
+
+    def _plausible(self, ident: str, pose: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the pose numbers without implausible ones, which are added to the losses."""
+        if is_plausible(*pose[6:9], *pose[13:]):
+            return pose
+        kept, faults = without_implausible(np.array([pose], np.float64))
+        self.losses += [(ident, words) for _, words in faults]
+        return tuple(kept[0].tolist())
+
+
+def _inside(name: str, value: float) -> float:
+    """Return a number in internal units: angles in radians, NaN for infinite values."""
+    value = float(value)
+    if not math.isfinite(value):
+        return _NAN
+    return math.radians(value) if name in _ANGLES else value
+
+
+def _kind_code(kind: str) -> int:
+    return KIND_CODE[_one_of("kind", kind_named(kind) or kind, ENTITY_KINDS)]
+
+
+def _light_code(state: str | None) -> int:
+    if state is None:
+        return -1
+    return LIGHT_STATE_CODE[_one_of("state of a traffic light", state, LIGHT_STATES)]
+
+
+def _mask_of(lights: Iterable[str] | None) -> int:
+    if lights is None:
+        return -1
+    mask = 0
+    for name in lights:
+        mask |= 1 << VEHICLE_LIGHTS.index(_one_of("light of a vehicle", name, VEHICLE_LIGHTS))
+    return mask
+
+
+def _one_of(what: str, name: str, known: Sequence[str]) -> str:
+    if name in known:
+        return name
+    like = suggestion(name, known)
+    hint = f"did you mean {like!r}?" if like else f"known: {', '.join(known)}"
+    raise ValueError(f"unknown {what} {name!r}; {hint}")
+
+
+def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iterator[Frame]:
+    """Yield the frames of a recording in order, each with its events.
+
+    Parameters
+    ----------
+    blocks : iterable of FrameBlock
+        All blocks of a trace.
+    recorded : iterable of str
+        Kinds of events that the recording contains from the start. Other kinds count from their first event on.
+
+    Yields
+    ------
+    Frame
+        The last frame of a block comes after the next block is read, because later events may belong to it.
+    """
+    replay, known = Replay(), set(recorded)
+    last: list[Frame] = []
+    clock, waiting = np.zeros((2, 0), np.int64), list["Event"]()
+    for block in blocks:
+        clock = np.hstack([clock[:, -1:], np.stack([block.time_ns, block.log_time_ns])])
+        waiting += block.events
+        places = nearest_frames(waiting, *clock).tolist()
+        happened: list[list[Event]] = [[] for _ in clock[0]]
+        for event, place in zip(waiting, places, strict=True):
+            happened[place].append(event)
+        waiting = happened[-1]
+        for events, frame in zip(happened, chain(last, replay.frames(block)), strict=True):
+            last = [frame]
+            if events is not waiting:
+                yield _recording(frame, events, known)
+    for frame in last:
+        yield _recording(frame, waiting, known)
+
+
+def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
+    """Add the events to a frame, and their kinds to ``known``. Return the frame."""
+    frame.events += [(event.kind, event.ident, event.other) for event in events]
+    known.update(kind for kind, _, _ in frame.events)
+    frame.recorded = frozenset(known)
+    return frame
+
+
+class Replay:
+    """Converter of the blocks of a recording into single :class:`Frame` objects.
+
+    The frames are the same as those of a client at the simulator. Memory grows with the number of distinct
+    entities, as for any reader.
+    """
+
+    def __init__(self) -> None:
+        self._known: list[tuple[str, int, str, str, str, bool, str]] = []
+        self._trailers: list[str] = []
+
+    def frames(self, block: FrameBlock) -> Iterator[Frame]:
+        """Yield the frames of the next block of a trace, with exactly the same numbers."""
+        new = block.entities
+        columns = (new.ident, new.kind.tolist(), new.special, new.subkind, new.type_name)
+        columns = (*columns, new.static.tolist(), new.map_ref)
+        self._known += zip(*columns, strict=True)
+        self._trailers += new.trailer or [""] * len(new)
+        standing = self._entities(block.scenery, 0, len(block.scenery))
+        for row, (time, ego) in enumerate(
+            zip(block.time_ns.tolist(), block.ego.tolist(), strict=True)
+        ):
+            frame = Frame(time, self._known[ego][0] if ego >= 0 else None)
+            start, stop = block.offsets[row : row + 2].tolist()
+            there = self._entities(block.states, start, stop)
+            if standing:  # In the order of the node ids, so that a client assigns the same ids.
+                nodes = [*block.scenery.node.tolist(), *block.states.node[start:stop].tolist()]
+                order = np.argsort(nodes, kind="stable").tolist()
+                there = [(*standing, *there)[i] for i in order]
+                standing = []
+            frame.entities = there
+            yield frame
+
+    def _entities(self, states: States, start: int, stop: int) -> list[Entity]:
+        numbers = np.stack([getattr(states, name)[start:stop] for name in NUMBERS], axis=1)
+        whole = np.stack([getattr(states, name)[start:stop] for name in WHOLE], axis=1)
+        return [
+            Entity(
+                *self._known[node],
+                numbers=tuple(values),
+                whole=tuple(codes),
+                trailer=self._trailers[node],
+            )
+            for node, values, codes in zip(
+                states.node[start:stop].tolist(), numbers.tolist(), whole.tolist(), strict=True
+            )
+        ]
+
+
+# Graph of one frame as records: the same as from a store, plus each entity's own id.
+
+TRACE: Final = "online"
+"""Trace name of the graphs in online mode."""
+
+_BOX: Final = ("x", "y", "z", "length", "width", "height")
+_MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
+_STILL: Final = dict.fromkeys(("speed", "vx", "vy", "vz"), 0.0)
+"""Velocity of static entities."""
+_DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate")
+_MAP_TEXTS: Final = ("name", "lane_type", "road", "junction", "turn")
+_MAP_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
+
+
+class EntityConstants(NamedTuple):
+    """Constant attributes of an entity."""
+
+    node: int
+    ident: str
+    kind: str
+    special: str
+    subkind: str
+    type_name: str = ""
+    lifetime: int = 1
+
+    def attributes(self, *, is_ego: bool, is_static: bool) -> Attributes:
+        """Return the attributes in the form of a scene graph."""
+        texts = {
+            "type_name": self.type_name,
+            "special": self.special,
+            "subkind": self.subkind,
+        }
+        return {
+            "kind": self.kind,
+            "name": f"{self.kind} {self.node}",
+            "ident": self.ident,
+            "is_ego": is_ego,
+            "is_static": is_static,
+            "lifetime": self.lifetime,
+            **{name: text for name, text in texts.items() if text},
+        }
+
+
+class Records:
+    """Converter of graph blocks into :class:`sgstore.model.graph.SceneGraph` records.
+
+    Parameters
+    ----------
+    road_map : RoadMap or None
+        The map of the graphs. The attributes of a map node are collected at its first use.
+    """
+
+    def __init__(self, road_map: RoadMap | None) -> None:
+        self._standing: dict[int, Attributes] = {}
+        self._map: MapRecords | None = None
+        if road_map is not None:
+            edges = road_map.edges
+            about = cache(partial(_map_node, road_map))
+            along = road_map.places.rows(), road_map.courses.rows()
+            reach = LaneDistances(*road_map.reach, *along)
+            self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
+
+    def stand(self, known: EntityConstants, states: States, row: int) -> None:
+        """Store the attributes of a static entity, whose pose comes only once."""
+        numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
+        numbers["heading"] = _degrees(states.heading[row : row + 1])[0]
+        about = known.attributes(is_ego=False, is_static=True)
+        self._standing[known.node] = about | _numbers(numbers) | _STILL
+
+    def graph(
+        self, graph: GraphBlock, outer: Ints, known: dict[int, EntityConstants]
+    ) -> SceneGraph:
+        """Return the scene graph of a block with one frame.
+
+        Parameters
+        ----------
+        graph : GraphBlock
+            Of one frame.
+        outer : int64
+            Node id of the block → node id of the records. Map nodes keep their ids.
+        known : dict
+            Node id of the records → entity, for all moving entities of the frame.
+        """
+        found = self._graph(graph, (graph,), graph.edges, outer, known)
+        excluded = frozenset(KINDS[code] for code, _ in graph.left_out.excluded)
+        found = replace(found, out_of_world=graph.left_out.beyond_world, excluded=excluded)
+        if (world := graph.world) is None:
+            return found
+
+        def around() -> SceneGraph:
+            edges = graph.edges.differing(world.edges)
+            return self._graph(graph, (graph, world), edges, outer, known)
+
+        return replace(found, around=cache(around))
+
+    def _graph(
+        self,
+        graph: GraphBlock,
+        parts: Sequence[GraphBlock | WorldBlock],
+        edges: Edges,
+        outer: Ints,
+        known: dict[int, EntityConstants],
+    ) -> SceneGraph:
+        """Return the scene graph for several parts: the graph, and optionally its surroundings."""
+        frames = graph.frames
+        states = chained([part.frames.states for part in parts])
+        presence = chained([part.presence for part in parts])
+        ego = int(outer[frames.ego[0]]) if frames.ego[0] >= 0 else None
+        node = outer[states.node]
+        moving = [
+            known[one].attributes(is_ego=one == ego, is_static=False) | told
+            for one, told in zip(node.tolist(), _moving(states), strict=True)
+        ]
+        for row in np.flatnonzero(states.carrier >= 0).tolist():
+            moving[row]["carrier"] = int(outer[states.carrier[row]])
+        src, dst = _outward(edges.src, outer), _outward(edges.dst, outer)
+        columns = SceneColumns(
+            trace=TRACE,
+            frame_id=frames.seq,
+            seq=frames.seq,
+            time_ns=frames.time_ns,
+            ego=[ego],
+            moving=(np.zeros_like(node), node, moving),
+            presence=StaticPresence(presence.frame, _outward(presence.node, outer)),
+            standing=self._standing,
+            edges=Edges(edges.frame, edges.relation, src, dst),
+            about=edge_attributes(
+                chain.from_iterable(_lanes(part.lanes, outer) for part in parts),
+                chain.from_iterable(_gaps(part.gaps, outer) for part in parts),
+            ),
+            map=self._map,
+        )
+        return next(columns.graphs())
+
+
+def _map_node(road_map: RoadMap, node: int) -> Attributes:
+    """Return the attributes of a map node."""
+    nodes, row = road_map.nodes, -1 - node
+    texts = {name: getattr(nodes, name)[row] for name in _MAP_TEXTS}
+    numbers = {name: float(getattr(nodes, name)[row]) for name in _MAP_NUMBERS}
+    # A store has 32 bits for these numbers.
+    numbers |= {
+        name: float(np.float32(numbers[name])) for name in ("length", "width", "speed_limit")
+    }
+    numbers["heading"] = math.degrees(numbers["heading"])
+    about: Attributes = {"kind": KINDS[nodes.kind[row]], "is_ego": False, "is_static": True}
+    about |= {name: text for name, text in texts.items() if text} | _numbers(numbers)
+    if about["kind"] not in MAP_KINDS:
+        about |= _STILL
+    if nodes.lane_type[row]:
+        about |= {"section": int(nodes.section[row]), "lane": int(nodes.lane[row])}
+    return about
+
+
+def _moving(states: States) -> list[Attributes]:
+    """Return the attributes of each state, in output units (degrees, m/s)."""
+    columns: dict[str, Floats] = {
+        name: getattr(states, name) for name in (*_BOX, *_MOTION, *INPUTS[:3])
+    }
+    columns["heading"] = np.degrees(wrapped(states.heading))
+    columns |= {name: np.degrees(getattr(states, name)) for name in ("pitch", "roll", "yaw_rate")}
+    speed = np.sqrt(states.vx**2 + states.vy**2 + np.nan_to_num(states.vz) ** 2)
+    columns["speed"] = number(speed).astype(np.float64)
+    columns["accel"] = states.ax * np.cos(states.heading) + states.ay * np.sin(states.heading)
+    names = tuple(columns)
+    table = np.stack([columns[name] for name in names], axis=1)
+    known = np.isfinite(table).tolist()
+    whole = [states.lights, states.light_state, states.derived, states.gear, states.hand_brake]
+    codes = zip(*(column.tolist() for column in whole), strict=True)
+    return [
+        {name: value for name, value, told in zip(names, row, is_known, strict=True) if told}
+        | _coded(*whole)
+        for row, is_known, whole in zip(table.tolist(), known, codes, strict=True)
+    ]
+
+
+def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float) -> Attributes:
+    """Return the attributes with coded values: lights, derived flags, gear and hand brake."""
+    about: Attributes = {}
+    if lights >= 0:
+        about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}
+    if light >= 0:
+        about["light_state"] = LIGHT_STATES[light]
+    if not math.isnan(gear):
+        about["gear"] = int(gear)
+    if not math.isnan(hand_brake):
+        about["hand_brake"] = bool(hand_brake)
+    return about | {name: bool(derived >> bit & 1) for bit, name in enumerate(_DERIVED)}
+
+
+def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
+    """Yield frame, source, target and attributes of each ``isIn`` edge."""
+    told = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
+    columns = (
+        *(lanes.frame.tolist(), _outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
+        *(number(column).tolist() for column in told),
+        *(lanes.primary.tolist(), lanes.own.tolist()),
+    )
+    for frame, node, lane, overlap, offset, error, along, primary, own in zip(
+        *columns, strict=True
+    ):
+        numbers = {
+            "overlap": overlap,
+            "lane_offset": offset,
+            "heading_error": math.degrees(error),
+            "along": along,
+        }
+        yield frame, node, lane, _numbers(numbers) | {"is_primary": primary, "is_own": own}
+
+
+def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
+    """Yield frame, source, target and attributes of each ``follows`` edge."""
+    src, dst = _outward(gaps.src, outer).tolist(), _outward(gaps.dst, outer).tolist()
+    for frame, a, b, gap in zip(
+        gaps.frame.tolist(), src, dst, number(gaps.gap).tolist(), strict=True
+    ):
+        yield frame, a, b, _numbers({"gap": gap})
+
+
+def _outward(nodes: Whole, outer: Ints) -> Ints:
+    """Return the node ids of the records for node ids of a block."""
+    return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
+
+
+def _degrees(heading: Floats) -> list[float]:
+    """Return headings in degrees, in (-180, 180]."""
+    return np.degrees(wrapped(heading)).tolist()
+
+
+def _numbers(values: dict[str, float]) -> Attributes:
+    return {name: value for name, value in values.items() if math.isfinite(value)}
+
+
+# Online generation in bounded memory.
+# Node ids are assigned in the order of appearance and never used twice. The tables of a generator grow with
+# every new entity. The generator is therefore replaced after most of its entities are gone. Its tables only
+# save work, so the graphs do not change. An absent entity is forgotten after :data:`REMEMBERED` other
+# entities; if it returns, it is a new entity.
+
+REMEMBERED: Final = 20_000
+"""Absent entities that are still known by their ids; about 5 MB."""
+
+SPARE: Final = 2048
+"""Absent entities that are allowed before a generator is replaced."""
+
+
+class Generator(Protocol):
+    """Protocol of the graph generator; see :class:`sgstore.sgg.SceneGraphGenerator`."""
+
+    @property
+    def kinds(self) -> Codes:
+        """Kinds of all entities so far, by node id."""
+        ...
+
+    def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
+        """Return the graphs of the next frames, one block per ego."""
+        ...
+
+
+class Stepper:
+    """Online generator: one frame in, its scene graphs out.
+
+    Parameters
+    ----------
+    make : callable
+        Makes a new generator.
+    road_map : RoadMap or None
+        The map of the graphs.
+    ego : str
+        Default ego for frames without an ego.
+
+    Attributes
+    ----------
+    last : tuple or None
+        The last graphs as blocks, and the kinds of their entities by the blocks' node ids.
+    faults : FaultTally
+        Implausible sizes and speeds in the frames.
+    """
+
+    def __init__(
+        self, make: Callable[[], Generator], road_map: RoadMap | None, ego: str = ""
+    ) -> None:
+        self._make = make
+        self._generator = make()
+        self._ego = ego
+        self._records = Records(road_map)
+        self._seq = 0
+        self._origin: Origin | None = None
+        self.last: tuple[list[GraphBlock], Codes] | None = None
+        self._next = 0
+        # Entities that move, by their id; those of the last frame at the end.
+        self._moving: OrderedDict[str, Lives[EntityConstants]] = OrderedDict()
+        self.faults = FaultTally()
+        self._time_ns: int | None = None
+        self._run = 0  # Run of the clock; a backward step starts the next run.
+        self._standing: dict[str, tuple[Entity, EntityConstants]] = {}
+        # Node id → node id inside the current generator, and the inverse.
+        self._inner: dict[int, int] = {}
+        self._introduced = 0
+        self._outer: Ints = np.zeros(64, np.int64)
+
+    def step(self, frame: Frame, egos: Sequence[str]) -> list[SceneGraph]:
+        """Return the scene graphs of the next frame, one per ego.
+
+        Parameters
+        ----------
+        frame : Frame
+        egos : sequence of str
+            Ids of the egos. An empty id means the ego of the frame, else that of the config.
+        """
+        moving, new = self._met(frame)
+        if self._introduced > 2 * (len(moving) + len(self._standing)) + SPARE:
+            self._generator, self._inner, self._introduced = self._make(), {}, 0
+            new = [entity for entity, _ in self._standing.values()]
+        block = self._kept(self._block(frame, moving, new))
+        for row, entity in enumerate(new):
+            self._records.stand(self._standing[entity.ident][1], block.scenery, row)
+        here = {entity.ident for entity in moving}
+        named = (ego or frame.ego or self._ego for ego in egos)
+        nodes = [
+            self._inner[self._moving[ego].last.entity.node] if ego in here else -1 for ego in named
+        ]
+        self.last = None  # Free the previous graphs, which are large for a crowd.
+        graphs = self._generator.blocks(block, [np.array([node]) for node in nodes])
+        self._seq += 1
+        self.last = graphs, self._generator.kinds
+        while len(self._moving) > len(moving) + REMEMBERED:
+            _, lives = self._moving.popitem(last=False)
+            for life in (lives.last, *lives.left):
+                self._inner.pop(life.entity.node, None)
+        constants = [self._moving[entity.ident].last.entity for entity in moving]
+        known = {one.node: one for one in constants}
+        happened = self._happened(frame)
+        with GcPaused():
+            found = [self._records.graph(graph, self._outer, known) for graph in graphs]
+            return [replace(one, events=happened) for one in found]
+
+    def _happened(self, frame: Frame) -> dict[str, list[tuple[int | None, int | None]]]:
+        """Return the events of a frame by kind, with node ids. Each recorded kind has an entry."""
+        found: dict[str, list[tuple[int | None, int | None]]] = {k: [] for k in frame.recorded}
+        for kind, *idents in frame.events:
+            a, b = (self._node_of(ident) for ident in idents)
+            found.setdefault(kind, []).append((a, b))
+        return found
+
+    def _node_of(self, ident: str) -> int | None:
+        if ident in self._standing:
+            return self._standing[ident][1].node
+        return self._moving[ident].last.entity.node if ident in self._moving else None
+
+    def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
+        """Return the moving entities of a frame, and its new static entities.
+
+        All checks come first: a rejected frame changes nothing.
+        """
+        check_entities(frame, self._is_static)
+        if self._time_ns is not None and frame.time_ns < self._time_ns:
+            self._run += 1
+        self._time_ns = frame.time_ns
+        for ident, words in frame.losses:
+            self.faults.add(ident, words)
+        moving = {entity.ident: entity for entity in frame.entities if not entity.static}
+        new: dict[str, Entity] = {}
+        for entity in frame.entities:
+            if entity.static and entity.ident not in self._standing:
+                new.setdefault(entity.ident, entity)
+        # Same node ids as for a recording: first the new ids, then the ids that have returned.
+        for entity in frame.entities:
+            if entity.ident not in self._moving and entity.ident not in self._standing:
+                known = self._enter(entity)
+                if entity.ident in new:
+                    self._standing[entity.ident] = entity, known
+                else:
+                    self._moving[entity.ident] = Lives(Life(known, entity.kind))
+        for entity in moving.values():
+            self._follow(entity, frame.time_ns)
+        return list(moving.values()), list(new.values())
+
+    def _is_static(self, ident: str) -> bool | None:
+        if ident in self._standing:
+            return True
+        return False if ident in self._moving else None
+
+    def _enter(self, entity: Entity, lifetime: int = 1) -> EntityConstants:
+        texts = entity.special, entity.subkind, entity.type_name
+        known = EntityConstants(self._next, entity.ident, KINDS[entity.kind], *texts, lifetime)
+        self._next += 1
+        return known
+
+    def _follow(self, entity: Entity, time_ns: int) -> None:
+        """Record the place of an entity. An id that has returned starts a new entity."""
+        lives = self._moving[entity.ident]
+        place = (_NAN,) * 3 if entity.whole[_LIGHT] >= 0 else entity.numbers[:3]
+        here = Sight(place, time_ns, self._run)
+        lives.follow(entity.kind, here, partial(self._enter, entity, lives.count + 1))
+        self._moving.move_to_end(entity.ident)
+
+    def _block(self, frame: Frame, moving: list[Entity], standing: list[Entity]) -> FrameBlock:
+        """Return a frame as a block with the node ids of the generator."""
+        first = self._introduced
+        new = [*standing, *(e for e in moving if self._node(e) not in self._inner)]
+        self._introduced += len(new)
+        while self._introduced > len(self._outer):
+            self._outer = np.concatenate([self._outer, self._outer])
+        for inner, entity in enumerate(new, start=first):
+            self._outer[inner] = node = self._node(entity)
+            self._inner[node] = inner
+        time, none = np.array([frame.time_ns]), np.zeros(0, np.int64)
+        return FrameBlock(
+            seq=np.array([self._seq]),
+            time_ns=time,
+            log_time_ns=time,
+            offsets=np.array([0, len(moving)]),
+            states=self._states(moving),
+            ego=np.array([-1]),  # The ego is passed separately.
+            entities=_entities(first, new),
+            scenery=self._states(standing),
+            messages=MessageRefs(none, none, none, none, none),
+        )
+
+    def _kept(self, block: FrameBlock) -> FrameBlock:
+        """Round the numbers of a block as a store does."""
+        self._origin = self._origin or origin_of(block)
+        return quantize(block, self._origin or Origin(0.0, 0.0, 0.0))
+
+    def _node(self, entity: Entity) -> int:
+        if entity.static:
+            return self._standing[entity.ident][1].node
+        return self._moving[entity.ident].last.entity.node
+
+    def _states(self, of: list[Entity]) -> States:
+        numbers = np.array([e.numbers for e in of], np.float64).reshape(-1, len(NUMBERS))
+        whole = np.array([e.whole for e in of], np.int64).reshape(-1, len(WHOLE))
+        lights, light_state, derived = whole.T
+        return States.of(
+            node=np.array([self._inner[self._node(e)] for e in of], np.int64),
+            lights=lights,
+            light_state=light_state.astype(np.int8),
+            derived=derived,
+            **{name: numbers[:, i] for i, name in enumerate(NUMBERS)},
+        )
+
+
+def check_entities(frame: Frame, is_static: Callable[[str], bool | None]) -> None:
+    """Raise if a frame contradicts itself or earlier frames.
+
+    Parameters
+    ----------
+    frame : Frame
+    is_static : callable
+        Returns for an id: True if the known entity is static, False if it moves, None for an unknown id.
+
+    Raises
+    ------
+    ValueError
+        Two entities have the same id, or a moving entity is now static, or a static one moves.
+    """
+    here: dict[str, Entity] = {}
+    for entity in frame.entities:
+        ident, static = entity.ident, is_static(entity.ident)
+        if ident in here and not (here[ident].static and entity.static):
+            raise ValueError(f"two entities have the id {ident!r}")
+        if static is not None and entity.static != static:
+            now, before = ("is static", "moved") if entity.static else ("moves", "was static")
+            raise ValueError(f"entity {ident!r} {before} before and {now} now")
+        here[ident] = entity
+
+
+class GcPaused:
+    """Context manager that pauses garbage collection, if it is enabled.
+
+    The records of a graph are thousands of small objects and no garbage. Python would scan them several times
+    during their creation, and every few frames all objects of the client: 30 ms and more. Objects freed inside
+    the context are never scanned, because Python counts the net growth.
+    """
+
+    def __enter__(self) -> None:
+        self._running = gc.isenabled()
+        gc.disable()
+
+    def __exit__(self, *_exception: object) -> None:
+        if self._running:
+            gc.enable()
+
+
+def _entities(first: int, new: list[Entity]) -> Entities:
+    return Entities(
+        first=first,
+        ident=tuple(e.ident for e in new),
+        kind=np.array([e.kind for e in new], np.int8),
+        special=tuple(e.special for e in new),
+        subkind=tuple(e.subkind for e in new),
+        type_name=tuple(e.type_name for e in new),
+        static=np.array([e.static for e in new], np.bool_),
+        map_ref=tuple(e.map_ref for e in new),
+        trailer=tuple(e.trailer for e in new),
+    )

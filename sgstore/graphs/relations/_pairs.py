@@ -1,0 +1,487 @@
+"""Related pairs of bodies and their numbers, with bounded memory.
+
+This module finds related bodies, and computes the numbers that the relations need.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.base.compiled import worth
+from sgstore.graphs.relations._scene import (
+    CHUNK,
+    IS_SIGNAL,
+    Bodies,
+    BodyPairs,
+    distances,
+    levels,
+    parts,
+    span_up_to,
+    spans,
+    spread,
+)
+from sgstore.mcap import Loss
+from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled, normalize_name
+from sgstore.model.world import Entities, MessageRefs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    from numpy.typing import NDArray
+
+    from sgstore.model.config import Config
+    from sgstore.model.graph import GraphBlock
+    from sgstore.model.world import Bools, Codes, FrameBlock, Ints
+
+    Rows = NDArray[np.intp]
+    Halves = tuple[Rows, Rows]
+
+
+CELLS: Final = 8
+"""Strips of the plane per search distance; more strips reduce the candidates a little."""
+
+FAR_STRIP: Final = 1 << 40
+"""Positions beyond this strip share a strip, so that keys fit into 64 bits."""
+
+
+NO_PAIRS: Final[Halves] = (np.zeros(0, np.intp), np.zeros(0, np.intp))
+
+
+def near_pairs(bodies: Bodies, config: Config, unwanted: Bools) -> Iterator[Halves]:
+    """Yield each unordered pair of moving bodies that are near each other, without signals.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    config : Config
+    unwanted : (F,) bool
+        Frames to skip; the caller may change it between chunks.
+
+    Yields
+    ------
+    a, b : intp
+        Rows, in chunks.
+    """
+    rows = np.flatnonzero(bodies.moves & ~IS_SIGNAL[bodies.kind])
+    return pairs_among(bodies, rows, config, unwanted)
+
+
+def pairs_among(bodies: Bodies, rows: Rows, config: Config, unwanted: Bools) -> Iterator[Halves]:
+    """Yield near pairs among these rows, moving or not."""
+    within, between = config.pairs.within, config.proximity.between
+    if within > 0 and between != "footprints" and worth():
+        yield from _near_in_loops(bodies, rows, within, between, unwanted)
+    elif within > 0:
+        yield from _near_pairs(bodies, rows, within, between, unwanted)
+
+
+def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> BodyPairs:
+    """Return all related pairs: the ego with every body, and moving bodies near each other.
+
+    Parameters
+    ----------
+    bodies : Bodies
+    ego : (F,) intp
+        Row of the ego of each frame, or -1.
+    near : tuple of intp arrays
+        Other pairs: bodies that are near each other.
+    config : Config
+        Signals and scenery are related to the ego only, unless the settings also relate static
+        entities to each other (:mod:`sgstore.graphs.relations._pairs`). A body without a position is near
+        no other; it is still related to the ego, with missing numbers, unless the ego has a
+        distance limit too.
+    """
+    settings, between = config.pairs, config.proximity.between
+    if not settings.ego:
+        return BodyPairs(bodies, *of_kinds(bodies, ego, near, settings.kinds), between)
+    mine = ego[bodies.frame]
+    is_ego = mine == np.arange(len(bodies))
+    others = np.flatnonzero((mine >= 0) & ~is_ego)
+    a, b = near
+    further = np.flatnonzero(~(is_ego[a] | is_ego[b]))
+    with_ego = mine[others], others
+    if settings.ego_within > 0:
+        close = distances(bodies, *with_ego, between) <= settings.ego_within
+        with_ego = with_ego[0][close], with_ego[1][close]
+    halves = _behind(with_ego, near, further)
+    halves = of_kinds(bodies, ego, halves, settings.kinds)
+    return BodyPairs(bodies, *halves, between)
+
+
+def _behind(pairs: Halves, others: Halves, rows: Rows) -> Halves:
+    """Append selected pairs of ``others`` to ``pairs``."""
+    count = len(pairs[0])
+    a, b = np.empty((2, count + len(rows)), np.intp)
+    for column, first, rest in zip((a, b), pairs, others, strict=True):
+        column[:count] = first
+        np.take(rest, rows, out=column[count:], mode="clip")  # this copies only the selected rows
+    return a, b
+
+
+def of_kinds(
+    bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
+) -> Halves:
+    """Return the pairs of listed kinds, in either order; all pairs for an empty list."""
+    if not kinds:
+        return pairs
+    a, b = pairs
+    kept = are_of_kinds(bodies, ego, pairs, kinds)
+    return a[kept], b[kept]
+
+
+def are_of_kinds(
+    bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
+) -> Bools:
+    """Return a mask of the pairs of listed kinds, in either order."""
+    listed = np.zeros((len(KINDS) + 1, len(KINDS) + 1), np.bool_)  # the last row is the ego
+    for one, other in kinds:
+        listed[np.ix_(_kind_codes(one), _kind_codes(other))] = True
+    listed |= listed.T
+    a, b = pairs
+    of_a, of_b = bodies.kind[a].astype(np.intp), bodies.kind[b].astype(np.intp)
+    kept = listed[of_a, of_b]
+    kept |= listed[-1, of_b] & (ego[bodies.frame[a]] == a)
+    return kept | listed[of_a, -1] & (ego[bodies.frame[b]] == b)
+
+
+def _kind_codes(label: str) -> list[int]:
+    if normalize_name(label) == "ego":
+        return [len(KINDS)]
+    return [KIND_CODE[kind] for kind in kinds_labelled(label) or ()]
+
+
+def joined_pairs(halves: list[Halves]) -> Halves:
+    """Concatenate lists of pairs."""
+    return np.concatenate([a for a, _ in halves]), np.concatenate([b for _, b in halves])
+
+
+def _near_pairs(
+    bodies: Bodies, rows: Rows, within: float, between: str, unwanted: Bools
+) -> Iterator[tuple[Rows, Rows]]:
+    """Yield each unordered pair of these rows within a distance, in the same frame.
+
+    The rows are sorted by frame and by strips across the x axis. The candidates of a row are the
+    later rows in its own strip and in the next few strips: a range of the sorted rows.
+    """
+    rows = rows[np.isfinite(bodies.x[rows])]
+    reach = within
+    if between == "footprints":
+        reach += float(np.nan_to_num(np.hypot(bodies.length, bodies.width)[rows]).max(initial=0))
+    strip = np.clip(np.floor(bodies.x[rows] * (CELLS / reach)), -FAR_STRIP, FAR_STRIP).astype(
+        np.int64
+    )
+    key = (bodies.frame[rows] << 43) + strip + FAR_STRIP
+    order = np.argsort(key, kind="stable")
+    rows, key = rows[order], key[order]
+    start = np.arange(1, len(rows) + 1)
+    # One strip more than the distance: the division above may round up.
+    count = np.searchsorted(key, key + CELLS + 1, side="right") - start
+    frame, limit = bodies.frame[rows], span_up_to(within, between)
+    for part in parts(count):
+        if unwanted[frame[part]].all():
+            continue
+        owner, index = spread(start[part], count[part])
+        first, second = rows[part][owner], rows[index]
+        near = np.flatnonzero(spans(bodies, first, second, between) <= limit)
+        yield first[near], second[near]
+
+
+def _near_in_loops(
+    bodies: Bodies, rows: Rows, within: float, between: str, unwanted: Bools
+) -> Iterator[Halves]:
+    """Yield the same pairs as :func:`_near_pairs`, in another order, with numba loops."""
+    from sgstore.graphs.relations import _loops
+
+    rows = rows[np.isfinite(bodies.x[rows])]
+    order = rows[np.lexsort((bodies.x[rows], bodies.frame[rows]))]
+    frame = bodies.frame[order]
+    end = np.searchsorted(frame, frame, side="right")
+    count = end - np.arange(len(end))
+    room = max(min(int(count.sum()), AT_ONCE), CHUNK, int(count.max(initial=0)))
+    a, b = found = np.empty(room, np.intp), np.empty(room, np.intp)
+    place, limit = (bodies.x, bodies.y, levels(bodies, between)), span_up_to(within, between)
+    first = 0
+    while first < len(order):
+        if unwanted[frame[first]]:
+            first = int(end[first])
+            continue
+        many, first = _loops.near_pairs(first, order, end, place, limit, found)
+        if first == len(order):
+            yield a[:many], b[:many]
+        else:
+            yield a[:many].copy(), b[:many].copy()
+
+
+# Pairs of static entities: found once, on their first appearance, and looked up where both are in
+# range.
+
+MOST_LEARNT: Final = 1 << 22
+"""Greatest number of remembered pairs; above it they are computed in every frame."""
+
+
+class StillPairs:
+    """Near pairs of the scenery of a trace; empty unless the settings request them.
+
+    Parameters
+    ----------
+    config : Config
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._a, self._b = NO_PAIRS
+        self._too_many = False
+
+    @property
+    def wanted(self) -> bool:
+        """True if the settings request static pairs."""
+        return self._config.pairs.static and self._config.pairs.within > 0
+
+    def learn(self, scenery: Bodies) -> None:
+        """Find the pairs of all scenery so far, independent of frames, unless they are too many."""
+        rows = np.arange(len(scenery))
+        (a, b), over = gathered(
+            lambda unwanted: pairs_among(scenery, rows, self._config, unwanted),
+            np.zeros(len(scenery), np.int64),
+            frames=1,
+            most=MOST_LEARNT,
+        )
+        order = np.argsort(a, kind="stable")
+        self._a, self._b = a[order], b[order]
+        self._too_many = bool(over.any())
+
+    def among(
+        self, bodies: Bodies, keys: Ints, states: int, count: int, unwanted: Bools
+    ) -> Iterator[tuple[Rows, Rows]]:
+        """Yield near static pairs with both entities in range.
+
+        Parameters
+        ----------
+        bodies : Bodies
+            Bodies in range.
+        keys : int64
+            Entities in range, ascending: from ``states`` on, frame times ``count`` plus the row of
+            the scenery.
+        states, count : int
+            Rows of the block's states, and of the scenery.
+        unwanted : (F,) bool
+            Frames to skip; the caller may change it between chunks.
+
+        Yields
+        ------
+        a, b : intp
+            Places in ``keys``, in chunks.
+        """
+        if self._too_many:
+            yield from pairs_among(bodies, np.flatnonzero(~bodies.moves), self._config, unwanted)
+        if not len(self._a):
+            return
+        first = int(np.searchsorted(keys, states))
+        still = keys[first:] - states
+        start = np.searchsorted(self._a, still % count)
+        length = np.searchsorted(self._a, still % count, side="right") - start
+        frame = bodies.frame[first:]
+        for part in parts(length):
+            if unwanted[frame[part]].all():
+                continue
+            owner, pair = spread(start[part], length[part])
+            owner += part.start
+            other = still[owner] - self._a[pair] + self._b[pair]
+            place = np.minimum(np.searchsorted(still, other), max(len(still) - 1, 0))
+            found = np.flatnonzero(still[place] == other)
+            yield first + owner[found], first + place[found]
+
+
+# Crowds: what keeps pairs of bodies within bounds of memory, whatever a frame holds -------------
+# n bodies in one place have n² / 2 pairs, and each pair can have several edges. Two bounds limit
+# the memory: a block is cut into pieces of frames with at most :data:`AT_ONCE` pairs; and one frame
+# relates at most :data:`MOST_PAIRS`. In a frame above this limit bodies are related to the ego
+# only; the store records this as a loss.
+
+MOST_PAIRS: Final = 1 << 18
+"""Greatest number of related pairs in one frame, each counted once, and of pairs that touch. 724
+bodies near each other reach it, or 5,000 bodies with a hundred neighbours each."""
+
+AT_ONCE: Final = 1 << 18
+"""Estimated pairs of the frames that are processed together: about 200 MB with all results."""
+
+NEAR: Final = "near"
+TOUCHING: Final = "touching"
+
+_WIDEST: Final = 1 << 20
+"""Positions beyond this cell of the plane share a cell."""
+
+
+def gathered(
+    chunks: Callable[[Bools], Iterable[Halves]], frame: Ints, frames: int, most: int | None = None
+) -> tuple[Halves, Bools]:
+    """Collect pairs of bodies from chunks, without frames that have too many.
+
+    Parameters
+    ----------
+    chunks : function
+        Function that yields pairs of rows. Its argument is a mask of frames to skip, which changes
+        while pairs are read.
+    frame : (N,) int64
+        Frame of each row.
+    frames : int
+        Number of frames.
+    most : int, optional
+        Greatest number of pairs per frame; by default :data:`MOST_PAIRS`.
+
+    Returns
+    -------
+    pairs : tuple of intp arrays
+    over : (frames,) bool
+        Frames with more pairs; their pairs are left out.
+    """
+    most = MOST_PAIRS if most is None else most
+    over, count = np.zeros(frames, np.bool_), np.zeros(frames, np.int64)
+    found: list[Halves] = [NO_PAIRS]
+    crowd = int(np.bincount(frame, minlength=1).max())
+    for chunk in chunks(over):
+        found.append(chunk)
+        if crowd * (crowd - 1) // 2 <= most:
+            continue
+        count += np.bincount(frame[chunk[0]], minlength=frames)
+        new = (count > most) & ~over
+        if new.any():
+            over |= new
+            found = [_without(pairs, over[frame[pairs[0]]]) for pairs in found]
+        elif over.any():
+            found[-1] = _without(chunk, over[frame[chunk[0]]])
+    return found[1] if len(found) == 2 else joined_pairs(found), over
+
+
+def _without(pairs: Halves, left_out: Bools) -> Halves:
+    return pairs[0][~left_out], pairs[1][~left_out]
+
+
+def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Iterator[FrameBlock]:
+    """Split a block into consecutive blocks with a bounded number of pairs; usually one block.
+
+    Parameters
+    ----------
+    frames : FrameBlock
+    kinds : int8
+        Kinds of all entities by node id, including those of the block.
+    config : Config
+    egos : int
+        Number of graphs made of each frame.
+
+    Yields
+    ------
+    FrameBlock
+        The first one has the new entities, messages and events of the block.
+    """
+    most = max(AT_ONCE // max(egos, 1), 1)
+    node = frames.states.node
+    known = (node >= 0) & (node < len(kinds))  # the generator rejects unknown nodes later
+    rows = np.flatnonzero(known)
+    rows = rows[~IS_SIGNAL[kinds[node[rows]]]]
+    count = np.bincount(frames.frame_of[rows], minlength=len(frames)).astype(np.int64)
+    pairs = count * count // 2
+    if int(pairs.sum()) > most:
+        pairs = np.minimum(pairs, _neighbours(frames, rows, config))
+    if int(pairs.sum()) <= most:
+        yield frames
+        return
+    start = 0
+    total = np.cumsum(pairs)
+    while start < len(frames):
+        before = int(total[start - 1]) if start else 0
+        stop = max(int(np.searchsorted(total, before + most, side="right")), start + 1)
+        yield _part(frames, start, stop)
+        start = stop
+
+
+def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
+    """Return an upper bound of the near pairs of each frame, (F,), by counting adjacent cells."""
+    states = frames.states
+    reach = max(config.pairs.within, 1.0)
+    size = np.nan_to_num(np.hypot(states.length, states.width)[rows])
+    reach += float(size.max(initial=0))  # touching bodies are also within reach
+    cells = [
+        np.clip(np.nan_to_num(np.floor(column[rows] / reach)), 2 - _WIDEST, _WIDEST - 2) + _WIDEST
+        for column in (states.x, states.y)
+    ]
+    x, y = (cell.astype(np.int64) for cell in cells)
+    frame = frames.frame_of[rows]
+    wide = 2 * _WIDEST
+    key = (frame * wide + x) * wide + y
+    held, count = np.unique(key, return_counts=True)
+    around = np.zeros(len(held), np.int64)
+    for dx in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            other = held + dx * wide + dy
+            at = np.minimum(np.searchsorted(held, other), len(held) - 1)
+            around += np.where(held[at] == other, count[at], 0)
+    of = held // (wide * wide)
+    return np.bincount(of, weights=count * around / 2, minlength=len(frames)).astype(np.int64)
+
+
+def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
+    """Return some frames of a block; only the first frames keep the block's new entities and messages."""
+    first, last = int(frames.offsets[start]), int(frames.offsets[stop])
+    entities, scenery, messages = frames.entities, frames.scenery, frames.messages
+    events = frames.events
+    if start:
+        none = slice(0, 0)
+        entities = Entities(
+            entities.first + len(entities),
+            *((), entities.kind[none], (), (), (), entities.static[none], ()),
+        )
+        scenery = scenery.take(np.zeros(0, np.intp))
+        columns = (messages.channel, messages.log_time_ns, messages.chunk_offset)
+        columns += (messages.offset, messages.length)
+        messages = MessageRefs(*(column[none] for column in columns))
+        events = ()
+    return type(frames)(
+        seq=frames.seq[start:stop],
+        time_ns=frames.time_ns[start:stop],
+        log_time_ns=frames.log_time_ns[start:stop],
+        offsets=frames.offsets[start : stop + 1] - first,
+        states=frames.states.take(np.arange(first, last)),
+        ego=frames.ego[start:stop],
+        entities=entities,
+        scenery=scenery,
+        messages=messages,
+        events=events,
+    )
+
+
+class Crowds:
+    """Record of frames of a trace with too many pairs."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, tuple[int, int, int, Loss]] = {}
+
+    def see(self, graph: GraphBlock) -> None:
+        """Register the crowded frames of a block."""
+        for what, frame, bodies in graph.crowded:
+            time = int(graph.frames.log_time_ns[frame])
+            count, seq, most, loss = self._found.get(what) or (
+                *(0, int(graph.frames.seq[frame]), bodies),
+                Loss("", start_ns=time, end_ns=time),
+            )
+            span = Loss("", start_ns=min(loss.start_ns, time), end_ns=max(loss.end_ns, time))
+            self._found[what] = count + 1, seq, most, span
+
+    def losses(self, config: Config) -> list[Loss]:
+        """Return the omitted pairs as losses: by kind, with first frame, bodies and setting."""
+        found: list[Loss] = []
+        for what, (count, seq, bodies, span) in self._found.items():
+            if what == NEAR:
+                of = f"are within {config.pairs.within:g} m of one another ('pairs.within')"
+                told = "how near and where bodies are is told of the ego alone"
+            else:
+                of, told = "touch one another", "what touches is told of the ego alone"
+            more = f", and {count - 1} more frames like it" if count > 1 else ""
+            reason = (
+                f"frame {seq} has {bodies:,} bodies, of which more than {MOST_PAIRS:,} pairs {of}:"
+                f" {told}{more}"
+            )
+            found.append(Loss(reason, start_ns=span.start_ns, end_ns=span.end_ns))
+        return found

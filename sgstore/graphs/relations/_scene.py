@@ -1,0 +1,702 @@
+"""Input of relation families: bodies, pairs and map context of a block.
+
+Overlapping intervals of a line give candidates without testing all pairs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.base.columns import taken
+from sgstore.base.compiled import worth
+from sgstore.base.geometry import bearings
+from sgstore.model.graph import Edges
+from sgstore.model.pair_numbers import STOREY, TOUCH, UPRIGHT, all_level, climb, gap, low_and_high
+from sgstore.model.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.maps.roads import LaneHits
+    from sgstore.model.config import Config
+    from sgstore.model.world import Bools, Codes, Floats, Ints
+
+    Nodes = NDArray[np.int32]
+    Rows = NDArray[np.intp]
+    Columns = tuple[Nodes, Codes, Nodes, Nodes]
+    Looped = tuple[
+        Rows, Rows, tuple[Nodes, Nodes], tuple[Floats, Floats, Floats], tuple[Floats, Floats]
+    ]
+
+
+CHUNK: Final = 1 << 16
+"""Candidates that are processed together: bounds the memory, and fits a cache."""
+
+FAR: Final = 1e9
+"""End of the line; m. Places beyond it are moved to it and can only add candidates."""
+
+_ROUNDING: Final = 1e-15
+"""Relative error of a place on the line that holds all groups in sequence."""
+
+
+def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows]]:
+    """Yield each unordered pair of overlapping intervals of one group, and some that almost overlap.
+
+    Parameters
+    ----------
+    group : (N,) int64
+        Not negative.
+    low, high : (N,) float64
+        Ends of the intervals. NaN overlaps nothing.
+
+    Yields
+    ------
+    a, b : (n,) intp
+        Rows, in chunks of about :data:`CHUNK`.
+    """
+    rows = np.flatnonzero(~np.isnan(low + high))
+    if not len(rows):
+        return
+    group, low, high = group[rows], np.clip(low[rows], -FAR, FAR), np.clip(high[rows], -FAR, FAR)
+    base = float(low.min())
+    span = float(high.max()) - base + 1
+    # All groups are laid in sequence: the intervals that overlap one are the next in order, up to
+    # its end.
+    start = group * span + (low - base)
+    order = np.argsort(start, kind="stable")
+    rows, start = rows[order], start[order]
+    slack = _ROUNDING * span * (int(group.max()) + 2)
+    end = group[order] * span + (high[order] - base) + slack
+    first = np.arange(1, len(rows) + 1)
+    count = np.searchsorted(start, end, side="right") - first
+    for part in parts(count):
+        owner, index = spread(first[part], count[part])
+        yield rows[part][owner], rows[index]
+
+
+def parts(count: Ints) -> Iterator[slice]:
+    """Yield consecutive slices of counts with sums of about :data:`CHUNK`."""
+    total = np.cumsum(count)
+    bounds = np.searchsorted(total, np.arange(CHUNK, int(total[-1]), CHUNK)) if len(total) else []
+    for begin, end in zip([0, *bounds], [*bounds, len(count)], strict=True):
+        yield slice(begin, end)
+
+
+# Input of a family of relations: the bodies of many frames, their related pairs, and the map under
+# them. All of it is computed once per block and shared by the families. A *body* is an entity in
+# one frame: an entity that stands still in sixty frames is sixty bodies, so that array arithmetic
+# is enough.
+
+
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """Entities in the graphs of a block, one row per entity and frame, in any order; shape (N,).
+
+    Attributes
+    ----------
+    frame : int64
+        Index of the frame in the block.
+    node : int64
+        Node id.
+    kind : int8
+        Codes of :data:`sgstore.model.vocabulary.KINDS`.
+    moves : bool
+        False for scenery.
+    x, y, z, heading, length, width, height : float64
+        The box; m, m, m, rad, m, m, m. A zero height of an upright kind is missing.
+    carrier : int64
+        Node id of its carrier or tractor; negative for none.
+    """
+
+    frame: Ints
+    node: Ints
+    kind: Codes
+    moves: Bools
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    length: Floats
+    width: Floats
+    height: Floats
+    pitch: Floats
+    carrier: Ints
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def take(self, rows: NDArray[np.intp]) -> Bodies:
+        """Return these rows, in this order."""
+        return taken(self, rows)
+
+    @property
+    def bottom(self) -> Floats:
+        """Return the height of the lower side of the box, (N,); m. Without a height it is ``z``."""
+        return self.z - np.nan_to_num(self.height) / 2
+
+    @property
+    def low_and_high(self) -> tuple[Floats, Floats]:
+        """Return heights of lower and upper side, (N,); see :func:`sgstore.model.pair_numbers.low_and_high`."""
+        return low_and_high(self.z, self.height, IS_SIGNAL[self.kind], IS_UPRIGHT[self.kind])
+
+    @property
+    def boxes(self) -> Floats:
+        """Return ``x, y, heading, length, width``, (N, 5)."""
+        return np.stack([self.x, self.y, self.heading, self.length, self.width], axis=1)
+
+
+class BodyPairs:
+    """Related ordered pairs of bodies: each pair, then the mirror image of each; shape (K,).
+
+    Parameters
+    ----------
+    bodies : Bodies
+    a, b : (K / 2,) intp
+        Rows of bodies in the same frame, each pair once.
+    between : str
+        Reference points of the distance: :attr:`sgstore.model.config.Proximity.between`.
+    """
+
+    def __init__(self, bodies: Bodies, a: Rows, b: Rows, between: str) -> None:
+        self._bodies, self._between = bodies, between
+        self._halves, self._half = (a, b), len(a)
+
+    def __len__(self) -> int:
+        return 2 * self._half
+
+    @cached_property
+    def a(self) -> Rows:
+        """Return the first body of each pair as rows of :class:`Bodies`, (K,)."""
+        return np.concatenate(self._halves)
+
+    @cached_property
+    def b(self) -> Rows:
+        """Return the second body of each pair as rows of :class:`Bodies`, (K,)."""
+        return np.concatenate(self._halves[::-1])
+
+    @cached_property
+    def span(self) -> Floats:
+        """Return comparable distances of the first half of the pairs, (K / 2,); see :func:`spans`."""
+        half = self._half
+        found = np.empty(half)
+        for part in even_parts(half):
+            found[part] = spans(
+                self._bodies, self._halves[0][part], self._halves[1][part], self._between
+            )
+        return found
+
+    @cached_property
+    def distance(self) -> Floats:
+        """Return distances by the configured measure; m."""
+        distance = self.span if self._between == "footprints" else np.sqrt(self.span)
+        return np.concatenate([distance, distance])
+
+    @cached_property
+    def bearing(self) -> Floats:
+        """Return bearings of b from a, in (-π, π]; rad. NaN without a's heading; 0 in the same place."""
+        return self.bearings(np.arange(len(self)))
+
+    def bearings(self, rows: Rows) -> Floats:
+        """Return bearings of these pairs; rad."""
+        of, (a, b) = self._bodies, self.some(rows)
+        return bearings(of.x[b] - of.x[a], of.y[b] - of.y[a], of.heading[a])
+
+    def some(self, rows: Rows) -> tuple[Rows, Rows]:
+        """Return both bodies of these pairs as rows."""
+        first, second = (half[rows % max(self._half, 1)] for half in self._halves)
+        mirrored = rows >= self._half
+        return np.where(mirrored, second, first), np.where(mirrored, first, second)
+
+    @cached_property
+    def offsets(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return b's distance ahead of a and to its left; fast, error below 1e-6 of the distance; m.
+
+        NaN without a's heading, or with a heading beyond :data:`MOST_TURNED`.
+        """
+        of, half = self._bodies, self._half
+        cos, sin = (column.astype(np.float32) for column in self._turns)
+        ahead, left = np.empty((2, len(self)), np.float32)
+        for part in even_parts(half):
+            a, b = self._halves[0][part], self._halves[1][part]
+            dx = (of.x[b] - of.x[a]).astype(np.float32)
+            dy = (of.y[b] - of.y[a]).astype(np.float32)
+            for rows, first in ((a, 0), (b, half)):
+                to = slice(first + part.start, first + part.stop)
+                ahead[to] = dx * cos[rows] + dy * sin[rows]
+                left[to] = dy * cos[rows] - dx * sin[rows]
+        np.negative(ahead[half:], out=ahead[half:])
+        np.negative(left[half:], out=left[half:])
+        return ahead, left
+
+    @cached_property
+    def for_loops(self) -> Looped:
+        """Return the input of the pair loops: halves, frames and nodes, positions and turns."""
+        of = self._bodies
+        return (
+            *self._halves,
+            (of.frame.astype(np.int32), of.node.astype(np.int32)),
+            (of.x, of.y, levels(of, self._between)),
+            self._turns,
+        )
+
+    @cached_property
+    def of_bodies(self) -> Bools:
+        """Return a mask (K / 2,) of the pairs accepted by :func:`meet_as_bodies`; empty means all."""
+        of = self._bodies
+        plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
+        levels = of.low_and_high
+        if plain and all_level(*levels):
+            return np.zeros(0, np.bool_)
+        return meet_as_bodies(of, *self._halves)
+
+    @property
+    def in_loops(self) -> bool:
+        """True if numba loops can process the pairs; they do not support footprints."""
+        return self._between != "footprints" and worth()
+
+    @cached_property
+    def _turns(self) -> tuple[Floats, Floats]:
+        heading = self._bodies.heading
+        heading = np.where(np.abs(heading) <= MOST_TURNED, heading, np.nan)
+        return np.cos(heading), np.sin(heading)
+
+    @cached_property
+    def ends(self) -> tuple[Nodes, Nodes, Nodes]:
+        """Return frames, and node ids of a and b, of the pairs; int32."""
+        frame, node = self._bodies.frame.astype(np.int32), self._bodies.node.astype(np.int32)
+        frame, one, other = frame[self._halves[0]], node[self._halves[0]], node[self._halves[1]]
+        return (
+            np.concatenate([frame, frame]),
+            np.concatenate([one, other]),
+            np.concatenate([other, one]),
+        )
+
+
+MOST_TURNED: Final = 1e3
+"""Headings beyond this have errors above a tenth of a nanoradian; rad."""
+
+EVEN_PART: Final = 1 << 13
+"""Pairs whose numbers are computed together, to fit the fastest caches."""
+
+
+def by_frame(frame: Ints, frames: int) -> tuple[Rows, Ints]:
+    """Return rows sorted by frame, and the start of each frame in them."""
+    order = np.argsort(frame, kind="stable")
+    return order, np.searchsorted(frame[order], np.arange(frames + 1))
+
+
+def turns(bodies: Bodies) -> tuple[Floats, Floats]:
+    """Return cosines and sines of the headings."""
+    return np.cos(bodies.heading), np.sin(bodies.heading)
+
+
+def even_parts(count: int) -> Iterator[slice]:
+    """Yield consecutive slices of :data:`EVEN_PART` rows."""
+    for start in range(0, count, EVEN_PART):
+        yield slice(start, min(start + EVEN_PART, count))
+
+
+def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
+    """Return distances of pairs of bodies by the measure :attr:`sgstore.model.config.Proximity.between`; m.
+
+    The origin of a moving vehicle is on the ground, that of other bodies in the centre of the box,
+    as in CARLA. A footprint without extent or heading is a point.
+    """
+    found = spans(bodies, a, b, between)
+    return found if between == "footprints" else np.sqrt(found)
+
+
+def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
+    """Return numbers that sort like distances: their squares, or gaps of footprints."""
+    if between == "footprints":
+        boxes = bodies.boxes
+        boxes[np.isnan(boxes).any(axis=1), 2:] = 0
+        return gap(boxes[a], boxes[b])
+    places = (bodies.x, bodies.y, levels(bodies, between))
+    dx, dy, dz = (of[b] - of[a] for of in places)
+    dz = np.where(np.isnan(dz), 0.0, dz)  # in the plane if a height is unknown
+    return dx * dx + dy * dy + dz * dz
+
+
+def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Return a mask of the pairs of bodies that overlap in height; True if it is unknown."""
+    low, high = bodies.low_and_high
+    reach = np.fmax(low[b] - high[a], low[a] - high[b])
+    solid = high > low
+    return ~np.where(solid[a] & solid[b], reach > TOUCH, np.abs(low[b] - low[a]) > STOREY)
+
+
+def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Return a mask of the pairs of bodies on the same storey; True if it is unknown.
+
+    Two bodies are on one storey if they overlap in height, or if a climbing road can join them.
+    """
+    level = heights_meet(bodies, a, b)
+    rest = np.flatnonzero(~level)
+    a, b = a[rest], b[rest]
+    low, _ = bodies.low_and_high
+    away = np.hypot(bodies.x[b] - bodies.x[a], bodies.y[b] - bodies.y[a])
+    level[rest] = np.abs(low[b] - low[a]) <= climb(away, bodies.pitch[a], bodies.pitch[b])
+    return level
+
+
+def meet_as_bodies(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Return a mask of the pairs of solid bodies on one level; see :func:`solid_pairs`."""
+    return solid_pairs(bodies, a, b) & on_one_level(bodies, a, b)
+
+
+def solid_pairs(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Return a mask of the pairs of solid bodies, without a carrier and its load."""
+    flat = ~IS_UPRIGHT[bodies.kind] & (bodies.height == 0)
+    return ~(flat[a] | flat[b] | carried_by(bodies, a, b))
+
+
+def carried_by(bodies: Bodies, a: Rows, b: Rows) -> Bools:
+    """Return a mask of the pairs with a carrier and its load, or with a common carrier."""
+    carrier, node = bodies.carrier, bodies.node
+    bound = (carrier[a] == node[b]) | (carrier[b] == node[a])
+    return bound | (carrier[a] >= 0) & (carrier[a] == carrier[b])
+
+
+def levels(bodies: Bodies, between: str) -> Floats:
+    """Return the heights used for distances; m."""
+    if between != "origins":
+        return bodies.z
+    on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
+    return np.where(on_ground, bodies.bottom, bodies.z)
+
+
+def span_up_to(distance: float, between: str) -> float:
+    """Return the greatest span whose rounded distance does not exceed this distance."""
+    if between == "footprints":
+        return distance
+    span = distance * distance
+    while math.sqrt(math.nextafter(span, math.inf)) <= distance:
+        span = math.nextafter(span, math.inf)
+    while math.sqrt(span) > distance:
+        span = math.nextafter(span, 0.0)
+    return span
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Parts of the map under bodies, independent of the ego.
+
+    Attributes
+    ----------
+    hits : LaneHits
+        Lanes that bodies touch; ``row`` is a row of :class:`Bodies`, ascending. Empty for signals.
+    along : float64
+        Place of the body's centre along the lane of each hit, also beyond its ends; m.
+    own : bool
+        True if the lane of the hit is one of the body's own
+        (:func:`sgstore.graphs.relations._following.own_hits`).
+    parts : tuple of int64 arrays
+        Rows of :class:`Bodies`, ascending, and node ids of their crosswalks and waypoints.
+    off_road : intp array
+        Rows of the bodies that touch no driving lane, ascending.
+    """
+
+    hits: LaneHits
+    along: Floats
+    own: Bools
+    parts: tuple[Ints, Ints]
+    off_road: NDArray[np.intp]
+
+    def take(self, place: NDArray[np.intp]) -> Standing:
+        """Return the map parts of some bodies; ``place`` (N,) has their new rows, or -1."""
+        hits, (rows, nodes) = self.hits, self.parts
+        kept, there = place[hits.row] >= 0, place[rows] >= 0
+        hits = taken(hits, kept)
+        off_road = place[self.off_road]
+        return Standing(
+            replace(hits, row=place[hits.row]),
+            self.along[kept],
+            self.own[kept],
+            (place[rows[there]], nodes[there]),
+            off_road[off_road >= 0],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MapContext:
+    """The map under the bodies of a block, and around its egos.
+
+    Attributes
+    ----------
+    standing : Standing
+    present : (F, K) bool
+        Mask of the map nodes in each graph; column i is node -1 - i.
+    controls, affects : tuple of int64 arrays
+        Node ids of signals of the trace, ascending, and of a lane that each one controls or may
+        affect.
+    map_affects : tuple of int64 arrays
+        Node ids of signals of the map, and of a lane that each may affect.
+    following : tuple of intp, intp, float64 arrays
+        Rows of bodies: the follower, its leader, and the gap along the lanes; m.
+    """
+
+    standing: Standing
+    present: Bools
+    controls: tuple[Ints, Ints]
+    affects: tuple[Ints, Ints]
+    map_affects: tuple[Ints, Ints]
+    following: tuple[NDArray[np.intp], NDArray[np.intp], Floats]
+
+
+def _columns_of(count: int) -> Columns:
+    frame, src, dst = np.empty((3, count), np.int32)
+    return frame, np.empty(count, np.int8), src, dst
+
+
+class EdgeRoom:
+    """Shared columns that the families of relations fill with the edges of a block.
+
+    Therefore edges are written once. A family can also return its own columns, which are copied at
+    the end.
+
+    Parameters
+    ----------
+    count : int
+        Capacity in edges.
+    """
+
+    def __init__(self, count: int = 0) -> None:
+        self._columns = _columns_of(count)
+        self._parts: list[Edges] = []
+        self._used = 0
+
+    def rest(self, count: int) -> Columns:
+        """Return columns with room for ``count`` edges, to be filled from the start."""
+        if self._used + count > len(self._columns[0]):
+            return _columns_of(count)
+        frame, relation, src, dst = self._columns
+        first = self._used
+        return frame[first:], relation[first:], src[first:], dst[first:]
+
+    def filled(self, columns: Columns, count: int, more: Edges | None = None) -> Edges:
+        """Return the filled part of shared columns as edges, with ``more`` edges appended."""
+        if more is not None and len(more):
+            if count + len(more) > len(columns[0]):
+                return Edges.chained([self.filled(columns, count), more])
+            _fill(columns, count, more)
+            count += len(more)
+        edges = _first(columns, count)
+        if count and columns[0].base is self._columns[0].base:
+            self._parts.append(edges)
+            self._used += count
+        return edges
+
+    def chained(self, parts: Sequence[Edges]) -> Edges:
+        """Concatenate the edges of all parts; parts in the shared columns are not copied."""
+        others = [part for part in parts if not any(part is own for own in self._parts)]
+        count = self._used + sum(map(len, others))
+        if len(parts) - len(others) < len(self._parts) or count > len(self._columns[0]):
+            return Edges.chained(parts)
+        for part in others:
+            _fill(self._columns, self._used, part)
+            self._used += len(part)
+        return _first(self._columns, count)
+
+
+def _first(columns: Columns, count: int) -> Edges:
+    frame, relation, src, dst = columns
+    return Edges(frame[:count], relation[:count], src[:count], dst[:count])
+
+
+def _fill(columns: Columns, first: int, edges: Edges) -> None:
+    to = slice(first, first + len(edges))
+    for column, values in zip(
+        columns, (edges.frame, edges.relation, edges.src, edges.dst), strict=True
+    ):
+        column[to] = values
+
+
+@dataclass(frozen=True, slots=True)
+class BlockScene:
+    """Frames of a block, prepared for the families of relations.
+
+    Attributes
+    ----------
+    config : Config
+    bodies : Bodies
+    ego : (F,) intp
+        Row of the ego of each frame, or -1.
+    pairs : BodyPairs
+    contacts : tuple of intp arrays
+        Rows of bodies that touch, each pair once.
+    ground : MapContext or None
+        ``None`` without a map.
+    room : EdgeRoom
+        Shared columns for the edges.
+    """
+
+    config: Config
+    bodies: Bodies
+    ego: NDArray[np.intp]
+    pairs: BodyPairs
+    contacts: tuple[NDArray[np.intp], NDArray[np.intp]]
+    ground: MapContext | None
+    room: EdgeRoom = field(default_factory=EdgeRoom)
+
+    def parameters(self, relation: Relation) -> Mapping[str, Any]:
+        """Return the settings of a relation: those of the config, and defaults for the others."""
+        return {**relation.parameters, **self.config.relations.get(relation.name, {})}
+
+
+def always(config: Config) -> bool:
+    """Return True: every config requests the relation."""
+    return True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Relation:
+    """Complete declaration of a relation.
+
+    Attributes
+    ----------
+    name : str
+        Letters, digits and ``_``, a letter first; compared without regard to case and underscores.
+    doc : str
+        Its meaning, for tables: source, target and condition.
+    edges : function, optional
+        Pure function that returns the edges of a scene. Relations that share a function are
+        computed together; it may yield edges of any of them. ``None`` means that the relation comes
+        with the map.
+    symmetric : bool
+        True if each edge has its mirror image.
+    needs_map : bool
+        True if it is unknown without a map. Otherwise :attr:`BlockScene.ground` can be ``None``.
+    needs_lanes : bool
+        True if one end is a lane; it is then unknown without lanes.
+    of_map : bool
+        True if it also holds among parts of a map; then every map provides it.
+    of_pairs : bool
+        True if it holds between related pairs (:attr:`BlockScene.pairs`); it is then unknown if the
+        settings relate no pairs.
+    settings : function
+        Function that returns True if a config requests it.
+    parameters : mapping
+        Its settings, by name with defaults, for ``[relations.NAME]`` of a config; numbers, texts,
+        true or false. See :meth:`BlockScene.parameters`.
+    legend : str
+        Short text for the legend of a picture, seen from the other end; empty means the name.
+    """
+
+    name: str
+    doc: str
+    edges: Callable[[BlockScene], Edges] | None = None
+    symmetric: bool = False
+    needs_map: bool = False
+    needs_lanes: bool = False
+    of_map: bool = False
+    of_pairs: bool = False
+    settings: Callable[[Config], bool] = always
+    parameters: Mapping[str, Any] = field(default_factory=dict[str, Any], hash=False)
+    legend: str = ""
+
+    def asked(self, config: Config) -> bool:
+        """True if a config requests the relation, with a map if it needs one."""
+        return self.settings(config) and (not self.of_pairs or relates_pairs(config))
+
+
+def relates_pairs(config: Config) -> bool:
+    """True if the settings relate any pairs."""
+    return config.pairs.ego or config.pairs.within > 0
+
+
+def edges_between(
+    scene: BlockScene, relation: str | Codes, src: NDArray[np.intp], dst: NDArray[np.intp]
+) -> Edges:
+    """Return edges from body to body (rows), with one relation or one code each."""
+    bodies = scene.bodies
+    return Edges(
+        bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], bodies.node[dst]
+    )
+
+
+def edges_of_pairs(
+    scene: BlockScene, codes: Codes, holds: Bools, *, seen_by_a: bool = False
+) -> tuple[Columns, int]:
+    """Return the edges of the pairs in a mask: from a to b, or with ``seen_by_a`` from b to a.
+
+    Parameters
+    ----------
+    scene : BlockScene
+    codes : (K,) int8
+        Codes of the relations.
+    holds : (K,) bool
+    seen_by_a : bool
+
+    Returns
+    -------
+    columns, count
+        Input of :meth:`EdgeRoom.filled`.
+    """
+    columns = scene.room.rest(len(codes))
+    frame, src, dst = scene.pairs.ends
+    if seen_by_a:
+        src, dst = dst, src
+    rows = None if holds.all() else np.flatnonzero(holds)
+    count = len(codes) if rows is None else len(rows)
+    for column, values in zip(columns, (frame, codes, src, dst), strict=True):
+        if rows is None:
+            column[:count] = values
+        else:
+            np.take(
+                values, rows, out=column[:count], mode="clip"
+            )  # this copies only the selected rows
+    return columns, count
+
+
+def edges_to_map(
+    scene: BlockScene, relation: str, src: NDArray[np.intp] | Ints, dst: Ints
+) -> Edges:
+    """Return edges from bodies (rows) to nodes of the map (node ids)."""
+    bodies = scene.bodies
+    return Edges(bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], dst)
+
+
+def _relation_codes(relation: str | Codes, count: int) -> Codes:
+    if isinstance(relation, str):
+        return np.full(count, RELATION_CODE[relation], np.int8)
+    return relation
+
+
+def kinds_mask(names: tuple[str, ...]) -> Bools:
+    """Return a table of bool by kind code: True for the named kinds."""
+    table = np.zeros(MOST_KINDS, np.bool_)
+    table[[KIND_CODE[name] for name in names]] = True
+    return table
+
+
+IS_SIGNAL: Final = kinds_mask(SIGNALS)
+IS_VEHICLE: Final = kinds_mask(VEHICLES)
+IS_UPRIGHT: Final = kinds_mask(UPRIGHT)
+IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
+
+
+def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Expand ranges into arrays of owner and index.
+
+    Returns
+    -------
+    owner, index : (sum of counts,) intp
+        For each range i, ``counts[i]`` times i, and the indices from ``starts[i]`` on.
+    """
+    owner = np.repeat(np.arange(len(counts)), counts)
+    before = np.cumsum(counts) - counts
+    return owner, np.arange(len(owner)) + (starts - before)[owner]
+
+
+def joined(keys: Ints, wanted: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return all matches of ``wanted`` in ascending ``keys``: rows of ``wanted``, and rows of ``keys``."""
+    start = np.searchsorted(keys, wanted)
+    return spread(start, np.searchsorted(keys, wanted, side="right") - start)

@@ -1,0 +1,1 @@
+"""Queries that other tools write, translated into the query language."""

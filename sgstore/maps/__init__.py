@@ -1,0 +1,1 @@
+"""Road maps: their formats, and look-ups of lanes and junctions."""

@@ -1,0 +1,156 @@
+"""Conversion of OpenStreetMap XML to points in metres, ways and relations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.base.markup import MarkupError, MarkupParser
+from sgstore.errors import MapError
+from sgstore.maps.roads import MAX_POINTS
+
+if TYPE_CHECKING:
+    from sgstore.maps.lanelet2._projection import Projection
+    from sgstore.model.world import Floats
+
+MAX_CHARACTERS: Final = 256 << 20
+MAX_ELEMENTS: Final = 8_000_000
+_FAR: Final = 1e8
+"""Greatest distance of a point from the origin; m."""
+_NODE_TAGS: Final = ("ele", "local_x", "local_y")
+
+
+@dataclass(slots=True)
+class OsmElement:
+    """Node, way or relation; ``members`` has type, id and role of each member, or a way's nodes."""
+
+    kind: str
+    ident: str
+    tags: dict[str, str] = field(default_factory=dict[str, str])
+    members: list[tuple[str, str, str]] = field(default_factory=list[tuple[str, str, str]])
+    place: tuple[str, str] = ("", "")
+
+    def members_of(self, role: str, kind: str = "way") -> list[str]:
+        """Return the ids of the members with this role."""
+        return [ref for what, ref, own in self.members if own == role and what == kind]
+
+
+@dataclass(slots=True)
+class OsmDocument:
+    """Map as lines (n, 3) by way id, with their nodes and tags, and the relations."""
+
+    lines: dict[str, Floats]
+    nodes: dict[str, list[str]]
+    tags: dict[str, dict[str, str]]
+    relations: dict[str, OsmElement]
+    warnings: list[str]
+
+
+def read_osm(text: str, projection: Projection) -> OsmDocument:
+    """Parse the points, ways and relations of a text.
+
+    Raises
+    ------
+    MapError
+        The text is not XML, not OpenStreetMap data, or exceeds a limit.
+    """
+    if len(text) > MAX_CHARACTERS:
+        raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
+    builder = _OsmBuilder()
+    try:
+        MarkupParser(builder.start, builder.end, most=MAX_ELEMENTS).feed(text, last=True)
+    except MarkupError as error:
+        raise MapError(str(error), element=error.element or None) from error
+    ways = [one for one in builder.elements if one.kind == "way"]
+    points = sum(len(way.members) for way in ways)
+    if points > MAX_POINTS:
+        raise MapError(f"lines of {points:,} points; a map may have {MAX_POINTS:,}", element="way")
+    used = {ref for way in ways for _, ref, _ in way.members}
+    nodes = [one for one in builder.elements if one.kind == "node" and one.ident in used]
+    warnings: list[str] = []
+    places = _places(nodes, projection, warnings)
+    row = {node.ident: number for number, node in enumerate(nodes)}
+    document = OsmDocument({}, {}, {}, {}, warnings)
+    broken: list[str] = []
+    for way in ways:
+        refs = [ref for _, ref, _ in way.members]
+        rows = [row[ref] for ref in refs if ref in row]
+        line = places[rows]
+        if len(rows) < len(refs) or not (np.abs(line) < _FAR).all():
+            broken.append(way.ident)
+            continue
+        document.lines[way.ident] = line
+        document.nodes[way.ident], document.tags[way.ident] = refs, way.tags
+    if broken:
+        named = ", ".join(broken[:8]) + (f" and {len(broken) - 8} more" if len(broken) > 8 else "")
+        warnings.append(f"ways {named}: a node of theirs is missing, or no place; left out")
+    document.relations = {one.ident: one for one in builder.elements if one.kind == "relation"}
+    return document
+
+
+def _places(nodes: list[OsmElement], projection: Projection, warnings: list[str]) -> Floats:
+    """Return places (n, 3) of nodes: ``local_x`` and ``local_y`` if complete, else projected."""
+    if not nodes:
+        return np.zeros((0, 3))
+    height, x, y = (
+        np.array([_number(node.tags.get(tag, "")) for node in nodes]) for tag in _NODE_TAGS
+    )
+    height = np.nan_to_num(height)
+    local = np.isfinite(x) & np.isfinite(y)
+    degrees = np.array([[_number(value) for value in node.place] for node in nodes])
+    known = (np.abs(degrees) <= (90.0, 180.0)).all(axis=1)
+    if (local | ~known).all() or projection.name == "Local":
+        return np.column_stack((x, y, height))
+    if local.any():
+        few = f"{int((~local).sum())} of {len(local)} points have no local_x and local_y"
+        warnings.append(f"{few}: all are placed by latitude and longitude")
+    places = np.full((len(nodes), 3), np.nan)
+    if known.any():
+        latitude, longitude = degrees[known].T
+        with np.errstate(all="ignore"):
+            places[known] = projection.project(latitude, longitude, height[known])
+    return places
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return np.nan
+
+
+class _OsmBuilder:
+    """Handler of XML events; skips elements that an editor marks as deleted."""
+
+    def __init__(self) -> None:
+        self.elements: list[OsmElement] = []
+        self._depth = 0
+        self._open: OsmElement | None = None
+
+    def start(self, tag: str, attributes: dict[str, Any]) -> None:
+        """Handle the start of an element."""
+        self._depth += 1
+        if self._depth == 1 and tag != "osm":
+            raise MapError(f"the root element is <{tag[:80]}>, expected <osm>")
+        if self._depth == 2:
+            self._open = None
+            wanted = tag in {"node", "way", "relation"} and attributes.get("action") != "delete"
+            if wanted and "id" in attributes:
+                place = attributes.get("lat", ""), attributes.get("lon", "")
+                self._open = OsmElement(tag, attributes["id"], place=place)
+                self.elements.append(self._open)
+        elif self._depth == 3 and self._open is not None:
+            if tag == "tag":
+                self._open.tags[attributes.get("k", "")] = attributes.get("v", "")
+            elif tag == "nd":
+                self._open.members.append(("node", attributes.get("ref", ""), ""))
+            elif tag == "member":
+                member = (attributes.get(key, "") for key in ("type", "ref", "role"))
+                kind, ref, role = member
+                self._open.members.append((kind, ref, role))
+
+    def end(self, _tag: str) -> None:
+        """Handle the end of an element."""
+        self._depth -= 1

@@ -1,0 +1,478 @@
+"""Signals: type, place and controlled lanes, with warnings about contradictions.
+
+This module finds signals whose place contradicts the lanes of their orientation.
+
+Only signals without validity are checked. The place contradicts if no lane has the named direction
+although there is traffic. The place of a light, stop or yield sign before a junction also
+contradicts if all named lanes come out of the junction while other lanes lead into it.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.base.columns import chained
+from sgstore.maps.opendrive._document import coefficients_of, cubic, last_before
+from sgstore.maps.opendrive._lanes import PlanView, poses
+from sgstore.maps.opendrive._network import END, FIRST_LANE, START, junction_of, speed
+from sgstore.maps.roads import MapNodes
+from sgstore.model.vocabulary import DRIVING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sgstore.maps.opendrive._document import Document
+    from sgstore.maps.opendrive._network import Network
+    from sgstore.maps.roads import Edge
+    from sgstore.model.config import Signs
+    from sgstore.model.world import Floats, Ints
+
+
+NEAR: Final = 50.0
+"""A signal farther from a junction than this does not count as before it; m along the road."""
+LISTED: Final = 8
+"""Greatest number of signals that a warning names."""
+_BEFORE_JUNCTIONS: Final = frozenset({"traffic_light", "stop_sign", "yield_sign"})
+_READERS: Final = {"asam": "as ASAM OpenDRIVE reads it", "carla": "as CARLA reads it"}
+
+
+@dataclass(slots=True)
+class Doubts:
+    """Collector of contradictory orientations of the signals of a map.
+
+    Parameters
+    ----------
+    document : Document
+    network : Network
+    reading : str
+        ``asam`` or ``carla``: interpretation of orientations.
+
+    Attributes
+    ----------
+    kinds : dict
+        Signal -> its kind.
+    asked : int
+        Number of elements with an orientation and without validity.
+    """
+
+    document: Document
+    network: Network
+    reading: str
+    kinds: dict[str, str] = field(default_factory=dict[str, str])
+    asked: int = 0
+    _odd: dict[str, bool] = field(default_factory=dict[str, bool])
+    _lengths: list[float] = field(default_factory=list[float])
+    _junctions: dict[str, frozenset[int]] = field(default_factory=dict[str, frozenset[int]])
+
+    def ask(
+        self,
+        signal: str,
+        place: tuple[int, float],
+        there: frozenset[int],
+        readings: tuple[frozenset[int], frozenset[int]],
+    ) -> None:
+        """Check an element of a signal at a place (road, s).
+
+        ``there``: the driving lanes at this place; ``readings``: the lanes of its orientation in
+        the chosen and in the other interpretation.
+        """
+        self.asked += 1
+        ours, theirs = (self._fits(self.kinds.get(signal, ""), place, there, r) for r in readings)
+        if not ours:
+            self._odd[signal] = self._odd.get(signal, True) and theirs
+
+    def warnings(self) -> list[str]:
+        """Return a warning about signals with a doubtful orientation, or an empty list."""
+        if not self._odd:
+            return []
+        names = ", ".join(map(repr, list(self._odd)[:LISTED]))
+        more = f" and {len(self._odd) - LISTED} more" if len(self._odd) > LISTED else ""
+        other = "carla" if self.reading == "asam" else "asam"
+        better = sum(self._odd.values())
+        help_ = f'; {better} of {len(self._odd)} would fit with the setting orientation = "{other}"'
+        return [
+            f"signals without <validity> {names}{more}: their orientation, {_READERS[self.reading]}, names no"
+            f" traffic, or what comes out of the junction before which they stand{help_ if better else ''}"
+        ]
+
+    def _fits(
+        self, kind: str, place: tuple[int, float], there: frozenset[int], named: frozenset[int]
+    ) -> bool:
+        if not there:
+            return True
+        if not named:
+            return False
+        end = self._before(*place) if kind in _BEFORE_JUNCTIONS else ""
+        if not end:
+            return True
+        towards = {lane for lane in there if self._leads_to(lane, end)}
+        return not towards or not named.isdisjoint(towards)
+
+    def _leads_to(self, lane: int, end: str) -> bool:
+        lanes = self.network.lanes
+        return bool(lanes.both[lane] or lanes.forward[lane] == (end == END))
+
+    def _before(self, road: int, s: float) -> str:
+        """Return the end of the road with a junction near this place; empty if there is none near."""
+        if not self._junctions:
+            self._lengths = self.document.rough_numbers("road", "length").tolist()
+            self._junctions = {
+                contact: frozenset(
+                    table.parent[row]
+                    for row, attributes in enumerate(table.attributes)
+                    if attributes.get("elementType") == "junction"
+                )
+                for contact, table in (
+                    (START, self.document["road/predecessor"]),
+                    (END, self.document["road/successor"]),
+                )
+            }
+        length = self._lengths[road]
+        end, away = (START, s) if s < length / 2 else (END, length - s)
+        return end if away <= NEAR and road in self._junctions[end] else ""
+
+
+# Places along roads: (road, s, t) → position, for signals and objects ---------------------------
+
+
+def places(
+    document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return map positions and headings of places ``s`` and ``t`` on roads, clamped to their ends.
+
+    Returns x, y and z in map axes, and the heading of the road there.
+    """
+    length = document.numbers("road", "length")[road]
+    s = np.clip(s, 0.0, length)
+    pose = poses(plan, last_before(plan.road, plan.s, road, s), s)
+    at = document.numbers("road/elevation", "s")
+    record = last_before(document["road/elevation"].road, at, road, s)
+    level = np.zeros((len(at) + 1, 4))
+    level[:-1] = coefficients_of(document, "road/elevation")
+    into = np.maximum(s - np.append(at, 0.0)[record], 0.0)
+    return (
+        pose.x - t * np.sin(pose.heading),
+        pose.y + t * np.cos(pose.heading),
+        cubic(level[record], into),
+        pose.heading,
+    )
+
+
+def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> Ints:
+    """Return the rows with a valid place; add a warning for each other row."""
+    table = document[kind]
+    placed = np.ones(len(table), bool)
+    for name in ("s", "t", "zOffset", "hdg", "hOffset"):
+        placed &= np.isfinite(document.rough_numbers(kind, name))
+    warnings.extend(
+        f"road {document.road_ids[table.road[row]]!r}, <{table.element}>"
+        f" {table.attributes[row].get('id', '')!r}: its place is no number, left out"
+        for row in rows[~placed[rows]].tolist()
+    )
+    return rows[placed[rows]]
+
+
+def node_columns(
+    document: Document,
+    plan: PlanView,
+    kind: str,
+    rows: Ints,
+    at: tuple[Floats, Floats, Floats] | None = None,
+) -> dict[str, Any]:
+    """Return columns of :class:`~sgstore.maps.roads.MapNodes` for places of signals or objects.
+
+    ``at`` is s, t and the height above the road, else the element's own. The heading is the sum of
+    the road's and the element's heading.
+    """
+    table = document[kind]
+    own = {
+        name: document.rough_numbers(kind, name)[rows]
+        for name in ("s", "t", "zOffset", "hdg", "hOffset")
+    }
+    s, t, up = at or (own["s"], own["t"], own["zOffset"])
+    road = table.road[rows]
+    x, y, z, heading = places(document, plan, road, s, t)
+    heading = heading + own["hdg"] + own["hOffset"]
+    return {
+        "x": x,
+        "y": y,
+        "z": z + up,
+        "heading": np.pi - (np.pi - heading) % (2 * np.pi),
+        "road": tuple(document.road_ids[r] for r in road.tolist()),
+        "junction": tuple(junction_of(document, r) for r in road.tolist()),
+    }
+
+
+# Signals: what they are, where they stand, and which lanes they apply to ------------------------
+# A signal has one place. It applies to lanes of the roads that name it: by its own validity, and by
+# each ``signalReference`` with its validity. Without a validity it applies to all traffic in the
+# direction of its orientation. (ASAM OpenDRIVE 1.8, 14.) LibCarla uses the lanes of a *side*
+# instead: for ``+`` the lanes left of the road's line. On a road for right-hand traffic the two
+# interpretations are opposite, and maps exist for both; therefore a contradictory place causes a
+# warning (:mod:`sgstore.maps.opendrive._signals`). The maps of CARLA contain speed limits and painted
+# stop signs as *objects* named ``Speed_30`` and ``Stencil_STOP``. LibCarla reads them as signals of
+# type 274 and 206 (and loses the painted ones among its landmarks); their orientation is the sign
+# of the lanes that they apply to.
+
+KIND_OF_TYPE: Final = {
+    "206": "stop_sign",
+    "R1-1": "stop_sign",
+    "205": "yield_sign",
+    "R1-2": "yield_sign",
+    "274": "speed_limit",
+    "274.1": "speed_limit",
+    "R2-1": "speed_limit",
+}
+"""Codes of traffic signs → kinds: StVO (Germany), used by CARLA and esmini, and MUTCD (United States)."""
+
+_LIGHT: Final = re.compile(r"10000(0[1-9]|1\d|2\d)$")
+"""Codes of traffic lights in the catalogue of OpenDRIVE's country ``OpenDRIVE``."""
+_NOT_LIGHTS: Final = {"1000003", "1000004"}
+"""Crossings for people and bicycles, painted on the road."""
+_STOP_LINE: Final = "294"
+"""Code of a stop line: StVO (Germany), also used in maps of other countries."""
+_SPEED_OBJECT: Final = re.compile(r"speed_(\d+(?:\.\d+)?)", re.IGNORECASE)
+_STOP_STENCIL: Final = "stencil_stop"
+
+
+Stops = frozenset[tuple[int, float]]
+"""Lanes, counted from 0, and places ``s`` on their roads; m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """Signals and the lanes that they apply to.
+
+    Attributes
+    ----------
+    nodes : MapNodes
+    lanes : list of Stops
+        Lanes that each signal applies to, and the places.
+    codes : list of str
+        The type of each in the file.
+    told : str
+        Configured kinds, and the interpretation of orientations if it differs from the standard and
+        matters; empty if neither applies.
+    """
+
+    nodes: MapNodes
+    lanes: list[Stops]
+    codes: list[str]
+    told: str = ""
+
+    def edges(self, first: int) -> Edge:
+        """Return the edges ``controlsTrafficOf``; ``first`` is the row of the first signal among the nodes."""
+        found = {(first + row, lane) for row, lanes in enumerate(self.lanes) for lane, _ in lanes}
+        pairs = sorted(found)
+        signal, lane = np.array(pairs, np.int64).reshape(-1, 2).T
+        return ("controlsTrafficOf", signal, FIRST_LANE + lane)
+
+    def places(self, first: int) -> tuple[Ints, Ints, Floats]:
+        """Return rows of signals among the nodes, their lanes, and the places ``s`` on the roads."""
+        rows = [(row, *one) for row, lanes in enumerate(self.lanes) for one in sorted(lanes)]
+        row, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
+        return first + row, lane, np.array([s for *_, s in rows], np.float64)
+
+    def stop_lines(self, first: int) -> Ints:
+        """Return rows of the painted stop lines among the nodes."""
+        return first + np.array([r for r, c in enumerate(self.codes) if c == _STOP_LINE], np.int64)
+
+
+def read_signals(document: Document, plan: PlanView, network: Network, signs: Signs) -> Signals:
+    """Read the signals of a map; a signal with an invalid place is left out with a warning."""
+    reach = _Reach(document, network, signs.orientation)
+    kinds = dict(signs.kinds)
+    parts = (_elements(document, plan, reach, kinds), _signal_objects(document, plan, reach))
+    network.warnings.extend(reach.doubts.warnings())
+    other = "" if signs.orientation == "asam" or not reach.doubts.asked else signs.orientation
+    return Signals(
+        chained([part.nodes for part in parts]),
+        [s for p in parts for s in p.lanes],
+        [code for p in parts for code in p.codes],
+        " ".join(filter(None, (parts[0].told, other))),
+    )
+
+
+def read_controllers(document: Document) -> dict[str, tuple[str, ...]]:
+    """Map each controller to the ids of the signals that switch together."""
+    table = document["controller/control"]
+    names = document["controller"].texts("id")
+    members: dict[str, list[str]] = {}
+    for row, signal in zip(table.parent, table.texts("signalId"), strict=True):
+        members.setdefault(names[row], []).append(signal)
+    return {name: tuple(dict.fromkeys(signals)) for name, signals in members.items()}
+
+
+def is_signal_object(name: str) -> bool:
+    """True if an object with this name is a signal."""
+    return bool(_SPEED_OBJECT.match(name)) or _STOP_STENCIL in name.lower()
+
+
+def kind_of_signal(code: str, *, dynamic: bool, name: str = "") -> str:
+    """Return the kind of a signal with this type code; by default ``sign``."""
+    if _LIGHT.match(code) and code not in _NOT_LIGHTS:
+        return "traffic_light"
+    if code in KIND_OF_TYPE:
+        return KIND_OF_TYPE[code]
+    if dynamic and "light" in name.lower():
+        return "traffic_light"
+    return "sign"
+
+
+class _Reach:
+    """Look-up of the driving lanes at a place of a road, by their ids or their direction."""
+
+    def __init__(self, document: Document, network: Network, orientation: str) -> None:
+        self.warnings = network.warnings
+        self.doubts = Doubts(document, network, orientation)
+        self._reading = orientation
+        self._network = network
+        lanes = network.lanes
+        self._driving: dict[int, list[tuple[int, int]]] = {}
+        for lane, (kind, section, ident) in enumerate(
+            zip(lanes.type, lanes.section.tolist(), lanes.ident.tolist(), strict=True)
+        ):
+            if kind in DRIVING:
+                self._driving.setdefault(section, []).append((lane, ident))
+        self._ranges = {
+            kind: _validities(document, kind) for kind in ("road/signal", "road/signalReference")
+        }
+        self._tables = {kind: document[kind] for kind in self._ranges}
+        # Many signals apply to the same lanes: results are cached.
+        self._known: dict[tuple[int, object], frozenset[int]] = {}
+
+    def valid(self, element: tuple[str, int, str], place: tuple[int, float]) -> frozenset[int]:
+        """Return the driving lanes at a place (road, s) to which an element's validity applies."""
+        kind, row, signal = element
+        ranges = self._ranges[kind].get(row)
+        orientation = self._tables[kind].attributes[row].get("orientation", "")
+        section = self._network.section_at(*place)
+        key = (section, orientation if ranges is None else tuple(ranges))
+        lanes = self._driving.get(section, [])
+        if key not in self._known:
+            self._known[key] = (
+                self._oriented(lanes, orientation, self._reading)
+                if ranges is None
+                else frozenset(
+                    lane
+                    for lane, ident in lanes
+                    if any(low <= ident <= high for low, high in ranges)
+                )
+            )
+        if ranges is None and orientation in {"+", "-"}:
+            there = frozenset(lane for lane, _ in lanes)
+            other = "carla" if self._reading == "asam" else "asam"
+            readings = self._known[key], self._oriented(lanes, orientation, other)
+            self.doubts.ask(signal, place, there, readings)
+        return self._known[key]
+
+    def on_side(self, place: tuple[int, float], *, left: bool) -> frozenset[int]:
+        """Return the driving lanes at a place (road, s) to the left or right of the centre lane."""
+        lanes = self._driving.get(self._network.section_at(*place), [])
+        return frozenset(lane for lane, ident in lanes if (ident > 0) == left)
+
+    def _oriented(
+        self, lanes: list[tuple[int, int]], orientation: str, reading: str
+    ) -> frozenset[int]:
+        """Return the lanes that an orientation selects: by direction, or by side."""
+        if orientation not in {"+", "-"}:
+            return frozenset(lane for lane, _ in lanes)
+        plus, about = orientation == "+", self._network.lanes
+        if reading == "carla":
+            return frozenset(lane for lane, ident in lanes if (ident > 0) == plus)
+        return frozenset(
+            lane for lane, _ in lanes if about.both[lane] or about.forward[lane] == plus
+        )
+
+
+def _validities(document: Document, kind: str) -> dict[int, list[tuple[float, float]]]:
+    kind = f"{kind}/validity"
+    ends = (document.rough_numbers(kind, name).tolist() for name in ("fromLane", "toLane"))
+    ranges: dict[int, list[tuple[float, float]]] = {}
+    for row, one, other in zip(document[kind].parent, *ends, strict=True):
+        ranges.setdefault(row, []).append((min(one, other), max(one, other)))
+    return ranges
+
+
+def _elements(
+    document: Document, plan: PlanView, reach: _Reach, signs: Mapping[str, str]
+) -> Signals:
+    kind = "road/signal"
+    rows = standing(document, kind, np.arange(len(document[kind])), reach.warnings)
+    attributes = [document[kind].attributes[row] for row in rows.tolist()]
+    ids = [a.get("id", "") for a in attributes]
+    codes = [a.get("type", "") for a in attributes]
+    told = {code: signs[code.lower()] for code in sorted(set(codes)) if code.lower() in signs}
+    kinds = [
+        told.get(code)
+        or kind_of_signal(code, dynamic=a.get("dynamic") == "yes", name=a.get("name", ""))
+        for code, a in zip(codes, attributes, strict=True)
+    ]
+    limits = [
+        _limit(a) if kind == "speed_limit" else np.nan
+        for kind, a in zip(kinds, attributes, strict=True)
+    ]
+    road, s = document[kind].road, document.rough_numbers(kind, "s")
+    reach.doubts.kinds = dict(zip(ids, kinds, strict=True))
+    referred = _referred(document, reach)
+    lanes: list[Stops] = []
+    for row, name in zip(rows.tolist(), ids, strict=True):
+        place = int(road[row]), float(s[row])
+        own = _stops(reach.valid((kind, row, name), place), place)
+        lanes.append(own | referred.get(name, frozenset()))
+    columns = node_columns(document, plan, kind, rows)
+    nodes = MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns)
+    return Signals(nodes, lanes, codes, repr(told) if told else "")
+
+
+def _stops(lanes: frozenset[int], place: tuple[int, float]) -> Stops:
+    return frozenset((lane, place[1]) for lane in lanes)
+
+
+def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
+    """Map each signal to the lanes and places of all references to it."""
+    kind = "road/signalReference"
+    table = document[kind]
+    s = document.rough_numbers(kind, "s")
+    found: dict[str, Stops] = {}
+    for row in np.flatnonzero(np.isfinite(s)).tolist():
+        attributes = table.attributes[row]
+        place = (int(table.road[row]), float(s[row]))
+        name = attributes.get("id", "")
+        lanes = _stops(reach.valid((kind, row, name), place), place)
+        found[name] = found.get(name, frozenset()) | lanes
+    return found
+
+
+def _limit(attributes: dict[str, str]) -> float:
+    """Return the speed limit of a sign; the default unit is km/h, or mph for codes of the United States."""
+    american = attributes.get("type", "").startswith("R") or attributes.get("country") == "US"
+    unit = attributes.get("unit") or ("mph" if american else "km/h")
+    return speed(attributes.get("value", ""), unit)
+
+
+def _signal_objects(document: Document, plan: PlanView, reach: _Reach) -> Signals:
+    kind = "road/object"
+    table = document[kind]
+    named = np.array([is_signal_object(name) for name in table.texts("name")], bool)
+    rows = standing(document, kind, np.flatnonzero(named), reach.warnings)
+    kinds: list[str] = []
+    limits: list[float] = []
+    lanes: list[Stops] = []
+    s = document.rough_numbers(kind, "s")
+    for row in rows.tolist():
+        attributes = table.attributes[row]
+        limit = _SPEED_OBJECT.match(attributes.get("name", ""))
+        kinds.append("speed_limit" if limit else "stop_sign")
+        limits.append(speed(limit[1], "km/h") if limit else np.nan)
+        left = attributes.get("orientation", "") == "+"
+        place = (int(table.road[row]), float(s[row]))
+        lanes.append(_stops(reach.on_side(place, left=left), place))
+    ids = [table.attributes[row].get("id", "") for row in rows.tolist()]
+    columns = node_columns(document, plan, kind, rows)
+    nodes = MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns)
+    return Signals(nodes, lanes, [""] * len(ids))

@@ -1,0 +1,838 @@
+"""Conversion of lane lines, links and borders to plain lanes.
+
+The input is lane lines and links, the output is plain lanes.
+
+Simulators without OpenDRIVE describe lanes as lines with the ids of connected lanes. The direction
+of a line can differ from the direction of its traffic. This module adds cross sections, turns lanes
+into the direction of traffic, and relates them to one another. Unusable lanes are left out and
+named in a warning.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+import shapely
+
+from sgstore.errors import MapError
+from sgstore.maps.roads._lanes import (
+    APART,
+    WIDE,
+    PlainLane,
+    Sections,
+    along_line,
+    cross_sections,
+    feet,
+    half_width,
+    run_of,
+    thinned,
+    way_between,
+)
+from sgstore.maps.roads._map import STOREY
+from sgstore.model.vocabulary import DRIVING, TRAFFIC
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from sgstore.model.world import Floats
+
+
+START: Final = "start"
+END: Final = "end"
+
+MAX_POINTS: Final = 2_000_000
+"""Greatest number of points of all lines together."""
+MAX_LANES: Final = 30_000
+MAX_WAYS: Final = 20_000
+"""Greatest number of ways through areas."""
+MAX_RELATED: Final = 500_000
+"""Greatest number of references between lanes (ends that touch, and neighbours)."""
+GAP: Final = 5.0
+"""Ends of lanes with a larger gap do not touch, even if the file links them; m."""
+SEAM: Final = 1.0
+"""Gaps up to this length between a lane and the next one are closed; m."""
+LISTED: Final = 8
+"""Greatest number of lanes that a warning names."""
+_MOST_ACROSS: Final = 16
+"""Greatest number of lanes without traffic between two lanes that count as neighbours."""
+_ABOUT: Final = 1.0
+"""Lanes of a junction belong together if their centre lines come this close; m."""
+
+
+class Joint(NamedTuple):
+    """Another lane that touches an end of a lane, and the end of it: ``start``, ``end`` or empty (unknown)."""
+
+    lane: str
+    contact: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Border:
+    """Line at the side of a lane.
+
+    Attributes
+    ----------
+    line : (k, 3) float64
+    to_left, to_right : bool or None
+        True if traffic may cross it from its right to its left (and from left to right), in the
+        direction of the lane's line; ``None`` means unknown.
+    ident : str
+        Id by which lanes refer to it; empty if there is no id.
+    broad : bool
+        True for a broad marking.
+    """
+
+    line: Floats
+    to_left: bool | None = None
+    to_right: bool | None = None
+    ident: str = ""
+    broad: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class LaneLine:
+    """Lane as a line; left, right, start and end refer to the line, not to the traffic.
+
+    Attributes
+    ----------
+    ident : str
+        Id by which other lanes refer to it.
+    type : str
+        Lane type of OpenDRIVE.
+    centre : (n, 3) float64
+        Its centre line; m.
+    forward, both : bool
+        ``forward``: traffic runs along the line. ``both``: traffic runs both ways.
+    lefts, rights : tuple of Border
+        In any order.
+    sections : Sections, optional
+        Known cross sections along the line; by default they are computed from the lines.
+    before, after : tuple of Joint
+        Lanes that touch its start and its end.
+    left_beside, right_beside : tuple of str
+    name, road, section, number
+        As in :class:`~sgstore.maps.roads.MapNodes`; empty ``road``: it belongs to the road of its
+        neighbours.
+    junction : str or None
+        ``None`` means a junction without a name.
+    speed_limit : float
+        m/s; NaN if there is no limit.
+    roundabout : str
+        Its roundabout, or empty.
+    """
+
+    ident: str
+    type: str
+    centre: Floats
+    forward: bool = True
+    both: bool = False
+    lefts: tuple[Border, ...] = ()
+    rights: tuple[Border, ...] = ()
+    sections: Sections | None = None
+    before: tuple[Joint, ...] = ()
+    after: tuple[Joint, ...] = ()
+    left_beside: tuple[str, ...] = ()
+    right_beside: tuple[str, ...] = ()
+    name: str = ""
+    road: str = ""
+    section: int = 0
+    number: int = 0
+    junction: str | None = ""
+    speed_limit: float = np.nan
+    roundabout: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """Junction as an area, with pairs of lanes (from, to) that are connected through it."""
+
+    ident: str
+    ways: tuple[tuple[str, str], ...]
+
+
+@dataclass(slots=True)
+class _Network:
+    """Lanes of a map by index, with look-ups of their ends."""
+
+    lines: list[LaneLine]
+    sections: list[Sections]
+    index: dict[str, int]
+    warnings: list[str] = field(default_factory=list[str])
+    _turned: dict[tuple[int, int], bool] = field(default_factory=dict[tuple[int, int], bool])
+
+    def direction(self, lane: int) -> int:
+        return 1 if self.lines[lane].forward else -1
+
+    def end_of(self, lane: int, contact: str) -> Floats:
+        """Return the start or end point of a lane's line."""
+        middle = self.sections[lane].middle
+        return middle[0 if contact == START else -1]
+
+    def gap(self, lane: int, end: str, other: int, contact: str) -> float:
+        """Return the distance between an end of a lane and an end of another lane; m."""
+        return float(np.hypot(*(self.end_of(lane, end) - self.end_of(other, contact))))
+
+    def runs_against(self, lane: int, other: int) -> bool:
+        """True if the lines of two neighbouring lanes run in opposite directions."""
+        key = (lane, other) if lane < other else (other, lane)
+        if key not in self._turned:
+            self._turned[key] = _turned_round(*(self.sections[row].middle for row in key))
+        return self._turned[key]
+
+    def exits(self, lane: int, contact: str) -> bool:
+        """True if traffic leaves a lane at this end of its line."""
+        line = self.lines[lane]
+        return line.both or line.forward == (contact == END)
+
+    def enters(self, lane: int, contact: str) -> bool:
+        """True if traffic enters a lane at this end of its line."""
+        line = self.lines[lane]
+        return line.both or line.forward == (contact == START)
+
+
+def plain_lanes(
+    lines: Sequence[LaneLine], areas: Sequence[Area] = ()
+) -> tuple[list[PlainLane], list[str]]:
+    """Return plain lanes, and warnings about skipped or guessed parts.
+
+    Raises
+    ------
+    MapError
+        The map has too many lanes, neighbours or ways.
+
+    Notes
+    -----
+    Each way through an area becomes a lane: the cubic from the end of one lane to the start of the
+    other.
+    """
+    _check_numbers(lines, areas)
+    network = _shaped(lines)
+    _add_ways(network, areas)
+    joints = _joints(network)
+    beside = _beside(network)
+    roads, junctions = _roads(network, beside), _junctions(network)
+    onto = _onto(network, joints)
+    names = _names(network)
+    _close_seams(network, joints)
+    lanes: list[PlainLane] = []
+    for row, line in enumerate(network.lines):
+        sections = network.sections[row]
+        sections = sections if line.forward else sections.turned_round()
+        left, right = beside[row] if line.forward else beside[row][::-1]
+        bounds = (line.lefts, line.rights) if line.forward else (line.rights, line.lefts)
+        against = set(_against(network, row, left | right))
+        lanes.append(
+            PlainLane(
+                name=names[row],
+                type=line.type,
+                road=roads[row],
+                junction=junctions[row],
+                section=line.section,
+                number=line.number,
+                left=sections.left,
+                right=sections.right,
+                z=sections.z,
+                onto=tuple(sorted(onto[row])),
+                left_beside=tuple(sorted(left)),
+                right_beside=tuple(sorted(right)),
+                against=tuple(sorted(against)),
+                changes=tuple(_changes(network, row, beside[row], against)),
+                speed_limit=line.speed_limit,
+                roundabout=line.roundabout,
+                broad=tuple(
+                    side
+                    for side, borders in zip(("left", "right"), bounds, strict=True)
+                    if borders and all(border.broad for border in borders)
+                ),
+            )
+        )
+    return lanes, network.warnings
+
+
+def _check_numbers(lines: Sequence[LaneLine], areas: Sequence[Area]) -> None:
+    related = sum(
+        len(line.before) + len(line.after) + len(line.left_beside) + len(line.right_beside)
+        for line in lines
+    )
+    ways = sum(len(area.ways) for area in areas)
+    for number, limit, what in (
+        (len(lines), MAX_LANES, "lanes"),
+        (related, MAX_RELATED, "neighbours of lanes"),
+        (ways, MAX_WAYS, "ways through intersections"),
+    ):
+        if number > limit:
+            raise MapError(f"{number:,} {what}; a map may have {limit:,}", element="lane")
+
+
+# Surfaces ------------------------------------------------------------------------------------------
+
+
+def _shaped(lines: Sequence[LaneLine]) -> _Network:
+    """Compute the lane surfaces and return the network of lanes with a surface."""
+    network = _Network([], [], {})
+    usable: list[LaneLine] = []
+    short: list[str] = []
+    twice: list[str] = []
+    for line in lines:
+        centre = thinned(line.centre)
+        if line.ident in network.index:
+            twice.append(line.ident)
+        elif line.sections is None and (len(centre) < 2 or run_of(centre)[-1] < 1e-3):
+            short.append(line.ident)
+        else:
+            network.index[line.ident] = len(usable)
+            usable.append(replace(line, centre=centre))
+    _tell(network, twice, "there are two of this id; the first one counts")
+    _tell(network, short, "no centre line and no ways through: left out")
+    guessed: list[str] = []
+    for line in usable:
+        sections, told = (line.sections, True) if line.sections else _cut(line, usable, network)
+        network.lines.append(line)
+        network.sections.append(sections)
+        guessed += [line.ident] * (not told)
+    width = f"no boundary beside them: as wide as lanes beside them are apart, else {WIDE} m"
+    _tell(network, guessed, width)
+    return network
+
+
+def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[Sections, bool]:
+    lefts, rights = (
+        [thin for border in side if len(thin := thinned(border.line)) > 1]
+        for side in (line.lefts, line.rights)
+    )
+    half = WIDE / 2
+    if not lefts and not rights:
+        beside = (network.index.get(i) for i in (*line.left_beside, *line.right_beside))
+        others = [lines[row].centre for row in beside if row is not None]
+        half = half_width(line.centre, [other for other in others if len(other) > 1])
+    return cross_sections(line.centre, lefts, rights, half)
+
+
+def about_lanes(lanes: Sequence[str], what: str) -> str:
+    """Return a warning that names the first few of these lanes."""
+    more = f" and {len(lanes) - LISTED} more" if len(lanes) > LISTED else ""
+    return f"{'lanes' if len(lanes) > 1 else 'lane'} {', '.join(lanes[:LISTED])}{more}: {what}"
+
+
+def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
+    if lanes:
+        network.warnings.append(about_lanes(lanes, what))
+
+
+def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
+    """Add connecting lanes through junction areas."""
+    missing: list[str] = []
+    astray: list[str] = []
+    for area in areas:
+        number = 0
+        for start, end in dict.fromkeys(area.ways):
+            lanes = network.index.get(start), network.index.get(end)
+            if lanes[0] is None or lanes[1] is None:
+                missing.append(area.ident)
+            elif not all(
+                _touches(network.lines[lane], area.ident, at_exit=at_exit)
+                for lane, at_exit in ((lanes[0], True), (lanes[1], False))
+            ):
+                astray.append(f"{area.ident} from {start} to {end}")
+            else:
+                number += 1
+                _add_way(network, area.ident, number, (lanes[0], lanes[1]))
+    _tell(network, list(dict.fromkeys(missing)), "a way through it leads to a missing lane")
+    _tell(network, astray, "told to be a way through, but not by the lanes at its ends: it is none")
+
+
+def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
+    """True if the traffic of a lane enters or leaves an area, or if the lane has no joints."""
+    joints = line.after if line.forward == at_exit else line.before
+    joints = (*line.before, *line.after) if line.both else joints
+    untold = not line.before and not line.after
+    return untold or any(joint.lane == area for joint in joints)
+
+
+def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) -> None:
+    start, end = (network.lines[lane] for lane in lanes)
+    leaves, enters = END if start.forward else START, START if end.forward else END
+    sections = way_between(_gate(network, lanes[0], leaves), _gate(network, lanes[1], enters))
+    ident = f"{area}:{start.ident}-{end.ident}"
+    network.index[ident] = len(network.lines)
+    network.sections.append(sections)
+    network.lines.append(
+        LaneLine(
+            ident,
+            start.type,
+            np.column_stack((sections.middle, sections.z)),
+            before=(Joint(start.ident, leaves),),
+            after=(Joint(end.ident, enters),),
+            name=f"{area}/0/{number}",
+            road=area,
+            number=number,
+            junction=area,
+        )
+    )
+
+
+def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, float, float]:
+    """Return an end of a lane: place, heading of its traffic, width and height."""
+    sections = network.sections[lane]
+    at, other = (0, 1) if contact == START else (-1, -2)
+    middle = sections.middle
+    way = (middle[other] - middle[at]) * (1 if contact == START else -1)
+    way *= network.direction(lane)
+    width = float(np.hypot(*(sections.left[at] - sections.right[at])))
+    return middle[at], float(np.arctan2(way[1], way[0])), width, float(sections.z[at])
+
+
+# Where traffic flows on ----------------------------------------------------------------------------
+
+
+_Joined = tuple[int, str, int, str]
+"""Ends of lanes that touch: lane, its end, other lane, end of that lane."""
+
+
+def _joints(network: _Network) -> set[_Joined]:
+    joints: set[_Joined] = set()
+    far: list[str] = []
+    for row, line in enumerate(network.lines):
+        for own, touched in ((START, line.before), (END, line.after)):
+            for joint in touched:
+                other = network.index.get(joint.lane)
+                if other is None:
+                    continue
+                contact = joint.contact or _contact(network, row, own, other)
+                if network.gap(row, own, other, contact) > GAP:
+                    far.append(f"{line.ident} to {joint.lane}")
+                else:
+                    joints |= {(row, own, other, contact), (other, contact, row, own)}
+    _tell(network, far, f"told to touch, but their ends are more than {GAP} m apart: they do not")
+    return joints
+
+
+def _contact(network: _Network, lane: int, end: str, other: int) -> str:
+    """Return the end of another lane that touches an end of a lane."""
+    line, ident = network.lines[other], network.lines[lane].ident
+    says = {
+        contact
+        for contact, touched in ((START, line.before), (END, line.after))
+        if any(joint.lane == ident for joint in touched)
+    }
+    if len(says) == 1:
+        return says.pop()
+    return min((START, END), key=lambda contact: network.gap(lane, end, other, contact))
+
+
+def _onto(network: _Network, joints: Iterable[_Joined]) -> list[set[int]]:
+    onto: list[set[int]] = [set() for _ in network.lines]
+    for row, end, other, contact in joints:
+        if network.exits(row, end) and network.enters(other, contact):
+            onto[row].add(other)
+    return onto
+
+
+def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
+    """Extend lanes to the next one across small gaps, as between points half a metre apart."""
+    nearest: dict[int, tuple[float, str, int, str]] = {}
+    for row, end, other, contact in sorted(joints):
+        gap = network.gap(row, end, other, contact)
+        if network.exits(row, end) and network.enters(other, contact) and APART < gap <= SEAM:
+            nearest[row] = min(nearest.get(row, (np.inf, "", 0, "")), (gap, end, other, contact))
+    sections = list(network.sections)
+    for row, (_, end, other, contact) in nearest.items():
+        own, onward = sections[row], network.sections[other]
+        own = own if end == END else own.turned_round()
+        onward = onward if contact == START else onward.turned_round()
+        own = own.up_to(onward.left[0], onward.right[0], float(onward.z[0]))
+        network.sections[row] = own if end == END else own.turned_round()
+
+
+# Side by side --------------------------------------------------------------------------------------
+
+_Sides = tuple[set[int], set[int]]
+"""Lanes to the left and to the right of a line."""
+
+
+def _beside(network: _Network) -> list[_Sides]:
+    """Return the neighbours on both sides of each line; a link in one direction is enough."""
+    beside: list[_Sides] = [(set(), set()) for _ in network.lines]
+    for row, line in enumerate(network.lines):
+        for side, idents in enumerate((line.left_beside, line.right_beside)):
+            for ident in idents:
+                other = network.index.get(ident)
+                if other is None or other == row:
+                    continue
+                beside[row][side].add(other)
+                back = side if network.runs_against(row, other) else 1 - side
+                beside[other][back].add(row)
+    across = [
+        tuple(_across(network, beside, row, side) for side in (0, 1))
+        for row in range(len(network.lines))
+    ]
+    for sides, more in zip(beside, across, strict=True):
+        for side in (0, 1):
+            sides[side].update(more[side])
+    return beside
+
+
+def _turned_round(one: Floats, other: Floats) -> bool:
+    """True if two neighbouring lines run in opposite directions."""
+    way, back = one[-1] - one[0], other[-1] - other[0]
+    same = float(way @ back)
+    if abs(same) < 0.5 * float(np.hypot(*way) * np.hypot(*back)):
+        # Both lines bend: compare their directions where they are next to one another.
+        near = along_line(one, other[[0, -1]])
+        return bool(near[1] < near[0])
+    return same < 0
+
+
+def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set[int]:
+    """Return lanes of traffic that are separated from a lane only by lanes without traffic."""
+    if network.lines[row].type not in TRAFFIC:
+        return set()
+    found: set[int] = set()
+    seen, front = {row}, [(row, side)]
+    for _ in range(_MOST_ACROSS):
+        onward: list[tuple[int, int]] = []
+        for lane, towards in front:
+            for other in sorted(beside[lane][towards] - seen):
+                seen.add(other)
+                if network.lines[other].type in TRAFFIC:
+                    found.add(other)
+                else:
+                    turned = network.runs_against(lane, other)
+                    onward.append((other, 1 - towards if turned else towards))
+        front = onward
+    return found
+
+
+def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int]:
+    """Yield the neighbouring lanes of traffic with oncoming traffic."""
+    if network.lines[row].type not in TRAFFIC:
+        return
+    for other in others:
+        if network.lines[other].type in TRAFFIC:
+            turned = network.runs_against(row, other)
+            same = (network.lines[row].forward == network.lines[other].forward) != turned
+            if not same or network.lines[row].both or network.lines[other].both:
+                yield other
+
+
+def _changes(
+    network: _Network, row: int, beside: _Sides, against: set[int]
+) -> Iterator[tuple[int, float, float]]:
+    """Yield stretches where traffic may change to a neighbouring lane, in the direction of travel."""
+    line, middle = network.lines[row], network.sections[row].middle
+    if line.type not in DRIVING:
+        return
+    length = float(run_of(middle)[-1])
+    for side, others in enumerate(beside):
+        reached = [
+            other
+            for other in sorted(others)
+            if network.lines[other].type in DRIVING
+            and (other not in against or line.both or network.lines[other].both)
+        ]
+        stretches = _open_stretches(network, row, side) if reached else []
+        for other in reached if stretches else []:
+            reach = along_line(middle, network.sections[other].middle)
+            for start, end in stretches:
+                low, high = max(start, float(reach.min())), min(end, float(reach.max()))
+                if high > low:
+                    yield (
+                        (other, low, high) if line.forward else (other, length - high, length - low)
+                    )
+
+
+def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float, float]]:
+    """Return the stretches of a lane's line whose nearest border on one side may be crossed."""
+    line, middle = network.lines[row], network.sections[row].middle
+    borders = [b for b in (line.lefts, line.rights)[side] if len(b.line) > 1]
+    spans: list[tuple[float, float, float, bool]] = []
+    for border in borders:
+        along = along_line(middle, border.line[:, :2])
+        start, end = float(along.min()), float(along.max())
+        half = (start + end) / 2
+        inner = np.column_stack([np.interp([half], run_of(middle), c) for c in middle.T])
+        nearest = border.line[np.argmin(np.hypot(*(border.line[:, :2] - inner).T)), :2]
+        allowed = bool(border.to_left if side == 0 else border.to_right)
+        spans.append((start, end, float(np.hypot(*(nearest - inner[0]))), allowed))
+    cuts = sorted({place for span in spans for place in span[:2]})
+    found: list[tuple[float, float]] = []
+    for start, end in pairwise(cuts):
+        over = [span for span in spans if span[0] <= start and span[1] >= end]
+        if over and min(over, key=lambda span: span[2])[3]:
+            follows = bool(found) and found[-1][1] == start
+            found.append((found.pop()[0] if follows else start, end))
+    return found
+
+
+# Roads and junctions -------------------------------------------------------------------------------
+
+
+def _names(network: _Network) -> list[str]:
+    """Return unique names of lanes; an ambiguous name gets the lane's id as a suffix."""
+    wanted = [line.name or line.ident for line in network.lines]
+    count: dict[str, int] = defaultdict(int)
+    for name in wanted:
+        count[name] += 1
+    return [
+        name if count[name] == 1 else f"{name}#{line.ident}"
+        for name, line in zip(wanted, network.lines, strict=True)
+    ]
+
+
+def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
+    """Return the road of each lane; a lane without a road belongs to the road of its neighbours."""
+    road = [line.road for line in network.lines]
+    for row, line in enumerate(network.lines):
+        if road[row]:
+            continue
+        road[row] = line.ident
+        front = [row] if line.junction == "" else []
+        while front:
+            for other in set().union(*beside[front.pop()]):
+                if not road[other] and network.lines[other].junction == "":
+                    road[other] = line.ident
+                    front.append(other)
+    return road
+
+
+def _junctions(network: _Network) -> list[str]:
+    """Return the junction of each lane; an unnamed junction is a group of lanes that cross or touch."""
+    junction = [line.junction or "" for line in network.lines]
+    rows = [row for row, line in enumerate(network.lines) if line.junction is None]
+    if not rows:
+        return junction
+    centres: Any = [shapely.LineString(network.sections[row].middle) for row in rows]
+    union: Any = shapely.union_all(shapely.buffer(centres, _ABOUT / 2, quad_segs=1))
+    parts: Any = shapely.get_parts(union)
+    tree = shapely.STRtree(parts)
+    starts: Any = [shapely.Point(network.sections[row].middle[0]) for row in rows]
+    inside = dict(zip(*tree.query(starts, predicate="intersects").tolist(), strict=True))
+    name: dict[int, str] = {}
+    for number, row in enumerate(rows):
+        part = inside[number]
+        junction[row] = name.setdefault(part, network.lines[row].ident)
+    return junction
+
+
+# Lanes described by their borders only: the middle line, and lanes that share a border. The pieces
+# of a border have any order and direction; two of them can be next to each other, as double lines
+# are. The direction of a lane's line follows from its left and right border.
+
+MAX_PIECES: Final = 1_000
+"""Greatest number of pieces of a border. A lane with more is left out and named in a warning."""
+_DOUBLE: Final = 1.0
+"""Pieces of a border this close are parallel (a double line), unless one continues the other; m."""
+_ONE_SIDED: Final = 0.5
+"""Least share of the way between two borders along which left and right must be correct."""
+_BORDER_LOOKS: Final = 9
+"""Number of sample places along a lane and along a border."""
+_SHARED: Final = 0.1
+"""Least common part of a border of two neighbouring lanes, as a share of the shorter lane."""
+
+
+def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
+    """Return the line in the middle of two borders, by shares of their lengths.
+
+    Parameters
+    ----------
+    lefts, rights : sequence of (k, 3) float64
+        Pieces of the borders.
+
+    Returns
+    -------
+    middle : (n, 3) float64
+        Its direction has the left border on the left.
+
+    Raises
+    ------
+    ValueError
+        A border has no length or too many pieces, or the borders cross or are equal.
+    """
+    left, right = _chained(lefts, "left"), _chained(rights, "right")
+    along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
+    across = np.hypot(*(left[[0, -1]] - right[[-1, 0]])[:, :2].T).sum()
+    right = right if along <= across else right[::-1]
+    for end in (0, -1):
+        left, right = _cut_back(left, right, end), _cut_back(right, left, end)
+    shares = [run_of(line) / run_of(line)[-1] for line in (left, right)]
+    at = np.unique(np.concatenate(shares))
+    one, other = (
+        np.column_stack([np.interp(at, share, column) for column in line.T])
+        for share, line in zip(shares, (left, right), strict=True)
+    )
+    middle = (one + other) / 2
+    step, aside = np.diff(middle[:, :2], axis=0), (one - other)[:, :2]
+    aside = (aside[:-1] + aside[1:]) / 2
+    area = step[:, 0] * aside[:, 1] - step[:, 1] * aside[:, 0]
+    if not abs(area.sum()) > max(_ONE_SIDED * np.abs(area).sum(), APART * run_of(middle)[-1]):
+        raise ValueError("its boundaries cross, or are one and the same")
+    return thinned(middle if area.sum() > 0 else middle[::-1])
+
+
+def _chained(pieces: Sequence[Floats], side: str) -> Floats:
+    """Join the pieces of a border, beginning with the longest and continuing with the nearest end."""
+    left = [thin for piece in pieces if len(thin := thinned(piece)) > 1 and run_of(thin)[-1] > 0]
+    if not left:
+        raise ValueError(f"neither a centre line nor a boundary to its {side}")
+    if len(left) > MAX_PIECES:
+        raise ValueError(f"more than {MAX_PIECES} boundaries to its {side}")
+    left.sort(key=lambda piece: -run_of(piece)[-1])
+    chain, left = left[0], left[1:]
+    ends = np.array([piece[[0, -1], :2] for piece in left]).reshape(-1, 2, 2)
+    while left:
+        # (piece, end of the piece, end of the chain)
+        away = np.hypot(*np.moveaxis(ends[:, :, None] - chain[[0, -1], :2], -1, 0))
+        number, own, at = (int(i) for i in np.unravel_index(np.argmin(away), away.shape))
+        piece, ends = left.pop(number), np.delete(ends, number, axis=0)
+        half = run_of(piece)[-1] / 2
+        middle = np.array([[np.interp(half, run_of(piece), piece[:, i]) for i in (0, 1)]])
+        found = feet(middle, [chain])
+        if not found.is_end[0] and np.hypot(*(found.at - middle)[0]) <= _DOUBLE:
+            continue
+        if at == 1:
+            chain = np.concatenate((chain, piece if own == 0 else piece[::-1]))
+        else:
+            chain = np.concatenate((piece if own == 1 else piece[::-1], chain))
+    return thinned(chain)
+
+
+def _cut_back(line: Floats, other: Floats, end: int) -> Floats:
+    """Cut the part of a border that extends beyond the end of the other border."""
+    run = run_of(line)
+    found = feet(other[[end], :2], [line])
+    along, apart = float(found.along[0]), float(np.hypot(*(found.at[0] - other[end, :2])))
+    beyond = along if end == 0 else run[-1] - along
+    if beyond <= max(apart, APART) or not 0 < along < run[-1]:
+        return line
+    cut = np.array([[np.interp(along, run, column) for column in line.T]])
+    return (
+        np.concatenate((cut, line[run > along]))
+        if end == 0
+        else np.concatenate((line[run < along], cut))
+    )
+
+
+def with_shared_borders(lines: Sequence[LaneLine]) -> list[LaneLine]:
+    """Add neighbours that share a border, on sides without known neighbours.
+
+    Two lanes share a border if they are on its two sides, along the same part of it.
+    """
+    users: dict[str, dict[tuple[int, int], Floats]] = defaultdict(dict)
+    for row, line in enumerate(lines):
+        if len(thinned(line.centre)) < 2:
+            continue
+        for side, borders in enumerate((line.lefts, line.rights)):
+            for border in borders:
+                if border.ident and len(border.line) > 1:
+                    users[border.ident][row, side] = thinned(border.line)
+    beside: dict[tuple[int, int], list[str]] = defaultdict(list)
+    for shared in users.values():
+        untold = [key for key in shared if not _told(lines, key)]
+        if len(shared) < 2 or not untold or min(map(len, shared.values())) < 2:
+            continue
+        places = {key: _place(lines[key[0]].centre, border) for key, border in shared.items()}
+        for key in untold:
+            beside[key] += [
+                lines[other[0]].ident
+                for other in shared
+                if other[0] != key[0] and _share(places[key], places[other])
+            ]
+    return [
+        replace(
+            line,
+            left_beside=line.left_beside or tuple(dict.fromkeys(beside[row, 0])),
+            right_beside=line.right_beside or tuple(dict.fromkeys(beside[row, 1])),
+        )
+        for row, line in enumerate(lines)
+    ]
+
+
+def _told(lines: Sequence[LaneLine], key: tuple[int, int]) -> bool:
+    row, side = key
+    return bool((lines[row].left_beside, lines[row].right_beside)[side])
+
+
+def _place(centre: Floats, border: Floats) -> tuple[float, float, bool]:
+    """Return start and end of a lane along a border, and True if it is on the border's left."""
+    centre, border = thinned(centre)[:, :2], border[:, :2]
+    own, at = _looks(centre), run_of(border)[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
+    onto, back = feet(own, [border]), feet(_looks(border), [centre])
+    beside = np.concatenate((~onto.is_end, ~back.is_end))
+    if not beside.any():
+        return 0.0, 0.0, True
+    along = np.concatenate((onto.along, at))[beside]
+    aside = np.concatenate((own - onto.at, back.at - _looks(border)))[beside]
+    piece = np.clip(np.searchsorted(run_of(border), along, "right") - 1, 0, len(border) - 2)
+    way = np.diff(border, axis=0)[piece]
+    left = float((way[:, 0] * aside[:, 1] - way[:, 1] * aside[:, 0]).sum()) > 0
+    return float(along.min()), float(along.max()), left
+
+
+def _looks(line: Floats) -> Floats:
+    """Return places (n, 2) along a line, at equal distances."""
+    run = run_of(line)
+    at = run[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
+    return np.column_stack([np.interp(at, run, column) for column in line[:, :2].T])
+
+
+def _share(one: tuple[float, float, bool], other: tuple[float, float, bool]) -> bool:
+    common = min(one[1], other[1]) - max(one[0], other[0])
+    shorter = min(one[1] - one[0], other[1] - other[0])
+    return one[2] != other[2] and common > max(_SHARED * shorter, APART)
+
+
+# Junctions of maps that know of none: lanes that lie on others' ways ---------------------------------
+
+_ON_ANOTHER: Final = 0.5
+"""Least length of a centre line inside another lane that makes both a junction; m."""
+_ASKED_AT_ONCE: Final = 100
+
+
+def with_junctions(lines: Sequence[LaneLine]) -> list[LaneLine]:
+    """Assign a junction to lanes for motor traffic whose centre lines run through one another.
+
+    This applies to lanes that cross, diverge and merge, but not to lanes on different storeys.
+    Lanes without sections stay unchanged.
+
+    Raises
+    ------
+    MapError
+        Too many lanes overlap.
+    """
+    rows = [row for row, line in enumerate(lines) if line.type in DRIVING and line.sections]
+    sections = [one for row in rows if (one := lines[row].sections)]
+    outlines: Any = shapely.make_valid(
+        [shapely.Polygon(np.concatenate((one.right, one.left[::-1]))) for one in sections]
+    )
+    centres: Any = np.array([shapely.LineString(one.middle) for one in sections], object)
+    tree = shapely.STRtree(outlines)
+    inside: set[int] = set()
+    pairs = 0
+    for start in range(0, len(rows), _ASKED_AT_ONCE):
+        one, other = tree.query(centres[start : start + _ASKED_AT_ONCE], predicate="intersects")
+        pairs += len(one)
+        if pairs > MAX_RELATED:
+            raise MapError(f"more than {MAX_RELATED:,} lanes on one another", element="lane")
+        one = one + start
+        one, other = one[one != other], other[one != other]
+        common: Any = shapely.intersection(centres[one], outlines[other])
+        long = shapely.length(common) > _ON_ANOTHER
+        for lane, crossed, part in zip(one[long], other[long], common[long], strict=True):
+            place = shapely.point_on_surface(part)
+            heights = [_height(sections[row], centres[row], place) for row in (lane, crossed)]
+            if abs(heights[0] - heights[1]) <= STOREY:
+                inside |= {rows[lane], rows[crossed]}
+    return [
+        replace(line, junction=None) if row in inside and line.junction == "" else line
+        for row, line in enumerate(lines)
+    ]
+
+
+def _height(sections: Sections, centre: Any, place: Any) -> float:
+    return float(
+        np.interp(shapely.line_locate_point(centre, place), run_of(sections.middle), sections.z)
+    )

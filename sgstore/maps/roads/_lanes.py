@@ -1,0 +1,751 @@
+"""Conversion of plain lanes to a ``RoadMap``, and cross sections from lines.
+
+A plain lane has its cross sections in the direction of travel and its related lanes. All other
+parts of a :class:`~sgstore.maps.roads.RoadMap` follow from them: roads, junctions, turns, conflicts,
+lengths and widths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import shapely
+
+from sgstore.base.columns import chained
+from sgstore.maps.roads._courses import lane_courses
+from sgstore.maps.roads._map import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap, turn_words
+from sgstore.maps.roads._places import broad_lines
+from sgstore.maps.roads._ribbons import Ribbons, conflicts, mean_widths, turned, wrapped
+from sgstore.model.vocabulary import DRIVING, RELATION_CODE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from sgstore.model.world import Bools, Floats, Ints
+
+
+_SIDEWAYS: Final = 0.9
+"""A step is a jump if a larger share of it goes across the lane."""
+_FIRST_LANE: Final = 1
+"""Row of the first lane among the nodes: row 0 is ``off_road``."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlainLane:
+    """Lane with cross sections; other lanes are referred to by their index in the list of lanes.
+
+    Attributes
+    ----------
+    name, type, road, junction : str
+        As in :class:`~sgstore.maps.roads.MapNodes`.
+    section, number : int
+        Section and lane number in the road, or 0.
+    left, right : (n, 2) float64
+        Ends of the cross sections, in the direction of travel; m. At least two.
+    z : (n,) float64
+        Heights of the cross sections; m.
+    onto : tuple of int
+        Lanes that traffic flows on to.
+    left_beside, right_beside : tuple of int
+        Lanes next to it, seen in the direction of its traffic.
+    against : tuple of int
+        Its neighbours with oncoming traffic.
+    changes : tuple of (int, float, float)
+        Lanes that traffic may change to, with start and end along this lane; m.
+    speed_limit : float
+        m/s; NaN if there is no limit.
+    roundabout : str
+        The roundabout of its road, or empty.
+    broad : tuple of str
+        ``left``, ``right``: sides with a broad marking.
+    """
+
+    name: str
+    type: str
+    road: str
+    junction: str
+    section: int
+    number: int
+    left: Floats
+    right: Floats
+    z: Floats
+    onto: tuple[int, ...] = ()
+    left_beside: tuple[int, ...] = ()
+    right_beside: tuple[int, ...] = ()
+    against: tuple[int, ...] = ()
+    changes: tuple[tuple[int, float, float], ...] = ()
+    speed_limit: float = np.nan
+    roundabout: str = ""
+    broad: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PlainSignal:
+    """A traffic light or sign.
+
+    Attributes
+    ----------
+    name, kind : str
+        Its id, and one of :data:`sgstore.model.vocabulary.SIGNALS`.
+    x, y, z, heading : float
+        Position and facing direction; m, rad. NaN means unknown.
+    lanes : tuple of int
+        Lanes that it applies to, by index.
+    stops : tuple of (int, float)
+        Lanes with a stopping place before the signal, and the place along each; m.
+    is_stop_line : bool
+        True for a line painted on the road.
+    line : (n, 2) float64
+        Its own line; m. Empty if it is a point.
+    speed_limit : float
+        m/s; NaN if it has none.
+    """
+
+    name: str
+    kind: str
+    x: float = np.nan
+    y: float = np.nan
+    z: float = np.nan
+    heading: float = np.nan
+    lanes: tuple[int, ...] = ()
+    stops: tuple[tuple[int, float], ...] = ()
+    is_stop_line: bool = False
+    line: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    speed_limit: float = np.nan
+
+
+@dataclass(frozen=True, slots=True)
+class PlainCrosswalk:
+    """Pedestrian crossing.
+
+    Attributes
+    ----------
+    name : str
+    outline : (n, 2) float64
+        Corners all around; m. At least three.
+    z : float
+        Its height; m.
+    """
+
+    name: str
+    outline: Floats
+    z: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlainObject(PlainCrosswalk):
+    """Object at the side of lanes, as an outline on the ground.
+
+    Attributes
+    ----------
+    name, outline, z
+        As in :class:`PlainCrosswalk`.
+    kind : str
+        One of :data:`OBJECT_KINDS`.
+    """
+
+    kind: str
+
+
+OBJECT_KINDS: Final = ("building", "vegetation", "prop")
+
+
+def road_map_of(
+    lanes: Sequence[PlainLane],
+    signals: Sequence[PlainSignal] = (),
+    crosswalks: Sequence[PlainCrosswalk] = (),
+    objects: Sequence[PlainObject] = (),
+    *,
+    name: str,
+    text: str,
+    warnings: Iterable[str] = (),
+) -> RoadMap:
+    """Build the road map of plain lanes, signals, crosswalks and objects from ``text``.
+
+    Raises
+    ------
+    MapError
+        A junction has too many lanes for a comparison in pairs.
+    """
+    ribbons = ribbons_of(lanes)
+    surfaces = plain_nodes(lanes, ribbons)
+    roads, junctions = _road_nodes(lanes, ribbons), _junction_nodes(lanes)
+    off_road = MapNodes.of("off_road", ["off_road"])
+    larger = [junctions, _roundabout_nodes(lanes)]
+    before = [off_road, surfaces, roads, *larger, _crosswalk_nodes(crosswalks)]
+    nodes = chained([*before, _signal_nodes(signals), _object_nodes(objects)])
+    first = sum(map(len, before))
+    shapes = np.full(len(nodes), None, object)
+    outlines = [shapely.Polygon(crosswalk.outline) for crosswalk in crosswalks]
+    lines = [shapely.LineString(s.line) if len(s.line) > 1 else None for s in signals]
+    grounds = [shapely.Polygon(one.outline) for one in objects]
+    shapes[first - len(outlines) :] = [*outlines, *lines, *grounds]
+    return RoadMap(
+        name=name,
+        text=text,
+        nodes=nodes,
+        edges=_edges(lanes, ribbons, roads, larger, signals, first),
+        ribbons=ribbons,
+        shapes=shapes,
+        lane_changes=_lane_changes(lanes),
+        warnings=warnings,
+        stops=_stops(signals, first),
+        stop_lines=np.array([first + r for r, s in enumerate(signals) if s.is_stop_line], np.int64),
+        # Formats of lanes as lines use 0 for an unknown height.
+        courses=lane_courses(ribbons, ribbons.height if ribbons.z.any() else None),
+        broad_lines=broad_lines(
+            [
+                (row, side == "left", 0.0, float(length))
+                for row, (lane, length) in enumerate(zip(lanes, ribbons.lengths, strict=True))
+                for side in lane.broad
+            ]
+        ),
+    )
+
+
+def _stops(signals: Sequence[PlainSignal], first: int) -> tuple[Ints, Ints, Floats]:
+    """Return the stopping places of signals as columns: signal, lane, and place along it."""
+    rows = [(first + row, *stop) for row, signal in enumerate(signals) for stop in signal.stops]
+    column, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
+    return column, lane, np.array([along for *_, along in rows], np.float64)
+
+
+def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
+    """Return the surface of plain lanes."""
+    counts = np.array([len(lane.z) for lane in lanes], np.int64)
+    offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
+    left = np.concatenate([np.zeros((0, 2)), *(lane.left for lane in lanes)])
+    right = np.concatenate([np.zeros((0, 2)), *(lane.right for lane in lanes)])
+    x, y = ((left + right) / 2).T
+    first = np.zeros(len(x), np.bool_)
+    first[offsets[:-1]] = True
+    run_x, run_y = np.diff(x, prepend=0.0), np.diff(y, prepend=0.0)
+    step = np.where(first, 0.0, np.hypot(run_x, run_y))
+    run = np.cumsum(step)
+    along = run - np.repeat(run[offsets[:-1]], counts)
+    # Traffic does not follow a sideways jump of a lane.
+    across_x, across_y = (left - right).T
+    aside = np.abs(run_x * across_x + run_y * across_y)
+    width = np.hypot(across_x, across_y)
+    jumps = (width > 0) & (aside > _SIDEWAYS * step * width)
+    square = np.arctan2(-across_x, across_y)
+    return Ribbons(
+        offsets=offsets,
+        left_x=left[:, 0],
+        left_y=left[:, 1],
+        right_x=right[:, 0],
+        right_y=right[:, 1],
+        z=np.concatenate([np.zeros(0), *(lane.z for lane in lanes)]),
+        heading=headings(x, y, first | jumps, square),
+        s=along,
+        along=along,
+    )
+
+
+def headings(x: Floats, y: Floats, first: Bools, alone: Floats | None = None) -> Floats:
+    """Return headings of polylines at their points, (N,), not wrapped; ``first`` marks line starts.
+
+    A line of one point has the heading ``alone``. An inner point has the mean of the directions of
+    both pieces, weighted by their lengths; the cubic through points and headings then stays close
+    to both. An end has the heading of a circle through its piece.
+    """
+    if not len(x):
+        return np.zeros(0)
+    inner = ~first[1:]
+    length = np.where(inner, np.hypot(np.diff(x), np.diff(y)), 0.0)
+    direction = np.arctan2(np.diff(y), np.diff(x))
+    before, after = np.append(0.0, length), np.append(length, 0.0)
+    into, out = np.append(0.0, direction), np.append(direction, 0.0)
+    turn = wrapped(out - into)
+    total = before + after
+    both = (before > 0) & (after > 0)
+    share = after / np.where(total > 0, total, 1.0)
+    heading = np.where(both, into + turn * share, np.where(after > 0, out, into))
+    if alone is not None:
+        heading = np.where(total > 0, heading, alone)
+    # Ends of a line: mirror the heading of the other end at the direction of the piece.
+    starts, ends = np.flatnonzero(~both & (after > 0)), np.flatnonzero(~both & (before > 0))
+    for rows, others, pieces in ((starts, starts + 1, out), (ends, ends - 1, into)):
+        bend = wrapped(heading[others] - pieces[rows])
+        curved = both[others] & (np.abs(bend) < np.pi / 4)
+        heading[rows] = pieces[rows] - np.where(curved, bend, 0.0)
+    return heading
+
+
+def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
+    """Return the nodes of plain lanes with these surfaces."""
+    every, length = np.arange(len(ribbons)), ribbons.lengths
+    middle = ribbons.at(every, length / 2)
+    turns = turn_words(turned(ribbons))
+    return MapNodes.of(
+        "lane",
+        [lane.name for lane in lanes],
+        x=middle.x,
+        y=middle.y,
+        z=middle.z,
+        heading=middle.heading,
+        lane_type=tuple(lane.type for lane in lanes),
+        road=tuple(lane.road for lane in lanes),
+        junction=tuple(lane.junction for lane in lanes),
+        turn=tuple(word if lane.junction else "" for word, lane in zip(turns, lanes, strict=True)),
+        section=np.array([lane.section for lane in lanes], np.int64),
+        lane=np.array([lane.number for lane in lanes], np.int64),
+        length=length,
+        width=mean_widths(ribbons),
+        speed_limit=np.array([lane.speed_limit for lane in lanes], np.float64),
+    )
+
+
+def _road_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
+    """Return roads ordered by first lane; the length is the sum of the longest lanes per section."""
+    junction: dict[str, str] = {}
+    longest: dict[str, dict[int, float]] = {}
+    for lane, length in zip(lanes, ribbons.lengths.tolist(), strict=True):
+        junction.setdefault(lane.road, lane.junction)
+        sections = longest.setdefault(lane.road, {})
+        sections[lane.section] = max(sections.get(lane.section, 0.0), length)
+    names = tuple(junction)
+    return MapNodes.of(
+        "road",
+        names,
+        length=np.array([sum(longest[name].values()) for name in names], np.float64),
+        road=names,
+        junction=tuple(junction.values()),
+    )
+
+
+def _junction_nodes(lanes: Sequence[PlainLane]) -> MapNodes:
+    names = tuple(dict.fromkeys(lane.junction for lane in lanes if lane.junction))
+    return MapNodes.of("junction", names, junction=names)
+
+
+def _roundabout_nodes(lanes: Sequence[PlainLane]) -> MapNodes:
+    return MapNodes.of(
+        "roundabout", tuple(dict.fromkeys(lane.roundabout for lane in lanes if lane.roundabout))
+    )
+
+
+def _crosswalk_nodes(crosswalks: Sequence[PlainCrosswalk]) -> MapNodes:
+    middles = np.array([one.outline.mean(axis=0) for one in crosswalks]).reshape(-1, 2)
+    z = np.array([one.z for one in crosswalks], np.float64)
+    names = [one.name for one in crosswalks]
+    return MapNodes.of("crosswalk", names, x=middles[:, 0], y=middles[:, 1], z=z)
+
+
+def _object_nodes(objects: Sequence[PlainObject]) -> MapNodes:
+    """Return objects as their smallest bounding boxes; the heading is along the longer side."""
+    boxes = [shapely.Polygon(one.outline).minimum_rotated_rectangle for one in objects]
+    sides = np.array([np.diff(shapely.get_coordinates(box)[:3], axis=0) for box in boxes])
+    sides = sides.reshape(-1, 2, 2)
+    long = np.hypot(sides[..., 0], sides[..., 1])
+    longer = np.take_along_axis(sides, long.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+    middles = np.array([shapely.get_coordinates(box.centroid)[0] for box in boxes]).reshape(-1, 2)
+    return MapNodes.of(
+        [one.kind for one in objects],
+        [one.name for one in objects],
+        x=middles[:, 0],
+        y=middles[:, 1],
+        z=np.array([one.z for one in objects], np.float64),
+        heading=np.arctan2(longer[:, 1], longer[:, 0]),
+        length=long.max(axis=1, initial=0.0),
+        width=long.min(axis=1, initial=np.inf),
+    )
+
+
+def _signal_nodes(signals: Sequence[PlainSignal]) -> MapNodes:
+    columns = {
+        name: np.array([getattr(signal, name) for signal in signals], np.float64)
+        for name in ("x", "y", "z", "heading", "speed_limit")
+    }
+    kinds = [signal.kind for signal in signals]
+    return MapNodes.of(kinds, [signal.name for signal in signals], **columns)
+
+
+def _edges(
+    lanes: Sequence[PlainLane],
+    ribbons: Ribbons,
+    roads: MapNodes,
+    larger: Sequence[MapNodes],
+    signals: Sequence[PlainSignal],
+    first_signal: int,
+) -> MapEdges:
+    first_road = _FIRST_LANE + len(lanes)
+    road = {name: first_road + row for row, name in enumerate(roads.name)}
+    first = first_road + len(roads)
+    junction, roundabout = (
+        {name: begin + row for row, name in enumerate(nodes.name)}
+        for nodes, begin in zip(larger, (first, first + len(larger[0])), strict=True)
+    )
+    within = [(_FIRST_LANE + row, road[lane.road]) for row, lane in enumerate(lanes)]
+    within += [(road[r], junction[j]) for r, j in zip(roads.name, roads.junction, strict=True) if j]
+    within += {(road[lane.road], roundabout[lane.roundabout]) for lane in lanes if lane.roundabout}
+    flow = _spread([lane.onto for lane in lanes])
+    crossing = [row for row, lane in enumerate(lanes) if lane.junction and lane.type in DRIVING]
+    one, other = conflicts(
+        ribbons,
+        np.array(crossing, np.int64),
+        [lane.junction for lane in lanes],
+        (flow[:, 0], flow[:, 1]),
+        STOREY,
+    )
+    against = _spread([lane.against for lane in lanes])
+    change = np.array(
+        [(row, to) for row, lane in enumerate(lanes) for to, _, _ in lane.changes], np.int64
+    ).reshape(-1, 2)
+    among_lanes = {
+        "travelsTo": flow,
+        "laneChange": change,
+        "toLeftOf": _spread([lane.left_beside for lane in lanes])[:, ::-1],
+        "toRightOf": _spread([lane.right_beside for lane in lanes])[:, ::-1],
+        "opposes": np.concatenate((against, against[:, ::-1])),
+        "conflictsWith": np.column_stack((np.append(one, other), np.append(other, one))),
+    }
+    parts = {"isIn": np.array(within, np.int64).reshape(-1, 2)}
+    parts |= {relation: _FIRST_LANE + pairs for relation, pairs in among_lanes.items()}
+    controls = [
+        (first_signal + row, _FIRST_LANE + lane)
+        for row, signal in enumerate(signals)
+        for lane in signal.lanes
+        if lanes[lane].type in DRIVING
+    ]
+    parts["controlsTrafficOf"] = np.array(controls, np.int64).reshape(-1, 2)
+    return edges_of([(relation, pairs[:, 0], pairs[:, 1]) for relation, pairs in parts.items()])
+
+
+Edge = tuple[str, "Ints", "Ints"]
+"""Relation, with the rows of sources and destinations among the nodes."""
+
+
+def edges_of(parts: Sequence[Edge]) -> MapEdges:
+    """Convert edges between rows of nodes to unique, ordered edges between node ids."""
+    code = np.concatenate([np.full(len(src), RELATION_CODE[name]) for name, src, _ in parts])
+    src = np.concatenate([s for _, s, _ in parts])
+    dst = np.concatenate([d for _, _, d in parts])
+    table = np.unique(np.column_stack((code, src, dst)), axis=0).reshape(-1, 3)
+    return MapEdges(table[:, 0].astype(np.int8), -1 - table[:, 1], -1 - table[:, 2])
+
+
+def _spread(groups: Sequence[tuple[int, ...]]) -> Ints:
+    """Return pairs of a group's index and each of its members, (n, 2)."""
+    row = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    return np.column_stack((row, np.array([*chain(*groups)], np.int64)))
+
+
+def _lane_changes(lanes: Sequence[PlainLane]) -> LaneChanges:
+    rows = [(row, *change) for row, lane in enumerate(lanes) for change in lane.changes]
+    if not rows:
+        return LaneChanges.none()
+    lane, to, start, end = zip(*sorted(rows), strict=True)
+    return LaneChanges(
+        np.array(lane, np.int64), np.array(to, np.int64), np.array(start), np.array(end)
+    )
+
+
+# Cross sections of lanes that are told as lines: a centre line and its borders --------------------
+
+APART: Final = 0.05
+"""Least distance between kept points of a line, and between cross sections; m."""
+WIDE: Final = 3.5
+"""Default lane width; m."""
+NEIGHBOURS: Final = (2.0, 6.0)
+"""Range of centre line distances from which the width of neighbouring lanes is derived; m."""
+_LOOKS: Final = 9
+"""Number of sample places along a lane for the distance to its neighbours."""
+_STEP: Final = 1.0
+"""Distance between the cross sections of a way through an area; m."""
+_FEW: Final = 20_000
+"""Up to this number of pairs (place, piece of a line), brute force is faster than a tree."""
+_AHEAD: Final = 0.2, 0.1, 0.5
+"""Greatest offset along the lane between a cross section and a border end that is used for it:
+metres, and the share of its sideways distance; at the ends of a lane, which can be oblique, the
+last share."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sections:
+    """Cross sections along a line, in the line's direction; shape (n, 2) and (n,)."""
+
+    left: Floats
+    right: Floats
+    z: Floats
+    middle: Floats = field(init=False)
+    """(n, 2): the centre line."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "middle", (self.left + self.right) / 2)
+
+    def turned_round(self) -> Sections:
+        """Return the sections against the line's direction."""
+        return Sections(self.right[::-1], self.left[::-1], self.z[::-1])
+
+    def up_to(self, left: Floats, right: Floats, z: float) -> Sections:
+        """Append a cross section at the end of the line."""
+        return Sections(
+            np.vstack((self.left, left)), np.vstack((self.right, right)), np.append(self.z, z)
+        )
+
+
+def thinned(line: Floats) -> Floats:
+    """Remove points of a line (n, 3) that are closer than :data:`APART` to the previous one; keep the end."""
+    if len(line) < 2:
+        return line
+    step = np.hypot(*np.diff(line[:, :2], axis=0).T)
+    if (step >= APART).all():
+        return line
+    kept, run = [0], 0.0
+    for number, length in enumerate(step.tolist(), 1):
+        run += length
+        if run >= APART:
+            kept.append(number)
+            run = 0.0
+    if kept[-1] != len(line) - 1 and len(kept) > 1:
+        kept[-1] = len(line) - 1
+    return line[kept]
+
+
+def run_of(line: Floats) -> Floats:
+    """Return the length (n,) of a line up to each of its points, seen from above; m."""
+    return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))))
+
+
+@dataclass(frozen=True, slots=True)
+class Feet:
+    """Nearest points on lines to some places; shape (n,) and (n, 2).
+
+    ``along``: length of the line up to the point, with all lines laid end to end. ``is_end``: True
+    at the end of a line.
+    """
+
+    at: Floats
+    along: Floats
+    is_end: Bools
+
+
+def sections_between(left: Floats, right: Floats) -> Sections:
+    """Compute cross sections of a lane from its two borders, at every point of both.
+
+    Parameters
+    ----------
+    left, right : (n, 3) and (m, 3) float64
+        In the direction of the lane, thinned; at least two points.
+
+    Notes
+    -----
+    Opposite points of both borders, up to :data:`APART`, become the ends of one cross section.
+    Therefore the outline of the lane equals its borders.
+    """
+    runs = run_of(left), run_of(right)
+    shares = [run / run[-1] for run in runs]
+    near = APART / max(runs[0][-1], runs[1][-1])
+    here = there = 0
+    pairs: list[tuple[float, float]] = []
+    while here < len(left) or there < len(right):
+        one = shares[0][here] if here < len(left) else np.inf
+        other = shares[1][there] if there < len(right) else np.inf
+        both = abs(one - other) <= near
+        pairs.append((one if both else min(one, other), other if both else min(one, other)))
+        here += bool(both or one < other)
+        there += bool(both or other < one)
+    at = np.maximum.accumulate(np.array(pairs), axis=0).T
+    ends = [
+        np.column_stack([np.interp(along, share, column) for column in line.T])
+        for along, share, line in zip(at, shares, (left, right), strict=True)
+    ]
+    return Sections(ends[0][:, :2], ends[1][:, :2], (ends[0][:, 2] + ends[1][:, 2]) / 2)
+
+
+def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
+    """Return the nearest points on lines to places (n, 2); each line has at least two different points."""
+    start = np.concatenate([line[:-1, :2] for line in lines])
+    way = np.concatenate([line[1:, :2] for line in lines]) - start
+    x, y = places.T
+    squared = np.maximum(way[:, 0] ** 2 + way[:, 1] ** 2, 1e-18)
+    if len(places) * len(start) <= _FEW:
+        away_x, away_y = x[:, None] - start[:, 0], y[:, None] - start[:, 1]
+        shares = (away_x * way[:, 0] + away_y * way[:, 1]) / squared
+        shares = np.minimum(np.maximum(shares, 0.0), 1.0)
+        away_x -= shares * way[:, 0]
+        away_y -= shares * way[:, 1]
+        piece = np.argmin(away_x * away_x + away_y * away_y, axis=1)
+    else:
+        pieces: Any = shapely.linestrings(np.stack((start, start + way), axis=1))
+        points: Any = shapely.points(places)
+        _, piece = shapely.STRtree(pieces).query_nearest(points, all_matches=False)
+    begin, step = start[piece], way[piece]
+    share = ((x - begin[:, 0]) * step[:, 0] + (y - begin[:, 1]) * step[:, 1]) / squared[piece]
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
+    length = np.sqrt(squared)
+    before = np.cumsum(length) - length
+    first = np.zeros(len(start) + 1, np.bool_)
+    first[np.cumsum([0, *(len(line) - 1 for line in lines)])] = True
+    is_end = ((share <= 0) & first[piece]) | ((share >= 1) & first[piece + 1])
+    return Feet(begin + share[:, None] * step, before[piece] + share * length[piece], is_end)
+
+
+def along_line(line: Floats, places: Floats) -> Floats:
+    """Return the lengths (n,) of a line up to its points nearest to places (n, 2); m."""
+    return feet(places, [line]).along
+
+
+def cross_sections(
+    centre: Floats, lefts: Sequence[Floats], rights: Sequence[Floats], half: float
+) -> tuple[Sections, bool]:
+    """Compute cross sections of a lane; the flag is True if its borders define the width.
+
+    Parameters
+    ----------
+    centre : (n, 3) float64
+        Centre line, thinned; at least two points.
+    lefts, rights : sequence of (k, 3) float64
+        Thinned borders on its left and right, as any number of pieces in any order. If only one
+        side has a border, the other side has the same distance; without any border, both distances
+        are ``half``.
+    half : float
+        m.
+    """
+    run = run_of(centre)
+    at = _cuts(run, [along_line(centre, line[:, :2]) for line in (*lefts, *rights)])
+    x, y, z = (np.interp(at, run, column) for column in centre.T)
+    first = np.zeros(len(at), np.bool_)
+    first[0] = True
+    heading = headings(x, y, first)
+    ahead = np.column_stack((np.cos(heading), np.sin(heading)))
+    to_left = np.column_stack((-ahead[:, 1], ahead[:, 0]))
+    places = np.column_stack((x, y))
+    sides = [
+        _side(places, ahead, sign * to_left, borders)
+        for sign, borders in ((1.0, lefts), (-1.0, rights))
+    ]
+    told = any(side is not None for side in sides)
+    one, other = sides if told else (None, None)
+    plain = np.full(len(at), half)
+    left_away = one.away if one else other.away if other else plain
+    right_away = other.away if other else left_away
+    left = one.points if one else places + to_left * left_away[:, None]
+    right = other.points if other else places - to_left * right_away[:, None]
+    return Sections(left, right, z), told
+
+
+def _cuts(run: Floats, more: Sequence[Floats]) -> Floats:
+    """Return the places of cross sections along a line: its own points, and other distinct ones."""
+    inner = np.concatenate([run[1:-1], *more])
+    own = np.arange(len(inner)) < len(run) - 2
+    inside = (inner > APART) & (inner < run[-1] - APART)
+    inner, own = inner[inside], own[inside]
+    order = np.lexsort((~own, inner))
+    inner = inner[order]
+    if len(inner):
+        kept = [float(inner[0])]
+        for place in inner[1:].tolist():
+            if place - kept[-1] >= APART:
+                kept.append(place)
+        inner = np.array(kept)
+    return np.concatenate(([0.0], inner, [run[-1]]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Side:
+    points: Floats
+    away: Floats
+
+
+def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats]) -> _Side | None:
+    """Return the ends of the cross sections on one side, or ``None`` without a border on this side."""
+    if not borders:
+        return None
+    found = feet(places, borders)
+    nearest = found.at
+    way = nearest - places
+    away, beyond = (way * aside).sum(axis=1), (way * ahead).sum(axis=1)
+    share = np.full(len(away), _AHEAD[1])
+    share[[0, -1]] = _AHEAD[2]
+    beside: Bools = ~found.is_end | (np.abs(beyond) <= _AHEAD[0] + share * np.abs(away))
+    if not beside.any():
+        return None
+    rows: Ints = np.flatnonzero(beside)
+    # A lane without a border keeps the width at the nearest piece of its border.
+    away = np.where(beside, away, np.interp(np.arange(len(away)), rows, away[rows]))
+    points = np.where(beside[:, None], nearest, places + aside * away[:, None])
+    return _Side(points, away)
+
+
+def half_width(centre: Floats, others: Sequence[Floats]) -> float:
+    """Return half the width of a lane without borders, from the centre lines of its neighbours; m."""
+    run = run_of(centre)
+    places = np.linspace(0.0, run[-1], _LOOKS)
+    middle = np.column_stack([np.interp(places, run, column) for column in centre[:, :2].T])
+    gaps: list[float] = []
+    for other in others:
+        found = feet(middle, [other])
+        length = run_of(other)[-1]
+        beside = (found.along > 0) & (found.along < length)
+        if beside.any():
+            gap = float(np.median(np.hypot(*(found.at - middle)[beside].T)))
+            gaps += [gap] * (NEIGHBOURS[0] <= gap <= NEIGHBOURS[1])
+    return min(gaps, default=WIDE) / 2
+
+
+def way_between(
+    start: tuple[Floats, float, float, float], end: tuple[Floats, float, float, float]
+) -> Sections:
+    """Return a lane between two places: position (2,), heading, width and height of both ends.
+
+    Its centre line is a cubic; the lengths of its tangents are those of an arc with the same turn.
+    """
+    (p0, heading0, width0, z0), (p1, heading1, width1, z1) = start, end
+    chord = float(np.hypot(*(p1 - p0)))
+    turn = abs(float(np.remainder(heading1 - heading0 + np.pi, 2 * np.pi) - np.pi))
+    tangent = chord / np.cos(turn / 4) ** 2
+    t0 = tangent * np.array((np.cos(heading0), np.sin(heading0)))
+    t1 = tangent * np.array((np.cos(heading1), np.sin(heading1)))
+    n = int(np.clip(chord / _STEP, 8, 64)) + 1
+    t = np.linspace(0.0, 1.0, n)[:, None]
+    place = (
+        (1 + 2 * t) * (1 - t) ** 2 * p0
+        + t * (1 - t) ** 2 * t0
+        + t * t * (3 - 2 * t) * p1
+        - t * t * (1 - t) * t1
+    )
+    slope = 6 * t * (t - 1) * (p0 - p1) + (1 - t) * (1 - 3 * t) * t0 + t * (3 * t - 2) * t1
+    slope /= np.maximum(np.hypot(*slope.T), 1e-9)[:, None]
+    share = t[:, 0]
+    half = (width0 + share * (width1 - width0))[:, None] / 2
+    to_left = np.column_stack((-slope[:, 1], slope[:, 0]))
+    return Sections(place + to_left * half, place - to_left * half, z0 + share * (z1 - z0))
+
+
+# Lines painted across lanes ----------------------------------------------------------------------
+
+_ON_LANE: Final = 0.1
+"""Greatest distance between a stop line and the centre line of its lane; m."""
+_AT_START: Final = 0.5
+"""A line this close to the start of a lane belongs to the previous lane, if it is on that lane too; m."""
+
+
+def painted_across(lanes: Sequence[PlainLane], lines: Sequence[Floats]) -> list[dict[int, float]]:
+    """For each painted line (n, 2 or 3), find the lanes for motor traffic and the place along each; m.
+
+    A line between two consecutive lanes belongs to the first.
+    """
+    found: list[dict[int, float]] = [{} for _ in lines]
+    rows = [row for row, lane in enumerate(lanes) if lane.type in DRIVING]
+    long = [number for number, line in enumerate(lines) if len(line) > 1]
+    if not rows or not long:
+        return found
+    centres: Any = np.array(
+        [shapely.LineString((lanes[row].left + lanes[row].right) / 2) for row in rows], object
+    )
+    painted: Any = np.array([shapely.LineString(lines[one][:, :2]) for one in long], object)
+    line, lane = shapely.STRtree(centres).query(painted, predicate="dwithin", distance=_ON_LANE)
+    nearest: Any = shapely.shortest_line(centres[lane], painted[line])
+    places: Any = shapely.line_locate_point(centres[lane], shapely.get_point(nearest, 0))
+    for one, row, along in zip(line.tolist(), lane.tolist(), places.tolist(), strict=True):
+        found[long[one]][rows[row]] = along
+    for places in found:
+        onward = {to for row in places for to in lanes[row].onto}
+        for row in [row for row, at in places.items() if at < _AT_START and row in onward]:
+            del places[row]
+    return found

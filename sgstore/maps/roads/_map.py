@@ -1,0 +1,876 @@
+"""``RoadMap``: lanes, roads, junctions, crosswalks and signals as arrays, and distances along its lanes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter, defaultdict
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import pairwise
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sgstore.base.columns import taken
+from sgstore.maps.roads._courses import LaneCourses
+from sgstore.maps.roads._footprints import LaneIndex
+from sgstore.maps.roads._places import (
+    STOP_LINE,
+    MapPlaces,
+    made_of_lanes,
+    of_signals,
+    on_crosswalks,
+    together,
+)
+from sgstore.maps.roads._ribbons import LanePoints, Ribbons, lane_polygons, waypoints
+from sgstore.maps.roads._zones import zones
+from sgstore.model.vocabulary import DRIVING, ENTITY_KINDS, KIND_CODE, KINDS, RELATION_CODE, SIGNALS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.model.world import Bools, Codes, Floats, Ints
+
+
+# Distances along the lanes, over ``travelsTo`` ------------------------------------------------------
+
+FARTHEST: Final = 200.0
+"""Greatest search distance along the lanes from one entity to another; m. The view ``pairs`` uses it too."""
+_CELL: Final = 32.0
+"""Cell size of the grid that finds bodies far from all crosswalks; m."""
+_MOST_CELLS: Final = 1 << 16
+_PREPARED: Final = Lock()
+"""Only one thread at a time prepares shapes."""
+
+_MOST_AT_ONCE: Final = 1 << 22
+"""Pairs of lanes whose distances are in memory at a time."""
+
+
+def _downstream(
+    lengths: Floats, src: Ints, dst: Ints, limit: float
+) -> Iterator[tuple[Ints, Ints, Floats]]:
+    """Yield, in chunks, a lane, a lane that starts within ``limit`` after its end, and the distance.
+
+    Traffic flows from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
+    """
+    order = np.lexsort((dst, src))
+    onward, first = dst[order], np.searchsorted(src[order], np.arange(len(lengths) + 1))
+    step = max(_MOST_AT_ONCE // max(len(lengths), 1), 1)
+    for lanes in np.split(np.arange(len(lengths)), range(step, len(lengths), step)):
+        best = np.full((len(lanes), len(lengths)), np.inf)
+        source, at, distance = np.arange(len(lanes)), lanes, np.zeros(len(lanes))
+        while len(source):
+            counts = first[at + 1] - first[at]
+            of = np.repeat(np.arange(len(at)), counts)
+            number = np.arange(len(of)) - (np.cumsum(counts) - counts)[of]
+            source, at, distance = source[of], onward[first[at[of]] + number], distance[of]
+            better = np.flatnonzero((distance <= limit) & (distance < best[source, at]))
+            source, at, distance = source[better], at[better], distance[better]
+            np.minimum.at(best, (source, at), distance)
+            least = np.flatnonzero(distance == best[source, at])
+            key, one = np.unique(source[least] * len(lengths) + at[least], return_index=True)
+            source, at = np.divmod(key, len(lengths))
+            distance = distance[least[one]] + lengths[at]
+        row, other = np.nonzero(np.isfinite(best))
+        yield lanes[row], other, best[row, other]
+
+
+# Places and shapes --------------------------------------------------------------------------------
+
+
+def point_shapes(x: Floats, y: Floats) -> NDArray[np.object_]:
+    """Convert coordinates to shapely points, (N,)."""
+    points: Any = shapely.points(np.column_stack([x, y]))
+    return points
+
+
+def within(outline: Any, places: Floats) -> NDArray[np.bool_]:
+    """Return a mask (N,) of the places (N, 2) inside a shapely polygon."""
+    return np.asarray(shapely.contains_xy(outline, *places.T), np.bool_)
+
+
+# The words for the turns of lanes, whatever a map was read from ---------------------------------
+
+STRAIGHT: Final = np.radians(30.0)
+"""A lane through a junction with a smaller turn goes straight on; rad."""
+
+
+def turn_words(turn: Floats) -> list[str]:
+    """Return ``left``, ``right`` or ``straight`` for turn angles, positive to the left; rad."""
+    words = np.where(turn > STRAIGHT, "left", np.where(turn < -STRAIGHT, "right", "straight"))
+    return list(map(str, words))
+
+
+OFF_ROAD: Final = -1
+"""Node id of the single node for all places outside driving lanes."""
+
+STOREY: Final = 2.5
+"""Greatest difference of height between a footprint and its lane; m."""
+
+Geometries = NDArray[np.object_]
+"""An array of shapely geometries."""
+
+_FIRST_LANE: Final = OFF_ROAD - 1
+_QUADRANT: Final = np.pi / 4
+_MOST_PRESENT: Final = 1 << 24
+"""Greatest number of (node, point) pairs processed at once."""
+_CORNERS: Final = 8
+"""Corners of a shape for the quick test of nearness."""
+_TOUCH: Final = 1e-6
+"""Distances that differ by less need no exact test; m."""
+_MERGED: Final = " without sections"
+"""Suffix of the variant of a map with one node for all sections of a lane."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapNodes:
+    """All nodes of a map, ordered by descending node id: row i has node id -1 - i.
+
+    Attributes
+    ----------
+    kind : (K,) int8
+        Codes of :data:`sgstore.model.vocabulary.KINDS`.
+    name : tuple of str
+        ``road/section/lane`` of a lane, else the id in the map; ``off_road``.
+    x, y, z, heading : (K,) float64
+        A point on it and its direction there (a lane: the middle of its centre line, in the
+        direction of travel). NaN for ``off_road`` and for unknown places.
+    lane_type : tuple of str
+        ``driving``, ``sidewalk``, … as in OpenDRIVE; empty for other nodes.
+    road, junction, turn : tuple of str
+        Ids of its road and junction; ``left``, ``right``, ``straight`` for a lane in a junction.
+        Empty if there is none.
+    section, lane : (K,) int64
+        Section and lane number in the road; 0 for other nodes.
+    length, width, speed_limit : (K,) float64
+        m, mean m, m/s; NaN if unknown.
+    curvature : (K,) float64
+        Curvature of the centre line at a waypoint, positive to the left; 1/m. NaN for other nodes.
+    """
+
+    kind: Codes
+    name: tuple[str, ...]
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    lane_type: tuple[str, ...]
+    road: tuple[str, ...]
+    junction: tuple[str, ...]
+    turn: tuple[str, ...]
+    section: Ints
+    lane: Ints
+    length: Floats
+    width: Floats
+    speed_limit: Floats
+    curvature: Floats
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    @classmethod
+    def of(cls, kind: str | Sequence[str], name: Sequence[str], **columns: Any) -> MapNodes:
+        """Make nodes from the available columns; missing columns are empty, 0 or NaN.
+
+        ``kind``: one, or one per node.
+        """
+        n = len(name)
+        kinds = [kind] * n if isinstance(kind, str) else kind
+        missing: dict[str, Any] = {"section": np.zeros(n, np.int64), "lane": np.zeros(n, np.int64)}
+        texts = {"lane_type", "road", "junction", "turn"}
+        values = {
+            column.name: missing.get(
+                column.name, ("",) * n if column.name in texts else np.full(n, np.nan)
+            )
+            for column in fields(cls)
+        }
+        values |= {"kind": np.array([KIND_CODE[k] for k in kinds], np.int8), "name": tuple(name)}
+        return cls(**(values | columns))
+
+    def take(self, rows: Ints) -> MapNodes:
+        """Return these rows, in this order."""
+        return taken(self, rows)
+
+
+@dataclass(frozen=True, slots=True)
+class MapEdges:
+    """Edges among the nodes of a map; shape (E,).
+
+    Attributes
+    ----------
+    relation : int8
+        Codes of :data:`sgstore.model.vocabulary.RELATIONS`.
+    src, dst : int64
+        Node ids.
+    """
+
+    relation: Codes
+    src: Ints
+    dst: Ints
+
+    def __len__(self) -> int:
+        return len(self.relation)
+
+
+@dataclass(frozen=True, slots=True)
+class LaneHits:
+    """Pairs of a footprint and a lane that touch, ordered by footprint; shape (H,).
+
+    Attributes
+    ----------
+    row : int64
+        Row of the footprint in the query.
+    lane : int64
+        Node id of the lane.
+    overlap : float64
+        Share of the footprint's area in the lane, 0 … 1.
+    offset : float64
+        Lateral offset of the footprint's centre from the lane's centre line, positive to the left
+        of the direction of travel; m.
+    heading_error : float64
+        Heading of the footprint less the direction of travel there, in (-π, π]; rad.
+    primary : bool
+        True for the best lane of each footprint: centre inside first, then the smaller heading
+        error (by quadrants of 45°), then the larger overlap, then the lower lane.
+    """
+
+    row: Ints
+    lane: Ints
+    overlap: Floats
+    offset: Floats
+    heading_error: Floats
+    primary: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class LaneChanges:
+    """Stretches where traffic may change to a neighbouring lane; shape (n,).
+
+    Attributes
+    ----------
+    lane, to : int64
+        Lanes, counted from 0.
+    start, end : float64
+        Along the centre line of ``lane``; m.
+    """
+
+    lane: Ints
+    to: Ints
+    start: Floats
+    end: Floats
+
+    def __len__(self) -> int:
+        return len(self.lane)
+
+    @classmethod
+    def none(cls) -> LaneChanges:
+        """Return an empty table: no permitted lane changes."""
+        no_lanes, nowhere = np.zeros(0, np.int64), np.zeros(0)
+        return cls(no_lanes, no_lanes, nowhere, nowhere)
+
+
+class RoadMap:
+    """A road map: nodes, edges and lane surfaces, with geometric look-ups.
+
+    Parameters
+    ----------
+    name, text : str
+    nodes : MapNodes
+    edges : MapEdges
+    ribbons : Ribbons
+        The surface of the lanes, in the order of their nodes.
+    shapes : (K,) object
+        Geometries of the nodes, or ``None`` for lanes and for nodes that consist of lanes.
+    lane_changes : LaneChanges, optional
+    road_types, junction_types, controllers : mapping, optional
+    warnings : iterable of str, optional
+    stops : (m,) int64, int64 and float64, optional
+        Signals (columns of the nodes), lanes that they apply to (from 0), and the place along
+        these; m.
+    stop_lines : (n,) int64, optional
+        Columns of the signals that are painted stop lines.
+    courses : LaneCourses, optional
+    broad_lines : MapPlaces, optional
+        Broad markings at the sides of lanes.
+    variant : str, optional
+        Difference from the map that the text describes.
+
+    Attributes
+    ----------
+    name : str
+        Its name for people: the file name, or the name in the map's header.
+    text : str
+        The source text.
+    digest : str
+        SHA-256 of text and variant, in hexadecimal digits: the identity of the map.
+    nodes : MapNodes
+    edges : MapEdges
+        Static relations: ``isIn`` (lane → road, road → junction or roundabout), ``travelsTo``, ``opposes``,
+        ``toLeftOf``, ``toRightOf``, ``laneChange``, ``conflictsWith`` among lanes, ``controlsTrafficOf``
+        (signal → lane).
+    ribbons : Ribbons
+        The surface of the lanes. Lane i (wherever lanes are counted from 0) has node id -2 - i.
+    lane_changes : LaneChanges
+        Stretches of the ``laneChange`` edges along their lanes.
+    courses : LaneCourses
+        Curvature and slope of the lanes, metre by metre. Empty for a map without sections.
+    road_types : mapping of str to tuple of (float, str)
+        Id of a road → its types (``town``, ``motorway``, …) and the start of each along its
+        reference line; m.
+    junction_types : mapping of str to str
+        Id of a junction → ``default``, ``direct``, ``virtual``, …
+    controllers : mapping of str to tuple of str
+        Id of a controller → ids of the signals that it switches.
+    warnings : tuple of str
+        Tolerated defects of the map, each with its road.
+    """
+
+    _ways: tuple[float, tuple[Ints, Ints, Floats]] | None = None
+    """Limit and last result of :meth:`downstream`."""
+
+    def __init__(  # noqa: PLR0913 (a map is all of this)
+        self,
+        *,
+        name: str,
+        text: str,
+        nodes: MapNodes,
+        edges: MapEdges,
+        ribbons: Ribbons,
+        shapes: Geometries,
+        lane_changes: LaneChanges | None = None,
+        road_types: Mapping[str, tuple[tuple[float, str], ...]] | None = None,
+        junction_types: Mapping[str, str] | None = None,
+        controllers: Mapping[str, tuple[str, ...]] | None = None,
+        warnings: Iterable[str] = (),
+        stops: tuple[Ints, Ints, Floats] | None = None,
+        stop_lines: Ints | None = None,
+        courses: LaneCourses | None = None,
+        broad_lines: MapPlaces | None = None,
+        variant: str = "",
+    ) -> None:
+        self.name = name
+        self.text = text
+        self._broad_lines = broad_lines or MapPlaces.none()
+        self.digest = hashlib.sha256((text + variant).encode("utf-8", "surrogatepass")).hexdigest()
+        self.nodes = nodes
+        self.edges = edges
+        self.ribbons = ribbons
+        self.lane_changes = lane_changes or LaneChanges.none()
+        self.road_types = dict(road_types or {})
+        self.junction_types = dict(junction_types or {})
+        self.controllers = dict(controllers or {})
+        self.warnings = tuple(warnings)
+        self._shapes = shapes
+        nothing = np.zeros(0, np.int64)
+        self._stops = stops or (nothing, nothing, np.zeros(0))
+        self._stop_lines = nothing if stop_lines is None else stop_lines
+        self.courses = courses or LaneCourses.none()
+        self._variant = variant
+        self._lanes = len(ribbons.offsets) - 1
+
+    def outlines(self) -> Geometries:
+        """Return shapely polygons, lines or points of the nodes, (K,); ``None`` for nodes without a shape.
+
+        Roads, junctions and ``off_road`` have no shape: a road consists of its lanes.
+        """
+        return self._outlines.copy()
+
+    def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
+        """Return the lanes, of any type, that footprints touch on their storey.
+
+        Parameters
+        ----------
+        boxes : (N, 5) float64
+            ``x, y, heading, length, width`` of each footprint; m, m, rad, m, m. A footprint with
+            length or width 0 or NaN is a point or a line. A footprint with NaN in ``x, y`` touches
+            nothing.
+        z : (N,) float64
+            Height of the footprint's centre *on the ground* (the bottom of the box); m. NaN: any storey.
+
+        Notes
+        -----
+        A footprint within 1 mm of a lane touches it. Its height is compared with the lane at the
+        footprint's centre. The heading error in a bend is taken there, too.
+        """
+        touches = self._index.touches(np.asarray(boxes, np.float64), np.asarray(z, np.float64))
+        quadrant = np.floor(np.abs(touches.heading_error) / _QUADRANT)
+        order = np.lexsort((touches.lane, -touches.overlap, quadrant, ~touches.inside, touches.row))
+        first = np.diff(touches.row[order], prepend=-1) != 0
+        primary = np.zeros(len(order), np.bool_)
+        primary[order[first]] = True
+        return LaneHits(
+            touches.row,
+            _FIRST_LANE - touches.lane,
+            touches.overlap,
+            touches.offset,
+            touches.heading_error,
+            primary,
+        )
+
+    def crosswalks_of(self, boxes: Floats, z: Floats) -> tuple[Ints, Ints]:
+        """Find the crosswalks under footprints; return pairs of footprint row and node id.
+
+        Boxes and heights as in :meth:`lanes_of`.
+        """
+        columns, tree, cells = self._crosswalks
+        boxes = np.asarray(boxes, np.float64)
+        rows = np.flatnonzero(np.isfinite(boxes[:, :2]).all(axis=1))
+        if cells is not None:
+            long = (np.abs(boxes[rows, 3:5]) > _CELL).any(axis=1)
+            rows = rows[long | np.isin(_cells(boxes[rows, :2]), cells)]
+        if not len(columns) or not len(rows):
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        row, place = tree.query(_rectangles(boxes[rows]), predicate="intersects")
+        row, column = rows[row], columns[place]
+        same = ~(np.abs(self.nodes.z[column] - np.asarray(z, np.float64)[row]) > STOREY)
+        row, column = row[same], column[same]
+        order = np.lexsort((column, row))
+        return row[order], -1 - column[order]
+
+    def near(self, x: Floats, y: Floats, radius: float) -> tuple[Ints, Ints]:
+        """Find the map parts within ``radius`` of points; return pairs of point row and node id.
+
+        A road or junction is near if one of its lanes is near. Ordered by row and by descending
+        node id.
+        """
+        rows, columns = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+        places = np.column_stack((x, y))
+        step = max(_MOST_PRESENT // len(self.nodes), 1)
+        for first in range(0, len(places), step):
+            present = self._present(places[first : first + step], radius)
+            row, column = np.nonzero(present)
+            rows.append(first + row)
+            columns.append(column)
+        return np.concatenate(rows), -1 - np.concatenate(columns)
+
+    def _present(self, places: Floats, radius: float) -> Bools:
+        """Return a mask (N, K) of the nodes within ``radius`` of the places (N, 2)."""
+        columns, tree = self._extents
+        finite = np.flatnonzero(np.isfinite(places).all(axis=1))
+        low, high = places[finite] - radius, places[finite] + radius
+        row, place = tree.query(shapely.box(*low.T, *high.T))
+        # Boxes and some corners decide most pairs; only the other pairs need exact shapes.
+        box, corners = self._corners
+        at = places[finite][row]
+        aside = np.maximum(np.maximum(box[place, :2] - at, at - box[place, 2:]), 0)
+        near = ((corners[place] - at[:, None]) ** 2).sum(axis=2).min(axis=1) <= (
+            radius - _TOUCH
+        ) ** 2
+        near &= radius > _TOUCH
+        ask = np.flatnonzero(~near & ((aside**2).sum(axis=1) <= (radius + _TOUCH) ** 2))
+        points: Any = shapely.points(at[ask])
+        with _PREPARED:
+            near[ask] = shapely.dwithin(tree.geometries[place[ask]], points, radius)
+        row, place = row[near], place[near]
+        present = np.zeros((len(places), len(self.nodes)), np.bool_)
+        present[finite[row], columns[place]] = True
+        for child, parent in self._containment:
+            at, which = np.nonzero(present[:, child])
+            present[at, parent[which]] = True
+        return present
+
+    def near_shapes(self, corners: Floats, distance: float) -> tuple[Ints, Ints]:
+        """Find the map parts within ``distance`` of shapes; return pairs of shape row and node id.
+
+        Parameters
+        ----------
+        corners : (N, V, 2) float64
+            Ends of lines (V = 2), or corners of simple polygons; m.
+        distance : float
+            m.
+
+        Notes
+        -----
+        Roads, junctions and ``off_road`` have no shape and are never near.
+        """
+        make = shapely.linestrings if corners.shape[1] == 2 else shapely.polygons
+        shapes: Any = make(corners)
+        columns, tree = self._extents
+        row, place = tree.query(shapes, predicate="dwithin", distance=distance)
+        order = np.lexsort((columns[place], row))
+        return row[order], -1 - columns[place][order]
+
+    def lanes_of_signal(self, signal: str) -> Ints:
+        """Return node ids of the driving lanes that a signal applies to; empty for an unknown id.
+
+        For a signal that is missing in the map, :func:`lanes_ref` can replace its id.
+        """
+        if signal.startswith(_LANES_REF):
+            names = _names_in(signal)
+            nodes = self.nodes
+            found = [
+                -1 - column
+                for column in range(len(nodes))
+                if nodes.lane_type[column] in DRIVING and nodes.name[column] in names
+            ]
+            return np.array(found, np.int64)
+        return self._controlled.get(signal, np.zeros(0, np.int64))
+
+    def waypoints(self, spacing: float) -> LanePoints:
+        """Return points along the centre lines of all lanes, every ``spacing`` metres from each lane's start.
+
+        Raises
+        ------
+        ValueError
+            ``spacing`` is not above 0.
+        """
+        return waypoints(self.ribbons, spacing)
+
+    @cached_property
+    def without_sections(self) -> RoadMap:
+        """Return the map with one node for all sections of a lane.
+
+        The node is the one of the first section, with the name ``road_number``. The other nodes
+        stay, without edges; node ids keep their meaning. Surface queries still distinguish
+        sections. The result is another map with another digest.
+        """
+        nodes, same = self.nodes, first_sections(self.nodes)
+        first = same == np.arange(len(nodes))
+        lane = (nodes.kind == KIND_CODE["lane"]) & (nodes.lane != 0)
+        name = tuple(
+            f"{road}_{number}" if merged else name
+            for name, road, number, merged in zip(
+                nodes.name, nodes.road, nodes.lane.tolist(), lane & first, strict=True
+            )
+        )
+        length = np.bincount(same, np.nan_to_num(nodes.length), len(nodes))
+        return RoadMap(
+            name=self.name,
+            text=self.text,
+            nodes=replace(nodes, name=name, length=np.where(lane & first, length, nodes.length)),
+            edges=merged_edges(self.edges, same),
+            ribbons=self.ribbons,
+            shapes=self._shapes,
+            lane_changes=self.lane_changes,
+            road_types=self.road_types,
+            junction_types=self.junction_types,
+            controllers=self.controllers,
+            warnings=self.warnings,
+            stops=self._stops,
+            stop_lines=self._stop_lines,
+            variant=f"{self._variant}{_MERGED}",
+        )
+
+    def downstream(self, limit: float) -> tuple[Ints, Ints, Floats]:
+        """Return pairs of lanes where the second starts at most ``limit`` metres after the end of the first.
+
+        The last result is cached: a second call with the same limit is free.
+
+        Returns
+        -------
+        lane, other : (n,) int64
+            Lanes, counted from 0; ``lane`` ascends. A lane may reach itself.
+        distance : (n,) float64
+            From the end of ``lane`` to the start of ``other``; m.
+        """
+        if self._ways is None or self._ways[0] != limit:
+            flow = self.edges.relation == RELATION_CODE["travelsTo"]
+            src, dst = _FIRST_LANE - self.edges.src[flow], _FIRST_LANE - self.edges.dst[flow]
+            lanes = (src >= 0) & (src < self._lanes)
+            ways = _downstream(self.ribbons.lengths, src[lanes], dst[lanes], limit)
+            lane, other, distance = map(np.concatenate, zip(*ways, strict=True))
+            self._ways = limit, (lane, other, distance)
+        return self._ways[1]
+
+    @cached_property
+    def reach(self) -> tuple[Ints, Ints, Floats]:
+        """Return pairs of connected lanes, with the start of the second measured along the first.
+
+        Returns
+        -------
+        lane, other : (n,) int64
+            Node ids. Each lane also occurs with itself; two lanes occur twice if both directions
+            are drivable.
+        start : (n,) float64
+            Start of ``other``, along the lanes from the start of ``lane``; negative if the way
+            leads from ``other`` to ``lane``; m. At most :data:`FARTHEST` between the end of one and
+            the start of the next.
+
+        Notes
+        -----
+        Empty for a map without sections: places along its lanes refer to sections.
+        """
+        if _MERGED in self._variant:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+        begun, reached, distance = self.downstream(FARTHEST)
+        every, start = np.arange(self._lanes), self.ribbons.lengths[begun] + distance
+        lane = np.concatenate([every, begun, reached])
+        other = np.concatenate([every, reached, begun])
+        starts = np.concatenate([np.zeros(len(every)), start, -start])
+        order = np.lexsort((starts, other, lane))
+        return _FIRST_LANE - lane[order], _FIRST_LANE - other[order], starts[order]
+
+    @cached_property
+    def places(self) -> MapPlaces:
+        """Return places of junctions, roundabouts, zones, broad lines, crosswalks and signals along the lanes.
+
+        Empty for a map without sections, as :attr:`reach`.
+        """
+        nodes, lanes = self.nodes, slice(1, 1 + self._lanes)
+        if not self._lanes or _MERGED in self._variant:
+            return MapPlaces.none()
+        what = [KINDS[int(code)] for code in nodes.kind]
+        columns = {
+            of: {nodes.name[column]: column for column, kind in enumerate(what) if kind == of}
+            for of in ("road", "junction")
+        }
+        columns["lane"] = {str(column): column for column in range(1, lanes.stop)}
+        names = {"lane": list(columns["lane"]), "road": nodes.road[lanes]}
+        names["junction"] = nodes.junction[lanes]
+        wholes = [made_of_lanes(self.ribbons, of, names[of], columns[of]) for of in columns]
+        wholes += [self._on_roundabouts(), self._on_zones(), self._broad_lines]
+        for column in self._stop_lines.tolist():
+            what[column] = STOP_LINE
+        crosswalks, *_ = self._crosswalks
+        shapes, z = self._shapes[crosswalks], nodes.z[crosswalks]
+        control = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
+        applies = -1 - self.edges.src[control], _FIRST_LANE - self.edges.dst[control]
+        signals = of_signals(self.ribbons, names["junction"], what, applies, self._stops)
+        return together(
+            [*wholes, on_crosswalks(self.ribbons, crosswalks, shapes, z, STOREY), signals]
+        )
+
+    def _on_roundabouts(self) -> MapPlaces:
+        """Return the lanes of each roundabout as stretches along these lanes."""
+        (lane, road), (part, whole) = self._containment
+        around = np.flatnonzero(self.nodes.kind[whole] == KIND_CODE["roundabout"])
+        of_road: dict[int, list[int]] = {}
+        for at, one in zip(part[around].tolist(), whole[around].tolist(), strict=True):
+            of_road.setdefault(at, []).append(one)
+        pairs = [
+            (one, row - 1)
+            for row, at in zip(lane.tolist(), road.tolist(), strict=True)
+            for one in of_road.get(at, ())
+        ]
+        of, lanes = np.array(pairs, np.int64).reshape(-1, 2).T
+        return MapPlaces.of(
+            of, ["roundabout"] * len(of), lanes, np.zeros(len(of)), self.ribbons.lengths[lanes]
+        )
+
+    def _on_zones(self) -> MapPlaces:
+        """Return merge and departure zones along their lanes."""
+        lanes = slice(1, 1 + self._lanes)
+        pairs = {
+            name: (-2 - self.edges.src[on], -2 - self.edges.dst[on])
+            for name in ("travelsTo", "toLeftOf", "toRightOf", "opposes")
+            for on in [
+                (self.edges.relation == RELATION_CODE[name]) & (self.edges.src > -2 - self._lanes)
+            ]
+        }
+        one, other = np.concatenate([pairs["toLeftOf"], pairs["toRightOf"]], axis=1)
+        against = {*zip(*(column.tolist() for column in pairs["opposes"]), strict=True)}
+        same = [pair not in against for pair in zip(one.tolist(), other.tolist(), strict=True)]
+        nodes, beside = self.nodes, (one[same], other[same])
+        lengths = self.ribbons.lengths
+        return zones(
+            nodes.lane_type[lanes], nodes.junction[lanes], lengths, pairs["travelsTo"], beside
+        )
+
+    @cached_property
+    def _index(self) -> LaneIndex:
+        return LaneIndex(self.ribbons, STOREY)
+
+    @cached_property
+    def _outlines(self) -> Geometries:
+        shapes = self._shapes.copy()
+        shapes[1 : 1 + self._lanes] = lane_polygons(self.ribbons)
+        folded = ~shapely.is_missing(shapes) & ~shapely.is_valid(shapes)
+        shapes[folded] = shapely.make_valid(
+            shapes[folded], method="structure", keep_collapsed=False
+        )
+        return shapes
+
+    @cached_property
+    def _crosswalks(self) -> tuple[Ints, shapely.STRtree, Ints | None]:
+        """Return the crosswalks: columns, a spatial index, and the grid cells near them.
+
+        The cells are ``None`` if there are too many.
+        """
+        columns = np.flatnonzero(self.nodes.kind == KIND_CODE["crosswalk"])
+        shapes = self._shapes[columns]
+        tree = shapely.STRtree(shapes)
+        low, high = np.split(shapely.bounds(shapes).reshape(-1, 4) / _CELL, 2, axis=1)
+        if not np.prod(high - low + 4, axis=1).sum() < _MOST_CELLS:
+            return columns, tree, None
+        around = [np.zeros((0, 2), np.int64)] + [
+            np.stack(np.meshgrid(*map(np.arange, a, b)), axis=-1).reshape(-1, 2)
+            for a, b in zip(_floor(low) - 1, _floor(high) + 2, strict=True)
+        ]
+        return columns, tree, np.unique(_numbered(np.concatenate(around)))
+
+    @cached_property
+    def _corners(self) -> tuple[Floats, Floats]:
+        """Return boxes (M, 4) around the shapes of :attr:`_extents`, and some corners (M, C, 2) of each; m."""
+        _, tree = self._extents
+        every, shape = shapely.get_coordinates(tree.geometries, return_index=True)
+        count = np.bincount(shape, minlength=len(tree.geometries))
+        chosen = (count[:, None] * (np.arange(_CORNERS) / _CORNERS)).astype(np.int64)
+        chosen += (np.cumsum(count) - count)[:, None]
+        corners = np.append(every, [[np.inf, np.inf]], axis=0)[np.where(count[:, None], chosen, -1)]
+        return shapely.bounds(tree.geometries), corners
+
+    @cached_property
+    def _extents(self) -> tuple[Ints, shapely.STRtree]:
+        outlines = self._outlines
+        columns = np.flatnonzero(~shapely.is_missing(outlines))
+        tree = shapely.STRtree(outlines[columns])
+        shapely.prepare(tree.geometries)  # Prepared shapes make distances fast.
+        return columns, tree
+
+    @cached_property
+    def _containment(self) -> tuple[tuple[Ints, Ints], ...]:
+        """Return pairs of child and parent nodes: lanes in roads, then roads in junctions or roundabouts."""
+        inside = self.edges.relation == RELATION_CODE["isIn"]
+        child, parent = -1 - self.edges.src[inside], -1 - self.edges.dst[inside]
+        lane = self.nodes.kind[child] == KIND_CODE["lane"]
+        return (child[lane], parent[lane]), (child[~lane], parent[~lane])
+
+    @cached_property
+    def _controlled(self) -> dict[str, Ints]:
+        controls = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
+        src, dst = self.edges.src[controls], self.edges.dst[controls]
+        return {self.nodes.name[-1 - node]: dst[src == node] for node in np.unique(src).tolist()}
+
+
+_LANES_REF: Final = "lanes:"
+
+
+def lanes_ref(names: Iterable[str]) -> str:
+    """Return a substitute id, made of lane names, for a signal that the map lacks."""
+    return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
+
+
+def _names_in(ref: str) -> set[str]:
+    try:
+        told = json.loads(ref.removeprefix(_LANES_REF))
+    except (ValueError, RecursionError):
+        return set()
+    return {name for name in told if isinstance(name, str)} if isinstance(told, list) else set()
+
+
+def first_sections(nodes: MapNodes) -> Ints:
+    """Map each lane to the first lane with its road and number, other nodes to themselves; (K,)."""
+    same = np.arange(len(nodes))
+    first: dict[tuple[str, int], int] = {}
+    for column in np.flatnonzero(nodes.kind == KIND_CODE["lane"]).tolist():
+        key = nodes.road[column], int(nodes.lane[column])
+        if key[1]:  # lanes without a number in a section, such as parking spaces, stay
+            same[column] = first.setdefault(key, column)
+    return same
+
+
+def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
+    """Return unique edges between the representative nodes of :func:`first_sections`."""
+    src, dst = -1 - same[-1 - edges.src], -1 - same[-1 - edges.dst]
+    table = np.column_stack([edges.relation.astype(np.int64), src, dst])[src != dst]
+    relation, src, dst = np.unique(table, axis=0).reshape(-1, 3).T
+    return MapEdges(relation.astype(np.int8), src, dst)
+
+
+def _cells(places: Floats) -> Ints:
+    """Return the grid cell numbers of places (N, 2)."""
+    return _numbered(_floor(places / _CELL))
+
+
+def _floor(places: Floats) -> Ints:
+    return np.floor(places).astype(np.int64)
+
+
+def _numbered(cells: Ints) -> Ints:
+    """Return a number for each square (N, 2); a few squares may share a number."""
+    return cells[:, 0] << 32 ^ cells[:, 1]
+
+
+def _rectangles(boxes: Floats) -> Geometries:
+    """Return footprints as polygons; a missing or zero side becomes 0.1 mm long."""
+    half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5])) / 2, 5e-5)
+    heading = np.nan_to_num(boxes[:, 2])
+    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    along = half[:, :1] * np.array([1.0, -1.0, -1.0, 1.0])
+    across = half[:, 1:] * np.array([1.0, 1.0, -1.0, -1.0])
+    x = boxes[:, :1] + cos * along - sin * across
+    y = boxes[:, 1:2] + sin * along + cos * across
+    polygons: Any = shapely.polygons(np.stack((x, y), axis=-1))
+    return polygons
+
+
+# What is in a road map, counted -----------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class MapCount:
+    """Number of parts of a map, of one kind.
+
+    Attributes
+    ----------
+    part : str
+        ``lane``, ``road``, ``junction``, ``crosswalk``, ``signal``, ``controller``, ``object`` or ``warning``.
+    kind : str
+        Type of the lanes, roads or junctions; kind of the signals or objects; text of the warning.
+    count : int
+    length : float or None
+        Total length; m.
+    """
+
+    part: str
+    kind: str
+    count: int
+    length: float | None = None
+
+
+def summary(road_map: RoadMap) -> list[MapCount]:
+    """Summarise a road map: lanes by type, most frequent first, other parts, and warnings last.
+
+    A road with several types counts under each type, with its length of that type.
+    """
+    nodes = road_map.nodes
+    kinds = [KINDS[int(code)] for code in nodes.kind]
+    lanes = [(nodes.lane_type[row], float(nodes.length[row])) for row in _of(kinds, "lane")]
+    junctions = [road_map.junction_types.get(nodes.name[r], "") for r in _of(kinds, "junction")]
+    signals = Counter(kind for kind in kinds if kind in SIGNALS)
+    objects = Counter(kind for kind in kinds if kind in ENTITY_KINDS and kind not in SIGNALS)
+    single = [
+        MapCount("crosswalk", "", kinds.count("crosswalk")),
+        *(MapCount("signal", kind, count) for kind, count in signals.most_common()),
+        MapCount("controller", "", len(road_map.controllers)),
+        *(MapCount("object", kind, count) for kind, count in objects.most_common()),
+    ]
+    return [
+        *_measured("lane", lanes),
+        *_measured("road", _stretches(road_map, kinds)),
+        *(MapCount("junction", kind, count) for kind, count in Counter(junctions).most_common()),
+        *(part for part in single if part.count),
+        *(MapCount("warning", text, count) for text, count in Counter(road_map.warnings).items()),
+    ]
+
+
+def _of(kinds: list[str], kind: str) -> list[int]:
+    return [row for row, found in enumerate(kinds) if found == kind]
+
+
+def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]:
+    """Count the parts and add up their lengths per kind, longest kind first."""
+    count: Counter[str] = Counter()
+    total: defaultdict[str, float] = defaultdict(float)
+    for kind, length in lengths:
+        count[kind] += 1
+        total[kind] += float(np.nan_to_num(length))
+    order = sorted(count, key=lambda kind: (-total[kind], kind))
+    return [MapCount(part, kind, count[kind], total[kind]) for kind in order]
+
+
+def _stretches(road_map: RoadMap, kinds: list[str]) -> Iterable[tuple[str, float]]:
+    """Yield types of roads and their lengths, each type once per road; empty for an unknown type."""
+    nodes = road_map.nodes
+    for row in _of(kinds, "road"):
+        length = float(nodes.length[row])
+        types = road_map.road_types.get(nodes.name[row], ())
+        cuts = [start if 0 <= start <= length else 0.0 for start, _ in types] + [length]
+        held: defaultdict[str, float] = defaultdict(float)
+        for (_, kind), (start, end) in zip(types, pairwise(cuts), strict=True):
+            held[kind] += max(end - start, 0.0)
+        yield from held.items() or [("", length)]

@@ -1,0 +1,368 @@
+"""Lane surfaces, and lanes that cross or merge in junctions.
+
+Ribbons describe lane surfaces independent of the source format.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import shapely
+
+from sgstore.base.columns import chained
+from sgstore.errors import MapError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.model.world import Bools, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Ribbons:
+    """Cross sections of lanes in the direction of travel; lane i has rows ``offsets[i]:offsets[i + 1]``.
+
+    Between two cross sections a lane is the quadrangle of their four ends. A lane has at least two
+    cross sections; they may be in one place. Where a lane jumps, its cross sections jump too.
+
+    Attributes
+    ----------
+    offsets : (L + 1,) int64
+    left_x, left_y, right_x, right_y : (S,) float64
+        Ends of the cross section, to the left and to the right of the direction of travel; m.
+    z : (S,) float64
+        Height; m.
+    heading : (S,) float64
+        Direction of travel of the centre line; rad, not wrapped.
+    s : (S,) float64
+        Place on the reference line of its road; m. Decreases along lanes that run against it.
+    along : (S,) float64
+        Length of the centre line from the lane's start; m.
+    """
+
+    offsets: Ints
+    left_x: Floats
+    left_y: Floats
+    right_x: Floats
+    right_y: Floats
+    z: Floats
+    heading: Floats
+    s: Floats
+    along: Floats
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def followed_by(self, more: Ribbons) -> Ribbons:
+        """Append the ribbons of more lanes."""
+        offsets = np.concatenate((self.offsets, self.offsets[-1] + more.offsets[1:]))
+        return replace(chained([self, more]), offsets=offsets)
+
+    @property
+    def lengths(self) -> Floats:
+        """Return the lengths of the centre lines, (L,); m."""
+        return self.along[self.offsets[1:] - 1]
+
+    @property
+    def lane(self) -> Ints:
+        """Return the lane of each cross section, (S,)."""
+        return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+    @property
+    def bends(self) -> Floats:
+        """Return the turn of the centre line up to the next cross section, (S,); rad.
+
+        0 where the lane jumps, and at its end.
+        """
+        before = np.arange(len(self.along) - 1)
+        first, last, _ = self._turns(before)
+        bend = np.where(_is_smooth(first, last), wrapped(np.diff(self.heading)), 0.0)
+        bend = np.append(bend, 0.0)
+        bend[self.offsets[1:] - 1] = 0.0
+        return bend
+
+    def between(self, lane: Ints, along: Floats, column: Floats) -> Floats:
+        """Interpolate values of cross sections at places on lanes.
+
+        ``lane`` and ``along`` as in :meth:`at`.
+        """
+        before, share = self._place(self.along, np.ones(len(self)), lane, along)
+        return column[before] + share * (column[before + 1] - column[before])
+
+    def height(self, lane: Ints, along: Floats) -> Floats:
+        """Return heights at places on lanes; m."""
+        return self.between(lane, along, self.z)
+
+    def at(self, lane: Ints, along: Floats) -> LanePoints:
+        """Return points of centre lines.
+
+        Parameters
+        ----------
+        lane : (N,) int64
+            Lanes, counted from 0.
+        along : (N,) float64
+            Length of the centre line from the lane's start; m. Places outside the lane are moved to
+            its start or end.
+
+        Notes
+        -----
+        Between cross sections the centre line is the cubic that has their headings.
+        """
+        before, share = self._place(self.along, np.ones(len(self)), lane, along)
+        after = before + 1
+        x, y = (self.left_x + self.right_x) / 2, (self.left_y + self.right_y) / 2
+        first, last, (run_x, run_y) = self._turns(before)
+        # A step across, where the lane jumps, has no bulge.
+        smooth = _is_smooth(first, last)
+        aside = np.where(smooth, share * (1 - share) * (first * (1 - share) - last * share), 0.0)
+        width = np.hypot(self.left_x - self.right_x, self.left_y - self.right_y)
+        bend = wrapped(self.heading[after] - self.heading[before])
+        length = self.along[after] - self.along[before]
+        return LanePoints(
+            lane=np.asarray(lane, np.int64),
+            along=self.along[before] + share * length,
+            s=self.s[before] + share * (self.s[after] - self.s[before]),
+            x=x[before] + share * run_x - aside * run_y,
+            y=y[before] + share * run_y + aside * run_x,
+            z=self.z[before] + share * (self.z[after] - self.z[before]),
+            heading=wrapped(self.heading[before] + share * bend),
+            width=width[before] + share * (width[after] - width[before]),
+            curvature=np.where(smooth & (length > 0), bend / np.where(length > 0, length, 1), 0.0),
+        )
+
+    def _turns(self, before: Ints) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
+        """Return the headings at both ends of pieces relative to their chord, and the chord vectors."""
+        after = before + 1
+        x, y = (self.left_x + self.right_x) / 2, (self.left_y + self.right_y) / 2
+        way = x[after] - x[before], y[after] - y[before]
+        chord = np.arctan2(way[1], way[0])
+        first, last = (wrapped(self.heading[rows] - chord) for rows in (before, after))
+        return first, last, way
+
+    def along_at(self, lane: Ints, s: Floats) -> Floats:
+        """Return lengths of the centre lines up to places ``s`` of their roads, (N,); m."""
+        sign = np.where(self.s[self.offsets[1:] - 1] < self.s[self.offsets[:-1]], -1.0, 1.0)
+        before, share = self._place(self.s, sign, lane, s)
+        return self.along[before] + share * (self.along[before + 1] - self.along[before])
+
+    def _place(
+        self, column: Floats, sign: Floats, lane: Ints, value: Floats
+    ) -> tuple[Ints, Floats]:
+        """Find the cross sections before places, and the share of the way to the next.
+
+        ``column`` rises along lanes where ``sign`` is 1 and falls where it is -1. All lanes are
+        searched at once, laid end to end with gaps of 1 m.
+        """
+        of = self.lane
+        run = (column - column[self.offsets[:-1]][of]) * sign[of]
+        extent = run[self.offsets[1:] - 1]
+        base = np.cumsum(extent + 1.0) - extent
+        into = np.clip((value - column[self.offsets[:-1]][lane]) * sign[lane], 0.0, extent[lane])
+        place = np.searchsorted(run + base[of], into + base[lane], side="right") - 1
+        before = np.clip(place, self.offsets[:-1][lane], self.offsets[1:][lane] - 2)
+        gap = run[before + 1] - run[before]
+        return before, np.clip((into - run[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class LanePoints:
+    """Points of the centre lines of lanes; shape (N,).
+
+    Attributes
+    ----------
+    lane : int64
+        Lane, counted from 0.
+    along, s : float64
+        Length of the centre line from the lane's start, and place on the road's reference line; m.
+    x, y, z : float64
+    heading : float64
+        Direction of travel, in (-π, π]; rad.
+    width : float64
+        Width of the lane; m.
+    curvature : float64
+        Curvature of the centre line, positive to the left: the mean between the neighbouring cross
+        sections; 1/m.
+    """
+
+    lane: Ints
+    along: Floats
+    s: Floats
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    width: Floats
+    curvature: Floats
+
+    def __len__(self) -> int:
+        return len(self.lane)
+
+
+def _is_smooth(first: Floats, last: Floats) -> Bools:
+    """True for pieces without a jump: both headings are within 1 rad of the chord."""
+    return (np.abs(first) < 1) & (np.abs(last) < 1)
+
+
+def wrapped(angle: Floats) -> Floats:
+    """Wrap angles to (-π, π]."""
+    return np.pi - (np.pi - angle) % (2 * np.pi)
+
+
+def waypoints(ribbons: Ribbons, spacing: float) -> LanePoints:
+    """Return points along all centre lines, every ``spacing`` metres from the start of each lane.
+
+    Raises
+    ------
+    ValueError
+        ``spacing`` is not above 0.
+    """
+    if not spacing > 0:
+        raise ValueError(f"spacing is {spacing}; expected a length above 0, in metres")
+    counts = np.floor(ribbons.lengths / spacing + 1e-9).astype(np.int64) + 1
+    lane = np.repeat(np.arange(len(ribbons)), counts)
+    number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
+    return ribbons.at(lane, number.astype(np.float64) * spacing)
+
+
+def mean_widths(ribbons: Ribbons) -> Floats:
+    """Return mean widths along the road, (L,); m."""
+    width = np.hypot(ribbons.left_x - ribbons.right_x, ribbons.left_y - ribbons.right_y)
+    starts = ribbons.offsets[:-1]
+    step = np.abs(np.diff(ribbons.s, append=0.0))
+    step[ribbons.offsets[1:] - 1] = 0.0
+    total = np.add.reduceat(step, starts)
+    weighted = np.add.reduceat(step * (width + np.append(width[1:], 0.0)) / 2, starts)
+    plain = np.add.reduceat(width, starts) / np.diff(ribbons.offsets)
+    return np.where(total > 0, weighted / np.where(total > 0, total, 1.0), plain)
+
+
+def turned(ribbons: Ribbons) -> Floats:
+    """Return the turn of lanes from start to end, positive to the left, (L,); rad, not wrapped."""
+    bend = wrapped(np.diff(ribbons.heading, append=0.0))
+    bend[ribbons.offsets[1:] - 1] = 0.0
+    return np.add.reduceat(bend, ribbons.offsets[:-1])
+
+
+def centre_lines(ribbons: Ribbons) -> NDArray[Any]:
+    """Return shapely lines along the centres of lanes, (L,)."""
+    x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
+    lines: Any = shapely.linestrings(np.column_stack((x, y)), indices=ribbons.lane)
+    return lines
+
+
+def lane_polygons(ribbons: Ribbons) -> NDArray[Any]:
+    """Return shapely polygons of lanes, (L,): along the right border and back along the left."""
+    counts = np.diff(ribbons.offsets)
+    lane = ribbons.lane
+    number = np.arange(len(lane)) - ribbons.offsets[lane]
+    first = 2 * ribbons.offsets[lane] + lane  # each closed ring has one point more
+    points = np.empty((2 * len(lane) + len(counts), 2))
+    points[first + number] = np.column_stack((ribbons.right_x, ribbons.right_y))
+    back = first + 2 * counts[lane] - 1 - number
+    points[back] = np.column_stack((ribbons.left_x, ribbons.left_y))
+    start = 2 * ribbons.offsets[:-1] + np.arange(len(counts))
+    points[start + 2 * counts] = points[start]
+    ring = np.repeat(np.arange(len(counts)), 2 * counts + 1)
+    polygons: Any = shapely.polygons(shapely.linearrings(points, indices=ring))
+    return polygons
+
+
+# Lanes through junctions that cross or merge ----------------------------------------------------
+
+SAME_PLACE: Final = 0.5
+"""Ends of lanes this close, in about the same direction, are one place; m."""
+MOST_PAIRS: Final = 2_000_000
+"""Greatest number of compared pairs of lanes: a junction of 200 lanes has 20,000."""
+
+
+def conflicts(
+    ribbons: Ribbons, lanes: Ints, junction: Sequence[str], flow: tuple[Ints, Ints], storey: float
+) -> tuple[Ints, Ints]:
+    """Return pairs of lanes of a junction that cross or merge, each once, the lower lane first.
+
+    Lanes cross if the interiors of their centre lines meet. They merge if both flow into one lane
+    or end in one place. Lanes that start in one place do not conflict, however long they overlap.
+    Lanes on different storeys do not conflict either.
+
+    Parameters
+    ----------
+    ribbons : Ribbons
+    lanes : (n,) int64
+        Lanes of traffic in junctions.
+    junction : sequence of str
+        The junction of every lane of the map.
+    flow : (m,) int64 twice
+        Pairs of lanes (from, to) of the traffic flow.
+    storey : float
+        Least difference of height between lanes on different storeys; m.
+
+    Raises
+    ------
+    MapError
+        The lanes make more than :data:`MOST_PAIRS` pairs.
+    """
+    one, other = _pairs(lanes, junction)
+    lines = centre_lines(ribbons)
+    merge = _share(flow[0], flow[1], one, other) | _together(ribbons, one, other, at_end=True)
+    part = _share(flow[1], flow[0], one, other) | _together(ribbons, one, other, at_end=False)
+    cross: Any = shapely.crosses(lines[one], lines[other])
+    rows = np.flatnonzero(merge | (cross & ~part))
+    one, other = one[rows], other[rows]
+    level = np.abs(_heights(ribbons, lines, one, other)) <= storey
+    return one[level], other[level]
+
+
+def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
+    """Return all pairs of lanes of one junction, the lower lane first."""
+    names: dict[str, int] = {}
+    for name in junction:
+        names.setdefault(name, len(names))
+    group = np.array([names[name] for name in junction], np.int64)[lanes]
+    order = np.lexsort((lanes, group))
+    lanes, group = lanes[order], group[order]
+    later = np.searchsorted(group, group, side="right") - np.arange(len(group)) - 1
+    if later.sum() > MOST_PAIRS:
+        reason = f"{later.sum():,} pairs of lanes in junctions; there may be {MOST_PAIRS:,}"
+        raise MapError(reason, element="junction")
+    first = np.repeat(np.arange(len(lanes)), later)
+    second = first + 1 + np.arange(len(first)) - (np.cumsum(later) - later)[first]
+    return lanes[first], lanes[second]
+
+
+def _share(src: Ints, dst: Ints, one: Ints, other: Ints) -> Bools:
+    """Return a mask of the pairs of lanes with a common successor in ``src → dst``."""
+    after: dict[int, set[int]] = {}
+    for lane, onward in zip(src.tolist(), dst.tolist(), strict=True):
+        after.setdefault(lane, set()).add(onward)
+    nothing: set[int] = set()
+    return np.array(
+        [
+            not after.get(a, nothing).isdisjoint(after.get(b, nothing))
+            for a, b in zip(one.tolist(), other.tolist(), strict=True)
+        ],
+        np.bool_,
+    )
+
+
+def _together(ribbons: Ribbons, one: Ints, other: Ints, *, at_end: bool) -> Bools:
+    place = ribbons.offsets[1:] - 1 if at_end else ribbons.offsets[:-1]
+    a, b = place[one], place[other]
+    x, y = ribbons.left_x + ribbons.right_x, ribbons.left_y + ribbons.right_y
+    distance = np.hypot(x[a] - x[b], y[a] - y[b]) / 2
+    turn = np.abs(wrapped(ribbons.heading[a] - ribbons.heading[b]))
+    return (distance < SAME_PLACE) & (turn < np.pi / 4)
+
+
+def _heights(ribbons: Ribbons, lines: Any, one: Ints, other: Ints) -> Floats:
+    """Return the height of the first lane of a pair above the second, where they are closest."""
+    shortest: Any = shapely.shortest_line(lines[one], lines[other])
+    heights: list[Floats] = []
+    for lanes, end in ((one, 0), (other, -1)):
+        point = shapely.get_point(shortest, end)
+        along: Any = shapely.line_locate_point(lines[lanes], point)
+        heights.append(ribbons.at(lanes, along).z)
+    return heights[0] - heights[1]

@@ -1,0 +1,325 @@
+"""Reader of SUMO networks (``.net.xml``), which converts them to text of plain lanes.
+
+A lane is a line with a width; lane 0 of an edge is its rightmost. Lanes inside a junction
+(``:J0_1_0``) are lanes of that junction. Crossings become crosswalks; walking areas are skipped.
+The links of a traffic light apply to the lanes through the junction. Links with the same state in
+all phases are one signal. Its name is the name of the traffic light, and with several signals also
+the number of its first link (``J/3``). Coordinates are those of the network, as in all outputs of
+SUMO.
+
+Source: SUMO documentation, "SUMO Road Networks" (Eclipse, EPL-2.0).
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.base.markup import MarkupError, MarkupParser
+from sgstore.errors import MapError
+from sgstore.maps.roads import (
+    END,
+    MAX_LANES,
+    MAX_NAME,
+    MAX_POINTS,
+    START,
+    Border,
+    Joint,
+    LaneLine,
+    PlainCrosswalk,
+    PlainSignal,
+    about_lanes,
+    cross_sections,
+    lane_text,
+    plain_lanes,
+    run_of,
+    thinned,
+)
+
+if TYPE_CHECKING:
+    from sgstore.maps.roads import Sections
+    from sgstore.model.world import Floats
+
+MAX_ELEMENTS: Final = 8_000_000
+WIDTH: Final = 3.2
+"""Default width of a lane; m. (SUMO's default.)"""
+CROSSING_WIDTH: Final = 4.0
+_ALONE: Final = (
+    ({"pedestrian", "wheelchair"}, "sidewalk"),
+    ({"bicycle", "scooter"}, "biking"),
+    ({"tram"}, "tram"),
+    ({"rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car"}, "rail"),
+    ({"bus", "coach", "taxi", "emergency", "authority"}, "bus"),
+)
+"""Classes of vehicles, and the lane type for these and all previous classes only."""
+_NONE: Final = "all"
+_LOOKED_AT: Final = 1 << 16
+_APART: Final = 1.0
+"""Greatest gap between neighbouring lanes, in addition to their widths; m."""
+
+
+@dataclass(slots=True)
+class _SumoEdge:
+    ident: str
+    function: str
+    source: str
+    target: str
+    lanes: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
+
+
+@dataclass(slots=True)
+class _SumoNet:
+    """Content of a network: edges, connections, positions of junctions, opposite lanes."""
+
+    edges: list[_SumoEdge] = field(default_factory=list[_SumoEdge])
+    connections: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
+    junctions: dict[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
+    phases: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
+    """States of the links of each traffic light, in all phases of all programs."""
+    roundabouts: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
+    beside: dict[str, str] = field(default_factory=dict[str, str])
+    """Lane → its left neighbour with the opposite direction."""
+    depth: int = 0
+    logic: str = ""
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        """Handle the start of an element."""
+        self.depth += 1
+        if self.depth == 1 and tag != "net":
+            raise MapError(f"the root element is <{tag[:80]}>, expected <net>")
+        if self.depth == 2 and tag == "edge":
+            told = (attributes.get(key, "") for key in ("id", "function", "from", "to"))
+            ident, function, source, target = told
+            self.edges.append(_SumoEdge(ident, function, source, target))
+        elif self.depth == 2 and tag == "connection":
+            self.connections.append(attributes)
+        elif self.depth == 2 and tag == "roundabout":
+            self.roundabouts.append(attributes)
+        elif self.depth == 2 and tag == "junction":
+            place = attributes.get("x", ""), attributes.get("y", "")
+            self.junctions[attributes.get("id", "")] = place
+        elif self.depth == 2 and tag == "tlLogic":
+            self.logic = attributes.get("id", "")
+        elif self.depth == 3 and tag == "phase":
+            self.phases.setdefault(self.logic, []).append(attributes.get("state", ""))
+        elif self.depth == 3 and tag == "lane" and self.edges:
+            self.edges[-1].lanes.append(attributes)
+        elif self.depth == 4 and tag == "neigh" and self.edges and self.edges[-1].lanes:
+            self.beside[self.edges[-1].lanes[-1].get("id", "")] = attributes.get("lane", "")
+
+    def end(self, _tag: str) -> None:
+        """Handle the end of an element."""
+        self.depth -= 1
+
+
+def is_sumo_net(text: str) -> bool:
+    """True if a text is a SUMO network, by its first elements."""
+    start = text[:_LOOKED_AT]
+    return "<net " in start and ("<location " in start or "<edge " in start)
+
+
+def sumo_net_text(text: str) -> str:
+    """Convert a SUMO network to the text of plain lanes (:func:`sgstore.maps.roads.lane_text`).
+
+    Raises
+    ------
+    MapError
+        The text is not XML or not a network, exceeds a limit, or has no usable lane.
+    """
+    net = _SumoNet()
+    try:
+        MarkupParser(net.start, net.end, most=MAX_ELEMENTS).feed(text, last=True)
+    except MarkupError as error:
+        raise MapError(str(error), element=error.element or None) from error
+    broken: list[str] = []
+    lines, crosswalks = _lines(net, broken)
+    if not lines:
+        raise MapError("a network of SUMO without lanes", element="net")
+    lanes, warnings = plain_lanes(_joined(net, lines))
+    if broken:
+        warnings.insert(0, about_lanes(broken, "its shape is no line: left out"))
+    row_of = {lane.name: row for row, lane in enumerate(lanes)}
+    return lane_text(lanes, warnings, _lights(net, lines, row_of), crosswalks)
+
+
+def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[PlainCrosswalk]]:
+    """Return lanes by their ids, and crosswalks."""
+    lines: dict[str, LaneLine] = {}
+    crosswalks: list[PlainCrosswalk] = []
+    points = 0
+    around = _around(net)
+    for edge in net.edges:
+        if edge.function in {"walkingarea", "connector"}:
+            continue
+        inside = edge.ident.startswith(":")
+        for lane in edge.lanes:
+            ident = lane.get("id", "")
+            crossing = edge.function == "crossing"
+            centre = _shape(lane.get("shape", ""))
+            points += len(centre)
+            if points > MAX_POINTS:
+                raise MapError(f"lanes of more than {MAX_POINTS:,} points", element="lane")
+            width = _number(lane.get("width", ""), CROSSING_WIDTH if crossing else WIDTH)
+            if not ident or len(ident) > MAX_NAME or len(centre) < 2 or not 0 < width < 1000:
+                broken.append(ident or edge.ident)
+                continue
+            sections, _ = cross_sections(centre, [], [], width / 2)
+            if crossing:
+                crosswalks.append(_crosswalk(ident, sections))
+                continue
+            index = int(_number(lane.get("index", ""), 0.0))
+            junction = edge.ident[1:].rpartition("_")[0] if inside else ""
+            lines[ident] = LaneLine(
+                ident,
+                _type(lane),
+                centre,
+                sections=sections,
+                lefts=(_side(sections, left=True),),
+                rights=(_side(sections, left=False),),
+                road=edge.ident,
+                number=index + 1,
+                junction=junction,
+                speed_limit=_speed(lane),
+                roundabout=around.get(("node", junction) if inside else ("edge", edge.ident), ""),
+            )
+        _set_beside(net, edge, lines)
+    if len(lines) > MAX_LANES:
+        raise MapError(f"{len(lines):,} lanes; a map may have {MAX_LANES:,}", element="lane")
+    return _with_opposites(net, lines), crosswalks
+
+
+def _around(net: _SumoNet) -> dict[tuple[str, str], str]:
+    """Map nodes and edges of roundabouts to a name: the id of the first node."""
+    found: dict[tuple[str, str], str] = {}
+    for one in net.roundabouts:
+        nodes = one.get("nodes", "").split()
+        for what, names in (("node", nodes), ("edge", one.get("edges", "").split())):
+            found |= {(what, name): nodes[0][:MAX_NAME] for name in names if nodes}
+    return found
+
+
+def _crosswalk(ident: str, sections: Sections) -> PlainCrosswalk:
+    outline = np.concatenate((sections.right, sections.left[::-1]))
+    return PlainCrosswalk(ident, outline, float(sections.z.mean()))
+
+
+def _side(sections: Sections, *, left: bool) -> Border:
+    """Return a border that allows lane changes in both directions, as on SUMO edges."""
+    line = sections.left if left else sections.right
+    return Border(np.column_stack((line, sections.z)), to_left=True, to_right=True)
+
+
+def _set_beside(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> None:
+    """Register the lanes of an edge as neighbours; the next index is on the left."""
+    idents = [lane.get("id", "") for lane in edge.lanes]
+    for right, left in pairwise(idents):
+        if right in lines and left in lines:
+            lines[right] = replace(lines[right], left_beside=(left,))
+    for ident in idents:
+        other = net.beside.get(ident)
+        if ident in lines and other:
+            lines[ident] = replace(lines[ident], left_beside=(*lines[ident].left_beside, other))
+
+
+def _with_opposites(net: _SumoNet, lines: dict[str, LaneLine]) -> dict[str, LaneLine]:
+    """Register the leftmost lanes of opposite edges as neighbours, if they touch."""
+    back: dict[tuple[str, str], list[_SumoEdge]] = defaultdict(list)
+    for edge in net.edges:
+        if not edge.function and edge.lanes:
+            back[edge.source, edge.target].append(edge)
+    for (source, target), edges in back.items():
+        others = back.get((target, source), []) if source < target else []
+        if len(edges) != 1 or len(others) != 1:
+            continue
+        one, other = (e[0].lanes[-1].get("id", "") for e in (edges, others))
+        if one in lines and other in lines and _side_by_side(lines[one], lines[other]):
+            beside = (*lines[one].left_beside, other)
+            lines[one] = replace(lines[one], left_beside=tuple(dict.fromkeys(beside)))
+    return lines
+
+
+def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
+    """True if lanes of opposite directions touch at both ends."""
+    if one.sections is None or other.sections is None:
+        return False
+    gaps = one.sections.left[[0, -1]] - other.sections.left[[-1, 0]]
+    return bool((np.hypot(*gaps.T) < _APART).all())
+
+
+def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
+    """Add predecessors and successors to lanes, through the junction if it has lanes."""
+    after: dict[str, list[Joint]] = defaultdict(list)
+    before: dict[str, list[Joint]] = defaultdict(list)
+    for told in net.connections:
+        src = f"{told.get('from')}_{told.get('fromLane')}"
+        via, end = told.get("via", ""), f"{told.get('to')}_{told.get('toLane')}"
+        dst = via if via in lines else end
+        if src in lines and dst in lines:
+            after[src].append(Joint(dst, START))
+            before[dst].append(Joint(src, END))
+    return [
+        replace(line, before=tuple(before[ident]), after=tuple(after[ident]))
+        for ident, line in lines.items()
+    ]
+
+
+def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -> list[PlainSignal]:
+    """Return traffic lights, one for all lanes of a junction with the same link states."""
+    links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
+    for told in net.connections:
+        name, number = told.get("tl", ""), told.get("linkIndex", "0")
+        through = told.get("via") or f"{told.get('from')}_{told.get('fromLane')}"
+        if name and len(name) <= MAX_NAME and through in row_of and number.isdecimal():
+            link = int(number)
+            shown = tuple(state[link : link + 1] for state in net.phases.get(name, ()))
+            links[name].setdefault(shown, {})[link] = through
+    signals: list[PlainSignal] = []
+    for name, groups in links.items():
+        for lanes in groups.values():
+            begins = np.array([lines[lane].centre[0] for lane in lanes.values()])
+            x, y, z = begins.mean(axis=0).tolist()
+            own = name if len(groups) == 1 else f"{name}/{min(lanes)}"
+            rows = tuple(sorted({row_of[lane] for lane in lanes.values()}))
+            signals.append(PlainSignal(own, "traffic_light", x, y, z, lanes=rows))
+    return signals
+
+
+def _type(lane: dict[str, str]) -> str:
+    """Return the type of a lane by its permitted vehicle classes."""
+    allowed = {*lane.get("allow", "").split()}
+    if not allowed and _NONE in lane.get("disallow", "").split():
+        return "none"
+    seen: set[str] = set()
+    for classes, kind in _ALONE:
+        seen |= classes
+        if allowed and allowed <= seen:
+            return kind
+    return "entry" if lane.get("acceleration") in {"1", "true"} else "driving"
+
+
+def _shape(text: str) -> Floats:
+    """Parse the points (n, 3) of a line; empty for an invalid line."""
+    try:
+        points = [[float(number) for number in point.split(",")] for point in text.split()]
+        line = np.array([(*point, 0.0)[:3] for point in points], np.float64).reshape(-1, 3)
+    except ValueError:
+        return np.zeros((0, 3))
+    line = thinned(line)
+    usable = len(line) > 1 and bool((np.abs(line) < 1e8).all()) and run_of(line)[-1] > 0
+    return line if usable else np.zeros((0, 3))
+
+
+def _speed(lane: dict[str, str]) -> float:
+    speed = _number(lane.get("speed", ""), np.nan)
+    return speed if 0 < speed < 1000 else np.nan
+
+
+def _number(text: str, otherwise: float) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return otherwise

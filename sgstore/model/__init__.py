@@ -1,0 +1,1 @@
+"""The data model: states of the world, scene graphs, vocabulary, settings, numbers of pairs."""

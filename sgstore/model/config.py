@@ -1,0 +1,927 @@
+"""Settings of the scene graph generator: defaults, presets, validation, and TOML input and output.
+
+Every setting has a comment. ``sgstore config`` and ``docs/parameters.md`` print it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any, Final, TypeVar, get_args, get_origin, get_type_hints
+
+from sgstore.base import plugins
+from sgstore.errors import ConfigError
+from sgstore.model.vocabulary import (
+    DIRECTIONS,
+    ENTITY_KINDS,
+    LANE_TYPES,
+    MAP_ONLY,
+    OWN_RELATIONS,
+    PROXIMITY,
+    RELATIONS,
+    SIGNALS,
+    TypeMeaning,
+    add_kind,
+    add_relation,
+    kinds_labelled,
+    labels,
+    normalize_name,
+    relation_named,
+    suggestion,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+COMMENT: Final = "comment"
+"""Metadata key of a setting's comment."""
+
+SHAPES: Final = ("radius", "rectangle", "polygon", "corridor")
+EXTENTS: Final = ("footprint", "centre")
+GRANULARITIES: Final = ("none", "lane", "waypoint")
+MEASURES: Final = ("centres", "origins", "footprints")
+SIDES: Final = ("open", "closed", "none")
+TIES: Final = ("ahead", "both", "carlasgg")
+JOINS: Final = ("nearest", "latest")
+ORIENTATIONS: Final = ("asam", "carla")
+ALL_EGOS: Final = "all"
+
+OF_LABELS: Final = (
+    "only related pairs of these labels, in either order: [['Ego', 'Vehicle']]; empty: all"
+)
+
+MOST_CORNERS: Final = 64
+MOST_LENGTH: Final = 100_000.0
+"""Largest length of a range; m. No map is larger, and numbers stay exact."""
+
+_WORD: Final = re.compile(r"[a-z0-9][a-z0-9_]{0,39}|")
+
+T = TypeVar("T")
+
+
+def setting(default: T, comment: str) -> T:
+    """Return a dataclass field for a setting, with its default and its comment."""
+    plain: Any = default
+    metadata = {COMMENT: comment}
+    if isinstance(default, dict):
+        return field(default_factory=dict, metadata=metadata)  # pyright: ignore[reportReturnType]
+    return field(default=plain, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class RangeSettings:
+    """Settings of the area around the ego that the graph covers."""
+
+    radius: float = setting(50.0, "shape 'radius': how far from the ego's centre; m")
+    shape: str = setting(
+        "radius",
+        "'radius': a circle around the ego's centre; 'rectangle' and 'polygon': in the ego's axes; 'corridor': "
+        "along the lanes ahead of the ego (straight ahead where it is in no driving lane)",
+    )
+    front: float = setting(50.0, "shape 'rectangle': how far ahead of the ego's centre; m")
+    rear: float = setting(25.0, "shape 'rectangle': how far behind it; m")
+    side: float = setting(25.0, "shape 'rectangle': how far to each side; m")
+    polygon: tuple[tuple[float, ...], ...] = setting(
+        (), "shape 'polygon': its corners, [ahead, to the left] of the ego's centre; m"
+    )
+    width: float = setting(10.0, "shape 'corridor': from side to side, across the lane's centre; m")
+    length: float = setting(100.0, "shape 'corridor': how far along the lanes, through forks; m")
+    by: str = setting(
+        "footprint",
+        "what of an entity must be in range: 'footprint': any part of it; 'centre': its centre",
+    )
+    static_by: str = setting(
+        "footprint", "likewise for entities that never move; parts of a map count by their shape"
+    )
+    height: tuple[float, ...] = setting(
+        (),
+        "[lowest, highest]: how far below or above the ground under the ego the ground under an entity, and "
+        "the road, may be (storeys); signals may hang up to 6 m above it; m. Empty: at any height",
+    )
+    grade: float = setting(
+        0.0, "with height: what rises or falls by less than this for each metre away counts too"
+    )
+    height_of_entities: bool = setting(
+        default=True, comment="whether height holds for entities, too, or only for parts of the map"
+    )
+    world: float = setting(
+        200.0,
+        "how far from the ego's centre entities are known beyond its graph: states and places in lanes, no "
+        "edges; m. 0: the graph alone; inf: all of the recording",
+    )
+
+    def __post_init__(self) -> None:
+        check(self.shape in SHAPES, "range.shape", self.shape, one_of(SHAPES))
+        for name in ("radius", "width", "length"):
+            value = getattr(self, name)
+            _check_length(value > 0, f"range.{name}", value, "a length above 0, in metres")
+        check(
+            self.world >= 0, "range.world", self.world, "a length of 0 or more, in metres, or inf"
+        )
+        object.__setattr__(
+            self, "world", min(self.world, MOST_LENGTH)
+        )  # beyond it there is nothing
+        for name in ("front", "rear", "side"):
+            value = getattr(self, name)
+            _check_length(value >= 0, f"range.{name}", value, "a length of 0 or more, in metres")
+        if self.shape == "rectangle":
+            area = (self.front + self.rear) * self.side
+            check(area > 0, "range", (self.front, self.rear, self.side), "a rectangle with an area")
+        check(self.by in EXTENTS, "range.by", self.by, one_of(EXTENTS))
+        check(self.static_by in EXTENTS, "range.static_by", self.static_by, one_of(EXTENTS))
+        check(0 <= self.grade < math.inf, "range.grade", self.grade, "0 or more")
+        band = not self.height or (len(self.height) == 2 and self.height[0] <= self.height[1])
+        finite = all(map(math.isfinite, self.height))
+        check(band and finite, "range.height", self.height, "nothing, or [lowest, highest]")
+        if self.polygon or self.shape == "polygon":
+            check_polygon("range.polygon", self.polygon)
+
+    def beyond(self) -> RangeSettings | None:
+        """Circle of the known data outside the graphs. ``None`` means no such data."""
+        return replace(self, shape="radius", radius=self.world) if self.world else None
+
+    @property
+    def boundless(self) -> bool:
+        """True if the known data cover the whole recording."""
+        return self.world >= MOST_LENGTH
+
+
+@dataclass(frozen=True, slots=True)
+class LaneSettings:
+    """Settings of the map elements in a graph, and of the relations between lanes."""
+
+    ahead: float = setting(
+        100.0,
+        "how far along the lanes the next one ahead is looked for ('leads'), and how far upstream of a signal "
+        "lanes may be affected by it ('mayAffect'); m. 0: neither, so that nothing is known of them",
+    )
+    granularity: str = setting(
+        "lane",
+        "'none': no lanes, roads, junctions, crosswalks; 'lane': these; 'waypoint': points of lanes, too",
+    )
+    spacing: float = setting(1.0, "granularity 'waypoint': from point to point along a lane; m")
+    types: tuple[str, ...] = setting(
+        (),
+        "types of lanes that are kept, as OpenDRIVE has them ('driving', 'sidewalk', …); empty: all",
+    )
+    sections: bool = setting(
+        default=True,
+        comment="whether each section of a road has lanes of its own ('12/0/-1'); otherwise the lanes of a "
+        "number are one node ('12_-1'), as CARLASGG has it",
+    )
+
+    def __post_init__(self) -> None:
+        known = 0 <= self.ahead <= MOST_LENGTH
+        check(known, "lanes.ahead", self.ahead, "a length of 0 or more, in metres")
+        right = self.granularity in GRANULARITIES
+        check(right, "lanes.granularity", self.granularity, one_of(GRANULARITIES))
+        for name in self.types:
+            if name.lower() not in {known.lower() for known in LANE_TYPES}:
+                _check_name("lanes.types", name, LANE_TYPES)
+        right = 0.1 <= self.spacing <= MOST_LENGTH
+        check(right, "lanes.spacing", self.spacing, "a length of 0.1 or more, in metres")
+
+
+@dataclass(frozen=True, slots=True)
+class Proximity:
+    """Distance relations. The first one with an upper bound at or above the distance holds."""
+
+    names: tuple[str, ...] = setting(
+        PROXIMITY,
+        "relations from the nearest to the farthest, by these names or others; empty: none",
+    )
+    upper: tuple[float, ...] = setting(
+        (2.0, 4.0, 7.0, 10.0, 16.0, 25.0),
+        "their upper bounds, included; m. Each begins where that before it ends",
+    )
+    between: str = setting(
+        "centres",
+        "'centres' of the boxes, in space; 'origins': what CARLA takes for the place of an entity "
+        "(a vehicle's is on the ground); 'footprints': the gap between them, in the plane. "
+        "[pairs] has the same distance",
+    )
+    kinds: tuple[tuple[str, ...], ...] = setting((), OF_LABELS)
+
+    def __post_init__(self) -> None:
+        check_pairs("proximity.kinds", self.kinds)
+        check_steps("proximity", self.names, self.upper, PROXIMITY, len(self.names))
+        check(self.between in MEASURES, "proximity.between", self.between, one_of(MEASURES))
+
+
+@dataclass(frozen=True, slots=True)
+class Direction:
+    """Angular relations.
+
+    The first one with an upper bound at or above the absolute bearing holds; else the last.
+    """
+
+    names: tuple[str, ...] = setting(
+        DIRECTIONS, "relations from ahead to behind, by these names or others; empty: none"
+    )
+    upper: tuple[float, ...] = setting(
+        (45.0, 90.0, 135.0), "upper bounds of all but the last, included; degrees"
+    )
+    ties: str = setting(
+        "ahead",
+        "what holds exactly on a bound: 'ahead': the relation nearer to dead ahead; 'both' (RoadScene2Vec); "
+        "'carlasgg': its order: 45° and 90° to the left nearer ahead, 135° and 90° to the right nearer behind",
+    )
+    sides: str = setting(
+        "open",
+        "toLeftOf and toRightOf: 'open': what is dead ahead or dead behind is neither; 'closed': it is to the "
+        "left (CARLASGG); 'none': no such relations among entities",
+    )
+    within: float = setting(
+        0.0, "up to this distance, as [proximity] measures it; m. 0: as far as pairs are related"
+    )
+    kinds: tuple[tuple[str, ...], ...] = setting((), OF_LABELS)
+
+    def __post_init__(self) -> None:
+        check_pairs("direction.kinds", self.kinds)
+        _check_length(self.within >= 0, "direction.within", self.within, "a length of 0 or more")
+        check_steps("direction", self.names, self.upper, DIRECTIONS, max(len(self.names) - 1, 0))
+        within = all(bound < 180 for bound in self.upper)
+        check(within, "direction.upper", self.upper, "bounds below 180, in degrees")
+        check(self.ties in TIES, "direction.ties", self.ties, one_of(TIES))
+        check(self.sides in SIDES, "direction.sides", self.sides, one_of(SIDES))
+
+
+@dataclass(frozen=True, slots=True)
+class PairSettings:
+    """Settings of the pairs of entities that can have relations."""
+
+    within: float = setting(
+        25.0, "all entities that move, up to this distance from one another; m. 0: none"
+    )
+    ego: bool = setting(default=True, comment="the ego with everything in range")
+    static: bool = setting(
+        default=False,
+        comment="entities that never move with one another too, up to the same distance",
+    )
+    ego_within: float = setting(
+        0.0, "up to which distance from the ego; m. 0: whatever the distance"
+    )
+    kinds: tuple[tuple[str, ...], ...] = setting(
+        (),
+        "only pairs of these labels, in either order: [['Ego', 'Vehicle'], ['Person', 'Car']]; empty: all",
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("within", "ego_within"):
+            value = getattr(self, name)
+            _check_length(value >= 0, f"pairs.{name}", value, "a length of 0 or more, in metres")
+        check_pairs("pairs.kinds", self.kinds)
+
+
+@dataclass(frozen=True, slots=True)
+class Payloads:
+    """Settings of the join of sensor messages to frames."""
+
+    join: str = setting("nearest", "'nearest' in log time, or 'latest' at or before the frame")
+    tolerance: float = setting(
+        0.0,
+        "greatest difference of log times; s. 0: half the median period of the channel, or of the frames if "
+        "that is longer ('nearest'), the whole of it ('latest')",
+    )
+
+    def __post_init__(self) -> None:
+        check(self.join in JOINS, "payloads.join", self.join, one_of(JOINS))
+        waits = 0 <= self.tolerance < math.inf
+        check(waits, "payloads.tolerance", self.tolerance, "0 or more seconds")
+
+
+@dataclass(frozen=True, slots=True)
+class Signs:
+    """Settings for reading the signals of a road map."""
+
+    kinds: tuple[tuple[str, str], ...] = ()
+    """Signal type codes in lower case, with their configured kinds."""
+    orientation: str = "asam"
+    """One of :data:`ORIENTATIONS`: meaning of the orientation of a signal without validity."""
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Config:
+    """All settings of a scene graph generator.
+
+    Equal configs give equal graphs. The comment of each field, ``docs/parameters.md`` and ``sgstore config``
+    explain the settings.
+    """
+
+    range: RangeSettings = field(default_factory=RangeSettings)
+    proximity: Proximity = field(default_factory=Proximity)
+    direction: Direction = field(default_factory=Direction)
+    pairs: PairSettings = field(default_factory=PairSettings)
+    lanes: LaneSettings = field(default_factory=LaneSettings)
+    payloads: Payloads = field(default_factory=Payloads)
+    ego: str = setting("", "the simulator's id, role or name of the ego; empty: as the trace says")
+    mapping: str = setting(
+        "",
+        "what the boxes of a Foxglove scene are: a mapping that is shipped ('nuscenes2mcap') or the path of a "
+        "TOML file; empty: the shipped one that fits. Other recordings need none",
+    )
+    sees: bool = setting(
+        default=True,
+        comment="whether it is computed what the ego sees; otherwise nothing is known of it",
+    )
+    egos: tuple[str, ...] = setting(
+        (),
+        "several egos, each with graphs of its own: their ids, roles or names; ['all']: every vehicle",
+    )
+    rate: float = setting(
+        0.0,
+        "frames kept for each second of the trace's clock: the first frame at or after each step of 1/rate. "
+        "0: all frames",
+    )
+    kinds: tuple[str, ...] = setting(
+        (),
+        "labels of what is kept: entities ('Vehicle', 'Person', 'Signal') and parts of the map ('Lane'); the "
+        "ego always is. What is not kept is as if it were not there. Empty: everything",
+    )
+    exclude_ids: tuple[str, ...] = setting(
+        (),
+        "entities that are left out, as if they were not there: the simulator's ids, or roles or names of "
+        "vehicles as for ego; an ego never is",
+    )
+    without: tuple[str, ...] = setting(
+        (),
+        "relations that are not computed, so that nothing is known of them: ['overlaps', 'follows']",
+    )
+    orientation: str = setting(
+        "asam",
+        "whom a signal of an OpenDRIVE map applies to that has no <validity>: 'asam': traffic in the "
+        "direction of its orientation along the road, as the standard says; 'carla': the lanes to the left "
+        "of the road's line where it is '+', to the right where it is '-'. Where the place of signals "
+        "contradicts, that is said",
+    )
+    new_kinds: tuple[str, ...] = setting((), "kinds of your own, for types to name: ['scooter']")
+    types: Mapping[str, TypeMeaning] = setting(
+        {},
+        "type names of the simulator, and type codes of the map's signals ('206'), without regard to case -> "
+        "what they mean: kind, special kind and subkind, before what sgstore knows of them:\n"
+        '"vehicle.acme.patrol" = { kind = "car", special = "emergency" }',
+    )
+    relations: Mapping[str, Mapping[str, Any]] = setting(
+        {},
+        "settings of relations of other packages, a table for each:\n[relations.besides]\nreach = 3.0",
+    )
+
+    def __post_init__(self) -> None:
+        check(not (self.ego and self.egos), "egos", self.egos, "either ego or egos, not both")
+        check(len(set(self.egos)) == len(self.egos), "egos", self.egos, "each ego once")
+        check(all(self.egos), "egos", self.egos, "ids, roles or names")
+        alone = ALL_EGOS not in self.egos or len(self.egos) == 1
+        check(alone, "egos", self.egos, f"'{ALL_EGOS}' alone, or a list of egos")
+        for kind in self.new_kinds:
+            _make_known("new_kinds", add_kind, kind)
+        check(all(self.exclude_ids), "exclude_ids", self.exclude_ids, "ids, roles or names")
+        check(0 <= self.rate <= 1e6, "rate", self.rate, "0 or more frames per second")
+        check_labels("kinds", self.kinds, ego=False)
+        both = set(self.proximity.names) & set(self.direction.names)
+        check(not both, "direction.names", self.direction.names, "other names than proximity.names")
+        for name in self.without:
+            relation_named(name)  # those of other packages are looked for
+            _check_name("without", name, [r for r in RELATIONS if r not in MAP_ONLY])
+        right = one_of(ORIENTATIONS)
+        check(self.orientation in ORIENTATIONS, "orientation", self.orientation, right)
+        object.__setattr__(self, "types", _checked_types(self.types))
+        object.__setattr__(self, "relations", _checked_relations(self.relations))
+
+    def __hash__(self) -> int:
+        return hash(repr(self))
+
+    @property
+    def signs(self) -> Signs:
+        """Settings for reading the signals of a road map with :func:`sgstore.maps.opendrive.read_map`."""
+        kinds = tuple((name, of.kind) for name, of in self.types.items() if of.kind in SIGNALS)
+        return Signs(kinds, self.orientation)
+
+    @property
+    def notes(self) -> list[str]:
+        """Return notes on user-defined relation names that resemble a built-in name, perhaps by mistake."""
+        return [
+            f"setting '{table}.names': {name!r} is a relation of your own; did you mean {like!r}?"
+            for table, known in (("proximity", PROXIMITY), ("direction", DIRECTIONS))
+            for name in getattr(self, table).names
+            if name not in known and (like := suggestion(name, known, alike=0.8))
+        ]
+
+    def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
+        """Return the counts of the type names without a mapping."""
+        return {name: n for name, n in types.items() if name.lower() not in self.types}
+
+    def __repr__(self) -> str:
+        """Return the settings that differ from the defaults: ``Config(range.radius=30.0)``."""
+        told = list[str]()
+        for name, default in Config().as_dict().items():
+            value = self.as_dict()[name]
+            if not isinstance(default, dict) or not default:
+                told += [f"{name}={value!r}"] * (value != default)
+            else:
+                told += [f"{name}.{k}={value[k]!r}" for k in default if value[k] != default[k]]
+        return f"Config({', '.join(told)})"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as plain values, as in TOML and JSON."""
+        return asdict(self)
+
+
+def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: FBT001
+    """Raise an error with the expected value if a setting is invalid.
+
+    Raises
+    ------
+    ConfigError
+        The message names the setting, its value, and the expected value.
+    """
+    if not holds:
+        raise ConfigError(f"setting '{name}' is {value!r}; expected {right}")
+
+
+def one_of(words: Iterable[str]) -> str:
+    """Format words as ``'a', 'b' or 'c'``."""
+    *most, last = (f"'{word}'" for word in words)
+    return f"{', '.join(most)} or {last}"
+
+
+def _make_known(name: str, add: Callable[[str], int], new: str) -> None:
+    try:
+        add(new)
+    except ValueError as error:
+        raise ConfigError(f"setting '{name}': {error}") from None
+
+
+def check_steps(
+    name: str, names: tuple[str, ...], upper: tuple[float, ...], known: tuple[str, ...], bounds: int
+) -> None:
+    """Reject relation names that are reserved or repeated, and bounds that do not ascend.
+
+    New names are registered in this process.
+    """
+    for relation in names:
+        free = relation in known or relation not in OWN_RELATIONS
+        check(free, f"{name}.names", relation, f"one of {', '.join(known)}, or a new name")
+        _make_known(f"{name}.names", add_relation, relation)
+    check(len(set(names)) == len(names), f"{name}.names", names, "each name once")
+    check(len(upper) == bounds, f"{name}.upper", upper, f"{bounds} bounds for {len(names)} names")
+    rising = all(a < b < math.inf for a, b in zip((0.0, *upper), upper, strict=False))
+    check(rising, f"{name}.upper", upper, "ascending bounds above 0")
+
+
+def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
+    """Reject labels that no kind has. ``Ego`` is valid if ``ego`` is true."""
+    known = [label for label in labels() if ego or label != "Ego"]
+    for label in given:
+        if not (kinds_labelled(label) or (ego and normalize_name(label) == "ego")):
+            _check_name(name, label, known)
+
+
+def check_pairs(name: str, pairs: tuple[tuple[str, ...], ...]) -> None:
+    """Reject a list with anything but pairs of valid labels."""
+    for i, pair in enumerate(pairs):
+        check(len(pair) == 2, f"{name}[{i}]", pair, "two labels")
+        check_labels(f"{name}[{i}]", pair, ego=True)
+
+
+def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
+    """Reject corners that do not form a simple polygon."""
+    pairs = all(len(corner) == 2 and all(map(math.isfinite, corner)) for corner in corners)
+    right = f"3 to {MOST_CORNERS} corners [ahead, to the left], in metres"
+    check(pairs and 3 <= len(corners) <= MOST_CORNERS, name, corners, right)
+    near = all(abs(number) <= MOST_LENGTH for corner in corners for number in corner)
+    check(near, name, corners, f"corners up to {MOST_LENGTH:.0f} m away")
+    from sgstore.base.geometry import is_simple  # it comes with numpy, which most configs need not
+
+    right = "sides that meet at the corners only, one after another"
+    check(is_simple(corners), name, corners, right)
+
+
+def _check_length(holds: bool, name: str, value: float, right: str) -> None:  # noqa: FBT001
+    check(holds and value <= MOST_LENGTH, name, value, right)
+
+
+def _check_name(setting: str, name: str, known: Iterable[str], more: str = "") -> None:
+    """Reject an unknown name, and suggest the most similar known name."""
+    known = list(known)
+    if name not in known:
+        alias = relation_named(name)
+        like = alias if alias in known else suggestion(name, known)
+        right = f"'{like}', perhaps" if like else f"one of {', '.join(known)}"
+        check(False, setting, name, right + more)  # noqa: FBT003
+
+
+def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
+    checked: dict[str, TypeMeaning] = {}
+    for name, meaning in sorted(types.items(), key=lambda item: item[0].lower()):
+        where = f'types."{name}"'
+        check(bool(name.strip()), where, name, "the type name of a simulator")
+        more = "; new_kinds names those of your own"
+        _check_name(f"{where}.kind", meaning.kind, ENTITY_KINDS, more)
+        for part in ("special", "subkind"):
+            word = getattr(meaning, part)
+            check(bool(_WORD.fullmatch(word)), f"{where}.{part}", word, "a word of a-z, 0-9 and _")
+        check(name.lower() not in checked, where, name, "each type name once")
+        checked[name.lower()] = meaning
+    return checked
+
+
+def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the settings of relations, with defaults for missing values."""
+    registry, checked = plugins.RELATIONS, dict[str, dict[str, Any]]()
+    others = registry.others() if given else {}
+    for name, values in sorted(given.items()):
+        own = registry.load(name) if name in registry.own else None
+        if not getattr(own, "parameters", {}):
+            check(bool(others), "relations", name, "no table")
+            _check_name("relations", name, others)
+        relation = own or registry.load_other(others[name], ConfigError)
+        known: Mapping[str, Any] = getattr(relation, "parameters", {})
+        for key in values:
+            if key not in known:
+                raise _unknown(f"relations.{name}.", key, {*known})
+        where = f"relations.{name}."
+        chosen = {key: _value(type(known[key]), v, where + key) for key, v in values.items()}
+        checked[name] = {**known, **chosen}
+    return checked
+
+
+# Presets: the default, and configs that reproduce other tools -----------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Preset:
+    """Named config.
+
+    Attributes
+    ----------
+    summary : str
+        Description in one line.
+    notes : str
+        Notes for users, as lines of Markdown.
+    config : Config
+    """
+
+    summary: str
+    notes: str
+    config: Config
+
+
+_MET_BY_CARLASGG: Final = ("Person", "Bicycle", "Car", "Motorcycle", "Bus", "Train", "Truck")
+_CARLASGG: Final = Config(
+    range=RangeSettings(
+        shape="rectangle",
+        front=50.0,
+        rear=2.0,
+        side=25.0,
+        static_by="centre",
+        height=(-2.0, 2.0),
+        grade=0.1,
+        height_of_entities=False,
+    ),
+    proximity=Proximity(between="origins"),
+    direction=Direction(ties="carlasgg", sides="closed"),
+    pairs=PairSettings(
+        within=0.0,
+        ego_within=25.0,
+        kinds=tuple(("Ego", kind) for kind in _MET_BY_CARLASGG),
+    ),
+    lanes=LaneSettings(ahead=50.0, types=("driving",), sections=False),
+    sees=False,
+    kinds=(
+        *("Car", "Truck", "Van", "Bus", "Motorcycle", "Bicycle", "Person"),
+        *("TrafficLight", "StopSign", "YieldSign", "SpeedLimit", "Sign"),
+        *("Lane", "Road", "Junction", "OffRoad"),
+    ),
+    without=("leads", "follows", "overlaps", "sees", "tows"),
+)
+
+_ROADSCENE2VEC: Final = Config(
+    proximity=Proximity(
+        names=("near_coll", "super_near", "very_near", "near", "visible"),
+        upper=(4.0, 7.0, 10.0, 16.0, 25.0),
+    ),
+    direction=Direction(ties="both"),
+    pairs=PairSettings(
+        within=0.0,
+        ego_within=25.0,
+        kinds=(("Ego", "Vehicle"), ("Ego", "Person"), ("Ego", "Signal")),
+    ),
+    sees=False,
+    without=("leads", "follows", "overlaps", "sees", "tows"),
+)
+
+_OF_CARLASGG: Final = """\
+* *Imitated.* The rectangle, 50 m ahead, 2 m behind, 25 m to each side; in it count the footprints of
+  what moves and the centres of what stands. The rule that keeps roads of other storeys out (less than 2
+  m higher or lower, or a grade of less than 0.1), for the map alone. Distances between the origins of
+  actors. Which bearing is what, and who has the ties; what is dead ahead or dead behind is to the left.
+  Relations of the ego with people, bicycles, cars, motorcycles, buses, trains and trucks up to 25 m, and
+  of nobody else; vans it leaves out. Lanes of type driving alone, whatever their section, and `off_road`
+  for what touches none of them.
+* *Defects, not imitated.* It has no lane changes, although its documentation promises them. Its lanes
+  stick out by 1 m beyond their ends and beside their bends, and stop up to 2 m short of their ends. Of
+  lanes that begin in one place, one seems to lead to the others. A traffic light is there twice, as a
+  pole and as a landmark. What has no edge to a lane is "Off Road", lights and signs too. An entity is in
+  the lanes of every storey above and below it.
+* `python -m bench.against_carlasgg TRACE ORACLE` counts all of it against graphs that CARLASGG itself
+  made; its exit status is 1 where a row falls below its mark or a difference has no cause.
+"""
+
+_OF_ROADSCENE2VEC: Final = """\
+* On a bound of two directions both hold. Of the distances one holds, the nearest, as there.
+* Relations of the ego alone, up to 25 m, with what RoadScene2Vec knows: cars (whatever is as large, trams
+  too), motorcycles, bicycles, people, lights and signs.
+* The settings are those of relations. Its three lanes, and left and right by them, are what the abstraction
+  `roadscene2vec` makes of any graph, ingested with whatever settings.
+"""
+
+PRESETS: Final[Mapping[str, Preset]] = {
+    "default": Preset(
+        "All round the ego, all kinds, all lane types, storeys kept apart, numbers kept.",
+        "",
+        Config(),
+    ),
+    "carlasgg": Preset(
+        "The graphs of CARLASGG as its code computes them, without its defects.",
+        _OF_CARLASGG,
+        _CARLASGG,
+    ),
+    "roadscene2vec": Preset(
+        "The relations and thresholds of RoadScene2Vec, whose bins hold both their bounds.",
+        _OF_ROADSCENE2VEC,
+        _ROADSCENE2VEC,
+    ),
+}
+"""All presets by name."""
+
+
+def preset(name: str) -> Config:
+    """Return the config of a preset.
+
+    Raises
+    ------
+    ConfigError
+        The preset does not exist.
+    """
+    if name not in PRESETS:
+        like = suggestion(name, PRESETS)
+        hint = f"did you mean '{like}'?" if like else f"there are {', '.join(PRESETS)}"
+        raise ConfigError(f"no preset '{name}'; {hint}")
+    return PRESETS[name].config
+
+
+# Configs from TOML files, plain values and keyword arguments ------------------------------------
+
+MAX_CONFIG_BYTES: Final = 1 << 20
+
+
+def load(path: str | Path) -> Config:
+    """Read a config from a TOML file. Missing settings come from its preset, or keep their defaults.
+
+    Raises
+    ------
+    ConfigError
+        The file is not readable, is not TOML, or has an unknown or invalid setting.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise ConfigError(f"{path}: larger than {MAX_CONFIG_BYTES} bytes, which no config is")
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from error
+    try:
+        return from_dict(values)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def from_dict(values: Mapping[str, Any]) -> Config:
+    """Return the config described by plain values.
+
+    Parameters
+    ----------
+    values : mapping
+        Values as in TOML and JSON. ``preset`` names the preset for missing settings; without it, the defaults
+        apply.
+
+    Raises
+    ------
+    ConfigError
+        A setting is unknown, of the wrong type, or out of range.
+    """
+    values = dict(values)
+    name = values.pop("preset", "")
+    check(isinstance(name, str), "preset", name, "the name of a preset")
+    return _changed(preset(name) if name else Config(), values, "")
+
+
+def configured(**settings: Any) -> Config:
+    """Return the config described by keyword arguments. Tables are mappings or settings objects.
+
+    ::
+
+        configured(preset="carlasgg", range={"front": 80}, pairs=PairSettings(within=0), rate=2)
+
+    Raises
+    ------
+    ConfigError
+        See :func:`from_dict`.
+    """
+    return from_dict(settings)
+
+
+def _changed(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    """Return a copy of a settings table with some values changed."""
+    hints = get_type_hints(type(config))
+    known = {f.name for f in fields(config)}
+    for name in values:
+        if name not in known:
+            raise _unknown(prefix, name, known)
+    changes = {
+        name: _value(hints[name], value, f"{prefix}{name}", getattr(config, name))
+        for name, value in values.items()
+    }
+    return replace(config, **changes)
+
+
+def _unknown(prefix: str, name: str, known: set[str]) -> ConfigError:
+    like = suggestion(name, known)
+    hint = f"did you mean '{prefix}{like}'?" if like else f"known: {', '.join(sorted(known))}"
+    return ConfigError(f"unknown setting '{prefix}{name}'; {hint}")
+
+
+_ENDLESS: Final = frozenset({"range.world"})
+"""Settings that can be infinite."""
+
+_PLAIN: Final[dict[object, str]] = {str: "a text", bool: "true or false", int: "a whole number"}
+
+
+def _value(hint: Any, value: Any, name: str, default: Any = None) -> Any:
+    """Convert a plain value to the type of a setting."""
+    if is_dataclass(hint):
+        return _table(hint, value, name, default)
+    if get_origin(hint) is Mapping:
+        check(isinstance(value, Mapping), name, value, f"a table [{name}]")
+        inner = get_args(hint)[1]
+        return {str(key): _value(inner, one, f'{name}."{key}"') for key, one in value.items()}
+    if hint is float:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        endless = number and value == math.inf and name in _ENDLESS
+        check(endless or (number and abs(value) <= sys.float_info.max), name, value, "a number")
+        return float(value)
+    if hint is Any:
+        return value
+    if hint in _PLAIN:
+        check(type(value) is hint, name, value, _PLAIN[hint])
+        return value
+    check(isinstance(value, (list, tuple)), name, value, "a list")
+    return tuple(_value(get_args(hint)[0], item, f"{name}[{i}]") for i, item in enumerate(value))
+
+
+def _table(cls: Any, value: Any, name: str, default: Any) -> Any:
+    if isinstance(value, cls):
+        return value
+    check(isinstance(value, Mapping), name, value, f"a table [{name}]")
+    prefix = f"{name}."
+    return _built(cls, value, prefix) if default is None else _changed(default, value, prefix)
+
+
+def _built(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    """Build a record from plain values. Fields without a default are required."""
+    hints = get_type_hints(cls)
+    for name in values:
+        if name not in hints:
+            raise _unknown(prefix, name, set(hints))
+    for part in fields(cls):
+        given = part.name in values or part.default is not MISSING
+        check(given, f"{prefix}{part.name}", None, "a value")
+    return cls(**{name: _value(hints[name], v, f"{prefix}{name}") for name, v in values.items()})
+
+
+# Configs as commented TOML, and the page of all settings ----------------------------------------
+
+WIDTH: Final = 98
+"""Line width of comments; characters."""
+
+
+def as_toml(config: Config) -> str:
+    """Return the whole config as TOML, each setting with its comment. :func:`load` restores the config."""
+    lines = ["# Settings of sgstore. Lengths are metres, angles degrees, times seconds.", ""]
+    tables: list[str] = []
+    for one in fields(config):
+        value = getattr(config, one.name)
+        if is_dataclass(value):
+            tables += ["", *(f"# {line}" for line in _summary(type(value))), f"[{one.name}]"]
+            for inner in fields(value):
+                tables += _setting(inner, getattr(value, inner.name))
+        elif one.name == "relations":
+            tables += ["", *_comment(one), *([] if value else ["[relations]"])]
+            for name, values in value.items():
+                tables.append(f"[relations.{name}]")
+                tables += [f"{k} = {_literal(v)}" for k, v in values.items()]
+        elif isinstance(value, Mapping):
+            tables += ["", *_comment(one), f"[{one.name}]"]
+            tables += [f"{_text(key)} = {_meaning(asdict(v))}" for key, v in value.items()]
+        else:
+            lines += _setting(one, value)
+    return "\n".join([*lines, *tables, ""])
+
+
+def _setting(one: Any, value: Any) -> Iterator[str]:
+    yield from _comment(one)
+    yield f"{one.name} = {_literal(value)}"
+
+
+def _comment(one: Any) -> Iterator[str]:
+    for paragraph in one.metadata[COMMENT].splitlines():
+        yield from (f"# {line}" for line in wrap(paragraph, WIDTH))
+
+
+def _summary(cls: type) -> list[str]:
+    return (cls.__doc__ or "").strip().splitlines()[:1]
+
+
+def _literal(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_literal, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return _text(value) if isinstance(value, str) else repr(value)
+
+
+def _text(value: str) -> str:
+    # Every JSON string of characters above U+001F is a TOML string, but for DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _meaning(parts: dict[str, str]) -> str:
+    said = ", ".join(f"{name} = {_text(word)}" for name, word in parts.items() if word)
+    return f"{{ {said} }}"
+
+
+PAGE: Final = """\
+# Settings
+
+Everything that decides what is in a scene graph. A config is a TOML file
+(`sgstore ingest … --config FILE`), or keyword arguments:
+
+```python
+from sgstore.model.config import PairSettings, configured
+
+configured(preset="carlasgg", range={{"front": 80.0}}, pairs=PairSettings(within=0.0), rate=2.0)
+```
+
+What a file does not name keeps its default, or the value of the preset that it names in its first line
+(`preset = "carlasgg"`). A config is validated when it is read, and recorded with every trace.
+`sgstore config [--preset NAME]` prints this:
+
+```toml
+{settings}```
+
+## Table I of the paper
+
+| parameter of CARLASGG | here |
+|---|---|
+| entity classes, special classes, signal classes | `[types]`, before the shipped tables; `kinds` |
+| road granularity: none, lane, waypoints | `lanes.granularity`, `lanes.spacing`, `lanes.types` |
+| distance relationships: none, thresholds | `[proximity]`, with `kinds`; none: `names` and `upper` are `[]` |
+| angular relationships: none, thresholds | `[direction]`, `kinds`, `within`; none: so, and `sides = "none"` |
+| entity relationships: none, pairs | `[pairs]`; none: `ego = false` and `within = 0` |
+| `exclude_ids` | `exclude_ids` |
+| range: the geometry of what is in the graph | `[range]` |
+
+## Presets
+
+{presets}"""
+
+
+def as_markdown(presets: Mapping[str, Preset]) -> str:
+    """Return the page ``docs/parameters.md``: all settings with their defaults, and the presets."""
+    parts = [_preset_text(name, one) for name, one in presets.items()]
+    return PAGE.format(settings=as_toml(Config()), presets="\n".join(parts))
+
+
+def _preset_text(name: str, one: Preset) -> str:
+    different = list(_differences(Config().as_dict(), one.config.as_dict(), ""))
+    changes = ["```toml", *different, "```", ""] if different else []
+    return "\n".join([f"### `{name}`", "", one.summary, "", *changes, one.notes])
+
+
+def _differences(
+    default: Mapping[str, Any], other: Mapping[str, Any], prefix: str
+) -> Iterator[str]:
+    for name, value in other.items():
+        if isinstance(value, Mapping) and name not in {"types", "relations"}:
+            yield from _differences(default[name], value, f"{prefix}{name}.")
+        elif value != default[name]:
+            yield f"{prefix}{name} = {_literal(value)}"

@@ -1,0 +1,34 @@
+"""Closest encounter in the recording, from each frame on.
+
+dce_recorded(t) (m) = min { gap(t′) : t′ ≥ t }, ttce_recorded(t) (s) = the first such t′ minus t.
+Source: Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from sgstore.model.criticality._encounter import Encounter
+    from sgstore.model.world import Floats
+
+
+def dce_recorded(of: Encounter) -> Floats:
+    """Return the least gap from each frame on, (T,); m. NaN if no later gap is known."""
+    gap = of.numbers["gap"]
+    least = np.minimum.accumulate(np.where(np.isnan(gap), np.inf, gap)[::-1])[::-1]
+    return np.where(np.isfinite(least), least, np.nan)
+
+
+def ttce_recorded(of: Encounter) -> Floats:
+    """Return the time until the least gap first occurs, from each frame on, (T,); s."""
+    gap, times, least = of.numbers["gap"], of.times, dce_recorded(of)
+    found = np.full(len(times), np.nan)
+    when = np.nan
+    for row in range(len(times) - 1, -1, -1):
+        if gap[row] == least[row]:
+            when = times[row]
+        found[row] = when - times[row]
+    return found

@@ -1,0 +1,34 @@
+"""Exposure to a short time to collision, over the frames of an encounter.
+
+TET (s) = Σ Δt over frames with ttc ≤ τ, TIT (s²) = Σ (τ − ttc) Δt over the same frames; Δt is the
+time to the next frame. Source: Minderhoud and Bovy, Extended Time-to-Collision Measures for Road
+Traffic Safety Assessment, AAP 33, 2001.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from sgstore.model.criticality._encounter import Encounter
+
+TAU: Final = 2.0
+"""Time to collision at or below which an entity is exposed; s."""
+
+
+def tet(of: Encounter, tau: float = TAU) -> float:
+    """Return the total time with a time to collision of at most ``tau``; s."""
+    return _summed(of, tau, 0)
+
+
+def tit(of: Encounter, tau: float = TAU) -> float:
+    """Return the exposed time, weighted by the distance of the time to collision below ``tau``; s²."""
+    return _summed(of, tau, 1)
+
+
+def _summed(of: Encounter, tau: float, power: int) -> float:
+    times, ttc = of.times, of.numbers["ttc"]
+    exposed = np.flatnonzero(ttc[:-1] <= tau)
+    return float(((tau - ttc[exposed]) ** power * np.diff(times)[exposed]).sum())

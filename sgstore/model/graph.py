@@ -1,0 +1,871 @@
+"""Scene graphs as columns: blocks of frames for the store, single frames for callers and networkx."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise, starmap
+from operator import eq, itemgetter
+from typing import TYPE_CHECKING, Any, Final, overload
+
+import numpy as np
+
+from sgstore.base.columns import taken
+from sgstore.model.pair_numbers import UNEVEN
+from sgstore.model.vocabulary import MOST_RELATIONS, RELATION_CODE, RELATIONS, SIGNALS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    import networkx as nx
+    from numpy.typing import NDArray
+
+    from sgstore.model.world import Codes, Floats, FrameBlock, Ints
+
+    Places = Sequence[tuple[int, float]]
+    Stretches = Sequence[tuple[int, float, float]]
+    Whole = NDArray[np.signedinteger[Any]]
+    Attributes = dict[str, Any]
+    EdgeRecord = tuple[int, str, int, Attributes]
+
+MOST_RECORDS: Final = 1 << 16
+"""Largest number of edges of a graph stored as records; larger graphs store columns."""
+
+_IS_IN, _LEADS, _FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
+"""Codes of the relations whose edges can have attributes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Edges of the graphs of a block, one row per edge and frame; shape (E,).
+
+    Attributes
+    ----------
+    frame : int32 or int64
+        Frame, counted in the block.
+    relation : int8
+        Codes of :data:`sgstore.model.vocabulary.RELATIONS`.
+    src, dst : int32 or int64
+        Node ids: 0 and above in the trace, below zero in the map.
+    """
+
+    frame: Whole
+    relation: Codes
+    src: Whole
+    dst: Whole
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def distinct(self) -> Edges:
+        """Return each edge once, ordered by frame, source, relation and destination."""
+        every, new = _ordered(self)
+        return taken(every, new)
+
+    def differing(self, other: Edges) -> Edges:
+        """Return the edges that only one of the two tables has, in the order of :meth:`distinct`."""
+        every, new = _ordered(Edges.chained([self.distinct(), other.distinct()]))
+        return taken(every, new & np.append(new[1:], True)[: len(new)])
+
+    @classmethod
+    def chained(cls, parts: Sequence[Edges]) -> Edges:
+        """Concatenate edge tables into int32 columns. Without parts, the result is empty."""
+        none = np.empty(0, np.int8)
+        parts = [cls(none, none, none, none), *parts]
+        frame, src, dst = (
+            np.concatenate(
+                [getattr(part, name) for part in parts], dtype=np.int32, casting="same_kind"
+            )
+            for name in ("frame", "src", "dst")
+        )
+        return cls(frame, np.concatenate([part.relation for part in parts]), src, dst)
+
+
+def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
+    """Return the sorted edges, and a mask of the rows that differ from the row before."""
+    order = np.lexsort((edges.dst, edges.relation, edges.src, edges.frame))
+    every = taken(edges, order)
+    columns = (every.frame, every.src, every.relation, every.dst)
+    new = np.ones(len(order), np.bool_)
+    new[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+    return every, new
+
+
+@dataclass(frozen=True, slots=True)
+class LaneGaps:
+    """Gaps along the lanes between a follower and its leader: attributes of both edges; shape (K,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    src, dst : int64
+        Node ids: src follows dst.
+    gap : float64
+        Bumper-to-bumper gap along the lanes; m. NaN means unknown.
+    """
+
+    frame: Ints
+    src: Ints
+    dst: Ints
+    gap: Floats
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True)
+class StaticPresence:
+    """Pairs of a frame and a static node in its graph; shape (M,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    node : int64
+        Node id; static entities of the trace (0 and above) and parts of the map (below zero).
+    """
+
+    frame: Ints
+    node: Ints
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True)
+class LaneStates:
+    """States of entities in lanes: the attributes of their ``isIn`` edges; shape (K,).
+
+    Attributes
+    ----------
+    frame : int64
+        Frame, counted in the block.
+    node, lane : int64
+        Node ids of the entity and of the lane.
+    overlap : float64
+        Share of the footprint that lies in the lane, 0 … 1.
+    offset : float64
+        Lateral offset of the box's centre from the lane's centre line, positive to the left of the
+        lane's direction; m.
+    heading_error : float64
+        Heading of the entity less the lane's direction, in (-π, π]; rad.
+    primary : bool
+        True for the primary lane, chosen by: centre inside, then heading, then overlap.
+    along : float64
+        Position of the box centre along the lane's centre line, from the lane's start; m. It can lie beyond
+        both ends.
+    own : bool
+        True for the lanes used for distances along the lanes: the primary lane and, in a junction, other lanes
+        that contain the centre and (for a vehicle) have its direction.
+    """
+
+    frame: Ints
+    node: Ints
+    lane: Ints
+    overlap: Floats
+    offset: Floats
+    heading_error: Floats
+    primary: np.ndarray[Any, np.dtype[np.bool_]]
+    along: Floats
+    own: np.ndarray[Any, np.dtype[np.bool_]]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True)
+class WorldBlock:
+    """Data outside the graphs of a block, up to the distance ``[range] world``.
+
+    Attributes
+    ----------
+    frames : FrameBlock
+        Frames with the states outside the graphs.
+    presence : StaticPresence
+        Static entities and map elements outside the graphs.
+    edges : Edges
+        Differences of the edges ``isIn``, ``controlsTrafficOf``, ``leads`` and ``follows``: edges that exist
+        only with, or only without, the data outside the graphs.
+    lanes : LaneStates
+        Attributes of the additional ``isIn`` edges.
+    gaps : LaneGaps
+        Gaps of the additional ``leads`` and ``follows`` edges.
+    """
+
+    frames: FrameBlock
+    presence: StaticPresence
+    edges: Edges
+    lanes: LaneStates
+    gaps: LaneGaps
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """Numbers of recorded states excluded from the graphs by settings. Static objects do not count.
+
+    Attributes
+    ----------
+    states : int
+        Number of all states.
+    beyond_radius, beyond_world : int
+        Numbers of states out of the range of the graphs, and out of ``[range] world``.
+    excluded : tuple of (int, int)
+        Codes of the excluded kinds, and the number of states of each.
+    """
+
+    states: int = 0
+    beyond_radius: int = 0
+    beyond_world: int = 0
+    excluded: tuple[tuple[int, int], ...] = ()
+
+    def more(self, other: LeftOut) -> LeftOut:
+        """Return the sum of both counts."""
+        excluded = dict(self.excluded)
+        for code, many in other.excluded:
+            excluded[code] = excluded.get(code, 0) + many
+        return LeftOut(
+            self.states + other.states,
+            self.beyond_radius + other.beyond_radius,
+            self.beyond_world + other.beyond_world,
+            tuple(sorted(excluded.items())),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class GraphBlock:
+    """Scene graphs of the frames of a block.
+
+    Attributes
+    ----------
+    frames : FrameBlock
+        Frames with the states that are nodes of their graphs (in range).
+    presence : StaticPresence
+        Static nodes of each graph. A static map edge belongs to a graph if both its nodes are present.
+    edges : Edges
+        All other edges.
+    lanes : LaneStates
+        Attributes of the ``isIn`` edges from entities to lanes.
+    gaps : LaneGaps
+        Attributes of ``leads`` and ``follows`` edges.
+    crowded : tuple of (str, int, int)
+        Frames with too many pairs (:mod:`sgstore.graphs.relations._pairs`): kind of the pairs, frame index in
+        the block, and number of bodies.
+    world : WorldBlock or None
+        Data outside the graphs. ``None`` means that the settings exclude such data.
+    left_out : LeftOut
+        Counts of the excluded states.
+    uneven : int
+        Special pairs of bodies in the block: bits of :data:`sgstore.model.pair_numbers.UNEVEN`.
+    """
+
+    frames: FrameBlock
+    presence: StaticPresence
+    edges: Edges
+    lanes: LaneStates
+    gaps: LaneGaps
+    crowded: tuple[tuple[str, int, int], ...] = ()
+    world: WorldBlock | None = None
+    left_out: LeftOut = LeftOut()
+    uneven: int = sum(UNEVEN.values())
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+
+def graph_of_records(
+    nodes: Iterable[Mapping[str, Any]], edges: Iterable[Mapping[str, Any]], **about: Any
+) -> nx.MultiDiGraph[Any]:
+    """Return a graph in node-link form as a ``networkx.MultiDiGraph``.
+
+    Parameters
+    ----------
+    nodes : iterable of mappings
+        ``id`` and attributes.
+    edges : iterable of mappings
+        ``source``, ``target``, ``relation`` (also the key), and attributes.
+    **about
+        Attributes of the graph.
+    """
+    import networkx as nx  # half a second to import: only when asked for
+
+    graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph(**about)
+    for node in nodes:
+        graph.add_node(node["id"], **{k: v for k, v in node.items() if k != "id"})
+    for edge in edges:
+        known = {k: v for k, v in edge.items() if k not in {"source", "target"}}
+        graph.add_edge(edge["source"], edge["target"], key=edge["relation"], **known)
+    return graph
+
+
+def named_graph(
+    nodes: Mapping[str, str], edges: Iterable[tuple[str, str, str]], **about: Any
+) -> nx.MultiDiGraph[str]:
+    """Return a graph of names and labels, as in the literature, as a ``networkx.MultiDiGraph``.
+
+    Parameters
+    ----------
+    nodes : mapping of str to str
+        Name → label.
+    edges : iterable of (str, str, str)
+        Source, label, destination.
+    **about
+        Attributes of the graph.
+
+    Returns
+    -------
+    networkx.MultiDiGraph
+        Names as nodes, with the attributes ``name`` and ``base_class``; edges with the attribute ``label``,
+        which is also the key if it occurs once between two nodes.
+    """
+    import networkx as nx  # half a second to import: only when asked for
+
+    graph: nx.MultiDiGraph[str] = nx.MultiDiGraph(**about)
+    for name, label in nodes.items():
+        graph.add_node(name, name=name, base_class=label)
+    for src, label, dst in edges:
+        again = graph.has_edge(src, dst, key=label)
+        key = f"{label} {graph.number_of_edges(src, dst)}" if again else label
+        graph.add_edge(src, dst, key=key, label=label)
+    return graph
+
+
+class LaneDistances:
+    """Lane starts measured along other lanes: the table for distances along the lanes of a map.
+
+    Parameters
+    ----------
+    lane, other : (n,) int64
+        Node ids of lanes. A pair repeats if several routes connect its lanes.
+    start : (n,) float64
+        Start of ``other``, along the lanes from the start of ``lane``; m. Negative if the route leads from
+        ``other`` to ``lane``.
+    parts : iterable of (int, str, int, float, float)
+        Map elements: node id, kind, lane, and start and end along the lane; m.
+    courses : iterable of (int, float, float, float)
+        Stretches of lanes, each up to the next: lane, start (m), curvature (1/m) and slope. NaN or ``None``
+        means an unknown slope.
+    """
+
+    FARTHEST: Final = 200.0
+    """Longest distance along lanes; m. The view ``pairs`` contains the same number."""
+
+    def __init__(
+        self,
+        lane: Ints,
+        other: Ints,
+        start: Floats,
+        parts: Iterable[tuple[int, str, int, float, float]] = (),
+        courses: Iterable[tuple[int, float, float, float | None]] = (),
+    ) -> None:
+        self._columns, self._parts = (lane, other, start), tuple(parts)
+        self._courses = tuple(courses)
+
+    @cached_property
+    def _starts(self) -> dict[tuple[int, int], list[float]]:
+        found: dict[tuple[int, int], list[float]] = {}
+        rows = zip(*(column.tolist() for column in self._columns), strict=True)
+        for lane, other, start in rows:
+            found.setdefault((lane, other), []).append(start)
+        return found
+
+    @cached_property
+    def _onward(self) -> dict[int, list[tuple[int, float]]]:
+        found: dict[int, list[tuple[int, float]]] = {}
+        for (lane, other), starts in self._starts.items():
+            found.setdefault(lane, []).extend((other, start) for start in starts if start >= 0)
+        return found
+
+    @cached_property
+    def _of_parts(self) -> dict[int, list[tuple[int, float, float]]]:
+        found: dict[int, list[tuple[int, float, float]]] = {}
+        for node, _, lane, start, end in self._parts:
+            found.setdefault(node, []).append((lane, start, end))
+        return found
+
+    @cached_property
+    def _on_lanes(self) -> dict[tuple[str, int], list[tuple[float, float]]]:
+        found: dict[tuple[str, int], list[tuple[float, float]]] = {}
+        for _, what, lane, start, end in self._parts:
+            found.setdefault((what, lane), []).append((start, end))
+        return found
+
+    @cached_property
+    def _of_lanes(self) -> dict[int, list[tuple[float, float, float | None]]]:
+        """Lane → its stretches, ascending: start (m), curvature (1/m) and slope of each."""
+        found: dict[int, list[tuple[float, float, float | None]]] = {}
+        for lane, start, curvature, slope in self._courses:
+            known = None if slope is None or math.isnan(slope) else slope
+            found.setdefault(lane, []).append((start, curvature, known))
+        for stretches in found.values():
+            stretches.sort(key=itemgetter(0))
+        return found
+
+    def tells(self, what: str) -> bool:
+        """True if the map has values of this kind: ``ways``, ``curvature`` or ``slope``."""
+        return what in self._told
+
+    @cached_property
+    def _told(self) -> frozenset[str]:
+        ways, curved = len(self._columns[0]) > 0, bool(self._of_lanes)
+        sloped = any(slope is not None for of in self._of_lanes.values() for *_, slope in of)
+        known = {"ways": ways, "curvature": curved, "slope": sloped}
+        return frozenset(what for what, is_known in known.items() if is_known)
+
+    def course(self, lane: int, along: float) -> tuple[float | None, float | None]:
+        """Return curvature (1/m) and slope of a lane at a position along it. ``None`` means unknown."""
+        stretches = self._of_lanes.get(lane, ())
+        if not stretches:
+            return None, None
+        return stretches[bisect_right(stretches, max(along, 0.0), key=itemgetter(0)) - 1][1:]
+
+    def stretches(self, node: int) -> Stretches:
+        """Return the lanes of a map element, with its start and end along each lane; m."""
+        return self._of_parts.get(node, ())
+
+    def stretches_of(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
+        """Return the start and end, along a lane, of each map element of one kind; m."""
+        return self._on_lanes.get((what, lane), ())
+
+    def distance(self, one: Places, other: Places) -> float | None:
+        """Return the distance between two entities from their lane positions; m."""
+        ends = ([(lane, along, along) for lane, along in places] for places in (one, other))
+        return self.between(*ends)
+
+    def between(self, one: Stretches, other: Stretches) -> float | None:
+        """Return the gap between two stretches along the lanes; m.
+
+        Overlap gives 0; a stretch behind is negative.
+        """
+        ahead, behind = math.inf, -math.inf
+        for lane, first, last in one:
+            for to, start, end in other:
+                for way in self._starts.get((lane, to), ()):
+                    if (far := way + (start - last)) >= 0:
+                        ahead = min(ahead, far)
+                    elif (back := way + (end - first)) < 0:
+                        behind = max(behind, back)
+                    else:
+                        ahead = 0.0
+        nearest = ahead if ahead <= -behind else behind
+        return nearest if abs(nearest) <= self.FARTHEST else None
+
+    def next(self, one: Stretches, what: str) -> float | None:
+        """Return the driving distance to the next map element of one kind, 0 on the element; m."""
+        found = math.inf
+        for lane, first, last in one:
+            for to, way in self._onward.get(lane, ()):
+                for start, end in self.stretches_of(what, to):
+                    if way + (end - first) >= 0:
+                        found = min(found, max(way + (start - last), 0.0))
+        return found if found <= self.FARTHEST else None
+
+
+class EdgeColumns(Sequence["EdgeRecord"]):
+    """Edges of one graph, stored as columns. A record is created on access.
+
+    A record takes about 250 bytes, a row ten. The object equals any sequence of the same records.
+
+    Parameters
+    ----------
+    src, dst : (n,) int
+        Node ids.
+    relation : (n,) int8
+        Codes of :data:`sgstore.model.vocabulary.RELATIONS`.
+    about : dict
+        Row → attributes, for rows with attributes.
+    """
+
+    AT_ONCE: Final = 4096
+    """Rows converted to records at once during iteration."""
+
+    def __init__(
+        self, src: Whole, relation: Codes, dst: Whole, about: Mapping[int, dict[str, Any]]
+    ) -> None:
+        self._src, self._relation, self._dst = src, relation, dst
+        self._about = about
+
+    def __len__(self) -> int:
+        return len(self._src)
+
+    def __iter__(self) -> Iterator[EdgeRecord]:
+        for first in range(0, len(self), self.AT_ONCE):
+            yield from self[first : first + self.AT_ONCE]
+
+    @overload
+    def __getitem__(self, index: int) -> EdgeRecord: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[EdgeRecord]: ...
+
+    def __getitem__(self, index: int | slice) -> EdgeRecord | list[EdgeRecord]:
+        rows = range(len(self))[index]
+        if isinstance(rows, int):
+            return self[rows : rows + 1][0]
+        codes: list[int] = self._relation[index].tolist()
+        ends = (self._src[index].tolist(), self._dst[index].tolist())
+        return [
+            (src, RELATIONS[code], dst, self._about.get(row, {}))
+            for code, src, dst, row in zip(codes, *ends, rows, strict=True)
+        ]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, (EdgeColumns, list, tuple)):
+            return NotImplemented
+        return len(self) == len(other) and all(starmap(eq, zip(self, other, strict=True)))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"<{len(self):,} edges>"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class SceneGraph:
+    """Scene graph of one frame as records: ``(V, E, Ego, kind, rel, att)`` of the paper.
+
+    Attributes
+    ----------
+    frame_id : int
+    trace : str
+        Name of the trace.
+    seq, time_ns : int
+    ego : int or None
+        Node id of the ego.
+    nodes : dict
+        Node id → attributes in outward units (m, s, m/s, degrees): ``kind``, ``name``, ``is_ego``, and all
+        known attributes (``x``, ``y``, ``heading``, ``speed``, ``light_state``, …). Unknown attributes are
+        absent.
+    edges : sequence of tuple
+        ``(src, relation, dst, attributes)``. A list, or online with more than 65,536 edges an
+        :class:`EdgeColumns`.
+    reach : LaneDistances, optional
+        Lane distances of the map. Without them, distances along lanes are unknown.
+    events : mapping of str to sequence of pairs
+        Events of the frame: kind → pairs of entity and other entity. A missing kind means that the trace does
+        not record it.
+    around : callable, optional
+        Function that returns the graph with all known data around it; see :meth:`known`.
+    out_of_world : int
+        Online: number of entities out of ``[range] world``, and so unknown.
+    excluded : frozenset of str
+        Online: kinds in the frame that the settings exclude.
+    """
+
+    frame_id: int
+    trace: str
+    seq: int
+    time_ns: int
+    ego: int | None
+    nodes: dict[int, dict[str, Any]]
+    edges: Sequence[tuple[int, str, int, dict[str, Any]]]
+    reach: LaneDistances | None = field(default=None, compare=False, repr=False)
+    events: Mapping[str, Sequence[tuple[int | None, int | None]]] = field(
+        default_factory=dict[str, "Sequence[tuple[int | None, int | None]]"],
+        compare=False,
+        repr=False,
+    )
+    around: Callable[[], SceneGraph] | None = field(default=None, compare=False, repr=False)
+    out_of_world: int = field(default=0, compare=False, repr=False)
+    excluded: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
+
+    def known(self) -> SceneGraph:
+        """Graph of all known objects: this graph, extended to the distance ``[range] world``.
+
+        Outside this graph, only the edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows`` and map edges
+        exist.
+        """
+        if self.around is None:
+            return self
+        cut = {"out_of_world": self.out_of_world, "excluded": self.excluded}
+        return replace(self.around(), events=self.events, **cut)
+
+    def __repr__(self) -> str:
+        size = f"{len(self.nodes)} nodes, {len(self.edges)} edges"
+        return f"<SceneGraph {self.trace}#{self.seq}: {size}>"
+
+    def places(self) -> dict[int, list[tuple[int, float]]]:
+        """Positions along own lanes: node id → pairs of (lane, distance from its start); m."""
+        found: dict[int, list[tuple[int, float]]] = {}
+        for src, relation, dst, about in self.edges:
+            if relation == "isIn" and about.get("is_own") and "along" in about:
+                found.setdefault(src, []).append((dst, about["along"]))
+        return found
+
+    def stretches(self) -> dict[int, Stretches]:
+        """Stretches of lanes that entities occupy: node id → (lane, start, end); m.
+
+        Traffic lights and signs are at the stop positions of the lanes they control; see
+        :mod:`sgstore.maps.roads._places`.
+        """
+        found: dict[int, list[tuple[int, float, float]]] = {}
+        signals = {node for node, about in self.nodes.items() if about["kind"] in SIGNALS}
+        for src, relation, dst, about in self.edges:
+            if relation == "isIn" and src not in signals:
+                if about.get("is_own") and "along" in about:
+                    found.setdefault(src, []).append((dst, about["along"], about["along"]))
+            elif relation == "controlsTrafficOf" and src in signals and src >= 0:
+                stops = ((dst, *at) for at in self._stops(self.nodes[src]["kind"], dst))
+                found.setdefault(src, []).extend(stops)
+        return dict(found)
+
+    def _stops(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
+        """Return the stop positions of a lane before a signal."""
+        known = self.reach.stretches_of(what, lane) if self.reach is not None else ()
+        about = self.nodes.get(lane, {})
+        if not known and ("junction" in about or "length" in about):
+            at = 0.0 if "junction" in about else float(about["length"])
+            return [(at, at)]
+        return known
+
+    def lane_dist(self, a: int, b: int) -> float | None:
+        """Return the distance along the lanes between two entities or map elements; m.
+
+        Measured from centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and
+        the lanes connected by ``travelsTo``. Positive if the route leads from a to b, negative from b to a; the
+        shortest route counts. A lane, road, junction or crosswalk occupies an interval of lanes, so the
+        distance inside is 0. A light or sign is at the stop position of the lanes that it controls. ``None``
+        means no route of at most 200 m. Routes do not change lanes.
+        """
+        if self.reach is None:
+            return None
+        known = self.stretches()
+        ends = (known.get(n, ()) if n >= 0 else self.reach.stretches(n) for n in (a, b))
+        return self.reach.between(*ends)
+
+    def to_next(self, node: int, what: str) -> float | None:
+        """Return the distance along the lanes to the next map element of one kind, 0 on the element; m.
+
+        ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
+        means none within 200 m.
+        """
+        return None if self.reach is None else self.reach.next(self.stretches().get(node, ()), what)
+
+    def curvature(self, node: int) -> float | None:
+        """Return the curvature of an entity's primary lane at its position; 1/m.
+
+        Mean over about a metre of the centre line; positive in a left turn of the lane's traffic. ``None``
+        means no lane, or no map.
+        """
+        return self._course(node)[0]
+
+    def slope(self, node: int) -> float | None:
+        """Return the slope of an entity's primary lane at its position: rise over run, 0.05 for 5 %.
+
+        Mean over about a metre; positive if the lane's traffic drives uphill. ``None`` means no lane, no map,
+        or a map without heights.
+        """
+        return self._course(node)[1]
+
+    def _course(self, node: int) -> tuple[float | None, float | None]:
+        place = self.primary_places().get(node)
+        return (None, None) if self.reach is None or place is None else self.reach.course(*place)
+
+    def primary_places(self) -> dict[int, tuple[int, float]]:
+        """Primary lane of each entity: node id → (lane, distance from its start); m."""
+        return {
+            src: (dst, about["along"])
+            for src, relation, dst, about in self.edges
+            if relation == "isIn" and about.get("is_primary") and "along" in about
+        }
+
+    def to_networkx(self) -> nx.MultiDiGraph[int]:
+        """Return the graph as a ``networkx.MultiDiGraph``.
+
+        Returns
+        -------
+        networkx.MultiDiGraph
+            Node ids as nodes with their attributes; the key and the attribute ``relation`` of an edge are its
+            relation. An edge between entities has the attribute ``lane_dist`` if known (:meth:`lane_dist`). The
+            graph's attributes are ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``ego``.
+        """
+        import networkx as nx  # half a second to import: only when asked for
+
+        graph: nx.MultiDiGraph[int] = nx.MultiDiGraph(
+            frame_id=self.frame_id,
+            trace=self.trace,
+            seq=self.seq,
+            time_ns=self.time_ns,
+            ego=self.ego,
+        )
+        graph.add_nodes_from(self.nodes.items())
+        places = {} if self.reach is None else self.stretches()
+        known: dict[tuple[int, int], dict[str, Any]] = {}
+        for src, relation, dst, attributes in self.edges:
+            more: dict[str, Any] = {}
+            if self.reach is not None and src in places and dst in places:
+                if (src, dst) not in known:
+                    far = self.reach.between(places[src], places[dst])
+                    known[src, dst] = {} if far is None else {"lane_dist": far}
+                more = known[src, dst]
+            about = {"relation": relation, **attributes, **more}
+            graph.add_edge(src, dst, key=relation)
+            graph.edges[src, dst, relation].update(about)  # whose names may be anything
+        return graph
+
+
+# Columns of many frames → scene graphs, from a store or a generator -----------------------------
+
+
+class MapRecords:
+    """Graph elements of a road map: the attributes of its nodes, and its edges.
+
+    Parameters
+    ----------
+    about : callable
+        Node id → attributes.
+    src, dst : (n,) int64
+        Node ids; below zero.
+    relation : (n,) int8
+        Codes of :data:`sgstore.model.vocabulary.RELATIONS`.
+    reach : LaneDistances
+
+    Attributes
+    ----------
+    about, reach
+        As above.
+    src, relation, dst
+        Edges, ordered by source, relation and destination. Ids of map elements descend.
+    """
+
+    def __init__(
+        self,
+        about: Callable[[int], Attributes],
+        src: Ints,
+        relation: Codes,
+        dst: Ints,
+        reach: LaneDistances,
+    ) -> None:
+        self.about, self.reach = about, reach
+        order = np.lexsort((-dst, relation, -src))
+        self.src, self.relation, self.dst = src[order], relation[order], dst[order]
+        self._lowest = min(src.min(initial=0), dst.min(initial=0))
+
+    def among(self, present: Ints) -> Ints:
+        """Return the rows of the edges whose two nodes are both present."""
+        if not len(present):
+            return np.zeros(0, np.intp)
+        here = np.zeros(1 - min(present.min(), self._lowest), np.bool_)
+        here[-present] = True
+        return np.flatnonzero(here[-self.src] & here[-self.dst])
+
+
+@dataclass(frozen=True, slots=True)
+class SceneColumns:
+    """Scene graphs of several frames of a trace, stored as shared columns.
+
+    Attributes
+    ----------
+    trace : str
+    frame_id, seq, time_ns : (F,) int64
+    ego : sequence of int or None, F long
+    moving : tuple of Ints, Ints and sequence of dict
+        Frame (from 0), node id and attributes of moving nodes, in any order.
+    presence : StaticPresence
+        Static nodes and map elements of each frame.
+    standing : mapping
+        Node id → attributes of static nodes.
+    edges : Edges
+        Edges with at least one entity of the trace, in any order. Duplicates are allowed.
+    about : mapping
+        Frame, relation, source and destination → attributes; see :func:`edge_attributes`.
+    map : MapRecords or None
+    """
+
+    trace: str
+    frame_id: Ints
+    seq: Ints
+    time_ns: Ints
+    ego: Sequence[int | None]
+    moving: tuple[Ints, Ints, Sequence[Attributes]]
+    presence: StaticPresence
+    standing: Mapping[int, Attributes]
+    edges: Edges
+    about: Mapping[tuple[int, int, int, int], Attributes]
+    map: MapRecords | None
+
+    def graphs(self) -> Iterator[SceneGraph]:
+        """Yield the graph of each frame: moving, static and map nodes.
+
+        Edges of the trace come before map edges.
+        """
+        frame, node, about = self.moving
+        order = np.lexsort((node, frame))
+        moving = _divided(frame[order], len(self.frame_id))
+        present = self.presence
+        by_place = np.lexsort((abs(present.node), present.node < 0, present.frame))
+        standing = _divided(present.frame[by_place], len(self.frame_id))
+        edges = self.edges.distinct()
+        related = _divided(edges.frame, len(self.frame_id))
+        tells = np.isin(np.arange(MOST_RELATIONS), [relation for _, relation, *_ in self.about])
+        for row in range(len(self.frame_id)):
+            rows = order[moving[row]].tolist()
+            nodes = dict(zip(node[rows].tolist(), (about[i] for i in rows), strict=True))
+            still = present.node[by_place[standing[row]]]
+            for one in still[still >= 0].tolist():
+                if (known := self.standing.get(one)) is not None:
+                    nodes[one] = dict(known)
+            mapped = still[still < 0]
+            if self.map is not None:
+                nodes |= {one: dict(self.map.about(one)) for one in mapped.tolist()}
+            yield SceneGraph(
+                frame_id=int(self.frame_id[row]),
+                trace=self.trace,
+                seq=int(self.seq[row]),
+                time_ns=int(self.time_ns[row]),
+                ego=self.ego[row],
+                nodes=nodes,
+                edges=self._edges(row, edges, related[row], mapped, tells),
+                reach=self.map.reach if self.map is not None and len(mapped) else None,
+            )
+
+    def _edges(
+        self, row: int, edges: Edges, own: slice, mapped: Ints, telling: NDArray[np.bool_]
+    ) -> Sequence[EdgeRecord]:
+        src, relation, dst = edges.src[own], edges.relation[own], edges.dst[own]
+        about: dict[int, Attributes] = {}
+        tells = np.flatnonzero(telling[relation])
+        ends = (column[tells].tolist() for column in (relation, src, dst))
+        for place, *key in zip(tells.tolist(), *ends, strict=True):
+            if (found := self.about.get((row, *key))) is not None:
+                about[place] = found
+        if self.map is not None:
+            rows = self.map.among(mapped)
+            src = np.concatenate([src, self.map.src[rows]])
+            dst = np.concatenate([dst, self.map.dst[rows]])
+            relation = np.concatenate([relation, self.map.relation[rows]])
+        found = EdgeColumns(_narrow(src), relation, _narrow(dst), about)
+        return found if len(found) > MOST_RECORDS else found[:]
+
+
+def edge_attributes(
+    lanes: Iterable[tuple[int, int, int, Attributes]],
+    gaps: Iterable[tuple[int, int, int, Attributes]],
+) -> dict[tuple[int, int, int, int], Attributes]:
+    """Return the attributes of edges: (frame, relation, source, destination) → attributes.
+
+    Parameters
+    ----------
+    lanes : iterable of (int, int, int, dict)
+        Frame, entity, lane and attributes of an ``isIn`` edge.
+    gaps : iterable of (int, int, int, dict)
+        Frame, follower, leader and attributes of the ``follows`` and ``leads`` edges.
+    """
+    known = {(frame, _IS_IN, node, lane): about for frame, node, lane, about in lanes}
+    for frame, one, other, about in gaps:
+        known[frame, _FOLLOWS, one, other] = about
+        known[frame, _LEADS, other, one] = dict(about)
+    return known
+
+
+def _divided(frame: Whole, frames: int) -> list[slice]:
+    ends = np.searchsorted(frame, np.arange(frames + 1)).tolist()
+    return [slice(*pair) for pair in pairwise(ends)]
+
+
+def _narrow(nodes: Whole) -> Whole:
+    narrow = nodes.astype(np.int32)
+    return narrow if np.array_equal(narrow, nodes) else nodes

@@ -1,0 +1,830 @@
+"""Simulator data: the frames of a trace as arrays, and the file positions of its messages.
+
+Readers pass these values to the scene graph generator and to the store. The store rounds them. Conventions of
+axes, units and signs are those of :mod:`sgstore.base.geometry`: OpenDRIVE's inertial axes, metres, radians,
+seconds, ``int64`` nanoseconds. A missing number is NaN, a missing code -1.
+
+A *node id* names an entity within its trace: 0, 1, 2, … in the order of appearance. Ids below zero
+belong to the road map (:mod:`sgstore.maps.roads`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import field, fields, replace
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
+
+from sgstore.base.arrays import np
+from sgstore.base.columns import taken
+from sgstore.base.geometry import wrapped
+from sgstore.base.records import dataclass
+from sgstore.mcap import Findings, Loss
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+Floats: TypeAlias = "NDArray[np.float64]"
+Ints: TypeAlias = "NDArray[np.int64]"
+Codes: TypeAlias = "NDArray[np.int8]"
+Bools: TypeAlias = "NDArray[np.bool_]"
+
+BUCKET_FRAMES = 60
+"""Frames per mask of the store. Blocks should start at multiples of it."""
+
+GAP: Final = 2.5
+"""Frames are missing between two frames if their gap exceeds this number of median periods."""
+
+JUMP_NS: Final = 86_400_000_000_000
+"""Assumed time between two frames at a backward clock jump: a day; ns."""
+
+TOLERANCE_NS: Final = 1_000
+"""Smallest time tolerance for equality; ns."""
+
+TOLERANCE_SHARE: Final = 100
+"""Time tolerance as a fraction of the median period: one part in this number."""
+
+
+def seconds_of(ns: int) -> float:
+    """Return a time in nanoseconds as seconds, rounded to whole microseconds.
+
+    Simulator clocks lose the last nanosecond: 7.499999999 s means 7.5 s.
+    """
+    whole = (abs(ns) + 500) // 1000 / 1e6
+    return whole if ns >= 0 else -whole
+
+
+def tolerance_ns(period_ns: int) -> int:
+    """Return the largest clock jitter of a trace: times this near count as equal; ns.
+
+    All comparisons of time use this tolerance in favour of equality: ``>= 3 s`` is true for 2.9999 s, ``< 3 s``
+    is false.
+
+    Parameters
+    ----------
+    period_ns : int
+        Median time between two frames; ns.
+
+    Returns
+    -------
+    int
+        Tolerance; ns. A hundredth of the period, at least a microsecond.
+    """
+    return max(TOLERANCE_NS, period_ns // TOLERANCE_SHARE)
+
+
+def derivable_ns(period_ns: float) -> float:
+    """Return the longest gap between frames over which motion is derived: three median periods; ns."""
+    return 3 * period_ns + tolerance_ns(int(period_ns))
+
+
+def longest_step_ns(period_ns: int) -> float:
+    """Return the longest time between consecutive frames without a missing frame; ns."""
+    return GAP * period_ns + tolerance_ns(period_ns)
+
+
+POSE: Final = (
+    *("x", "y", "z", "heading", "pitch", "roll"),
+    *("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
+    *("length", "width", "height"),
+)
+"""Columns of :class:`States` with pose, motion and size of a body, in order."""
+
+LARGEST: Final = 1_000.0
+"""Largest valid length, width or height of a body; m."""
+
+FASTEST: Final = 150.0
+"""Highest valid speed of a body; m/s."""
+
+HARDEST: Final = 30.0
+"""Highest valid acceleration derived from positions or velocities; m/s²."""
+
+LEAP: Final = 5.0
+"""A position belongs to another body if it is this far beyond the reach at :data:`FASTEST`; m."""
+
+INPUTS: Final = ("steer", "throttle", "brake", "gear", "hand_brake")
+"""Columns of :class:`States` with the control inputs of a vehicle, in order."""
+
+_SPEEDS: Final = slice(POSE.index("vx"), POSE.index("vz") + 1)
+_SIZES: Final = slice(POSE.index("length"), POSE.index("height") + 1)
+
+
+def implausible(values: Floats) -> Bools:
+    """Return a mask of impossible sizes and velocities. All flavours and the online mode use this check.
+
+    Parameters
+    ----------
+    values : (n, 16) float64
+        Columns :data:`POSE`.
+
+    Returns
+    -------
+    (n, 16) bool
+        Sizes below 0 or above :data:`LARGEST`; all three parts of a velocity above :data:`FASTEST`.
+    """
+    found = np.zeros(values.shape, np.bool_)
+    sizes, speeds = values[:, _SIZES], values[:, _SPEEDS]
+    found[:, _SIZES] = (sizes < 0) | (sizes > LARGEST)
+    with np.errstate(over="ignore"):
+        found[:, _SPEEDS] = (np.nansum(speeds * speeds, axis=1) > FASTEST**2)[:, None]
+    return found
+
+
+def is_plausible(
+    vx: float, vy: float, vz: float, length: float, width: float, height: float
+) -> bool:
+    """Fast test of one entity. False if :func:`implausible` may reject one of its values."""
+    # A comparison with NaN is false.
+    if any(size < 0 or size > LARGEST for size in (length, width, height)):
+        return False
+    return not any(abs(part) > FASTEST / 2 for part in (vx, vy, vz))
+
+
+def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
+    """Return the values with NaN in place of impossible sizes and velocities, and their faults.
+
+    Parameters
+    ----------
+    values : (n, 16) float64
+        Columns :data:`POSE`.
+
+    Returns
+    -------
+    values : (n, 16) float64
+        The same array if nothing is implausible.
+    faults : list of (int, str)
+        Row and fault: ``"length is -4.5 m"``, ``"speed is 900 m/s"``.
+    """
+    found = implausible(values)
+    if not found.any():
+        return values, []
+    faults = [
+        (row, f"{POSE[column]} is {values[row, column]:g} m")
+        for row, column in np.argwhere(found).tolist()
+        if column >= _SIZES.start
+    ]
+    fast = np.flatnonzero(found[:, _SPEEDS.start])
+    with np.errstate(over="ignore"):
+        speeds = np.sqrt(np.nansum(values[fast, _SPEEDS] ** 2, axis=1)).tolist()
+    faults += [
+        (row, f"speed is {speed:g} m/s") for row, speed in zip(fast.tolist(), speeds, strict=True)
+    ]
+    return np.where(found, np.nan, values), faults
+
+
+class FaultTally:
+    """Impossible values by entity: the first value, and the number of states with such values."""
+
+    MOST: Final = 1000
+    """Number of listed faults. Further faults are only counted."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, tuple[str, int]] = {}
+        self._more = 0
+
+    def add(self, ident: str, words: str) -> None:
+        """Count one fault, such as ``length is -4.5 m``."""
+        number, _, value = words.partition(" ")
+        what = f"{number} of entity {ident!r}"
+        if what not in self._found and len(self._found) == self.MOST:
+            self._more += 1
+            return
+        first, count = self._found.get(what, (value, 0))
+        self._found[what] = first, count + 1
+
+    def losses(self) -> list[Loss]:
+        """Return one loss for each faulty attribute of an entity."""
+        reasons = [
+            f"{what} {first}: missing in {count} states"
+            for what, (first, count) in self._found.items()
+        ]
+        if self._more:
+            reasons.append(f"{self._more} more sizes and speeds that no body has are missing")
+        return [Loss(reason, 0, 0) for reason in reasons]
+
+
+def is_leap(away: float, seconds: float) -> bool:
+    """True if the distance is too long for any body to cover in this time.
+
+    Parameters
+    ----------
+    away : float
+        Distance; m.
+    seconds : float
+        Duration of the movement; s. At 0 or less, the clock stands or jumps, and the result is false.
+    """
+    return seconds > 0 and away > FASTEST * seconds + LEAP
+
+
+def leaps(away: Floats, seconds: Floats) -> Bools:
+    """Vectorised form of :func:`is_leap`."""
+    return (seconds > 0) & (away > FASTEST * seconds + LEAP)
+
+
+TWINS_NS: Final = 1_000_000_000
+"""Longest absence of an entity whose id another entity uses meanwhile; ns."""
+
+TWINS: Final = 4
+"""Number of earlier entities that can share an id in turns."""
+
+AnyEntity = TypeVar("AnyEntity")
+
+
+class Sight(NamedTuple):
+    """Place and time of an observation of an entity.
+
+    Attributes
+    ----------
+    place : tuple of float
+        x, y and z; m. NaN means unknown.
+    time_ns : int
+        Simulation time; ns.
+    run : int
+        Number of the clock run. A backward jump starts a new run.
+    """
+
+    place: tuple[float, ...]
+    time_ns: int
+    run: int
+
+    @property
+    def is_placed(self) -> bool:
+        """True if the position in the plane is known."""
+        return not (math.isnan(self.place[0]) or math.isnan(self.place[1]))
+
+
+class Life(NamedTuple, Generic[AnyEntity]):
+    """One entity among those that share an id. ``seen`` is its last place; ``None`` means unknown."""
+
+    entity: AnyEntity
+    kind: int
+    seen: Sight | None = None
+
+    def goes_on(self, kind: int | None, here: Sight) -> bool:
+        """True if the observation can belong to this entity.
+
+        The kinds must be equal (``None``: uncertain kind), and the distance must be possible. After a clock
+        jump, any distance is possible.
+        """
+        seen = self.seen
+        if kind is not None and kind != self.kind:
+            return False
+        if seen is None or seen.run != here.run or not here.is_placed:
+            return True
+        (x, y, z), (x_then, y_then, z_then) = here.place, seen.place
+        up = z - z_then
+        away = math.hypot(x - x_then, y - y_then, 0.0 if math.isnan(up) else up)
+        return not is_leap(away, (here.time_ns - seen.time_ns) / 1e9)
+
+    def is_recent(self, here: Sight) -> bool:
+        """True if the entity disappeared only a short time ago, or if the clock was reset since."""
+        seen = self.seen
+        if seen is None or seen.run != here.run:
+            return True
+        return 0 <= here.time_ns - seen.time_ns <= TWINS_NS
+
+
+class Lives(Generic[AnyEntity]):
+    """Entities that have used one id, one after another.
+
+    If an id returns with another kind, or at an impossible distance, it denotes another entity from then on.
+    Entities that use one id in turns continue.
+
+    Parameters
+    ----------
+    last : Life
+        Current entity of the id.
+
+    Attributes
+    ----------
+    last : Life
+    left : sequence of Life
+        Earlier entities of the id that may continue, latest last.
+    count : int
+        Number of entities so far.
+    """
+
+    __slots__ = ("count", "last", "left")
+
+    def __init__(self, last: Life[AnyEntity]) -> None:
+        self.last = last
+        self.left: Sequence[Life[AnyEntity]] = ()
+        self.count = 1
+
+    def follow(
+        self, kind: int, here: Sight, enter: Callable[[], AnyEntity], *, sure_kind: bool = True
+    ) -> AnyEntity:
+        """Return the entity that uses the id in this observation.
+
+        Parameters
+        ----------
+        kind : int
+            Its kind.
+        here : Sight
+            Where it is.
+        enter : callable
+            Creates a new entity if no earlier one fits.
+        sure_kind : bool
+            False if the kind is a guess. A different kind alone then does not mean another entity.
+        """
+        last, judged = self.last, kind if sure_kind else None
+        if not last.goes_on(judged, here):
+            twins = (one for one in self.left if one.is_recent(here) and one.goes_on(judged, here))
+            after = next(twins, None)
+            if after is None:
+                after = Life(enter(), kind)
+                self.count += 1
+            self.left = [one for one in (*self.left, last) if one is not after][-TWINS:]
+            last = after
+        self.last = last._replace(seen=here) if here.is_placed else last
+        return last.entity
+
+
+UNTOLD: Final = -2
+"""Carrier value set by readers: the generator computes the carrier."""
+
+HIGHEST_GEAR: Final = 127
+"""Highest valid gear, forwards and backwards. A store has 8 bits for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entities:
+    """Constant properties of the new entities of a block, ordered by node id.
+
+    Attributes
+    ----------
+    first : int
+        Node id of the first row; the following rows follow in steps of one.
+    ident : tuple of str
+        The simulator's own id.
+    kind : (n,) int8
+        Codes of :data:`sgstore.model.vocabulary.KINDS`.
+    special, subkind, type_name : tuple of str
+        Special kind, subkind, and the simulator's own type name; empty if missing.
+    static : (n,) bool
+        True if the entity never moves. Its only pose is in :attr:`FrameBlock.scenery`.
+    map_ref : tuple of str
+        Id of the matching OpenDRIVE signal or object, or an empty string. For a signal that the map lacks: its
+        lanes, in the format of :func:`sgstore.maps.roads.lanes_ref`.
+    lifetime : tuple of int
+        1 for the first entity with an id, 2 for the next one with the same id, and so on. Empty means 1 for
+        all.
+    trailer : tuple of str
+        Id of the trailer at the first observation, or an empty string. Without the column, trailers are
+        unknown.
+    """
+
+    first: int
+    ident: tuple[str, ...]
+    kind: Codes
+    special: tuple[str, ...]
+    subkind: tuple[str, ...]
+    type_name: tuple[str, ...]
+    static: Bools
+    map_ref: tuple[str, ...]
+    lifetime: tuple[int, ...] = ()
+    trailer: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.ident)
+
+
+@dataclass(frozen=True, slots=True)
+class States:
+    """States of entities, one row per entity and time. All arrays have shape (N,).
+
+    Attributes
+    ----------
+    node : int64
+        Node id.
+    x, y, z : float64
+        Centre of the box; m.
+    heading, pitch, roll : float64
+        Orientation; rad.
+    vx, vy, vz, ax, ay, az : float64
+        Velocity and acceleration in map axes; m/s, m/s².
+    yaw_rate : float64
+        rad/s.
+    length, width, height : float64
+        Full extents of the box; m.
+    lights : int64
+        Lights of a vehicle: bit i is :data:`sgstore.model.vocabulary.VEHICLE_LIGHTS` [i]; -1: unknown.
+    light_state : int8
+        State of a traffic light: code of :data:`sgstore.model.vocabulary.LIGHT_STATES`; -1: no light.
+    steer, throttle, brake : float64
+        Control inputs, if recorded; -1 … 1 (positive to the left), 0 … 1, 0 … 1.
+    gear : float64
+        1, 2, …; 0: neutral; below 0: backwards.
+    hand_brake : float64
+        1: on, 0: off.
+    derived : int64
+        Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read.
+    carrier : int64
+        Node id of the carrier or towing vehicle; -1: none; :data:`UNTOLD`: not yet computed.
+    """
+
+    node: Ints
+    x: Floats
+    y: Floats
+    z: Floats
+    heading: Floats
+    pitch: Floats
+    roll: Floats
+    vx: Floats
+    vy: Floats
+    vz: Floats
+    ax: Floats
+    ay: Floats
+    az: Floats
+    yaw_rate: Floats
+    length: Floats
+    width: Floats
+    height: Floats
+    lights: Ints
+    light_state: Codes
+    steer: Floats
+    throttle: Floats
+    brake: Floats
+    gear: Floats
+    hand_brake: Floats
+    derived: Ints
+    carrier: Ints
+
+    def __post_init__(self) -> None:
+        for column in fields(self):
+            shape = getattr(self, column.name).shape
+            if shape != self.node.shape or len(shape) != 1:
+                raise ValueError(f"{column.name} has shape {shape}, expected {self.node.shape}")
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def take(self, rows: NDArray[np.intp] | Bools) -> States:
+        """Return the selected rows in the given order."""
+        return taken(self, rows)
+
+    @classmethod
+    def of(cls, **columns: NDArray[np.generic]) -> States:
+        """Return states from the given columns.
+
+        ``node`` is required; other columns default to missing values.
+        """
+        n = len(columns["node"])
+        missing = {
+            "lights": np.full(n, -1, np.int64),
+            "light_state": np.full(n, -1, np.int8),
+            "derived": np.zeros(n, np.int64),
+            "carrier": np.full(n, UNTOLD),
+        }
+        return cls(
+            **{
+                f.name: columns.get(f.name, missing.get(f.name, np.full(n, np.nan)))
+                for f in fields(cls)
+            }  # pyright: ignore[reportArgumentType]
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRefs:
+    """Positions of messages in the recording, one row per message; shape (M,).
+
+    Attributes
+    ----------
+    channel : int64
+        Index into :attr:`TraceInfo.channels`.
+    log_time_ns : int64
+        Log time in MCAP; ns.
+    chunk_offset : int64
+        Byte offset of the chunk record in the file; -1: the message is in no chunk.
+    offset : int64
+        Byte offset of the message record (its opcode) in the chunk's records, uncompressed, or in the file.
+    length : int64
+        Bytes of the message's data, without the record's head.
+    """
+
+    channel: Ints
+    log_time_ns: Ints
+    chunk_offset: Ints
+    offset: Ints
+    length: Ints
+
+    def __len__(self) -> int:
+        return len(self.channel)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameBlock:
+    """Consecutive frames of a trace. Frame f has the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
+
+    Attributes
+    ----------
+    seq : (F,) int64
+        Number of the frame in its trace, from 0, without gaps.
+    time_ns : (F,) int64
+        Simulation time; ns. It can jump backwards.
+    log_time_ns : (F,) int64
+        Log time of the leading message; payloads are joined by it.
+    offsets : (F + 1,) int64
+        Rows of each frame in ``states``.
+    states : States
+        Every entity that moves or changes (traffic lights too), in and out of range.
+    ego : (F,) int64
+        Node id of the ego; -1 means absent.
+    entities : Entities
+        Entities that appear in this block for the first time.
+    scenery : States
+        Poses of the new static entities, valid for the rest of the trace.
+    messages : MessageRefs
+        The messages read with this block, of all channels that are not latched.
+    events : tuple of Event
+        Events read with this block. They belong to its frames, and possibly to later frames.
+    """
+
+    seq: Ints
+    time_ns: Ints
+    log_time_ns: Ints
+    offsets: Ints
+    states: States
+    ego: Ints
+    entities: Entities
+    scenery: States
+    messages: MessageRefs
+    events: tuple[Event, ...] = ()
+
+    def __post_init__(self) -> None:
+        frames = len(self.seq)
+        if not len(self.time_ns) == len(self.log_time_ns) == len(self.ego) == frames:
+            raise ValueError("seq, time_ns, log_time_ns and ego must have one row a frame")
+        if len(self.offsets) != frames + 1 or self.offsets[-1] != len(self.states):
+            raise ValueError("offsets must have one more row than frames and end at the last state")
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+    @property
+    def frame_of(self) -> Ints:
+        """(N,) int64: the index of the frame of each state in this block."""
+        return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel of a trace.
+
+    Attributes
+    ----------
+    id : int
+        The channel's id in the file.
+    topic, schema, schema_encoding, message_encoding : str
+        Values in the file.
+    messages : int
+        Number of messages in the file's statistics; -1 without statistics.
+    role : str
+        ``ground_truth``, ``map``, or ``payload``.
+    """
+
+    id: int
+    topic: str
+    schema: str
+    schema_encoding: str
+    message_encoding: str
+    messages: int
+    role: str
+
+
+@dataclass(frozen=True, slots=True)
+class TraceInfo:
+    """Properties of a recording that are known before its frames are read.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    size, mtime_ns : int
+        Size in bytes and modification time, summed up for the files of a bag. They later show a replaced file.
+    digest : str
+        SHA-256 of the whole file, in hexadecimal digits.
+    flavour : str
+        Name of the reader: ``osi``.
+    channels : tuple of Channel
+    ego : str
+        Simulator id of the ego; empty without an ego.
+    map_text, map_name : str
+        Text (OpenDRIVE or plain lanes) and name of the road map in the trace; empty without a map.
+    context : MessageRefs
+        Messages that later messages need: maps, latched messages, static data. A clip must include those before
+        its start.
+    mapping : str
+        Digest of the type mapping, for flavours that need one.
+    lost_lanes : tuple of str
+        Lanes of the trace that its lane map lacks, with the reasons.
+    """
+
+    path: Path
+    size: int
+    mtime_ns: int
+    digest: str
+    flavour: str
+    channels: tuple[Channel, ...]
+    ego: str
+    map_text: str
+    map_name: str
+    context: MessageRefs
+    mapping: str = ""
+    lost_lanes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Event reported by a simulator, for a vehicle or for weather and light.
+
+    Attributes
+    ----------
+    kind : str
+        ``collision``, ``lane_invasion`` or ``environment``.
+    time_ns, log_time_ns : int
+        Simulation time and log time.
+    seq : int
+        Number of the last frame before the event in the file; -1: none.
+    ident : str
+        Id of the vehicle; empty: unknown.
+    other : str
+        Id of the other object in a collision; empty: none.
+    value : float or None
+        Length of the impulse of a collision; N·s.
+    detail : str
+        Crossed lane markings: ``broken``, ``solid``, ``other``, separated by commas. For an environment, its
+        new state: ``precipitation=light, fog=mist``.
+    lifetime, other_lifetime : int
+        Lifetime numbers of the entities; see :class:`Entities`.
+    """
+
+    kind: str
+    time_ns: int
+    log_time_ns: int
+    seq: int
+    ident: str = ""
+    other: str = ""
+    value: float | None = None
+    detail: str = ""
+    lifetime: int = 1
+    other_lifetime: int = 1
+
+
+FAR_NS: Final = 1_000_000_000
+"""An event is assigned by log time if its simulation time is this far from all near frames; ns."""
+_PIECE: Final = 4096
+
+
+def nearest_frames(events: Sequence[Event], time_ns: Any, log_time_ns: Any) -> Ints:
+    """Return the row of the nearest frame for each event. The first of two equally near frames is used."""
+    found: list[Ints] = [np.zeros(0, np.int64)]
+    for start in range(0, len(events), _PIECE):
+        some = events[start : start + _PIECE]
+        apart = np.abs(np.array([event.time_ns for event in some])[:, None] - time_ns)
+        row = apart.argmin(axis=1)
+        far = apart[np.arange(len(row)), row] > FAR_NS
+        logged = np.abs(np.array([event.log_time_ns for event in some])[:, None] - log_time_ns)
+        found.append(np.where(far, logged.argmin(axis=1), row))
+    return np.concatenate(found)
+
+
+@dataclass(slots=True)
+class TraceReport(Findings):
+    """Findings from the reading of a trace. The reader adds findings block by block.
+
+    Attributes
+    ----------
+    frames, states : int
+        Numbers of frames and states read.
+    unknown_types : dict
+        Type names without a mapping → number of entities.
+    warnings : list of str
+        Anomalies without loss of data.
+    about_ego : list of str
+        Warnings that do not matter if the caller names the egos.
+    losses : list of Loss
+        Unusable data.
+    events : list of Event
+        Events in file order, up to a limit.
+    """
+
+    frames: int = 0
+    states: int = 0
+    unknown_types: dict[str, int] = field(default_factory=dict[str, int])
+    about_ego: list[str] = field(default_factory=list[str])
+    events: list[Event] = field(default_factory=list[Event])
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """Time interval of a trace, both ends included.
+
+    Attributes
+    ----------
+    trace : str
+        Name of the trace in its store.
+    start_ns, end_ns : int
+        Log times; ns.
+    """
+
+    trace: str
+    start_ns: int
+    end_ns: int
+
+    def widened(self, by: int) -> Clip:
+        """Return the clip, extended by this time at both ends; ns."""
+        return Clip(self.trace, self.start_ns - by, self.end_ns + by)
+
+
+# Stored values: float32 relative to an origin
+
+KEPT: Final = (
+    *("pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
+    *("length", "width", "height", *INPUTS),
+)
+"""Columns of :class:`States` that a store keeps as float32."""
+
+_VELOCITY: Final = slice(KEPT.index("vx"), KEPT.index("vz") + 1)
+_GEAR: Final = KEPT.index("gear")
+_HAND_BRAKE: Final = KEPT.index("hand_brake")
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Reference point of the positions of a trace; whole metres."""
+
+    x: float
+    y: float
+    z: float
+
+
+def origin_of(frames: FrameBlock) -> Origin | None:
+    """Return the median position in the first frame with positions, in whole metres.
+
+    The result does not depend on the ego. Without moving entities, the scenery counts. ``None`` means no
+    positions yet.
+    """
+    states, scenery = frames.states, frames.scenery
+    placed = np.flatnonzero(np.isfinite(states.x) & np.isfinite(states.y))
+    if len(placed):
+        frame = frames.frame_of[placed]
+        return _middle(states.take(placed[frame == frame[0]]))
+    standing = np.isfinite(scenery.x) & np.isfinite(scenery.y)
+    return _middle(scenery.take(standing)) if standing.any() else None
+
+
+def _middle(states: States) -> Origin:
+    z = states.z[np.isfinite(states.z)]
+    x, y = round(float(np.median(states.x))), round(float(np.median(states.y)))
+    return Origin(float(x), float(y), float(round(float(np.median(z)))) if len(z) else 0.0)
+
+
+def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
+    """Round values as the store does. Graphs are then equal before and after storage."""
+    return replace(
+        frames,
+        states=_as_kept(frames.states, origin),
+        scenery=_as_kept(frames.scenery, origin),
+    )
+
+
+def _as_kept(states: States, origin: Origin) -> States:
+    """Return states as float32 relative to an origin. A second call, or storage, changes nothing.
+
+    A float32 has 24 significant bits. The sum with the origin may round off low bits in float64; the difference
+    to the origin then still fits into 24 bits.
+    """
+    if not len(states):
+        return states
+    # All columns are processed at once, because a single frame has only a few dozen rows.
+    names = (*KEPT, "heading", "x", "y", "z")
+    shift = np.array([0.0] * (len(names) - 3) + [origin.x, origin.y, origin.z])[:, None]
+    given = [getattr(states, name) for name in KEPT]
+    given += [turned(states.heading), states.x, states.y, states.z]
+    kept = number(np.stack(given) - shift).astype(np.float64)
+    kept[~np.isfinite(kept)] = np.nan
+    # A traffic light has states, because it changes, but its position is constant.
+    velocity = kept[_VELOCITY]
+    kept[_VELOCITY] = np.where((states.light_state >= 0) & np.isnan(velocity), 0.0, velocity)
+    gear, hand_brake = np.rint(kept[_GEAR]), kept[_HAND_BRAKE]
+    kept[_GEAR] = np.where(np.abs(gear) <= HIGHEST_GEAR, gear, np.nan)
+    kept[_HAND_BRAKE] = np.where(np.isnan(hand_brake), np.nan, hand_brake != 0)
+    kept[-3:] += shift[-3:]
+    return replace(states, **dict(zip(names, kept, strict=True)))
+
+
+def turned(heading: Floats) -> Floats:
+    """Return headings in (-π, π], also after rounding to float32."""
+    # The largest float32 that is not above π: the float32 nearest to π is.
+    largest = float(np.nextafter(np.float32(np.pi), np.float32(0)))
+    return np.clip(wrapped(heading), -largest, largest)
+
+
+def number(values: Floats) -> NDArray[np.float32]:
+    """Return values as float32. A value beyond its range becomes infinite."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)

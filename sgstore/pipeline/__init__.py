@@ -1,0 +1,1 @@
+"""The processing of one recording: segments, imports, derived relations, rebuilding, diagnosis."""

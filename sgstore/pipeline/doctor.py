@@ -1,0 +1,168 @@
+"""Check of recordings without a store: their contents and any damage."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sgstore.base.files import working_folder
+from sgstore.errors import failure
+from sgstore.maps.map_files import Maps, lost_lanes
+from sgstore.mcap import Loss, near
+from sgstore.model.config import Config
+from sgstore.model.world import BUCKET_FRAMES, TraceReport
+from sgstore.pipeline.segments import TraceTally
+from sgstore.readers import on_map, open_recording, open_trace
+
+
+@dataclass(slots=True)
+class Examination:
+    """Contents and faults of a recording.
+
+    Attributes
+    ----------
+    path : Path
+    size : int
+        Bytes.
+    flavour : str
+        Name of the matching reader; empty without one.
+    digest : str
+        SHA-256 of the file; empty if the file was not fully read.
+    channels : list of dict
+        ``topic``, ``schema``, ``message_encoding``, ``messages`` (number of readable messages) and ``role`` of
+        each: ``ground_truth``, ``map``, ``payload``, or empty without a matching reader.
+    ego : str
+        The simulator's id of the ego; empty without an ego.
+    road_map : str
+        Name of the road map for an ingest; empty without a map.
+    frames, states : int
+    seconds : float
+        Time from the first to the last frame; s.
+    entities : dict
+        Number of entities by kind.
+    unknown_types : dict
+        Number of entities by type name, for type names without a mapping.
+    clock_jumps, gaps : int
+        Number of backward steps of the clock, and of steps longer than 2.5 periods.
+    clock_jumps_at, gaps_at : list of dict
+        The first of them, as in :meth:`sgstore.pipeline.segments.TraceTally.as_dict`.
+    warnings : list of str
+        Oddities without loss of data.
+    losses : list of Loss
+        Unusable parts.
+    error : str
+        Reason why the recording cannot be ingested; empty if it can.
+    """
+
+    path: Path
+    size: int = 0
+    flavour: str = ""
+    digest: str = ""
+    channels: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    ego: str = ""
+    road_map: str = ""
+    frames: int = 0
+    states: int = 0
+    seconds: float = 0.0
+    entities: dict[str, int] = field(default_factory=dict[str, int])
+    unknown_types: dict[str, int] = field(default_factory=dict[str, int])
+    clock_jumps: int = 0
+    gaps: int = 0
+    clock_jumps_at: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    gaps_at: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
+    warnings: list[str] = field(default_factory=list[str])
+    losses: list[Loss] = field(default_factory=list[Loss])
+    error: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all fields as plain values."""
+        return asdict(self)
+
+
+def examine(
+    path: str | Path, *, config: Config | None = None, road_map: str | Path | None = None
+) -> Examination:
+    """Read a recording as :func:`sgstore.ingest.ingest` would, and return only the report.
+
+    Parameters
+    ----------
+    path : str or Path
+    config : Config, optional
+        Its ego counts.
+    road_map : str or Path, optional
+        A file, or a folder of them.
+
+    Raises
+    ------
+    MapError
+        The file given for the road map cannot be read.
+    """
+    config = config or Config()
+    maps = Maps(None if road_map is None else Path(road_map), config.signs)
+    found = Examination(Path(path))
+    report = TraceReport()
+    try:
+        with working_folder("recording") as held, near(found.path, held):
+            _read(found, config, maps, _channels(found, report))
+    except Exception as error:  # noqa: BLE001  the other recordings must still be examined
+        found.error = str(failure(error, found.path))
+        found.warnings = found.warnings or report.warnings
+        found.losses = found.losses or report.losses
+    return found
+
+
+def _channels(found: Examination, report: TraceReport) -> Counter[int]:
+    """Fill in the channels of a recording. Return the number of readable messages by channel id."""
+    counts: Counter[int] = Counter()
+    recording = open_recording(found.path)
+    try:
+        found.size = recording.size
+        try:
+            for run in recording.walk(report):
+                ids, numbers = np.unique(run.channel, return_counts=True)
+                counts.update(dict(zip(ids.tolist(), numbers.tolist(), strict=True)))
+        finally:
+            schemas = recording.schemas
+            found.channels = [
+                {
+                    "topic": one.topic,
+                    "schema": schemas[one.schema_id].name if one.schema_id in schemas else "",
+                    "message_encoding": one.message_encoding,
+                    "messages": counts[number],
+                    "role": "",
+                }
+                for number, one in sorted(recording.channels.items())
+            ]
+    finally:
+        recording.close()
+    return counts
+
+
+def _read(found: Examination, config: Config, maps: Maps, counts: Counter[int]) -> None:
+    tally = TraceTally()
+    with open_trace(found.path, ego=config.ego, mapping=config.mapping) as trace:
+        info = trace.info
+        found.flavour, found.digest, found.ego = info.flavour, info.digest, info.ego
+        names = ("topic", "schema", "message_encoding", "messages", "role")
+        found.channels = [
+            {name: counts[one.id] if name == "messages" else getattr(one, name) for name in names}
+            for one in info.channels
+        ]
+        used, odd = maps.of(info)
+        found.road_map = used.name if used else ""
+        on_map(trace, used)
+        try:
+            for block in trace.blocks(2 * BUCKET_FRAMES):
+                tally.see(block)
+        finally:
+            report = trace.report
+            for name, value in tally.as_dict().items():
+                setattr(found, name, value)
+            found.frames, found.states, found.seconds = tally.frames, report.states, tally.seconds
+            found.unknown_types = config.unknown_of(report.unknown_types)
+            found.warnings = [*odd, *report.warnings]
+            found.losses = [*lost_lanes(info, used), *report.losses]

@@ -1,0 +1,613 @@
+"""Conversion of one recording into sealed segments, one per ego.
+
+Types for the progress and the outcome of an ingest.
+
+``python -m sgstore.pipeline.segments`` is a worker process that reads recordings for its parent process. Input
+(stdin) and output (stdout) have one JSON value per line. The first input is the job; each further input is a
+recording. The outputs are progress and outcomes. The process ends at once when stdin ends.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+import traceback
+from array import array
+from collections import Counter
+from contextlib import ExitStack, suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+
+from sgstore import errors
+from sgstore.base.logs import logger
+from sgstore.errors import SgstoreError, TraceError, failure, place_named
+from sgstore.graphs.relations import Crowds, renamed
+from sgstore.maps.map_files import Maps, lost_lanes
+from sgstore.mcap import Loss, check_name, near
+from sgstore.model.config import ALL_EGOS, Config, from_dict
+from sgstore.model.trace_parts import TracePart
+from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled
+from sgstore.model.world import longest_step_ns
+from sgstore.readers import on_map, open_trace
+from sgstore.sgg import SceneGraphGenerator, map_of_graphs
+from sgstore.store import Identity, OnMap, Segment, StoreFile
+
+_log = logger("segments")
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from sgstore.maps.roads import RoadMap
+    from sgstore.model.world import Codes, FrameBlock, Ints, TraceInfo
+    from sgstore.readers import MessageTrace
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Progress within one recording and within the whole ingest.
+
+    Attributes
+    ----------
+    path : Path
+    frames : int
+        Frames done of this recording.
+    bytes_done, size : int
+        Bytes read of the file (approximate), and its size.
+    all_frames, all_bytes, all_size : int
+        The same numbers, summed over all recordings.
+    files_done, files : int
+        Recordings done, and their total number.
+    """
+
+    path: Path
+    frames: int
+    bytes_done: int
+    size: int
+    all_frames: int = 0
+    all_bytes: int = 0
+    all_size: int = 0
+    files_done: int = 0
+    files: int = 1
+
+
+@dataclass(slots=True, repr=False)
+class TraceOutcome:
+    """Outcome of the ingest of one recording for one ego.
+
+    Attributes
+    ----------
+    path : Path
+    status : str
+        ``added``; ``replaced``: read again; ``present``: the store already had the trace with the same
+        settings; ``new``: a real run would add it (dry run); ``failed``.
+    name : str
+        Name of the trace in the store; empty if it failed.
+    ego : str
+        The simulator's id of the ego; empty without a known ego.
+    frames : int
+    entities : dict
+        Number of entities by kind, in and out of range.
+    unknown_types : dict
+        Number of entities by type name, for type names without a mapping.
+    clock_jumps, gaps : int
+        Number of backward steps of the recording's clock, and of steps longer than 2.5 periods.
+    seconds : float
+        Duration of the ingest; s.
+    warnings : list of str
+        Oddities without loss of data.
+    losses : list of Loss
+        Unusable parts of the recording.
+    scope : dict
+        Number of states cut by the settings, as in the report of the trace; empty if it failed.
+    error : SgstoreError or None
+        Reason of the failure.
+    """
+
+    path: Path
+    status: str = "failed"
+    name: str = ""
+    ego: str = ""
+    frames: int = 0
+    entities: dict[str, int] = field(default_factory=dict[str, int])
+    unknown_types: dict[str, int] = field(default_factory=dict[str, int])
+    clock_jumps: int = 0
+    gaps: int = 0
+    seconds: float = 0.0
+    warnings: list[str] = field(default_factory=list[str])
+    losses: list[Loss] = field(default_factory=list[Loss])
+    scope: dict[str, Any] = field(default_factory=dict[str, Any])
+    error: SgstoreError | None = None
+
+    def __repr__(self) -> str:
+        about = (
+            str(self.error) if self.error else f"{self.frames} frames, {len(self.losses)} losses"
+        )
+        return f"<TraceOutcome {self.name or self.path.name!r}: {self.status}, {about}>"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the outcome as JSON values; :meth:`from_dict` is the inverse."""
+        told = {"class": type(self.error).__name__, "message": str(self.error)}
+        return asdict(self) | {
+            "path": place_named(self.path),
+            "error": told if self.error else None,
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Return the outcome for JSON values. An error keeps its class and message."""
+        told = values["error"]
+        error = getattr(errors, told["class"])(told["message"]) if told else None
+        changed: dict[str, Any] = {
+            "path": Path(values["path"]),
+            "error": error,
+            "losses": [Loss(**loss) for loss in values["losses"]],
+        }
+        return cls(**(values | changed))
+
+
+# Settings of a run, as a value for another process.
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Settings for the reading of recordings.
+
+    Attributes
+    ----------
+    store : Path
+        The store; the file may be missing.
+    road_map : Path or None
+        A file, or a folder of them; see :class:`sgstore.maps.map_files.Maps`.
+    config : Config
+    part : TracePart
+        Time span and rate of the frames to read.
+    force : bool
+        Read recordings again that the store already contains.
+    dry_run : bool
+        Only report the outcomes; write nothing.
+    block_frames : int
+        Frames per block.
+    """
+
+    store: Path
+    road_map: Path | None = None
+    config: Config = field(default_factory=Config)
+    part: TracePart = field(default_factory=TracePart)
+    force: bool = False
+    dry_run: bool = False
+    block_frames: int = 120
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the job as JSON values; :meth:`from_dict` is the inverse."""
+        return {
+            "store": str(self.store),
+            "road_map": None if self.road_map is None else str(self.road_map),
+            "config": self.config.as_dict(),
+            "part": [self.part.since, self.part.until, self.part.rate],
+            "force": self.force,
+            "dry_run": self.dry_run,
+            "block_frames": self.block_frames,
+        }
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Return the job for JSON values."""
+        road_map = values["road_map"]
+        changed: dict[str, Any] = {
+            "store": Path(values["store"]),
+            "road_map": None if road_map is None else Path(road_map),
+            "config": from_dict(values["config"]),
+            "part": TracePart(*values["part"]),
+        }
+        return cls(**(values | changed))
+
+
+# Counters during the reading of a trace: frames, entities by kind, steps of the clock.
+
+SHOWN: Final = 20
+"""Maximum number of listed jumps and gaps; further ones are only counted."""
+
+
+@dataclass(slots=True)
+class TraceTally:
+    """Counter of the frames and entities of a trace, with the frame times.
+
+    Attributes
+    ----------
+    frames : int
+    kinds : Counter
+        Number of entities by kind code.
+    times : array
+        Simulation times of the frames, 8 bytes each; ns.
+    """
+
+    frames: int = 0
+    kinds: Counter[int] = field(default_factory=Counter[int])
+    times: array[int] = field(default_factory=lambda: array("q"))
+
+    def see(self, frames: FrameBlock) -> None:
+        """Add the counts of the next frames."""
+        self.frames += len(frames)
+        self.kinds.update(frames.entities.kind.tolist())
+        self.times.frombytes(frames.time_ns.astype(np.int64).tobytes())
+
+    @property
+    def entities(self) -> dict[str, int]:
+        """Number of entities by kind, in the order of the vocabulary."""
+        return {KINDS[code]: self.kinds[code] for code in sorted(self.kinds)}
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first to the last frame; s."""
+        return (self.times[-1] - self.times[0]) / 1e9 if self.times else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the counts as JSON values.
+
+        Returns
+        -------
+        dict
+            ``entities``; ``clock_jumps``: number of backward steps of the clock; ``gaps``: number of steps
+            longer than 2.5 median periods; ``clock_jumps_at``, ``gaps_at``: the first ones, each with the
+            number of the frame after the step (``seq``), its time since the start of the trace (``t``), and the
+            step (``seconds``).
+        """
+        times = np.frombuffer(self.times, np.int64)
+        steps = np.diff(times)
+        forward = steps[steps > 0]
+        period = float(np.median(forward)) if len(forward) else 0.0
+        report: dict[str, Any] = {"entities": self.entities}
+        longest = longest_step_ns(int(max(period, 1)))
+        for name, found in (("clock_jumps", steps < 0), ("gaps", steps > longest)):
+            rows = np.flatnonzero(found)
+            report[name] = len(rows)
+            report[f"{name}_at"] = [
+                {
+                    "seq": row + 1,
+                    "t": int(times[row + 1] - times[0]) / 1e9,
+                    "seconds": int(steps[row]) / 1e9,
+                }
+                for row in rows[:SHOWN].tolist()
+            ]
+        return report
+
+
+# One recording → sealed segments, one per ego.
+
+EGOS_AT_ONCE: Final = 8
+"""Egos per pass over a recording; each needs the memory of one segment."""
+
+_VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle") or ()])
+
+
+@dataclass(slots=True)
+class _EgoView:
+    """View of a recording from one ego.
+
+    Attributes
+    ----------
+    outcome : TraceOutcome
+    info : TraceInfo
+        Facts of the recording, with this ego.
+    sealed : Path or None
+        Folder of the segment; ``None`` means not built.
+    nodes : list of int
+        Node ids of the ego; each frame has at most one of them.
+    met : bool
+        True if a frame contains the ego.
+    crowds : Crowds
+        Frames with too many pairs.
+    """
+
+    outcome: TraceOutcome
+    info: TraceInfo
+    sealed: Path | None = None
+    nodes: list[int] = field(default_factory=list[int])
+    met: bool = False
+    crowds: Crowds = field(default_factory=Crowds)
+
+
+class SegmentReader:
+    """Reader of recordings, one after another, into segments.
+
+    Parameters
+    ----------
+    job : Job
+    on_block : function
+        Called after every block with the frames done, the bytes of the file read (approximate), and its size.
+
+    Raises
+    ------
+    MapError
+        The road map of the job cannot be read.
+    """
+
+    def __init__(self, job: Job, on_block: Callable[[int, int, int], None]) -> None:
+        self._job = job
+        self._on_block = on_block
+        self._maps = Maps(job.road_map, job.config.signs)
+        self._file: StoreFile | None = None
+        self._on_map: OnMap | None = None
+
+    def read(self, path: Path, folder: Path) -> list[tuple[TraceOutcome, Path | None]]:
+        """Read a recording and build its segments in subfolders of ``folder``.
+
+        ``folder`` is created if needed. The result has one entry per ego: the outcome, and the folder of the
+        segment or ``None``.
+        """
+        start = time.perf_counter()
+        views: list[_EgoView] = []
+        failed: SgstoreError | None = None
+        try:
+            check_name(path)
+            with near(path, folder / "copy"):
+                self._read(path, folder, views)
+        except Exception as error:  # noqa: BLE001  the other recordings must still be read
+            failed = failure(error, path)
+            if failed is not error:
+                _log.debug("%s: %s", path, traceback.format_exc())
+        found = [(view.outcome, view.sealed) for view in views] or [(TraceOutcome(path), None)]
+        for outcome, _ in found:
+            if outcome.status == "failed" and outcome.error is None:
+                outcome.error = failed
+            outcome.seconds = time.perf_counter() - start
+        return found
+
+    def _read(self, path: Path, folder: Path, views: list[_EgoView]) -> None:
+        job, config = self._job, self._job.config
+        if self._file is None and job.store.exists():
+            self._file = StoreFile(job.store)
+        store = None if job.force else self._file
+        digest = store.known_digest(path) if store else ""  # A known digest saves the hashing.
+        with open_trace(path, ego=config.ego, digest=digest, mapping=config.mapping) as trace:
+            _log.debug("%s: a recording of flavour %s", path, trace.info.flavour)
+            road_map, odd = self._maps.of(trace.info)
+            lost = lost_lanes(trace.info, road_map)
+            on_map(trace, road_map)
+            wanted = [
+                one
+                for one in self._wanted(trace, views)
+                if store is None or self._is_new(store, one, road_map)
+            ]
+            if store is not None and wanted:  # The publishing process can then write at once.
+                store.close()
+            if wanted and not job.dry_run:
+                config = replace(config, exclude_ids=self._excluded(trace))
+            for first in range(0, len(wanted), EGOS_AT_ONCE):
+                group = wanted[first : first + EGOS_AT_ONCE]
+                for one in group:
+                    one.outcome.warnings += [*odd, *config.notes]
+                    one.outcome.losses += lost
+                    if job.dry_run:
+                        one.outcome.status = "new"
+                if not job.dry_run:
+                    self._build(trace, group, road_map, config, folder / str(first))
+
+    def _wanted(self, trace: MessageTrace, views: list[_EgoView]) -> Iterator[_EgoView]:
+        """Yield the requested views of a recording. The outcome of an unknown ego gets an error."""
+        info, egos = trace.info, self._job.config.egos
+        if not egos:
+            views.append(_EgoView(TraceOutcome(info.path, ego=info.ego), info))
+            yield views[0]
+            return
+        everyone, seen = egos == (ALL_EGOS,), set[str]()
+        for name in self._vehicles(trace) if everyone else egos:
+            view = _EgoView(TraceOutcome(info.path, ego=name), info)
+            try:
+                found = name if everyone else self._ident(trace, name)
+            except SgstoreError as error:
+                view.outcome.error = error
+                views.append(view)
+                continue
+            if found not in seen:  # Otherwise, two names mean the same ego.
+                seen.add(found)
+                view.outcome.ego, view.info = found, replace(info, ego=found)
+                views.append(view)
+                yield view
+
+    def _excluded(self, trace: MessageTrace) -> tuple[str, ...]:
+        """Return the ids of the entities to exclude. Each name may be a role, a vehicle name or an id."""
+        found: list[str] = []
+        for name in self._job.config.exclude_ids:
+            with suppress(SgstoreError):
+                found.append(self._ident(trace, name))
+            found.append(name)
+        return tuple(dict.fromkeys(found))
+
+    def _ident(self, trace: MessageTrace, name: str) -> str:
+        """Return the id of the ego for a name, as resolved by the reader of the recording."""
+        info = trace.info
+        try:
+            found = trace.ego_named(name)
+        except TraceError as error:
+            raise TraceError(error.reason, path=info.path) from error
+        if found is not None:
+            return found
+        mapping = self._job.config.mapping
+        with open_trace(info.path, ego=name, digest=info.digest, mapping=mapping) as again:
+            return again.info.ego
+
+    def _vehicles(self, trace: MessageTrace) -> list[str]:
+        """Return the ids of all vehicles of a recording."""
+        found: list[str] = []
+        for block in trace.blocks(self._job.block_frames):
+            entities = self._meant(block).entities
+            rows = np.flatnonzero(np.isin(entities.kind, _VEHICLES))
+            found += [entities.ident[row] for row in rows.tolist()]
+        if not found:
+            raise TraceError("no vehicle in it can be the ego", path=trace.info.path)
+        return found
+
+    def _is_new(self, store: StoreFile, view: _EgoView, road_map: RoadMap | None) -> bool:
+        """True if the store lacks the trace of this ego. Otherwise set the outcome."""
+        job, outcome = self._job, view.outcome
+        try:
+            shown = map_of_graphs(road_map, job.config)
+            name = store.stored(view.info, job.config, shown, (job.part.since, job.part.until))
+        except SgstoreError as error:
+            outcome.error = error
+            return False
+        if name is None:
+            return True
+        outcome.status, outcome.name = "present", name
+        stored = store.trace(name)
+        outcome.frames, outcome.scope = stored.frames, stored.report.get("scope", {})
+        return False
+
+    def _build(
+        self,
+        trace: MessageTrace,
+        group: list[_EgoView],
+        road_map: RoadMap | None,
+        config: Config,
+        folder: Path,
+    ) -> None:
+        """Build the segments of several egos in one pass over the recording."""
+        job, size = self._job, self._job.block_frames
+        generator = SceneGraphGenerator(road_map, config)
+        tally = TraceTally()
+        blocks = job.part.blocks(map(self._meant, trace.blocks(size)), size)
+        first = next(blocks, None)
+        if first is None:
+            raise TraceError("no frame of it can be read", path=trace.info.path)
+        with ExitStack() as stack:
+            segments: list[Segment] = []
+            shown, part = map_of_graphs(road_map, job.config), (job.part.since, job.part.until)
+            if self._on_map is None or self._on_map.road_map is not shown:
+                self._on_map = OnMap(shown)
+            for number, one in enumerate(group):
+                one.sealed = folder.with_name(f"{folder.name}-{number}")
+                one.sealed.mkdir(parents=True)
+                identity = Identity.of(one.info, job.config, shown, part)
+                place = (one.sealed, len(group))
+                segment = Segment(
+                    job.store,
+                    one.info,
+                    identity,
+                    self._on_map,
+                    generator.answers,
+                    place=place,
+                )
+                segments.append(stack.enter_context(segment))
+            while block := first or next(blocks, None):
+                first = None
+                self._append(generator, block, group, segments)
+                tally.see(block)
+                self._on_block(tally.frames, _reached(block, trace.info.size), trace.info.size)
+            self._seal(trace, group, segments, tally, (generator.parked, generator.world_parked))
+
+    def _append(
+        self,
+        generator: SceneGraphGenerator,
+        block: FrameBlock,
+        group: list[_EgoView],
+        segments: list[Segment],
+    ) -> None:
+        # Origins do not depend on the ego, so all segments store the same numbers.
+        kept, *_ = [segment.as_kept(block) for segment in segments]
+        egos = [kept.ego]
+        if self._job.config.egos:
+            egos = [_ego_of(block, one) for one in group]
+        for piece in generator.pieces(kept, len(egos)):
+            first = int(piece.seq[0] - kept.seq[0]) if len(piece) else 0
+            here = [ego[first : first + len(piece)] for ego in egos]
+            graphs = generator.one_by_one(piece, here)
+            for one, segment in zip(group, segments, strict=True):
+                graph = next(graphs)
+                one.crowds.see(graph)
+                segment.append(graph)
+                del graph  # Free this graph before the next one is built.
+
+    def _seal(
+        self,
+        trace: MessageTrace,
+        group: list[_EgoView],
+        segments: list[Segment],
+        tally: TraceTally,
+        parked: Sequence[Codes],
+    ) -> None:
+        report, told = trace.report, tally.as_dict()
+        moot = report.about_ego if self._job.config.egos else []
+        warnings = [warning for warning in report.warnings if warning not in moot]
+        for one, segment in zip(group, segments, strict=True):
+            outcome = one.outcome
+            if self._job.config.egos and not one.met:
+                reason = f"the ego {one.info.ego!r} is in none of the frames that were read"
+                outcome.error = TraceError(reason, path=one.info.path)
+                continue
+            outcome.frames = tally.frames
+            outcome.entities = tally.entities
+            outcome.clock_jumps, outcome.gaps = told["clock_jumps"], told["gaps"]
+            outcome.unknown_types = self._job.config.unknown_of(report.unknown_types)
+            outcome.warnings += warnings
+            outcome.losses += [*report.losses, *one.crowds.losses(self._job.config)]
+            kept = replace(report, warnings=outcome.warnings, losses=outcome.losses, about_ego=[])
+            outcome.scope = segment.scope.get("scope", {})
+            segment.seal(kept, told, parked)
+            outcome.status = "sealed"
+
+    def _meant(self, block: FrameBlock) -> FrameBlock:
+        """Apply the configured type mapping to the entities of a block."""
+        return replace(block, entities=renamed(block.entities, self._job.config.types))
+
+
+def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
+    """Return the node id of the ego in each frame: (F,) int64, -1 if absent."""
+    idents = enumerate(block.entities.ident, start=block.entities.first)
+    one.nodes += [node for node, ident in idents if ident == one.info.ego]
+    rows = np.isin(block.states.node, one.nodes)
+    found = np.full(len(block), -1, np.int64)
+    found[block.frame_of[rows]] = block.states.node[rows]
+    one.met = one.met or bool(rows.any())
+    return found
+
+
+def _reached(frames: FrameBlock, size: int) -> int:
+    """Return the approximate number of file bytes read up to this block."""
+    messages = frames.messages
+    places = np.where(messages.chunk_offset < 0, messages.offset, messages.chunk_offset)
+    return min(int(places.max(initial=0)), size)
+
+
+# Worker process that reads recordings for its parent.
+
+
+def main() -> None:
+    """Read recordings on request: requests on stdin, results on stdout, until stdin ends."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    sys.stdout = sys.stderr  # Printed text must not mix with the results.
+    told: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    threading.Thread(target=_listen, args=(told,), daemon=True).start()
+
+    def answer(values: dict[str, Any]) -> None:
+        answers.write(f"{json.dumps(values)}\n")
+        answers.flush()
+
+    def on_block(frames: int, reached: int, size: int) -> None:
+        answer({"index": index, "frames": frames, "bytes": reached, "size": size})
+
+    index = -1
+    reading = SegmentReader(Job.from_dict(told.get()), on_block)
+    while True:
+        task = told.get()
+        index = task["index"]
+        views = reading.read(Path(task["path"]), Path(task["folder"]))
+        done = [[outcome.as_dict(), sealed and str(sealed)] for outcome, sealed in views]
+        answer({"index": index, "done": done})
+
+
+def _listen(told: SimpleQueue[dict[str, Any]]) -> None:
+    for line in sys.stdin:
+        told.put(json.loads(line))
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

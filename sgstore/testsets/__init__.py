@@ -1,0 +1,1 @@
+"""Sets of tests: coverage, selection, locks, and the difference between stores."""

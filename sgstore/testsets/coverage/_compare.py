@@ -1,0 +1,562 @@
+"""Comparison of selections: common, new and missing classes, estimates of unseen classes, and failures.
+
+The estimates of unseen classes use the frequencies of the seen classes.
+
+Sources. Good–Turing: Good, "The population frequencies of species", Biometrika 40 (1953). Chao1, its variance
+and interval: Chao, "Nonparametric estimation of the number of classes in a population" (1984), bias-corrected
+as in Chao and Chiu, "Species richness: estimation and comparison" (2016), eq. 4, 7 and 8. Rarefaction:
+Hurlbert, "The nonconcept of species diversity", Ecology 52 (1971).
+
+All estimates assume independently drawn samples. Consecutive frames are not independent: count runs
+or traces.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.errors import ConfigError
+from sgstore.store import begins, trace_of
+from sgstore.testsets.coverage._classes import UNKNOWN, CountedUnit, shared
+from sgstore.testsets.coverage._frames import SHARES, ReportTable, names_of, of_unknown, share
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from sgstore.model.world import Bools, Floats, Ints
+    from sgstore.testsets.coverage._classes import Classed
+    from sgstore.testsets.coverage._frames import ChosenFrames
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Estimate of the number of unseen classes.
+
+    Attributes
+    ----------
+    units : int
+        Number of counted units.
+    seen : int
+        Number of their classes.
+    once, twice : int
+        Number of classes seen in exactly one unit, and in two.
+    unseen_mass : float
+        Good–Turing: the expected share of further units with a new class; NaN without units.
+    chao1 : float
+        Estimated number of classes, seen and unseen; a lower bound in expectation.
+    low, high : float
+        Its 95 % interval.
+    """
+
+    units: int
+    seen: int
+    once: int
+    twice: int
+    unseen_mass: float
+    chao1: float
+    low: float
+    high: float
+
+
+def estimate(sizes: Ints, samples: int = 0) -> Estimate:
+    """Estimate the number of unseen classes.
+
+    Parameters
+    ----------
+    sizes : (S,) int64
+        Number of units per class; zeros are ignored.
+    samples : int
+        Number of samples with several classes each (traces), where a class counts once per sample.
+        ``chao1`` is then Chao2 of these incidences. 0: each unit is its own sample.
+    """
+    sizes = sizes[sizes > 0]
+    units, seen = int(sizes.sum()), len(sizes)
+    once, twice = int((sizes == 1).sum()), int((sizes == 2).sum())
+    if not units:
+        return Estimate(0, 0, 0, 0, math.nan, 0.0, 0.0, 0.0)
+    factor = ((samples or units) - 1) / (samples or units)
+    if twice:
+        ratio = once / twice
+        unseen = factor * once**2 / (2 * twice)
+        variance = twice * (factor * ratio**2 / 2 + factor**2 * ratio**3 + factor**2 * ratio**4 / 4)
+    else:
+        unseen = factor * once * (once - 1) / 2
+        total = seen + unseen
+        variance = (
+            factor * once * (once - 1) / 2
+            + factor**2 * once * (2 * once - 1) ** 2 / 4
+            - factor**2 * once**4 / (4 * total)
+        )
+    low, high = _interval(seen, unseen, max(variance, 0.0))
+    return Estimate(units, seen, once, twice, once / units, seen + unseen, low, high)
+
+
+def _interval(seen: int, unseen: float, variance: float) -> tuple[float, float]:
+    """Return the 95 % interval of the number of classes, log-normal above the seen number."""
+    if unseen <= 0:
+        return float(seen), float(seen)
+    width = math.exp(1.96 * math.sqrt(math.log(1 + variance / unseen**2)))
+    return seen + unseen / width, seen + unseen * width
+
+
+def expected_classes(
+    sizes: Ints, drawn: Ints, units: int = 0, weight: Ints | None = None
+) -> Floats:
+    """Return the mean number of classes in a random subset: exact rarefaction.
+
+    A class in m of N units is missed by a subset of n in C(N - m, n) of C(N, n) cases
+    (hypergeometric).
+
+    Parameters
+    ----------
+    sizes : (S,) int64
+        Number of units with each class.
+    drawn : (K,) int64
+        Sizes of subsets, drawn without replacement; at most all units.
+    units : int
+        Number of units. 0: the sum of ``sizes``, for units with one class each.
+    weight : (S,) int64, optional
+        Number of classes that each entry represents.
+    """
+    seen = sizes > 0
+    units = units or int(sizes.sum())
+    if not units or not seen.any():
+        return np.zeros(len(drawn))
+    logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, units + 1)))])
+    often = np.bincount(sizes[seen], None if weight is None else weight[seen])
+    expected = np.full(len(drawn), float(often.sum()))
+    for size in np.flatnonzero(often).tolist():
+        rest = units - size - drawn
+        # C(units - size, drawn) / C(units, drawn), as logarithms
+        missed = logs[units - size] - logs[np.maximum(rest, 0)] - logs[units] + logs[units - drawn]
+        expected -= often[size] * np.where(rest >= 0, np.exp(missed), 0.0)
+    return expected
+
+
+# Comparison of two selections: covered, new and common classes; and growth of one selection.
+
+POINTS = 40
+"""Number of rows of a growth curve."""
+
+
+def classes(a: Classed, unit: CountedUnit = "frame") -> ReportTable:
+    """Return the classes of a selection, the most frequent first.
+
+    Returns
+    -------
+    ReportTable
+        ``rank``, ``class``, ``units``, ``share``, ``cumulative`` (shares of the units with a known
+        class), and ``frame``, the first one with the class. The notes name the denominators, and
+        estimate the unseen classes.
+    """
+    sizes, first = a.sizes(unit), a.first()
+    present = np.flatnonzero(sizes)
+    order = present[np.lexsort((first[present], -sizes[present]))]
+    total = a.samples(unit) or int(sizes.sum())
+    cumulative: list[float | None] = (np.cumsum(sizes[order]) / max(total, 1)).tolist()
+    if unit == "trace":  # a trace has several classes: cumulative shares have no meaning
+        cumulative = [None] * len(order)
+    rows = zip(
+        range(1, len(order) + 1),
+        [a.names[code] for code in order.tolist()],
+        sizes[order].tolist(),
+        (sizes[order] / max(total, 1)).tolist(),
+        cumulative,
+        names_of(a.chosen.store, first[order]),
+        strict=True,
+    )
+    columns = ("rank", "class", f"{unit}s", "share", "cumulative", "frame")
+    return ReportTable(
+        columns, list(rows), [*_said(a, unit), *of_unknown(a.unknown, a.chosen.text)]
+    )
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else value
+
+
+def _said(a: Classed, unit: CountedUnit) -> list[str]:
+    found = estimate(a.sizes(unit), a.samples(unit))
+    if not found.units:
+        return [f"{a.chosen.text}: no frame with a class"]
+    biggest, units = int(a.sizes(unit).max()), a.samples(unit) or found.units
+    return [
+        f"{found.seen} classes in {units} {unit}s of {a.chosen.text};"
+        f" the largest is in {biggest / units:.1%} of them,"
+        f" {found.once} classes ({found.once / found.seen:.1%}) come once",
+        unseen(found, unit),
+    ]
+
+
+def unseen(found: Estimate, unit: CountedUnit) -> str:
+    """Return the estimate of unseen classes as a sentence."""
+    return (
+        f"unseen: {found.unseen_mass:.2%} of further {unit}s would be of a new class (Good-Turing);"
+        f" at least {found.chao1:.0f} classes in all (Chao1, 95 %: {found.low:.0f} to {found.high:.0f}),"
+        f" if {unit}s were drawn independently"
+    )
+
+
+def covered(of: Classed, by: Classed) -> ReportTable:
+    """Return the share of the classes of one selection that occur in another, by class and by frame.
+
+    Returns
+    -------
+    ReportTable
+        ``measure``, ``part``, ``of``, ``share``, ``denominator``.
+    """
+    _, (of, by) = shared(of, by)
+    sizes, there = of.sizes(), by.sizes() > 0
+    both = (sizes > 0) & there
+    name, other = of.chosen.text, by.chosen.text
+    many, frames = int((sizes > 0).sum()), int(sizes.sum())
+    rows = [
+        share("classes covered", int(both.sum()), many, f"distinct classes of {name}"),
+        share("frames covered", int(sizes[both].sum()), frames, f"frames of {name} with a class"),
+    ]
+    said = [f"covered: of a class that also occurs in {other}", *of_unknown(of.unknown, name)]
+    return ReportTable(SHARES, rows, [*said, *of_unknown(by.unknown, other)])
+
+
+def is_novel(a: Classed, than: Classed) -> Bools:
+    """Return a mask (N,) of frames with a class that another selection lacks; common numbering required."""
+    there = np.append(than.sizes() > 0, True)  # the last entry is for unknown classes
+    return ~there[a.code]
+
+
+def novel(a: Classed, than: Classed) -> ReportTable:
+    """Return the classes of one selection that another lacks, the rarest first.
+
+    Returns
+    -------
+    ReportTable
+        ``class``, ``frames``, ``frame`` (the first with the class).
+    """
+    _, (a, than) = shared(a, than)
+    sizes, first = a.sizes(), a.first()
+    new = np.flatnonzero((sizes > 0) & (than.sizes() == 0))
+    order = new[np.lexsort((first[new], sizes[new]))]
+    names = [a.names[code] for code in order.tolist()]
+    frames = names_of(a.chosen.store, first[order])
+    rows = list(zip(names, sizes[order].tolist(), frames, strict=True))
+    total, many = int(sizes.sum()), int((sizes > 0).sum())
+    said = [
+        f"new: {len(new)} of {many} distinct classes of {a.chosen.text},"
+        f" {int(sizes[new].sum())} of its {total} frames with a class; not in {than.chosen.text}"
+    ]
+    said += of_unknown(a.unknown, a.chosen.text) + of_unknown(than.unknown, than.chosen.text)
+    return ReportTable(("class", "frames", "frame"), rows, said)
+
+
+def novel_frames(a: Classed, than: Classed) -> ReportTable:
+    """Return the frames with novel classes, rarest classes first.
+
+    Returns
+    -------
+    ReportTable
+        ``frame``, ``frame_id``, ``class``, ``frames_of_class``.
+    """
+    _, (a, than) = shared(a, than)
+    sizes = a.sizes()
+    rows = np.flatnonzero(is_novel(a, than))
+    rows = rows[np.lexsort((a.frame_id[rows], sizes[a.code[rows]]))]
+    frames = names_of(a.chosen.store, a.frame_id[rows])
+    listed = zip(frames, a.frame_id[rows].tolist(), a.code[rows].tolist(), strict=True)
+    table = [(frame, number, a.names[code], int(sizes[code])) for frame, number, code in listed]
+    said = [f"{len(rows)} frames of {a.chosen.text} of classes that are not in {than.chosen.text}"]
+    return ReportTable(("frame", "frame_id", "class", "frames_of_class"), table, said)
+
+
+def novel_clips(a: Classed, than: Classed) -> ReportTable:
+    """Return runs of consecutive frames with novel classes, the longest first.
+
+    Returns
+    -------
+    ReportTable
+        ``from``, ``to``, ``frames``, ``classes``.
+    """
+    _, (a, than) = shared(a, than)
+    rows = np.flatnonzero(is_novel(a, than))
+    ids = a.frame_id[rows]
+    fresh = begins(ids)
+    starts = np.flatnonzero(fresh)
+    ends = np.append(starts[1:], len(rows)) - 1
+    first, last = names_of(a.chosen.store, ids[starts]), names_of(a.chosen.store, ids[ends])
+    number = np.cumsum(fresh) - 1
+    pairs = np.unique(np.stack([number, a.code[rows]]), axis=1)[0]
+    kinds = np.bincount(pairs, minlength=len(starts))
+    table = [
+        (one, other, int(end - start + 1), int(many))
+        for one, other, start, end, many in zip(first, last, starts, ends, kinds, strict=True)
+    ]
+    table.sort(key=lambda row: -row[2])
+    said = [f"{len(table)} clips of {a.chosen.text} of classes that are not in {than.chosen.text}"]
+    return ReportTable(("from", "to", "frames", "classes"), table, said)
+
+
+def venn(a: Classed, b: Classed) -> ReportTable:
+    """Return the intersection of two selections, by class and by frame.
+
+    Returns
+    -------
+    ReportTable
+        ``set``, ``classes``, ``frames_of_a``, ``frames_of_b``.
+    """
+    _, (a, b) = shared(a, b)
+    in_a, in_b = a.sizes(), b.sizes()
+    sets = {
+        "A and B": (in_a > 0) & (in_b > 0),
+        "A without B": (in_a > 0) & (in_b == 0),
+        "B without A": (in_a == 0) & (in_b > 0),
+        "A or B": (in_a > 0) | (in_b > 0),
+    }
+    rows = [
+        (name, int(of.sum()), int(in_a[of].sum()), int(in_b[of].sum())) for name, of in sets.items()
+    ]
+    said = [f"A: {a.chosen.text}", f"B: {b.chosen.text}"]
+    said += of_unknown(a.unknown, a.chosen.text) + of_unknown(b.unknown, b.chosen.text)
+    return ReportTable(("set", "classes", "frames_of_a", "frames_of_b"), rows, said)
+
+
+def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> ReportTable:
+    """Return the number of classes in the first n units, in ingest order of traces.
+
+    Returns
+    -------
+    ReportTable
+        ``n``, ``classes``, ``new_per_1000`` since the previous row, and ``at_random``: the mean
+        number of classes in n random units.
+    """
+    sizes, found = curve(a, unit)
+    total = len(found)
+    at = np.unique(np.linspace(1, total, min(points, total)).round().astype(np.int64))
+    at_random = expected_classes(sizes, at) if unit != "trace" else np.full(len(at), np.nan)
+    rows: list[tuple[int, int, float, float | None]] = []
+    before = (0, 0)
+    for n, random in zip(at.tolist(), at_random.tolist(), strict=True):
+        so_far = int(found[n - 1])
+        rate = (so_far - before[1]) * 1000 / (n - before[0])
+        rows.append((n, so_far, rate, _known(random)))
+        before = (n, so_far)
+    said = unseen(estimate(sizes, a.samples(unit)), unit)
+    said = said if total else f"{a.chosen.text}: no frame with a class"
+    columns = (f"{unit}s", "classes", "new_per_1000", "at_random")
+    return ReportTable(columns, list(rows), [said, *of_unknown(a.unknown, a.chosen.text)])
+
+
+def curve(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Ints]:
+    """Return the sizes of the classes, and the number of classes after each unit.
+
+    A trace is a unit that adds all its classes at once.
+    """
+    order = a.in_order()
+    order = order[a.code[order] != UNKNOWN]
+    if unit == "run":
+        order = order[a.run_begins()[order]]
+    codes = a.code[order]
+    new = np.zeros(len(codes), np.int64)
+    new[np.unique(codes, return_index=True)[1]] = 1
+    found = np.cumsum(new)
+    if unit == "trace" and len(order):
+        trace = trace_of(a.frame_id[order])
+        found = found[np.flatnonzero(np.append(trace[1:] != trace[:-1], True))]
+    return a.sizes(unit), found
+
+
+def rank_sizes(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Floats]:
+    """Return the sizes of the classes, largest first, and their cumulative shares of all units."""
+    sizes = np.sort(a.sizes(unit))[::-1]
+    sizes = sizes[sizes > 0]
+    return sizes, np.cumsum(sizes) / max(int(sizes.sum()), 1)
+
+
+# Failures of a system under test by the classes of its inputs: S3C's novel failures --------------
+# Woodlief et al., "S3C: Spatial Semantic Scene Coverage for Autonomous Vehicles" (ICSE 2024),
+# section 4.2. A *novel failure* is a failing test input whose class has no failing training input.
+# PNFNC is the share of novel failures whose class has no training input at all: failures that
+# coverage could predict.
+
+S3C_THRESHOLD: Final = 5 / 140
+"""Error threshold of S3C's code for a steering angle, -1 … 1 for ±70°: 2.5°, although its paper states 5°."""
+
+_ID: Final = re.compile(r"[0-9]{1,19}")
+
+
+def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[str, bool]:
+    """Read the outcomes of a system's inputs from a CSV file.
+
+    Parameters
+    ----------
+    path : str or Path
+        Columns ``frame`` (or S3C's ``town`` and ``filename``) and ``failed``, or ``error``, or ``label`` and
+        ``pred``.
+    threshold : float
+        A greater error is a failure; for ``label`` and ``pred`` the error is their difference.
+
+    Returns
+    -------
+    dict
+        Name → True for a failure. A name is ``TRACE#SEQ``, a ``frame_id``, or the name of a graph
+        in an imported file.
+
+    Raises
+    ------
+    ConfigError
+        The file is unreadable, a column is missing, or a row is invalid.
+    """
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return dict(_outcomes(path, csv.reader(file, strict=True), threshold))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: no CSV: {error}") from error
+
+
+def told_outcomes(
+    outcomes: Mapping[str, bool], chosen: ChosenFrames, frame_id: Ints
+) -> tuple[Bools, Bools]:
+    """Return masks (N,) of failed frames, and of frames with a known outcome."""
+    failed, known = (np.zeros(len(frame_id), np.bool_) for _ in range(2))
+    place = {int(frame): row for row, frame in enumerate(frame_id.tolist())}
+    ids = chosen.abstracted.times()[0]
+    called = dict(zip(names_of(chosen.store, ids), ids.tolist(), strict=True))
+    called |= chosen.abstracted.imported_names()
+    for name, fails in outcomes.items():
+        row = place.get(called.get(name, int(name) if _ID.fullmatch(name) else -1))
+        if row is not None:
+            failed[row], known[row] = fails, True
+    return failed, known
+
+
+def _outcomes(
+    path: Path, rows: Iterator[list[str]], threshold: float
+) -> Iterator[tuple[str, bool]]:
+    header = [name.strip() for name in next(rows, [])]
+    names = ["frame"] if "frame" in header else ["town", "filename"]
+    values = next(
+        (v for v in (["failed"], ["error"], ["label", "pred"]) if set(v) <= set(header)), None
+    )
+    if not set(names) <= set(header) or values is None:
+        raise ConfigError(
+            f"{path}: expected columns 'frame' (or 'town', 'filename') and 'failed' (or 'error', or 'label',"
+            f" 'pred'); found {','.join(header)[:200]}"
+        )
+    at_name = [header.index(name) for name in names]
+    at_value = [header.index(name) for name in values]
+    for number, row in enumerate(rows, start=2):
+        if not row:
+            continue
+        if len(row) != len(header):
+            raise ConfigError(f"{path}: row {number}: {len(row)} columns, expected {len(header)}")
+        told = [row[place].strip() for place in at_value]
+        yield (
+            "/".join(row[place].strip() for place in at_name),
+            _failed(f"{path}: row {number}", values, told, threshold),
+        )
+
+
+_TRUE: Final = frozenset({"1", "true", "yes", "t", "failed", "fail"})
+_FALSE: Final = frozenset({"0", "false", "no", "f", "passed", "pass", ""})
+
+
+def _failed(where: str, columns: list[str], told: list[str], threshold: float) -> bool:
+    if columns == ["failed"]:
+        if told[0].lower() not in _TRUE | _FALSE:
+            raise ConfigError(f"{where}, column failed: expected true or false, found {told[0]!r}")
+        return told[0].lower() in _TRUE
+    try:
+        numbers = [float(text) for text in told]
+    except ValueError:
+        raise ConfigError(f"{where}: expected numbers, found {', '.join(told)!r}") from None
+    return abs(numbers[0] if len(numbers) == 1 else numbers[1] - numbers[0]) > threshold
+
+
+def failures(
+    train: Classed, test: Classed, outcomes: Mapping[str, bool]
+) -> tuple[ReportTable, ReportTable]:
+    """Compare the failures of test inputs with the classes of training inputs.
+
+    Parameters
+    ----------
+    train, test : Classed
+    outcomes : mapping
+        Name of a frame → True for a failure; see :func:`read_outcomes`.
+
+    Returns
+    -------
+    shares : ReportTable
+        ``measure``, ``part``, ``of``, ``share``, ``denominator``.
+    novel : ReportTable
+        The novel failures: ``frame``, ``class``, ``in_training`` (number of training inputs of the
+        class).
+
+    Raises
+    ------
+    ConfigError
+        The outcomes match no frame of either selection.
+    """
+    _, (train, test) = shared(train, test)
+    failed_train, known_train = told_outcomes(outcomes, train.chosen, train.frame_id)
+    failed, known = told_outcomes(outcomes, test.chosen, test.frame_id)
+    if not known.any():
+        raise ConfigError(
+            f"none of the {len(outcomes)} outcomes is about a frame of {test.chosen.text}"
+        )
+    failed &= test.known
+    failed_train &= train.known
+    # Number of training inputs of each test input's class.
+    inputs = np.append(train.sizes(), 0)[test.code]
+    fails = np.bincount(train.code[failed_train], minlength=len(train.names) + 1)
+    novel = failed & (fails[test.code] == 0)
+    ours, theirs = test.chosen.text, train.chosen.text
+    classes, first = np.unique(test.code[novel], return_index=True)
+    lacking = inputs[novel][first] == 0
+    told = [f"frames of {name} with an outcome" for name in (ours, theirs)]
+    new = f"failures of {ours}: no failing frame of their class in {theirs}"
+    uncovered, once = novel & (inputs == 0), novel & (inputs == 1)
+    facts = (
+        ("failures", failed, known & test.known, told[0]),
+        ("failures in training", failed_train, known_train & train.known, told[1]),
+        ("novel failures", novel, failed, new),
+        # The next rows show how many of them coverage could predict.
+        ("PNFNC", uncovered, novel, f"novel failures: their class does not occur in {theirs}"),
+        (
+            "classes of novel failures that are not covered",
+            lacking,
+            np.ones(len(classes)),
+            "distinct classes of novel failures",
+        ),
+        (
+            "novel failures of a class seen once",
+            once,
+            novel,
+            f"novel failures: their class has one frame in {theirs}",
+        ),
+        (
+            "test inputs not covered",
+            test.known & (inputs == 0),
+            test.known,
+            f"frames of {ours} with a class",
+        ),
+    )
+    rows = [share(name, int(part.sum()), int(of.sum()), text) for name, part, of, text in facts]
+    said = of_unknown(test.unknown, ours) + of_unknown(train.unknown, theirs)
+    said += [f"{int((~known).sum())} frames of {ours} have no outcome"] if (~known).any() else []
+    return ReportTable(SHARES, rows, said), _listed(test, novel, inputs)
+
+
+def _listed(test: Classed, novel: Bools, inputs: Ints) -> ReportTable:
+    rows = np.flatnonzero(novel)
+    frames = names_of(test.chosen.store, test.frame_id[rows])
+    columns = zip(frames, test.code[rows].tolist(), inputs[rows].tolist(), strict=True)
+    listed = [(frame, test.names[code], many) for frame, code, many in columns]
+    return ReportTable(("frame", "class", "in_training"), listed)

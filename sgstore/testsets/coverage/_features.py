@@ -1,0 +1,495 @@
+"""Features of frames in an abstraction, such as (car, near, ego), and combinations of k features.
+
+Equal classes have equal features; therefore one frame per class is read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import chain, combinations
+from math import comb
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.errors import ConfigError
+from sgstore.testsets.coverage._classes import shared
+from sgstore.testsets.coverage._frames import (
+    SHARES,
+    ReportTable,
+    is_of_ego,
+    of_unknown,
+    query_of_features,
+    share,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.model.world import Bools, Floats, Ints
+    from sgstore.testsets.coverage._classes import Classed
+
+
+Feature = tuple[str, ...]
+"""Labels of an edge's source, edge and destination; or of a node, in abstractions without edges."""
+
+MOST: Final = 5_000_000
+"""Greatest number of combinations; more are an error, never a partial result."""
+
+LARGEST: Final = 4_000_000_000
+"""Greatest size of the features of classes; bytes."""
+
+_ROWS: Final = 8_192
+"""Classes that are multiplied at once."""
+
+
+@dataclass(frozen=True)
+class ClassFeatures:
+    """Features of classes, with counts.
+
+    Attributes
+    ----------
+    names : tuple of Feature
+        In alphabetical order.
+    codes : (C,) int64
+        The classes, ascending.
+    counts : (C, F) unsigned
+        Number of occurrences of each feature in each class.
+    frames : (C,) int64
+        Number of frames of each class.
+    """
+
+    names: tuple[Feature, ...]
+    codes: Ints
+    counts: NDArray[np.unsignedinteger[Any]]
+    frames: Ints
+
+    @property
+    def there(self) -> Bools:
+        """Return a mask (C, F) of the features of each class."""
+        return self.counts > 0
+
+
+def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeatures:
+    """Return the features of the classes of a selection.
+
+    Parameters
+    ----------
+    a : Classed
+        Its classes must belong to this abstraction.
+    abstraction : str
+    of_ego : bool
+        True: only features of the ego, and of lanes by their role for it.
+
+    Raises
+    ------
+    ConfigError
+        They exceed the memory limit.
+    """
+    codes, first = a.present(), a.first()
+    order = np.argsort(first[codes], kind="stable")
+    number: dict[Feature, int] = {}
+    parts: list[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]] = []
+    read = a.chosen.abstracted.features(abstraction, first[codes[order]])
+    for row, some in read:
+        own = np.array([number.setdefault(name, len(number)) for name in some.names] or [0])
+        rows, columns = order[row[some.frame]].astype(np.int32), own[some.feature].astype(np.int32)
+        parts.append((rows, columns, some.often.astype(np.int32)))
+    edges = any(len(name) == 3 for name in number)
+    known = {name for name in number if len(name) == 3 or not edges}
+    names = tuple(sorted(name for name in known if not of_ego or is_of_ego(name)))
+    place = {name: i for i, name in enumerate(names)}
+    at = np.array([place.get(name, -1) for name in number] or [-1])
+    most = max((int(often.max(initial=0)) for *_, often in parts), default=0)
+    counts = zeros((len(codes), len(names)), np.min_scalar_type(most))
+    for rows, columns, often in parts:
+        column = at[columns]
+        kept = np.flatnonzero(column >= 0)
+        counts[rows[kept], column[kept]] = often[kept]
+    return ClassFeatures(names, codes, counts, a.sizes()[codes])
+
+
+def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedinteger[Any]]:
+    """Allocate an array for features of classes.
+
+    Raises
+    ------
+    ConfigError
+        It exceeds the memory limit.
+    """
+    if shape[0] * shape[1] * kind.itemsize > LARGEST:
+        raise ConfigError(
+            f"{shape[1]:,} features in {shape[0]:,} classes would take more than {LARGEST:,} bytes: ask of"
+            " fewer frames, or for an abstraction with fewer labels"
+        )
+    return np.zeros(shape, kind)
+
+
+def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int = 0) -> Floats:
+    """Return total weights (K, F) of the classes with each feature more than ``more_than`` times."""
+    total = np.zeros((len(weights), counts.shape[1]))
+    # Integers below 2²⁴ are exact in 32 bits.
+    small = np.abs(weights).sum() < 1 << 24 and (weights == np.round(weights)).all()
+    kind = np.float32 if small else np.float64
+    for first in range(0, len(counts), _ROWS):
+        there = (counts[first : first + _ROWS] > more_than).astype(kind)
+        total += weights[:, first : first + _ROWS].astype(kind) @ there
+    return total
+
+
+@dataclass(frozen=True)
+class Combinations:
+    """Occurring combinations of k features.
+
+    Attributes
+    ----------
+    features : ClassFeatures
+    k : int
+    members : (M, k) int64
+        All combinations: ascending indices of features.
+    frames : (M,) int64
+        Number of frames with each combination.
+    """
+
+    features: ClassFeatures
+    k: int
+    members: Ints
+    frames: Ints
+
+    def texts(self, rows: Sequence[int] | Ints) -> list[str]:
+        """Return combinations as readable texts."""
+        names = [" ".join(name) for name in self.features.names]
+        return [" & ".join(names[i] for i in one) for one in self.members[rows].tolist()]
+
+
+def combined(found: ClassFeatures, k: int) -> Combinations:
+    """Return all combinations of k features, with the number of frames of each.
+
+    Raises
+    ------
+    ConfigError
+        k is not positive, or there are too many combinations.
+    """
+    many = len(found.names)
+    if k < 1 or comb(many, k) > MOST:
+        raise ConfigError(
+            f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features; {MOST:,} can be gone through:"
+            " ask for a smaller k, or for an abstraction with fewer labels"
+        )
+    size = min(k, many + 1)  # larger sizes have no combinations either
+    listed = chain.from_iterable(combinations(range(many), size))
+    members = np.fromiter(listed, np.int64, comb(many, size) * size).reshape(-1, size)
+    if k == 2:
+        frames = _together(found)[members[:, 0], members[:, 1]]
+    else:
+        frames = np.fromiter(_counted(found, members), np.int64, len(members))
+    return Combinations(found, k, members, frames)
+
+
+def _counted(found: ClassFeatures, members: Ints) -> Iterator[int]:
+    """Yield the number of frames of each combination; eight classes per byte."""
+    packed = np.packbits(found.there, axis=0).T.copy()
+    for row in members.tolist():
+        both = np.bitwise_and.reduce(packed[row], axis=0)
+        classes = np.flatnonzero(np.unpackbits(both, count=len(found.codes)))
+        yield int(found.frames[classes].sum())
+
+
+@dataclass(frozen=True)
+class Combos:
+    """Combinations that a selection has, and those that it lacks.
+
+    Attributes
+    ----------
+    shares : ReportTable
+    found : Combinations
+        Combinations of the selection, over the features of both.
+    gaps : int64
+        Indices of missing combinations, the most frequent in the reference first.
+    reference : ClassFeatures or None
+        Features of the reference, over the features of both.
+    there : int64 or None
+        Number of frames of the reference with each combination.
+    """
+
+    shares: ReportTable
+    found: Combinations
+    gaps: Ints
+    reference: ClassFeatures | None
+    there: Ints | None
+
+    @property
+    def missing(self) -> ReportTable:
+        """Return the missing combinations.
+
+        The columns are ``combination``, ``frames_in_reference`` (or ``None``), ``query``.
+        """
+        names, members = self.found.features.names, self.found.members[self.gaps]
+        often = [None] * len(members) if self.there is None else self.there[self.gaps].tolist()
+        queries = [query_of_features([names[i] for i in one]) for one in members.tolist()]
+        rows = zip(self.found.texts(self.gaps), often, queries, strict=True)
+        return ReportTable(("combination", "frames_in_reference", "query"), list(rows))
+
+    def covered(self) -> ReportTable:
+        """Return the occurring combinations, most frequent first: ``combination``, ``frames``."""
+        found = self.found
+        rows = np.flatnonzero(found.frames)
+        rows = rows[np.argsort(-found.frames[rows], kind="stable")]
+        listed = zip(found.texts(rows), found.frames[rows].tolist(), strict=True)
+        return ReportTable(("combination", "frames"), list(listed))
+
+    def matrix(self) -> tuple[list[str], Ints, Bools]:
+        """Return pairs of features: names, frames with both (F, F), and a mask of wanted pairs (F, F)."""
+        own = self.found.features
+        frames = _together(own)
+        wanted = np.ones(frames.shape, np.bool_)
+        if self.reference is not None:
+            wanted = _together(self.reference) > 0
+        return [" ".join(name) for name in own.names], frames, wanted
+
+
+def combos(
+    a: Classed,
+    abstraction: str,
+    k: int,
+    reference: Classed | None = None,
+    *,
+    of_ego: bool = False,
+) -> Combos:
+    """Count the combinations of k features in a selection, and list the missing ones.
+
+    Parameters
+    ----------
+    a : Classed
+    abstraction : str
+    k : int
+    reference : Classed, optional
+        Selection whose combinations are the reference. By default all combinations of features of
+        ``a``.
+    of_ego : bool
+        As in :func:`features`.
+
+    Raises
+    ------
+    ConfigError
+        There are too many combinations.
+    """
+    own = features(a, abstraction, of_ego=of_ego)
+    other = None if reference is None else features(reference, abstraction, of_ego=of_ego)
+    names = tuple(sorted({*own.names, *(other.names if other else ())}))
+    other = None if other is None else over(other, names)
+    found = combined(over(own, names), k)
+    name, kinds = (
+        a.chosen.text,
+        f"combinations of {k} of the {len(names)} features{' of the ego' if of_ego else ''}",
+    )
+    if other is None or reference is None:
+        wanted, there = np.ones(len(found.frames), np.bool_), None
+        denominator = f"all {kinds} of {name}, whether they can be or not (product)"
+    else:
+        theirs = combined(other, k)
+        there = theirs.frames
+        wanted = there > 0
+        denominator = f"{kinds} that occur in {reference.chosen.text} (observed)"
+    covered = (found.frames > 0) & wanted
+    shares = ReportTable(
+        SHARES,
+        [share(f"{k}-way combinations", int(covered.sum()), int(wanted.sum()), denominator)],
+        of_unknown(a.unknown, name),
+    )
+    gaps = np.flatnonzero(wanted & (found.frames == 0))
+    if there is not None:
+        gaps = gaps[np.argsort(-there[gaps], kind="stable")]
+    return Combos(shares, found, gaps, other, there)
+
+
+def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
+    """Map class features to another list of features."""
+    place = {name: i for i, name in enumerate(names)}
+    counts = zeros((len(own.codes), len(names)), own.counts.dtype)
+    for column, name in enumerate(own.names):
+        if name in place:
+            counts[:, place[name]] = own.counts[:, column]
+    return ClassFeatures(names, own.codes, counts, own.frames)
+
+
+def _together(found: ClassFeatures) -> Ints:
+    """Return the number of frames with both features of each pair, (F, F)."""
+    total = np.zeros((len(found.names), len(found.names)))
+    kind = np.float32 if found.frames.sum() < 1 << 24 else np.float64  # exact for integers
+    for first in range(0, len(found.codes), _ROWS):
+        there = (found.counts[first : first + _ROWS] > 0).astype(kind)
+        total += (there * found.frames[first : first + _ROWS, None].astype(kind)).T @ there
+    return total.astype(np.int64)
+
+
+# Differences between two selections of frames: features, and a decision tree ----------------------
+# S3C uses this to find features of failing test inputs that training inputs lack. (Woodlief et al.,
+# ICSE 2024, RQ2.)
+
+DEPTH: Final = 4
+"""Greatest depth of the tree."""
+
+SMALLEST: Final = 5
+"""Least weight of each branch: in classes, or in frames."""
+
+_THRESHOLDS: Final = (0, 1, 2, 3)
+"""Thresholds for the number of occurrences; a greater number means yes."""
+
+
+def tree(
+    counts: NDArray[np.integer[Any]],
+    names: tuple[Feature, ...],
+    ours: Bools,
+    weight: Floats,
+    depth: int = DEPTH,
+) -> list[tuple[tuple[str, ...], float, float]]:
+    """Build a decision tree by Gini's impurity (Breiman et al., "Classification and regression trees", 1984).
+
+    Parameters
+    ----------
+    counts : (C, F) int
+        Number of occurrences of each feature in each case.
+    names : tuple of Feature
+    ours : (C,) bool
+    weight : (C,) float64
+    depth : int
+
+    Returns
+    -------
+    list of tuple
+        For each leaf the answers that lead to it, and its weights of ours and of the others; the
+        highest share of ours first.
+    """
+    leaves: list[tuple[tuple[str, ...], float, float]] = []
+
+    def grow(rows: Ints, asked: tuple[str, ...]) -> None:
+        known = counts[rows]
+        best = _best(known, ours[rows], weight[rows]) if len(asked) < depth else None
+        if best is None:
+            good, other = weight[rows[ours[rows]]].sum(), weight[rows[~ours[rows]]].sum()
+            leaves.append((asked, float(good), float(other)))
+            return
+        feature, more_than = best
+        yes, text = known[:, feature] > more_than, " ".join(names[feature])
+        grow(rows[yes], (*asked, f"{text} > {more_than}" if more_than else text))
+        grow(rows[~yes], (*asked, f"{text} <= {more_than}" if more_than else f"no {text}"))
+
+    grow(np.arange(len(counts)), ())
+    leaves.sort(key=lambda leaf: (-leaf[1] / max(leaf[1] + leaf[2], 1e-12), -leaf[1]))
+    return leaves
+
+
+def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tuple[int, int] | None:
+    """Return the best question: a feature, and the threshold of its number of occurrences."""
+    good = np.where(ours, weight, 0.0)
+    total, positive = float(weight.sum()), float(good.sum())
+    if min(positive, total - positive) < 1e-9:
+        return None
+    best, most = None, 1e-9 * total
+    highest = counts.max(axis=0, initial=0)
+    for more_than in _THRESHOLDS:
+        columns = np.flatnonzero(highest > more_than)
+        if not len(columns):
+            break
+        yes, good_yes = weighted(counts[:, columns], np.stack([weight, good]), more_than)
+        gain = (
+            _impurity(positive, total)
+            - _impurity(good_yes, yes)
+            - _impurity(positive - good_yes, total - yes)
+        )
+        gain[np.minimum(yes, total - yes) < SMALLEST] = -np.inf
+        first = int(np.argmax(gain))
+        if gain[first] > most:
+            best, most = (int(columns[first]), more_than), float(gain[first])
+    return best
+
+
+def _impurity(positive: Floats | float, total: Floats | float) -> Floats:
+    """Return Gini's impurity times the weight."""
+    share = positive / np.maximum(total, 1e-12)
+    return 2 * share * (1 - share) * total
+
+
+def explain(
+    b: Classed,
+    a: Classed,
+    abstraction: str,
+    *,
+    by_frame: bool = False,
+    depth: int = DEPTH,
+) -> tuple[ReportTable, ReportTable]:
+    """Explain the differences of ``b`` from ``a``; classes count once, or by their frames.
+
+    Parameters
+    ----------
+    b, a : Classed
+        A common frame of both counts for ``b`` only.
+    abstraction : str
+        Abstraction of their classes.
+    by_frame : bool
+    depth : int
+        Greatest depth of the tree.
+
+    Returns
+    -------
+    differing : ReportTable
+        ``feature``, ``share_of_b``, ``share_of_a``, ``difference``, and a ``query`` for the
+        feature; the largest difference first.
+    leaves : ReportTable
+        ``questions``, ``of_b``, ``of_a``, ``share_of_b`` in the leaf.
+    """
+    a, twice = _without(a, b)
+    _, (b, a) = shared(b, a)
+    of_b, of_a = features(b, abstraction), features(a, abstraction)
+    names = tuple(sorted({*of_b.names, *of_a.names}))
+    of_b, of_a = over(of_b, names), over(of_a, names)
+    weights = [
+        of.frames.astype(np.float64) if by_frame else np.ones(len(of.codes)) for of in (of_b, of_a)
+    ]
+    shares = [
+        weighted(of.counts, weight[None])[0] / max(float(weight.sum()), 1e-12)
+        for weight, of in zip(weights, (of_b, of_a), strict=True)
+    ]
+    order = np.argsort(-np.abs(shares[0] - shares[1]), kind="stable")
+    rows: list[tuple[Any, ...]] = [
+        (
+            " ".join(names[i]),
+            float(shares[0][i]),
+            float(shares[1][i]),
+            float(shares[0][i] - shares[1][i]),
+            query_of_features([names[i]]),
+        )
+        for i in order.tolist()
+    ]
+    unit = "frames with a class" if by_frame else "distinct classes"
+    said = [f"B: {unit} of {b.chosen.text}", f"A: {unit} of {a.chosen.text}"]
+    said += [f"{twice} frames of both count for B only"] if twice else []
+    said += of_unknown(b.unknown, b.chosen.text) + of_unknown(a.unknown, a.chosen.text)
+    counts = np.concatenate([of_b.counts, of_a.counts])
+    ours: NDArray[np.bool_] = np.arange(len(counts)) < len(of_b.codes)
+    grown = tree(counts, names, ours, np.concatenate(weights), depth)
+    leaves = [
+        (
+            " and ".join(asked) or "(all)",
+            good,
+            other,
+            good / (good + other) if good + other else None,
+        )
+        for asked, good, other in grown
+    ]
+    return (
+        ReportTable(("feature", "share_of_b", "share_of_a", "difference", "query"), rows, said),
+        ReportTable(("questions", "of_b", "of_a", "share_of_b"), leaves),
+    )
+
+
+def _without(a: Classed, b: Classed) -> tuple[Classed, int]:
+    """Return ``a`` without the frames of ``b``, and the number of removed frames."""
+    if a.chosen.place != b.chosen.place:
+        return a, 0
+    rows = np.flatnonzero(~np.isin(a.frame_id, b.frame_id))
+    kept = replace(a, frame_id=a.frame_id[rows], code=a.code[rows])
+    return kept, len(a.frame_id) - len(rows)

@@ -1,0 +1,514 @@
+"""Coverage over declared slots: scene parameters with values defined by patterns, and their combinations.
+
+Slots are declared in a TOML file::
+
+    name = "a truck ahead in the ego's lane"       # optional, as is where: only frames in which this holds
+    count where = "MATCH (:Ego)"
+
+    [[slot]]
+    name = "near"
+    values = { front = "MATCH (t:Truck)-[:near]->(:Ego), (t)-[:inDFrontOf]->(:Ego)", side = "MATCH …" }
+
+    [[impossible]]                                 # combinations that cannot be, and do not count
+    near = "none"
+
+A slot has a value in a frame where its pattern holds, several values if several hold, and ``none``
+if none holds; a frame with several values has each combination of them. A file can have several
+such parts, each a ``[[specification]]``. ``tables = { tags = "tags.csv" }`` joins user tables,
+relative to the file, for use in patterns.
+
+Alternatively a specification is a query: each combination of its returned values is a cell.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import dataclass, field
+from itertools import combinations, product
+from math import comb, prod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sgstore.errors import ConfigError, QueryError
+from sgstore.lang import each_match, parse, syntax
+from sgstore.testsets.coverage._frames import (
+    SHARES,
+    ReportTable,
+    Row,
+    block_of,
+    frames_of,
+    query_of_blocks,
+    selection_of,
+    share,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from sgstore.model.world import Bools, Ints
+    from sgstore.testsets.coverage._frames import ChosenFrames
+
+
+_FRAME: Final = ("frame_id", "trace", "seq", "time_ns", "t")
+_RETURN: Final = re.compile(r"\bRETURN\b", re.IGNORECASE)
+
+
+def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple[Any, ...], int]]:
+    """Return the columns of a query, and the number of frames of each combination of values.
+
+    Raises
+    ------
+    QueryError
+        The query is invalid, or returns no values.
+    """
+    store = chosen.store
+    matches = store.find(query)
+    if matches.columns[: len(_FRAME)] != _FRAME:
+        matches = store.find(_with_frames(query))
+    columns = matches.columns[len(_FRAME) :]
+    if not columns or not _RETURN.search(query):
+        raise QueryError(
+            "a specification returns values, each combination of which is a cell",
+            text=query,
+            hint="such as: MATCH (v:Vehicle)-[d:near|visible]->(:Ego) RETURN v.kind, type(d)",
+        )
+    wanted = None if chosen.frame_id is None else set(chosen.frame_id.tolist())
+    frames: dict[tuple[Any, ...], set[int]] = {}
+    for row in matches:
+        if wanted is None or row[0] in wanted:
+            frames.setdefault(row[len(_FRAME) :], set()).add(row[0])
+    return columns, {cell: len(of) for cell, of in sorted(frames.items(), key=lambda i: repr(i[0]))}
+
+
+def _with_frames(query: str) -> str:
+    """Return a query extended by the frame of each match among its returned values."""
+    found = [one for one in each_match(parse(query)) if isinstance(one, syntax.MatchClause)]
+    for part in reversed(found):  # insertions move the later text
+        returns = part.returns
+        if returns is None:
+            return query
+        chosen = (returns.limit, returns.sample, returns.top, returns.skip or None, returns.having)
+        if any(one is not None for one in chosen):
+            raise QueryError(
+                "a specification counts all matches, and has no LIMIT, SKIP, SAMPLE or HAVING",
+                text=query,
+                span=returns.span,
+            )
+        end = returns.items[-1].span.end
+        query = f"{query[:end]}, FRAMES{query[end:]}"
+    return query
+
+
+def specification(
+    chosen: ChosenFrames, query: str, declared: int = 0, reference: str | ChosenFrames = ""
+) -> tuple[ReportTable, ReportTable, ReportTable]:
+    """Return the occurring and the missing cells of a specification.
+
+    Parameters
+    ----------
+    chosen : ChosenFrames
+    query : str
+        ``MATCH … RETURN a, b``.
+    declared : int
+        Number of cells, if known; else 0.
+    reference : str or ChosenFrames
+        Selection of frames whose cells are the reference; empty: all combinations of the values of
+        each column.
+
+    Returns
+    -------
+    shares, covered, missing : Table
+        With ``declared``, no missing cells are listed.
+
+    Raises
+    ------
+    QueryError
+        The query is invalid, or returns no values.
+    """
+    columns, found = cells(chosen, query)
+    if declared:
+        missing: list[tuple[Any, ...]] = []
+        of, denominator = declared, "cells, as declared"
+    elif reference:
+        other = selection_of(reference) if isinstance(reference, str) else reference
+        there = cells(other, query)[1]
+        missing = [cell for cell in there if cell not in found]
+        of, denominator = len(there), f"cells that occur in {other.text} (observed)"
+        found = {cell: often for cell, often in found.items() if cell in there}
+    else:
+        values = [list(dict.fromkeys(column)) for column in zip(*found, strict=True)]
+        of = int(np.prod([len(column) for column in values])) if values else 0
+        listed = product(*values) if of <= _LISTED else ()
+        missing = [cell for cell in listed if cell not in found]
+        denominator = f"combinations of the values that occur in {chosen.text} (product)"
+    shares = ReportTable(
+        SHARES, [share("cells", len(found), of, denominator)], [f"frames of {chosen.text}"]
+    )
+    rows = [(*cell, often) for cell, often in found.items()]
+    return shares, ReportTable((*columns, "frames"), rows), ReportTable(columns, missing)
+
+
+_LISTED: Final = 1_000_000
+
+
+# Declared slots ----------------------------------------------------------------------------------
+
+Bits = NDArray[np.uint8]
+"""Truth values of frames, eight per byte."""
+
+NONE: Final = "none"
+"""Value of a slot in a frame without a matching pattern."""
+
+MOST: Final = 2_000_000
+"""Greatest number of combinations; more are an error, never a partial result."""
+
+_MAX_FILE: Final = 8 << 20
+_MAX_SLOTS: Final = 200
+_MAX_VALUES: Final = 1_000
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Parameter of a scene.
+
+    Attributes
+    ----------
+    name : str
+    values : mapping
+        Value → pattern; without ``none``.
+    """
+
+    name: str
+    values: Mapping[str, str]
+
+    @property
+    def domain(self) -> tuple[str, ...]:
+        """Return all its values, ``none`` first."""
+        return (NONE, *self.values)
+
+    def block(self, value: str) -> tuple[list[str], list[str]]:
+        """Return the required and the excluded patterns of a value."""
+        blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
+        return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
+
+
+@dataclass(frozen=True)
+class Specification:
+    """Slots, with the frames and combinations that count.
+
+    Attributes
+    ----------
+    name : str
+    where : str
+        A pattern; empty means all frames.
+    slots : tuple of Slot
+    impossible : tuple of mapping
+        Slot → value: combinations with these values do not count.
+    tables : mapping of str to Path
+        Tables that are joined to the frames, by name.
+    """
+
+    name: str
+    where: str
+    slots: tuple[Slot, ...]
+    impossible: tuple[Mapping[str, str], ...]
+    tables: Mapping[str, Path] = field(default_factory=dict[str, Path])
+
+
+DECLARED: Final = ("iso34503",)
+"""Included slot files, by name."""
+
+
+def read_specifications(path: str | Path) -> list[Specification]:
+    """Read the specifications in a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file, or the name of an included one: ``iso34503``, attributes of an operational design
+        domain that recordings contain.
+
+    Raises
+    ------
+    ConfigError
+        The file is not TOML, or has an invalid value.
+    """
+    path = Path(path)
+    if str(path) in DECLARED and not path.exists():
+        path = Path(__file__).with_name(f"{path}.toml")
+    try:
+        if path.stat().st_size > _MAX_FILE:
+            raise ConfigError(f"{path}: larger than {_MAX_FILE >> 20} MiB")
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: no TOML: {error}") from error
+    several = document.pop("specification", None)
+    if several is None:
+        return [_specification(path, document, path.stem)]
+    if document or not isinstance(several, list) or not several:
+        raise ConfigError(f"{path}: expected tables [[specification]] and nothing beside them")
+    return [_specification(path, one, f"{path.stem} {i}") for i, one in enumerate(several, start=1)]
+
+
+def _specification(path: Path, given: Any, name: str) -> Specification:
+    known = {"name", "where", "slot", "impossible", "tables"}
+    if not isinstance(given, dict) or given.keys() - known:
+        odd = ", ".join(sorted(given.keys() - known)) if isinstance(given, dict) else str(given)
+        raise ConfigError(f"{path}: {odd}: expected {', '.join(sorted(known))}")
+    slots = given.get("slot")
+    if not isinstance(slots, list) or not 0 < len(slots) <= _MAX_SLOTS:
+        raise ConfigError(f"{path}: expected 1 to {_MAX_SLOTS} tables [[slot]]")
+    where = given.get("where", "")
+    if not isinstance(where, str) or (where and block_of(where) is None):
+        raise ConfigError(f"{path}: where: {_EXPECTED}, found {str(where)[:80]!r}")
+    made = tuple(_slot(path, slot) for slot in slots)
+    if len({slot.name for slot in made}) < len(made):
+        raise ConfigError(f"{path}: two slots have the same name")
+    impossible = given.get("impossible", [])
+    domains = {slot.name: slot.domain for slot in made}
+    for one in impossible if isinstance(impossible, list) else [impossible]:
+        for key, value in one.items() if isinstance(one, dict) else [(one, None)]:
+            if value not in domains.get(str(key), ()):
+                raise ConfigError(f"{path}: impossible: {key} = {value!r}: no such slot or value")
+    named = str(given.get("name", name))
+    return Specification(named, where, made, tuple(impossible), _tables(path, given))
+
+
+def _tables(path: Path, given: Mapping[str, Any]) -> dict[str, Path]:
+    """Return the files of tables, relative to the folder of the slot file."""
+    tables = given.get("tables", {})
+    if not isinstance(tables, dict) or not all(isinstance(one, str) for one in tables.values()):
+        raise ConfigError(
+            f'{path}: tables: expected names of files, such as {{ tags = "tags.csv" }}'
+        )
+    return {name: path.parent / file for name, file in tables.items()}
+
+
+_EXPECTED: Final = "expected a pattern, MATCH … WHERE … and nothing else"
+
+
+def _slot(path: Path, given: Any) -> Slot:
+    if not isinstance(given, dict) or given.keys() != {"name", "values"}:
+        raise ConfigError(f"{path}: [[slot]]: expected 'name' and 'values'")
+    name, values = given["name"], given["values"]
+    if (
+        not isinstance(name, str)
+        or not isinstance(values, dict)
+        or not 0 < len(values) <= _MAX_VALUES
+    ):
+        raise ConfigError(
+            f"{path}: slot {str(name)[:80]!r}: expected a name, and 1 to {_MAX_VALUES} values"
+        )
+    for value, pattern in values.items():
+        if value == NONE or not isinstance(pattern, str) or block_of(pattern) is None:
+            reason = f"no value may be called {NONE!r}" if value == NONE else _EXPECTED
+            raise ConfigError(f"{path}: slot {name!r}: {value}: {reason}")
+    return Slot(name, values)
+
+
+class _Held:
+    """Cache of the frames of a selection in which patterns hold."""
+
+    def __init__(self, chosen: ChosenFrames, tables: Mapping[str, Path]) -> None:
+        self._chosen = chosen = chosen.joined(tables)
+        ids = chosen.abstracted.times()[0]
+        self._ids = ids[chosen.rows_of(ids)]
+        self._known: dict[str, Bools] = {}
+
+    def of(self, pattern: str) -> Bools:
+        """Return a mask (F,) of the frames that match a pattern; an empty pattern matches all."""
+        if pattern not in self._known:
+            there = np.ones(len(self._ids), np.bool_)
+            if pattern:
+                there = np.isin(self._ids, frames_of(self._chosen.store, pattern))
+            self._known[pattern] = there
+        return self._known[pattern]
+
+    def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
+        """Map each slot value to the counted frames that have it."""
+        counts = self.of(specification.where)
+        held: dict[tuple[str, str], Bits] = {}
+        for slot in specification.slots:
+            none = counts.copy()
+            for value, pattern in slot.values.items():
+                there = counts & self.of(pattern)
+                none &= ~there
+                held[slot.name, value] = np.packbits(there)
+            held[slot.name, NONE] = np.packbits(none)
+        return held
+
+    def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
+        """Return the frames that count, names of their slot values, and an index into the names."""
+        rows = np.flatnonzero(self.of(specification.where))
+        names, code = [""], np.zeros(len(rows), np.int64)
+        for slot in specification.slots:
+            own = np.zeros(len(rows), np.int64)
+            bits: list[str] = []
+            for value, pattern in slot.values.items():
+                found, own = np.unique(own * 2 + self.of(pattern)[rows], return_inverse=True)
+                bits = [
+                    "+".join(filter(None, (bits[n >> 1] if bits else "", value if n & 1 else "")))
+                    for n in found.tolist()
+                ]
+            both, code = np.unique(code * len(bits) + own, return_inverse=True)
+            names = [
+                f"{names[n // len(bits)]}, {slot.name}={bits[n % len(bits)] or NONE}".removeprefix(
+                    ", "
+                )
+                for n in both.tolist()
+            ]
+        return self._ids[rows], names, code.astype(np.int64)
+
+
+def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints, list[str], Ints]:
+    """Return the class of each frame by the values of declared slots.
+
+    Returns
+    -------
+    frame_id : int64
+        The frames of the selection that count, ascending.
+    names : list of str
+        ``close=person+vehicle, light=none``: all matching values of each slot.
+    code : int64
+        Index into ``names`` for each frame.
+
+    Raises
+    ------
+    QueryError
+        A pattern is invalid.
+    """
+    with chosen.snapshot():
+        return _Held(chosen, specification.tables).sets(specification)
+
+
+def _combined(
+    specification: Specification, k: int, held: _Held
+) -> Iterator[tuple[tuple[Slot, ...], tuple[str, ...], int]]:
+    """Yield all possible combinations of values of k slots, with the number of frames of each.
+
+    Raises
+    ------
+    ConfigError
+        There are fewer slots than k, or too many combinations.
+    """
+    slots = specification.slots
+    if k > len(slots):
+        raise ConfigError(f"{specification.name}: combinations of {k}, but {len(slots)} slots")
+    most = comb(len(slots), k)
+    if most <= MOST:
+        most = sum(prod(len(s.domain) for s in some) for some in combinations(slots, k))
+    if most > MOST:
+        raise ConfigError(
+            f"{specification.name}: {most:,} combinations; {MOST:,} can be gone through:"
+            " combine fewer slots, as pairs: 'sgstore coverage combos --k 2'"
+        )
+    there = held.values(specification)
+    for some in combinations(slots, k):
+        for values in product(*(slot.domain for slot in some)):
+            named = {slot.name: value for slot, value in zip(some, values, strict=True)}
+            if any(one.items() <= named.items() for one in specification.impossible):
+                continue
+            both = np.bitwise_and.reduce([there[item] for item in named.items()])
+            yield some, values, int(np.bitwise_count(both).sum())
+
+
+def slot_coverage(
+    chosen: ChosenFrames, specifications: Sequence[Specification], k: int = 0
+) -> tuple[ReportTable, ReportTable, ReportTable]:
+    """Return the occurring and the missing combinations of slot values.
+
+    Parameters
+    ----------
+    chosen : ChosenFrames
+    specifications : sequence of Specification
+    k : int
+        Number of combined slots; 0 means all.
+
+    Returns
+    -------
+    shares, covered, missing : Table
+        ``missing`` has a ``query`` for each combination.
+    """
+    shares: list[Row] = []
+    covered: list[Row] = []
+    missing: list[Row] = []
+    held = _Held(chosen, {k: v for one in specifications for k, v in one.tables.items()})
+    for one in specifications:
+        size = k or len(one.slots)
+        with chosen.snapshot():
+            found = list(_combined(one, size, held))
+        many = sum(frames > 0 for _, _, frames in found)
+        denominator = f"combinations of values of {size} of {len(one.slots)} declared slots"
+        denominator += f", less {len(one.impossible)} impossible" if one.impossible else ""
+        shares.append(share(one.name, many, len(found), denominator))
+        for slots, values, frames in found:
+            text = ", ".join(f"{s.name}={v}" for s, v in zip(slots, values, strict=True))
+            if frames:
+                covered.append((one.name, text, frames))
+            else:
+                missing.append((one.name, text, _query(one, slots, values)))
+    if len(specifications) > 1:
+        shares.append(share("all", len(covered), len(covered) + len(missing), "the sum of these"))
+    said = [f"frames of {chosen.text}"]
+    return (
+        ReportTable(SHARES, shares, said),
+        ReportTable(("specification", "combination", "frames"), covered),
+        ReportTable(("specification", "combination", "query"), missing),
+    )
+
+
+def slot_matrix(
+    chosen: ChosenFrames, specification: Specification
+) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
+    """Return pairs of slot values: their common frames, and the wanted pairs.
+
+    Returns
+    -------
+    items : list of (str, str)
+        Slot and value, slot by slot, ``none`` first.
+    frames : (F, F) int64
+        Frames with both, symmetric; on the diagonal, with the value.
+    wanted : (F, F) bool
+        Mask of possible pairs of values of two slots.
+
+    Raises
+    ------
+    QueryError
+        A pattern is invalid.
+    ConfigError
+        There are too many pairs.
+    """
+    items = [(slot.name, value) for slot in specification.slots for value in slot.domain]
+    if len(items) ** 2 > MOST:
+        raise ConfigError(
+            f"{specification.name}: {len(items) ** 2:,} pairs; {MOST:,} can be gone through"
+        )
+    with chosen.snapshot():
+        there = _Held(chosen, specification.tables).values(specification)
+    bits = np.stack([there[item] for item in items])
+    frames = np.stack([np.bitwise_count(bits & own).sum(axis=1, dtype=np.int64) for own in bits])
+    names = np.array([name for name, _ in items])
+    wanted = names[:, None] != names[None, :]
+    for one in specification.impossible:
+        if len(one) <= 2:  # with three values, each pair can be possible
+            ends = [items.index(item) for item in one.items()]
+            wanted[ends[0], ends[-1]] = wanted[ends[-1], ends[0]] = False
+            if len(ends) == 1:
+                wanted[ends[0]] = wanted[:, ends[0]] = False
+    return items, frames, wanted
+
+
+def _query(one: Specification, slots: Sequence[Slot], values: Sequence[str]) -> str:
+    there = [block_of(one.where) or ""] if one.where else []
+    absent: list[str] = []
+    for slot, value in zip(slots, values, strict=True):
+        blocks = slot.block(value)
+        there += blocks[0]
+        absent += blocks[1]
+    return query_of_blocks(there, absent)

@@ -1,0 +1,254 @@
+"""Text format of locks: JSON, one trace or case per line, equal bytes for equal content.
+
+The text has no path and no time of day. Therefore it is the same on every machine for the same
+selection of the same recordings, and two locks can be compared line by line.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from sgstore.base.files import write_bytes
+from sgstore.errors import ExportError, StoreError
+from sgstore.store import SCHEMA_VERSION
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+FORMAT: Final = 1
+"""Version of the text."""
+
+LARGEST: Final = 1 << 30
+"""Largest lock file; bytes."""
+
+KEY: Final = "sgstore_lock"
+
+ENDING: Final = ".lock"
+"""Ending of lock files, which distinguishes them from stores."""
+
+
+@dataclass(frozen=True, slots=True)
+class LockedTrace:
+    """Trace of the cases of a lock.
+
+    Attributes
+    ----------
+    name : str
+    recording : str
+        SHA-256 of the recording.
+    ego : str
+        The simulator's id of the ego.
+    flavour : str
+    frames : int
+    since, until : float or None
+        Time range of the recording that was read; s.
+    config, map : str
+        Digests of the settings and of the road map of its graphs; empty without a map.
+    version : str
+        Version of sgstore that made the graphs.
+    """
+
+    name: str
+    recording: str
+    ego: str
+    flavour: str
+    frames: int
+    since: float | None
+    until: float | None
+    config: str
+    map: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True)
+class LockedCase:
+    """Test case: consecutive frames of a trace.
+
+    Attributes
+    ----------
+    id : str
+        ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` for a single frame.
+    trace : str
+        Name of its trace in the lock.
+    first, last : int
+        Numbers of the first and the last frame.
+    start_ns, end_ns : int
+        The earliest and the latest log time of its frames.
+    frames : int
+        Number of frames.
+    split : str
+        Its split: ``train``; empty without splits.
+    graph : str
+        Digest of the scene graphs of the frames.
+    payload : dict of str to str, or None
+        Channel → digest of its messages of the frames. ``None`` means that payloads were not
+        included.
+    """
+
+    id: str
+    trace: str
+    first: int
+    last: int
+    start_ns: int
+    end_ns: int
+    frames: int
+    split: str
+    graph: str
+    payload: dict[str, str] | None
+
+
+@dataclass(frozen=True)
+class Lock:
+    """Test set.
+
+    Attributes
+    ----------
+    made_with : dict
+        Versions of ``sgstore`` and of the ``schema`` of its store.
+    selection : dict
+        Parameters of the selection, and facts about it.
+    traces : tuple of LockedTrace
+        By name, in natural order.
+    cases : tuple of LockedCase
+        By trace and first frame.
+    """
+
+    made_with: Mapping[str, Any]
+    selection: Mapping[str, Any]
+    traces: tuple[LockedTrace, ...] = field(default=())
+    cases: tuple[LockedCase, ...] = field(default=())
+
+    def text(self) -> str:
+        """Return the content of the lock's file."""
+        head = {KEY: FORMAT, "made_with": dict(self.made_with), "selection": dict(self.selection)}
+        whole = json.dumps(head, ensure_ascii=False, indent=2, sort_keys=True)[:-2]
+        for name, rows in (("traces", self.traces), ("cases", self.cases)):
+            lines = ",\n".join(f"    {json.dumps(asdict(r), ensure_ascii=False)}" for r in rows)
+            whole += f',\n  "{name}": [\n{lines}\n  ]' if rows else f',\n  "{name}": []'
+        return f"{whole}\n}}\n"
+
+    @property
+    def ordered(self) -> tuple[LockedCase, ...]:
+        """Return the cases in the recorded order, if there is one; others follow by trace and frame."""
+        order = self.selection.get("order")
+        names = [str(name) for name in order] if isinstance(order, list) else []
+        places = {name: place for place, name in enumerate(names)}
+        return tuple(sorted(self.cases, key=lambda case: places.get(case.id, len(places))))
+
+    def write(self, path: str | Path) -> None:
+        """Write the lock to a file.
+
+        Raises
+        ------
+        ExportError
+            The file cannot be written, or its name does not end in ``.lock``.
+        """
+        path = Path(path)
+        if path.suffix != ENDING:
+            raise ExportError(f"{path}: the name of a lock ends in {ENDING}, such as tests{ENDING}")
+        try:
+            data = self.text().encode()
+        except UnicodeEncodeError as error:
+            raise ExportError(f"{path}: {error}") from error
+        write_bytes(path, data)
+
+    def trace(self, name: str) -> LockedTrace:
+        """Return a trace by its name."""
+        return next(one for one in self.traces if one.name == name)
+
+
+def read_lock(path: str | Path) -> Lock:
+    """Read a lock from a file.
+
+    Raises
+    ------
+    StoreError
+        The file is missing, or is not a valid lock; the message shows the fault and its place.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > LARGEST:
+            raise StoreError(f"{path}: larger than {LARGEST} bytes; no lock is")
+        values = json.loads(path.read_bytes())
+    except OSError as error:
+        raise StoreError(f"{path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path}: not a lock: {error}") from error
+    try:
+        return _lock(values)
+    except StoreError as error:
+        raise StoreError(f"{path}: not a lock that can be read: {error}") from error
+
+
+def lock_from(text: str) -> Lock:
+    """Parse a lock from the text of :meth:`Lock.text`."""
+    return _lock(json.loads(text))
+
+
+def _lock(values: Any) -> Lock:
+    if not isinstance(values, dict) or KEY not in values:
+        raise StoreError(f"expected an object with {KEY!r}")
+    if values[KEY] != FORMAT:
+        raise StoreError(f"{KEY} is {values[KEY]!r}; expected {FORMAT}: upgrade sgstore")
+    known = {KEY, "made_with", "selection", "traces", "cases"}
+    if values.keys() != known:
+        odd = ", ".join(sorted(map(repr, values.keys() ^ known)))
+        raise StoreError(f"missing or unknown: {odd}")
+    for name, kind in (("made_with", dict), ("selection", dict), ("traces", list), ("cases", list)):
+        if not isinstance(values[name], kind):
+            raise StoreError(f"{name}: expected {'an object' if kind is dict else 'a list'}")
+    traces = tuple(_row(LockedTrace, r, f"traces[{i}]") for i, r in enumerate(values["traces"]))
+    cases = tuple(_row(LockedCase, r, f"cases[{i}]") for i, r in enumerate(values["cases"]))
+    _check_names(traces, cases)
+    return Lock(values["made_with"], values["selection"], traces, cases)
+
+
+def _check_names(traces: tuple[LockedTrace, ...], cases: tuple[LockedCase, ...]) -> None:
+    names = {trace.name for trace in traces}
+    if len(names) < len(traces):
+        raise StoreError("two traces have one name")
+    if len({case.id for case in cases}) < len(cases):
+        raise StoreError("two cases have one id")
+    for i, case in enumerate(cases):
+        if case.trace not in names:
+            raise StoreError(f"cases[{i}]: no trace {case.trace!r} among the traces")
+        if not 0 <= case.first <= case.last <= _LAST or case.start_ns > case.end_ns:
+            raise StoreError(f"cases[{i}]: it ends before it begins")
+
+
+_LAST: Final = 60 * 2**18 - 1
+"""Greatest frame number in a store."""
+
+_Row = TypeVar("_Row", LockedTrace, LockedCase)
+_NULL: Final = type(None)
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "str": (str,),
+    "int": (int,),
+    "float | None": (float, int, _NULL),
+    "dict[str, str] | None": (dict, _NULL),
+}
+
+
+def _row(kind: type[_Row], values: Any, where: str) -> _Row:
+    names = [one.name for one in fields(kind)]
+    if not isinstance(values, dict) or sorted(values) != sorted(names):
+        raise StoreError(f"{where}: expected {', '.join(names)}")
+    for one in fields(kind):
+        value = values[one.name]
+        allowed = _KINDS[str(one.type)]
+        if not isinstance(value, allowed) or isinstance(value, bool):
+            raise StoreError(f"{where}.{one.name}: {str(value)[:40]!r}; expected {one.type}")
+        if isinstance(value, int) and abs(value) >= 1 << 63:
+            raise StoreError(f"{where}.{one.name}: {value} is beyond 64 bits")
+        if isinstance(value, dict) and not all(isinstance(v, str) for v in value.values()):
+            raise StoreError(f"{where}.{one.name}: expected texts")
+    return kind(**values)
+
+
+def made_with() -> dict[str, Any]:
+    """Return the versions of sgstore and of the schema."""
+    return {"sgstore": version("sgstore"), "schema": SCHEMA_VERSION}

@@ -1,0 +1,716 @@
+"""Set cover: reduction, greedy choice, bounds, and overlapping units.
+
+Reduction removes clear decisions: required sets, and redundant elements and sets. It also splits
+the problem into independent parts.
+
+An element is redundant if all sets of another element contain it. A set is redundant if another set
+contains all its elements and does not cost more. A step can enable others; therefore the steps
+repeat until nothing changes. For clips at any places on a time axis almost nothing remains: an
+occurrence is in consecutive clips, and these steps solve such covers completely (the matrix has
+consecutive ones).
+
+Source. Garfinkel and Nemhauser, "Integer Programming" (1972), ch. 8.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.testsets.selection._sets import (
+    SetFamily,
+    greedy,
+    met,
+    or_alone,
+    ordered,
+    spread,
+    thinned,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from sgstore.model.world import Bools, Floats, Ints
+    from sgstore.testsets.selection._units import Holdings, Measure, Units
+
+
+ROUNDING: Final = 1e-7
+"""Rounding error as a share of a cost."""
+
+_COMPARISONS: Final = 100_000_000
+"""Greatest number of comparison steps; redundant items found within it are removed."""
+
+_BATCH: Final = 2_000_000
+"""Pairs that are compared at once."""
+
+_TABLE: Final = 1 << 26
+"""Greatest size of a look-up table of memberships."""
+
+
+def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
+    """Return the required sets, and the remaining parts with their set indices."""
+    need, alive = family.need.copy(), np.ones(len(family), np.bool_)
+    forced = np.zeros(len(family), np.bool_)
+    wanted = need > 0
+    work, size = _COMPARISONS, -1
+    if (
+        need.max(initial=0) <= 1
+    ):  # first, because bundles of a collection have already left out as much
+        alive &= cheapest_alike(family)
+    while size != (size := int(alive.sum()) + int(wanted.sum())):
+        _force(family, need, alive, forced)
+        wanted &= need > 0
+        _drop_same_elements(family, need, alive, wanted)
+        work -= _drop_larger_elements(family, need, alive, wanted, work)
+        if need[wanted].max(initial=0) == 1:
+            _drop_same_sets(family, alive, wanted)
+            work -= _drop_smaller_sets(family, alive, wanted, work)
+        alive &= np.bincount(family.set_of[wanted[family.members]], minlength=len(family)) > 0
+    return np.flatnonzero(forced), _parts(family, need, alive, wanted)
+
+
+def cheapest_alike(family: SetFamily) -> Bools:
+    """Return a mask (S,) of the cheapest set among equal ones; enough if each element is needed once."""
+    alive = np.ones(len(family), np.bool_)
+    _drop_same_sets(family, alive, np.ones(len(family.need), np.bool_))
+    return alive & (np.diff(family.starts) > 0)
+
+
+def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
+    """Take all sets of elements that have no more sets than needed."""
+    while True:
+        rows = alive[family.set_of]
+        often = np.bincount(family.members[rows], minlength=len(need))
+        tight = (need > 0) & (often <= need)
+        taken = np.zeros(len(family), np.bool_)
+        taken[family.set_of[rows & tight[family.members]]] = True
+        if not taken.any():
+            return
+        forced[taken], alive[taken] = True, False
+        need -= np.bincount(family.members[taken[family.set_of]], minlength=len(need))
+        np.maximum(need, 0, out=need)
+
+
+def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Bools) -> None:
+    """Keep one of the elements with equal sets: the one with the greatest need."""
+    rows = alive[family.set_of] & wanted[family.members]
+    key = _keys(family.members[rows], family.set_of[rows], len(need), len(family))
+    elements = np.flatnonzero(wanted)
+    order = elements[np.lexsort((elements, -need[elements], key[1][elements], key[0][elements]))]
+    wanted[order[_repeated(key[0][order], key[1][order])]] = False
+
+
+def _drop_same_sets(family: SetFamily, alive: Bools, wanted: Bools) -> None:
+    """Keep the cheapest of the sets with equal elements."""
+    rows = alive[family.set_of] & wanted[family.members]
+    key = _keys(family.set_of[rows], family.members[rows], len(family), len(wanted))
+    sets = np.flatnonzero(alive)
+    order = sets[np.lexsort((family.rank[sets], family.cost[sets], key[1][sets], key[0][sets]))]
+    alive[order[_repeated(key[0][order], key[1][order])]] = False
+
+
+def _keys(of: Ints, what: Ints, size: int, things: int) -> tuple[Ints, Ints]:
+    """Return a hash of 106 bits for each set, as two numbers: equal for equal sets."""
+    words = np.random.Generator(np.random.PCG64(20_24)).integers(1 << 31, size=(2, 2, things))
+    found: list[Ints] = []
+    for low, high in words:
+        # Sums of numbers below 2³¹ are exact in floating point for fewer than 2²² of them.
+        first = np.bincount(of, low[what], size).astype(np.int64)
+        second = np.bincount(of, high[what], size).astype(np.int64)
+        found.append(first * (1 << 31) ^ second)
+    return found[0], found[1]
+
+
+def _repeated(*keys: Ints) -> Bools:
+    same = np.zeros(len(keys[0]), np.bool_)
+    same[1:] = np.logical_and.reduce([key[1:] == key[:-1] for key in keys])
+    return same
+
+
+def _drop_larger_elements(
+    family: SetFamily, need: Ints, alive: Bools, wanted: Bools, most: int
+) -> int:
+    """Drop elements whose sets include all sets of another element; return the number of steps."""
+    rows = alive[family.set_of] & wanted[family.members]
+
+    def superfluous(small: Ints, large: Ints) -> Ints:
+        return large[need[large] <= need[small]]
+
+    gone, work = _contained(
+        family.members[rows], family.set_of[rows], len(need), len(family), superfluous, most
+    )
+    wanted[gone] = False
+    return work
+
+
+def _drop_smaller_sets(family: SetFamily, alive: Bools, wanted: Bools, most: int) -> int:
+    """Drop sets that a set of equal or lower cost contains; return the number of steps."""
+    rows = alive[family.set_of] & wanted[family.members]
+
+    def superfluous(small: Ints, large: Ints) -> Ints:
+        return small[family.cost[large] <= family.cost[small]]
+
+    gone, work = _contained(
+        family.set_of[rows], family.members[rows], len(family), len(wanted), superfluous, most
+    )
+    alive[gone] = False
+    return work
+
+
+def _contained(
+    one: Ints,
+    other: Ints,
+    ones: int,
+    others: int,
+    superfluous: Callable[[Ints, Ints], Ints],
+    most: int,
+) -> tuple[Bools, int]:
+    """Find redundant items: those contained in others, or containing others.
+
+    Parameters
+    ----------
+    one, other : (M,) int64
+        Items, and their components; without duplicates.
+    ones, others : int
+        Numbers of possible items and components.
+    superfluous : callable
+        Function from pairs of a contained and a containing item to the redundant items.
+    most : int
+        Greatest number of comparison steps.
+
+    Returns
+    -------
+    gone : (ones,) bool
+    work : int
+        Number of steps.
+    """
+    gone, done = np.zeros(ones, np.bool_), np.zeros(ones, np.bool_)
+    # Rare components distinguish items best: they are compared first.
+    common = np.bincount(other, minlength=others)
+    rare = np.empty(others, np.int64)
+    rare[np.argsort(common, kind="stable")] = np.arange(others)
+    other = rare[other]
+    work, batch = 0, _BATCH // 16
+    while work < most:
+        rows = ~gone[one]
+        key = np.sort(one[rows] * others + other[rows])
+        one, other = np.divmod(key, others)
+        things, pairs = _compared(one, other, (ones, others), done, batch)
+        if not len(things):
+            break
+        done[things] = True
+        small, large, used = _holding(key, (ones, others), pairs, most - work)
+        work += used
+        gone[superfluous(small, large)] = True
+        batch = _BATCH
+    return gone, work
+
+
+def _compared(
+    one: Ints, other: Ints, sizes: tuple[int, int], done: Bools, batch: int
+) -> tuple[Ints, tuple[Ints, Ints]]:
+    """Return some pending items, the smallest first, each with possible containing items.
+
+    A containing item has all components of the item, also its first, which is the rarest.
+    """
+    many = np.bincount(one, minlength=sizes[0])
+    common = np.bincount(other, minlength=sizes[1])
+    first = np.flatnonzero(np.append(True, np.diff(one) != 0)) if len(one) else one
+    first = first[~done[one[first]]]
+    first = first[np.argsort(many[one[first]], kind="stable")]
+    fits = max(int(np.searchsorted(np.cumsum(common[other[first]]), batch)), 1)
+    first = first[:fits]
+    by_other = np.argsort(other, kind="stable")
+    starts = np.searchsorted(other[by_other], np.arange(sizes[1] + 1))
+    begin = starts[other[first]]
+    which, place = spread(begin, begin + common[other[first]])
+    small, large = one[first][which], one[by_other[place]]
+    kept = (many[large] >= many[small]) & (large != small)
+    return one[first], (small[kept], large[kept])
+
+
+def _holding(
+    key: Ints, sizes: tuple[int, int], pairs: tuple[Ints, Ints], most: int
+) -> tuple[Ints, Ints, int]:
+    """Return the pairs whose second item has all components of the first, and the number of steps.
+
+    All pairs share the first component. Pairs that are undecided within the limit are excluded.
+    """
+    small, large = pairs
+    starts = np.searchsorted(key, np.arange(sizes[0] + 1) * sizes[1])
+    # A table is used if there is room for it.
+    table = np.zeros(sizes[0] * sizes[1] if sizes[0] * sizes[1] <= _TABLE else 0, np.bool_)
+    if len(table):
+        table[key] = True
+    held: list[tuple[Ints, Ints]] = [(small[:0], large[:0])]
+    place, work = 1, len(small)
+    while len(small) and work < most:
+        ended = starts[small] + place >= starts[small + 1]
+        held.append((small[ended], large[ended]))
+        small, large = small[~ended], large[~ended]
+        wanted = large * sizes[1] + key[starts[small] + place] % sizes[1]
+        if len(table):
+            kept = table[wanted]
+        else:
+            kept = key[np.minimum(np.searchsorted(key, wanted), len(key) - 1)] == wanted
+        work += len(small)
+        small, large = small[kept], large[kept]
+        place += 1
+    found = np.concatenate([np.stack(some) for some in held], axis=1)
+    return found[0], found[1], work
+
+
+def _parts(
+    family: SetFamily, need: Ints, alive: Bools, wanted: Bools
+) -> list[tuple[SetFamily, Ints]]:
+    """Return the remaining sets as independent families, ordered by first set."""
+    rows = alive[family.set_of] & wanted[family.members]
+    sets, members = family.set_of[rows], family.members[rows]
+    group = _joined(sets, members, len(family), len(need))[sets]
+    order = np.argsort(group, kind="stable")
+    ends = np.flatnonzero(np.append(np.diff(group[order]) != 0, True)) + 1 if len(order) else ()
+    found: list[tuple[SetFamily, Ints]] = []
+    first = 0
+    for end in map(int, ends):
+        own = order[first:end]
+        first = end
+        inside, place = np.unique(sets[own], return_inverse=True)
+        element, number = np.unique(members[own], return_inverse=True)
+        pairs = np.stack([place, number])
+        part = SetFamily.of(
+            pairs, len(inside), len(element), family.cost[inside], 1, family.rank[inside]
+        )
+        found.append((replace(part, need=need[element]), inside))
+    return found
+
+
+def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
+    """Return the smallest set index in each set's connected component, (many,)."""
+    first = np.arange(many)
+    while True:
+        # Propagate the least set number through elements and sets.
+        least = np.full(elements, many)
+        np.minimum.at(least, members, first[sets])
+        found = first.copy()
+        np.minimum.at(found, first[sets], least[members])
+        while (found[found] != found).any():
+            found = found[found]
+        if (found == first).all():
+            return first
+        first = found
+
+
+# Bounds of set covers from below ----------------------------------------------------------------
+# Each element gets a price. If no set costs less than the prices of its elements, no cover costs
+# less than the sum of all prices (the dual of the linear programme). Arbitrary prices also give a
+# bound, after a correction for sets cheaper than their elements (Lagrange). Subgradient steps find
+# the prices; they also suggest covers. Sources: Held, Wolfe, Crowder, "Validation of subgradient
+# optimization", Mathematical Programming 6 (1974); Beasley, "A Lagrangian heuristic for
+# set-covering problems", Naval Research Logistics 37 (1990); Caprara, Fischetti, Toth, "A heuristic
+# method for the set covering problem", Operations Research 47 (1999).
+
+ROUNDS: Final = 400
+"""Greatest number of subgradient steps."""
+
+PATIENCE: Final = 20
+"""Steps without a better bound before the step length is halved."""
+
+TRIES: Final = 10
+"""Interval of steps after which the prices suggest a cover."""
+
+_MEMBERSHIPS: Final = 200_000_000
+"""Greatest number of memberships in all steps together; very large problems get fewer steps."""
+
+
+def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
+    """Return a lower bound, and a cover that is not more expensive than the given one.
+
+    Parameters
+    ----------
+    family : SetFamily
+        Each element needs at least one set, and has enough sets.
+    cover : int64
+
+    Returns
+    -------
+    low : float
+    cover : int64
+    prices : (E,) float64
+        Prices of the elements that give the bound.
+    """
+    set_of, need, cost = family.set_of, family.need, family.cost
+    often = np.diff(family.starts)
+    share = cost / np.maximum(often, 1)
+    prices = np.full(len(need), np.inf)
+    np.minimum.at(prices, family.members, share[set_of])
+    upper = float(cost[cover].sum())
+    best, kept, low = cover, prices, -math.inf
+    scale, idle = 2.0, 0
+    rounds = int(np.clip(_MEMBERSHIPS // max(len(set_of), 1), TRIES, ROUNDS))
+    for step in range(rounds):
+        left = cost - np.bincount(set_of, prices[family.members], len(cost))
+        taken = left < 0
+        bound = float((need * prices).sum() + left[taken].sum())
+        if bound > low + 1e-9:
+            low, kept, idle = bound, prices, 0
+        else:
+            idle += 1
+            if idle == PATIENCE:
+                scale, idle, prices = scale / 2, 0, kept
+                continue
+        if step % TRIES == 0:
+            found = _suggested(family, left)
+            if cost[found].sum() < upper - ROUNDING:
+                best, upper = found, float(cost[found].sum())
+        lacking = need - np.bincount(family.members[taken[set_of]], minlength=len(need))
+        lacking[(prices == 0) & (lacking < 0)] = 0
+        length = float((lacking.astype(np.float64) ** 2).sum())
+        if not length or upper - low < ROUNDING or scale < 1e-3:
+            break
+        prices = np.maximum(prices + scale * (1.02 * upper - bound) / length * lacking, 0.0)
+    return max(low, 0.0), best, kept
+
+
+def _suggested(family: SetFamily, left: Floats) -> Ints:
+    """Return a cover from the sets with the least cost above the prices of their elements."""
+    order = np.lexsort((family.rank, left / np.maximum(np.diff(family.starts), 1)))
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    of_element = np.lexsort((place[family.set_of], family.members))
+    starts, _ = family.by_element()
+    # For each element the first sets in this order, as many as it needs.
+    within = np.arange(len(of_element)) - starts[family.members[of_element]]
+    first = within < family.need[family.members[of_element]]
+    chosen = np.unique(family.set_of[of_element[first]])
+    return thinned(family, chosen[np.argsort(place[chosen])])
+
+
+# Covers by HiGHS, a solver of integer programmes (the extra [solver]) ----------------------------
+# The solver finds covers that the greedy choice misses, and proves optimality. Without it, the
+# greedy choice and the price bound remain.
+
+NODES: Final = 2_000
+"""Branch-and-bound nodes in all parts together: counted, so that results are the same on every machine."""
+
+LARGEST: Final = 100_000
+"""Greatest number of memberships of a part for the solver: the first relaxation of larger parts
+takes minutes."""
+
+SECONDS: Final = 20.0
+"""Time limit of a part: guards against endless relaxations; the node limit is usually reached earlier."""
+
+_LOOK_S: Final = 0.1
+"""Interval for signal checks during solving; s."""
+
+
+def has_solver() -> bool:
+    """True if HiGHS is installed."""
+    return find_spec("highspy") is not None
+
+
+def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, int]:
+    """Return the improved or given cover, a lower bound, and the used solver nodes.
+
+    Parameters
+    ----------
+    family : SetFamily
+        Each element has enough sets.
+    cover : int64
+    nodes : int
+        Greatest number of branch-and-bound nodes. Without a proof the bound is 0.
+    """
+    if nodes <= 0 or len(family.members) > LARGEST or not has_solver():
+        return cover, 0.0, 0
+    import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
+
+    solver = _silent()
+    options = {
+        "threads": 1,
+        "mip_rel_gap": 0.0,
+        "mip_abs_gap": ROUNDING / 10,
+        "mip_max_nodes": nodes,
+        "time_limit": SECONDS,
+    }
+    for name, value in options.items():
+        solver.setOptionValue(name, value)
+    solver.passModel(_programme(family))
+    known = highspy.HighsSolution()
+    known.col_value = np.isin(np.arange(len(family)), cover).astype(float).tolist()
+    solver.setSolution(known)
+    _run(solver)
+    info = solver.getInfo()
+    used = max(int(info.mip_node_count), 1)
+    cost = float(family.cost[cover].sum())
+    found = np.flatnonzero(np.array(solver.getSolution().col_value) > 0.5)
+    covers = bool((family.covered(found) >= family.need).all())
+    if covers and family.cost[found].sum() < cost - ROUNDING * max(cost, 1):
+        cover, cost = found, float(family.cost[found].sum())
+    if solver.getModelStatus() == highspy.HighsModelStatus.kOptimal:
+        return cover, cost, used
+    low = float(info.mip_dual_bound)
+    low = low - ROUNDING * max(abs(low), 1) if math.isfinite(low) else 0.0
+    return cover, math.ceil(low) if family.whole else max(low, 0.0), used
+
+
+def _silent() -> Any:
+    """Return a silent solver: since version 1.15 a new solver prints its name to stdout."""
+    import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
+
+    class Silent(highspy.Highs):
+        def enableCallbacks(self) -> None:  # noqa: N802 - its constructor calls this first, and that writes
+            self.setOptionValue("output_flag", False)  # noqa: FBT003
+            super().enableCallbacks()
+
+    return Silent()
+
+
+def _run(solver: Any) -> None:
+    """Solve in a thread, so that an exception from a signal handler stops it."""
+    # All solvers of a process share one lock; an interrupted solver holds it until it stops.
+    while not solver.wait(_LOOK_S)[0]:
+        pass
+    solver.HandleUserInterrupt = True
+    solver.startSolve()
+    try:
+        while not solver.wait(_LOOK_S)[0]:
+            pass
+    except BaseException:
+        solver.cancelSolve()
+        raise
+
+
+def _programme(family: SetFamily) -> Any:
+    """Return the integer programme of a cover: a binary variable per set, a row per element."""
+    import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
+
+    sets, elements = len(family), len(family.need)
+    made = highspy.HighsLp()
+    made.num_col_, made.num_row_ = sets, elements
+    made.col_cost_ = family.cost
+    made.col_lower_, made.col_upper_ = np.zeros(sets), np.ones(sets)
+    made.row_lower_ = family.need.astype(np.float64)
+    made.row_upper_ = np.full(elements, highspy.kHighsInf)
+    made.a_matrix_.format_ = highspy.MatrixFormat.kColwise
+    made.a_matrix_.start_ = family.starts.astype(np.int32)
+    made.a_matrix_.index_ = family.members.astype(np.int32)
+    made.a_matrix_.value_ = np.ones(len(family.members))
+    made.integrality_ = [highspy.HighsVarType.kInteger] * sets
+    return made
+
+
+# Set cover: few or cheap sets that together hold every element as often as needed. Required sets
+# are taken, redundant ones are dropped, and the rest splits into independent parts. Each part is
+# covered greedily and bounded from below. A part whose cover exceeds its bound is given to HiGHS,
+# if that is installed. So the result is exact if that is cheap, and otherwise has a bound for its
+# distance from the optimum. Source, with a budget: Khuller, Moss, Naor, "The budgeted maximum
+# coverage problem", Information Processing Letters 70 (1999).
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Cover: chosen sets, with cost and lower bound.
+
+    Attributes
+    ----------
+    chosen : int64
+        Ordered by gain per cost.
+    cost : float
+        Total cost.
+    bound : float
+        Lower bound for the cost of any cover.
+    greedy : float
+        Cost of the greedy choice, after the required sets.
+    """
+
+    chosen: Ints
+    cost: float
+    bound: float
+    greedy: float
+
+    @property
+    def exact(self) -> bool:
+        """True if the cover is proven to be the cheapest."""
+        return self.cost <= self.bound + ROUNDING * max(self.cost, 1)
+
+
+def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
+    """Return a cheap cover that meets all needs, with a lower bound for its cost.
+
+    Parameters
+    ----------
+    family : SetFamily
+    nodes : int
+        Greatest number of solver nodes, in all parts together; 0 for greedy choice and bound only.
+    """
+    forced, rest = reduced(family)
+    chosen, bound = [forced], float(family.cost[forced].sum())
+    plain = bound
+    for part, sets in rest:
+        own = greedy(part)
+        plain += float(part.cost[own].sum())
+        low, own, _ = bounded(part, thinned(part, own))
+        low = math.ceil(low - ROUNDING) if part.whole else low
+        if part.cost[own].sum() > low + ROUNDING:
+            own, proven, used = improved(part, own, nodes)
+            low, nodes = max(low, proven), nodes - used
+        chosen.append(sets[own])
+        bound += min(low, float(part.cost[own].sum()))
+    all_chosen = np.concatenate(chosen)
+    cost = float(family.cost[all_chosen].sum())
+    return Cover(ordered(family, all_chosen), cost, min(bound, cost), plain)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Sets chosen within a budget, with the needs that they meet.
+
+    Attributes
+    ----------
+    chosen : int64
+        In order of choice.
+    cost : float
+    met : int
+        Amount of met needs: for each element at most its need, times its weight.
+    most : float
+        Upper bound for any sets within the budget.
+    """
+
+    chosen: Ints
+    cost: float
+    met: int
+    most: float
+
+
+def within(family: SetFamily, budget: float) -> Fitted:
+    """Choose sets within a budget that meet most needs: greedy, or the best single set.
+
+    The bound is that of submodular functions: for any current choice, the optimum meets at most its
+    needs plus the largest gains of single sets that fit the budget together, the last one in part.
+    """
+    chosen = or_alone(family, greedy(family, budget), budget)
+    at = np.unique(np.linspace(0, len(chosen), 16).astype(np.int64)).tolist()
+    most = min(_at_most(family, chosen[:many], budget) for many in at)
+    reached = met(family, chosen)
+    return Fitted(chosen, float(family.cost[chosen].sum()), reached, max(most, reached))
+
+
+def _at_most(family: SetFamily, chosen: Ints, budget: float) -> float:
+    left = family.need - np.minimum(family.covered(chosen), family.need)
+    gain = family.gains(left > 0)
+    gain[chosen] = 0
+    gain[family.cost > budget] = 0
+    order = np.argsort(-gain / family.cost, kind="stable")
+    cost = np.cumsum(family.cost[order])
+    fits = int(np.searchsorted(cost, budget * (1 + 1e-12), side="right"))
+    more = float(gain[order[:fits]].sum())
+    if fits < len(order):
+        room = budget - (float(cost[fits - 1]) if fits else 0.0)
+        more += float(gain[order[fits]]) * room / float(family.cost[order[fits]])
+    return met(family, chosen) + min(more, float((left * family.weight).sum()))
+
+
+# Overlapping units, whose shared frames cost once: few, cheap, or best within a budget. The cost of
+# clips in frames, seconds or bytes is the cost of their union. *Pieces* are the stretches between
+# consecutive beginnings and ends of units: each unit is a range of pieces, and pieces do not
+# overlap. A set of pieces is never worse than its units; therefore bounds for covers by pieces also
+# hold for covers by units. Units are chosen greedily, by gain per cost of their uncovered pieces.
+
+
+@dataclass(frozen=True)
+class UnitPieces:
+    """Selection units as ranges of pieces, which overlapping units share.
+
+    Attributes
+    ----------
+    begin, end : (U,) int64
+        Both ascending.
+    cost : (P,) float64
+        Cost of each piece.
+    """
+
+    begin: Ints
+    end: Ints
+    cost: Floats
+
+    def left(self, one: int, taken: Bools) -> float:
+        """Return the cost of those pieces of a unit that are not yet taken."""
+        own = slice(int(self.begin[one]), int(self.end[one]))
+        return float(self.cost[own][~taken[own]].sum())
+
+    def beside(self, one: int) -> range:
+        """Return the units that share a piece with a unit, including itself."""
+        low = int(np.searchsorted(self.end, self.begin[one], side="right"))
+        return range(low, int(np.searchsorted(self.begin, self.end[one])))
+
+    def together(self, picked: Ints) -> float:
+        """Return the total cost of units."""
+        taken = np.zeros(len(self.cost), np.bool_)
+        for one in picked.tolist():
+            taken[self.begin[one] : self.end[one]] = True
+        return float(self.cost[taken].sum())
+
+
+def pieces(units: Units, measure: Measure) -> tuple[Units, UnitPieces]:
+    """Return the pieces of units, and the units as ranges of pieces."""
+    cuts = np.unique(np.concatenate([units.begin, units.end]))
+    parts = replace(units, begin=cuts[:-1], end=cuts[1:])
+    cost = parts.summed(units.weights(measure), measure)
+    begin, end = np.searchsorted(cuts, units.begin), np.searchsorted(cuts, units.end)
+    return parts, UnitPieces(begin.astype(np.int64), end.astype(np.int64), cost)
+
+
+def cheapest(units: Units, held: Holdings, measure: Measure, rank: Ints) -> Cover:
+    """Return units that hold all elements at a low total cost: the greedy choice, or the fewest units.
+
+    The bound comes from single pieces.
+    """
+    parts, spans = pieces(units, measure)
+    family = held.family(units, units.costs(measure), 1, rank)
+    own = _thinned(family, spans, _greedy(family, spans))
+    cost = greedy = spans.together(own)
+    few = minimal(replace(family, cost=np.ones(len(units)))).chosen
+    if spans.together(few) < cost:
+        own, cost = few, spans.together(few)
+    alone = held.over(parts).family(parts, spans.cost, 1, np.arange(len(parts)))
+    return Cover(ordered(family, own), cost, min(minimal(alone).bound, cost), greedy)
+
+
+def affordable(units: Units, held: Holdings, measure: Measure, rank: Ints, budget: float) -> Fitted:
+    """Return units within a budget that hold most elements: greedy, or the best single unit.
+
+    The bound comes from single pieces.
+    """
+    parts, spans = pieces(units, measure)
+    family = held.family(units, units.costs(measure), 1, rank)
+    chosen = or_alone(family, _greedy(family, spans, budget), budget)
+    alone = held.over(parts).family(parts, spans.cost, 1, np.arange(len(parts)))
+    reached = met(family, chosen)
+    most = max(within(alone, budget).most, reached)
+    return Fitted(chosen, spans.together(chosen), reached, most)
+
+
+def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> Ints:
+    """Choose units one after another by gain per additional cost."""
+    taken = np.zeros(len(spans.cost), np.bool_)
+
+    def cheapened(one: int) -> Iterator[tuple[int, float]]:
+        """Yield the new prices of units that share pieces with a taken unit."""
+        taken[spans.begin[one] : spans.end[one]] = True
+        for other in spans.beside(one):
+            yield other, max(spans.left(other, taken), 1e-9)
+
+    return greedy(family, budget, cheapened)
+
+
+def _thinned(family: SetFamily, spans: UnitPieces, chosen: Ints) -> Ints:
+    """Remove redundant units, those with the greatest savings first."""
+    times = np.zeros(len(spans.cost) + 1, np.int64)
+    np.add.at(times, spans.begin[chosen], 1)
+    np.add.at(times, spans.end[chosen], -1)
+    shared = np.cumsum(times)[:-1] > 1
+    saved = np.array([spans.left(one, shared) for one in chosen.tolist()])
+    return thinned(family, chosen, np.argsort(-saved, kind="stable"))

@@ -1,0 +1,112 @@
+"""Situations of the ego: the first possible conflict partner, its direction, and the place."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.base.quoting import literal
+from sgstore.model.vocabulary import SIGNALS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from sgstore.model.world import Ints
+    from sgstore.testsets.selection._units import Units
+
+_FIXED: Final = (*SIGNALS, "building", "pole", "barrier", "vegetation")
+MET: Final = f"NOT IN ({', '.join(map(literal, _FIXED))})"
+"""SQL condition for kinds that the ego could meet."""
+
+OTHERS: Final = f"src_is_ego AND dst_kind {MET}"
+"""Pairs of the ego and entities that it could meet, without traffic lights, for example."""
+
+SITUATION: Final = "situation"
+"""Name of these classes in place of an abstraction."""
+
+NOBODY: Final = "nobody"
+"""Situation without other entities."""
+
+_NOBODY: Final = -1
+
+_FRAMES: Final = 1 << 17
+"""Frames whose pairs are read together."""
+
+_DIRECTIONS: Final = ("", " of the same direction", " that crosses", " that comes towards it")
+_WAYS: Final = ("", " in its way", " beside its way")
+_SIDES: Final = ("", ", ahead", ", behind")
+
+WHO: Final = """
+  min(ROW(coalesce(closing_time, 1e300), coalesce(dce_3s, 1e300), dst,
+    enum_code(dst_kind)::INTEGER * 64
+    + CASE WHEN abs(rel_heading) <= 45 THEN 16 WHEN abs(rel_heading) < 135 THEN 32
+      WHEN abs(rel_heading) >= 135 THEN 48 ELSE 0 END
+    + CASE WHEN lat_gap <= 0 THEN 4 WHEN lat_gap > 0 THEN 8 ELSE 0 END
+    + CASE WHEN lon > 0 THEN 1 WHEN lon <= 0 THEN 2 ELSE 0 END))[4] AS situation
+"""
+"""SQL of the situation of a frame as a number, from the pairs of :data:`OTHERS`."""
+
+_SQL: Final = f"""
+  SELECT frame_id, {WHO} FROM world_criticality WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id
+"""  # noqa: S608  names of ours
+
+
+def frames_in_parts(frames: Ints) -> Iterator[tuple[int, Ints]]:
+    """Yield chunks of ascending frames, each with the index of its first frame."""
+    for start in range(0, len(frames), _FRAMES):
+        yield start, frames[start : start + _FRAMES]
+
+
+def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
+    """Return the situation in one frame of each unit, (U,), as an index into a list of all.
+
+    Parameters
+    ----------
+    units : Units
+    rows : (U,) int64
+        Row of the frame of each unit.
+    """
+    frames, place = np.unique(units.frame_id[rows], return_inverse=True)
+    told = Situations.of_frames(units, len(frames))
+    for start, part in frames_in_parts(frames):
+        found = units.chosen.one_store.file.arrays(_SQL, [int(part[0]), int(part[-1])])
+        ids = found["frame_id"].astype(np.int64)
+        at = np.minimum(np.searchsorted(part, ids), len(part) - 1)
+        here = part[at] == ids
+        told.add(start + at[here], np.asarray(found["situation"])[here])
+    return told.of(place)
+
+
+class Situations:
+    """Situations of frames by index; a frame without an entry has no other entity."""
+
+    def __init__(self, count: int, kinds: Sequence[str]) -> None:
+        self._code = np.full(count, _NOBODY, np.int64)
+        self._kinds = kinds
+
+    @classmethod
+    def of_frames(cls, units: Units, count: int) -> Situations:
+        """Make an empty record for frames of a store."""
+        sql = "SELECT unnest(enum_range(NULL::kind))::VARCHAR"
+        return cls(count, [one for (one,) in units.chosen.one_store.file.rows(sql).values])
+
+    def add(self, rows: Ints, codes: Any) -> None:
+        """Set the situations of some frames."""
+        self._code[rows] = codes
+
+    def of(self, rows: Ints) -> tuple[Ints, list[str]]:
+        """Return the situations of some frames, as indices into a list."""
+        used, code = np.unique(self._code[rows], return_inverse=True)
+        names = list(map(self._name, used.tolist()))
+        order = sorted(range(len(names)), key=names.__getitem__)
+        rank = np.argsort(np.array(order, np.int64))
+        return rank[code].astype(np.int64), sorted(names)
+
+    def _name(self, code: int) -> str:
+        if code == _NOBODY:
+            return NOBODY
+        kind, about = divmod(code, 64)
+        return (
+            self._kinds[kind] + _DIRECTIONS[about // 16] + _WAYS[about // 4 % 4] + _SIDES[about % 4]
+        )
