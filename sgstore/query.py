@@ -644,8 +644,8 @@ class Store:
 
     def _range_of(self, clip: str | Clip | Interval) -> tuple[str, str]:
         """Return the names of the first and the last frame of a clip."""
-        from sgstore.draw import range_of
         from sgstore.matches import Interval
+        from sgstore.store import range_of
 
         if isinstance(clip, str):
             if (frames := range_of(clip)) is None:

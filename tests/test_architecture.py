@@ -50,7 +50,6 @@ LOOK_OUT = {
     "__main__": {"apps"},
     "matches": {"draw"},
     "query": {"draw", "exporters"},
-    "temporal/_shrink": {"draw"},
 }
 """Files of the core that may import outer packages, inside functions or at their top, and which."""
 

@@ -15,7 +15,7 @@ from matplotlib.artist import Artist
 from PIL import Image
 
 from sgstore.apps.cli import run
-from sgstore.draw import draw_clip, draw_stored, range_of
+from sgstore.draw import draw_clip, draw_stored
 from sgstore.draw._animation import Gif, animation, changed
 from sgstore.draw._film import FilmPage, TextSprites
 from sgstore.draw._page import TEXT, Page, own_style, printable
@@ -25,7 +25,7 @@ from sgstore.draw._stored import Shot, filmed, scale_of
 from sgstore.draw._view import view_of
 from sgstore.errors import ExportError, MissingExtraError, StoreError
 from sgstore.query import Store
-from sgstore.store import StoreFile
+from sgstore.store import StoreFile, range_of
 
 if TYPE_CHECKING:
     from pathlib import Path

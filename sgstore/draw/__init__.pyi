@@ -15,7 +15,6 @@ from ._stored import draw_clip as draw_clip
 from ._stored import draw_stored as draw_stored
 from ._stored import frame_image as frame_image
 from ._stored import graph_picture as graph_picture
-from ._stored import range_of as range_of
 from ._stored import thumbnail as thumbnail
 from ._swimlanes import LETTERS as LETTERS
 from ._swimlanes import Lane as Lane
@@ -49,7 +48,6 @@ __all__ = [
     "graph_picture",
     "lines_of",
     "parts_timeline",
-    "range_of",
     "thumbnail",
     "timelines",
 ]

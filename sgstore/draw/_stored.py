@@ -155,7 +155,6 @@ SAMPLES: Final = 8
 AT_ONCE: Final = 8
 """Frames that are read at a time."""
 
-_RANGE: Final = re.compile(r"(.+)([@#])(\d+(?:\.\d+)?s?)\.\.(\d+(?:\.\d+)?s?)")
 
 _PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 """First bytes of JPEG and PNG. A message contains the complete picture in any encoding."""
@@ -229,23 +228,6 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
             diagram=diagram,
         )
     return bool(bindings)
-
-
-def range_of(text: str) -> FrameRange | None:
-    """Parse a frame range such as ``TRACE@12s..18s`` or ``TRACE#120..180``; ``None`` for a single frame.
-
-    >>> range_of("town@12.5s..18s")
-    ('town@12.5s', 'town@18s')
-    >>> range_of("town#120..180"), range_of("town#120")
-    (('town#120', 'town#180'), None)
-    """
-    found = _RANGE.fullmatch(text.strip())
-    if found is None:
-        return None
-    trace, mark, first, last = found.groups()
-    unit = "s" if mark == "@" else ""
-    first, last = (f"{trace}{mark}{end.removesuffix('s')}{unit}" for end in (first, last))
-    return first, last
 
 
 def draw_clip(  # noqa: PLR0913  as many options as the picture has

@@ -76,6 +76,7 @@ from ._similarity import frames_like as frames_like
 from ._similarity import most_like as most_like
 from ._staging import Sealed as Sealed
 from ._traces import FrameRef as FrameRef
+from ._traces import range_of as range_of
 from ._traces import Identity as Identity
 from ._traces import StoredTrace as StoredTrace
 from ._traces import free_name as free_name
@@ -151,6 +152,7 @@ __all__ = [
     "refuse_name",
     "relations_of_set",
     "remains_of",
+    "range_of",
     "seq_of",
     "split_segment",
     "subset_catalogs",

@@ -548,3 +548,23 @@ def _range(connection: DuckDBPyConnection, trace_id: int) -> str:
 def _listed(names: list[str]) -> str:
     shown = ", ".join(repr(name) for name in names[:8])
     return shown if len(names) <= 8 else f"{shown}, … ({len(names)} in all)"
+
+
+_RANGE: Final = re.compile(r"(.+)([@#])(\d+(?:\.\d+)?s?)\.\.(\d+(?:\.\d+)?s?)")
+
+
+def range_of(text: str) -> tuple[str, str] | None:
+    """Parse a frame range such as ``TRACE@12s..18s`` or ``TRACE#120..180``; ``None`` for a single frame.
+
+    >>> range_of("town@12.5s..18s")
+    ('town@12.5s', 'town@18s')
+    >>> range_of("town#120..180"), range_of("town#120")
+    (('town#120', 'town#180'), None)
+    """
+    found = _RANGE.fullmatch(text.strip())
+    if found is None:
+        return None
+    trace, mark, first, last = found.groups()
+    unit = "s" if mark == "@" else ""
+    first, last = (f"{trace}{mark}{end.removesuffix('s')}{unit}" for end in (first, last))
+    return first, last

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.draw import range_of
 from sgstore.errors import StoreError
 from sgstore.lang import (
     CLOCK,
@@ -28,6 +27,7 @@ from sgstore.lang import (
 from sgstore.lang.ir import Tense, walk
 from sgstore.lang.syntax import CheckClause
 from sgstore.model.world import Clip
+from sgstore.store import range_of
 from sgstore.temporal._checks import StoreCheck
 from sgstore.temporal._matches import TemporalMatches
 from sgstore.temporal._sequences import Finder

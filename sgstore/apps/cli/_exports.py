@@ -376,7 +376,8 @@ def show(
     bounds: QueryLimits,
 ) -> int:
     """Draw a frame from above, or a clip as an animation; with a QUERY, what it matches is marked."""
-    from sgstore.draw import draw_clip, draw_stored, range_of
+    from sgstore.draw import draw_clip, draw_stored
+    from sgstore.store import range_of
 
     opened = bounds.opened(store)
     text, values = question.asked() if question else ("", {})
