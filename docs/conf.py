@@ -12,7 +12,7 @@ from pygments.lexers.special import TextLexer
 from pygments.token import Comment, Keyword, Name, Number, Operator, Punctuation, String, Text
 
 import sgstore
-from sgstore.lang import keywords
+from sgstore.lang.syntax import keywords
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx

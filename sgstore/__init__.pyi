@@ -14,7 +14,7 @@ from .errors import SqlError as SqlError
 from .errors import StoreError as StoreError
 from .errors import TraceError as TraceError
 from .model.graph import SceneGraph as SceneGraph
-from .lang import Pattern as Pattern
+from .lang.syntax import Pattern as Pattern
 from .maps.map_files import read_map_file as read_map_file
 from .matches import Interval as Interval
 from .matches import Matches as Matches

@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from sgstore.base.quoting import quoted
 from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, SgstoreError
-from sgstore.lang import (
+from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
+from sgstore.lang.sql import (
     Compiled,
     Layout,
     Window,
@@ -31,7 +32,6 @@ from sgstore.lang import (
     joined_rows,
     rewritten,
 )
-from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
 from sgstore.model.vocabulary import natural
 from sgstore.model.world import Clip, tolerance_ns
 from sgstore.store import (
@@ -54,8 +54,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, Compared, Gathered, SqlStatement, UnionParts
+    from sgstore.lang.catalog import Catalog
+    from sgstore.lang.help import Compared
     from sgstore.lang.ir import Query
+    from sgstore.lang.sql import Gathered, SqlStatement, UnionParts
     from sgstore.store import Given, StoreFile
     from sgstore.temporal.truth_lanes import TruthLanes
 
@@ -258,7 +260,7 @@ class Matches(Tabular):
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on likely mistakes, such as a text that equals no name in the store."""
-        from sgstore.lang import compared_in_query
+        from sgstore.lang.help import compared_in_query
 
         with self._compiled() as compiled:
             compared = compared_in_query(compiled.bound)
@@ -352,9 +354,9 @@ class Matches(Tabular):
         """Yield each match as a graph of its bound nodes and edges. ``RETURN`` has no effect.
 
         Nodes are node ids with all known attributes, and ``variables``: their names in the pattern. Edges have
-        their relation as key and as attribute, and all known attributes; see :mod:`sgstore.lang._compile`. The
-        graph has the attributes ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``t``, and the other values
-        of ``RETURN SUBGRAPHS``.
+        their relation as key and as attribute, and all known attributes; see :mod:`sgstore.lang.sql._compile`.
+        The graph has the attributes ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``t``, and the other
+        values of ``RETURN SUBGRAPHS``.
         """
         from sgstore.model.graph import graph_of_records
 
@@ -503,7 +505,7 @@ class Matches(Tabular):
             return compiled.stages()
 
     def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-        """Return columns and rows in readable form; see :func:`sgstore.lang.for_people`."""
+        """Return columns and rows in readable form; see :func:`sgstore.lang.sql.for_people`."""
         return for_people(self.columns, self, graphs=self.graphs)
 
     def _stream(
@@ -719,7 +721,7 @@ class UnionMatches(Matches):
 
         Default: the first part.
         """
-        from sgstore.lang import has_nodes
+        from sgstore.lang.help import has_nodes
 
         given = (binding or {}).items()
         named = [p for p in self._parts if has_nodes(p._ready.bound, binding or {})] or self._parts  # noqa: SLF001
@@ -911,8 +913,8 @@ def notes_in(
     query: str,
     parameters: Mapping[str, object],
 ) -> tuple[str, ...]:
-    """Return notes on query texts that the store does not contain; see :func:`sgstore.lang.notes_on`."""
-    from sgstore.lang import notes_on
+    """Return notes on query texts that the store does not contain; see :func:`sgstore.lang.help.notes_on`."""
+    from sgstore.lang.help import notes_on
 
     return notes_on(compared, query, parameters, lambda sql, values: file.rows(sql, values).values)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from sgstore.base.records import dataclass
 from sgstore.errors import StoreError, place_named, url_named
-from sgstore.lang import CONSTANTS, about_frame, compile_query, union_parts
+from sgstore.lang.sql import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.model.criticality import KNOWN
 from sgstore.model.vocabulary import normalize_name
@@ -30,8 +30,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from PIL.Image import Image
 
-    from sgstore.lang import Catalog, FrameView, Pattern, WhyNot, WhyNotSteps
+    from sgstore.lang.catalog import Catalog
+    from sgstore.lang.help import WhyNot, WhyNotSteps
     from sgstore.lang.ir import Query
+    from sgstore.lang.memory import FrameView
+    from sgstore.lang.syntax import Pattern
     from sgstore.matches import Interval, Matches
     from sgstore.model.world import Clip
     from sgstore.pipeline.segments import TraceOutcome
@@ -280,7 +283,7 @@ class Store:
             The text is not a query, or has an unknown name. The message gives the place and a hint.
         """
         if not isinstance(query, str):
-            from sgstore.lang import Pattern
+            from sgstore.lang.syntax import Pattern
 
             pattern = query if isinstance(query, Pattern) else Pattern.of(query)
             query, parameters = str(pattern), {**pattern.parameters, **parameters}
@@ -495,7 +498,7 @@ class Store:
         QueryError
             The frame has no ego, or no name matches ``ignore``.
         """
-        from sgstore.lang import pattern_of
+        from sgstore.lang.syntax import pattern_of
 
         return pattern_of(self.file.graph(_ref(frame)), ignore)
 
@@ -732,7 +735,7 @@ class Store:
         StoreError
             The frame does not exist.
         """
-        from sgstore.lang import (
+        from sgstore.lang.help import (
             WhyNot,
             why_not,  # with numpy: only for who asks
         )
@@ -806,7 +809,8 @@ class Store:
 
     def _view(self, frame: FrameRef, query: Query) -> FrameView:
         """Return a frame for evaluation in memory, with the store values that the query needs."""
-        from sgstore.lang import FrameView, events_in, looked_up
+        from sgstore.lang.help import events_in, looked_up
+        from sgstore.lang.memory import FrameView
         from sgstore.model.world import seconds_of
 
         trace = self.file.trace(frame.trace_id)
@@ -888,7 +892,7 @@ class UserStatement:
         self.notes: tuple[str, ...] = ()
         if "sgql" not in text.lower():
             return
-        from sgstore.lang import pattern_tables
+        from sgstore.lang.syntax import pattern_tables
 
         self.sql, calls = pattern_tables(text, tables)
         found = [(one.name, find(one.text, **dict(one.values))) for one in calls]

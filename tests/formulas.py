@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import QueryError
-from sgstore.lang import parse
-from sgstore.lang import syntax as s
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax import tree as s
 from sgstore.temporal import evaluate
 from sgstore.temporal._formula import (
     LOGIC,

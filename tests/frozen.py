@@ -34,7 +34,7 @@ import sgstore
 from sgstore.apps.cli import run as command_line
 from sgstore.apps.demo import RECORDING
 from sgstore.ingest import ingest
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for bench
 import sgstore
 from bench.replicas import EGOS, given, replicate, sources
 from sgstore.errors import QueryError, SqlError
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 PACKAGE = Path(__file__).parents[1] / "sgstore"
 
-INTERFACES_BELOW = {"apps", "base", "graphs", "maps", "model", "pipeline", "testsets"}
+INTERFACES_BELOW = {"apps", "base", "graphs", "lang", "maps", "model", "pipeline", "testsets"}
 """Packages whose parts have an interface each."""
 
 WH = {"what", "whether", "who", "which", "where", "how", "when", "why", "whose"}
@@ -94,7 +94,7 @@ def is_at_home(module: str, inner: str) -> bool:
 
 
 def module_of(path: Path) -> str:
-    """``lang/_bind.py`` as ``lang._bind``, ``lang/__init__.py`` as ``lang``."""
+    """``lang/bind/_bind.py`` as ``lang.bind._bind``, ``lang/__init__.py`` as ``lang``."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(part for part in parts if part != "__init__")
 

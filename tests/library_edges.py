@@ -52,7 +52,7 @@ from library_scenes import (
 )
 from scenes import Scene, actor, along, ego, path, through
 
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 
 if TYPE_CHECKING:
     from collections.abc import Callable

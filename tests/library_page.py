@@ -13,13 +13,13 @@ import numpy as np
 from library_scenes import SCENES
 from scenes import LANE
 
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 from sgstore.model.vocabulary import DRIVING
 
 if TYPE_CHECKING:
     from scenes import Actor, Scene
 
-    from sgstore.lang import NamedPattern
+    from sgstore.lang.library import NamedPattern
 
 REPOSITORY: Final = Path(__file__).parents[1]
 PAGE: Final = REPOSITORY / "docs" / "patterns.md"
@@ -205,7 +205,8 @@ def page() -> str:
         "",
         "Queries that need not be written: a library of predicates, concepts, scenarios and traffic rules. "
         "`sgstore patterns list` names them, `sgstore patterns show NAME` prints one as a query that can be "
-        "changed, `sgstore patterns run STORE NAME [k=v …]` asks it. In Python `sgstore.lang.patterns()` is "
+        "changed, `sgstore patterns run STORE NAME [k=v …]` asks it. In Python "
+        "`sgstore.lang.library.patterns()` is "
         'all of them, `store.find(patterns()["cut_in"].text)` asks one, and `.written(within="2s")` is its '
         "text with other parameters.",
         "",

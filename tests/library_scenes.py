@@ -23,7 +23,7 @@ from scenes import (
     through,
 )
 
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 
 WAYS: Final = street("driving", "driving")
 """Two lanes of one direction: y = -1.75 and -5.25."""

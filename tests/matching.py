@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sgstore.lang import Binding, Layout, ScopeSearch
-from sgstore.lang._compile import graph_of
 from sgstore.lang.ir import Node
+from sgstore.lang.memory import Binding, ScopeSearch
+from sgstore.lang.sql import Layout
+from sgstore.lang.sql._compile import graph_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from sgstore.lang import FrameView
-    from sgstore.lang._compile import Record
     from sgstore.lang.ir import Edge, Query
+    from sgstore.lang.memory import FrameView
+    from sgstore.lang.sql._compile import Record
 
 
 @dataclass(frozen=True, slots=True)

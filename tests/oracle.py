@@ -21,8 +21,8 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from sgstore.lang import parse
-from sgstore.lang import syntax as s
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import SIGNALS
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import networkx as nx
     from oracle_worlds import Frame, World
 
-    from sgstore.lang import SqlStatement
+    from sgstore.lang.sql import SqlStatement
 
     Compared = Callable[[World], tuple[str, int]]
 
@@ -663,7 +663,7 @@ def labels_in(label: s.LabelExpression) -> list[s.Label]:
 
 def disagreement(text: str, world: World, *, counted: bool = True) -> tuple[str, int]:
     """What the compiled query and the search do not agree on (nothing, if all is well); number of frames."""
-    from sgstore.lang import compile_query
+    from sgstore.lang.sql import compile_query
 
     compiled = compile_query(text, world.catalog)  # refused, before anything is searched
     wanted, frames = answer(text, world)
@@ -691,7 +691,7 @@ def asked(statement: SqlStatement, world: World) -> list[tuple[Any, ...]]:
 
 def disagreement_of_results(text: str, world: World) -> tuple[str, int]:
     """As above, of a query that returns values."""
-    from sgstore.lang import compile_query
+    from sgstore.lang.sql import compile_query
 
     statement = compile_query(text, world.catalog).rows()
     wanted = rounded(returned(text, world))

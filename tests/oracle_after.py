@@ -23,8 +23,8 @@ from oracle import (
 )
 from oracle_patterns import SIMPLE, Writer
 
-from sgstore.lang import parse
-from sgstore.lang import syntax as s
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import natural
 
 if TYPE_CHECKING:
@@ -319,7 +319,7 @@ def rounded(value: Any) -> Any:
 
 def disagreement_after(text: str, world: World, *, in_order: bool = True) -> tuple[str, int]:
     """What the compiled query and the definition do not agree on; how many rows there are."""
-    from sgstore.lang import compile_query
+    from sgstore.lang.sql import compile_query
 
     statement = compile_query(text, world.catalog).rows()
     wanted = [rounded(row) for row in treated(text, world)]

@@ -24,7 +24,7 @@ from test_lane_courses import by_elevation, by_its_points
 from test_lane_dist import FARTHEST, lane_ways
 from test_lane_places import PARTS, SORTS, columns_of, stretches, town, traffic
 
-from sgstore.lang import FrameView
+from sgstore.lang.memory import FrameView
 from sgstore.model.config import Config
 from sgstore.model.world import TraceReport
 from sgstore.query import Store

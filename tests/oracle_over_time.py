@@ -25,8 +25,8 @@ from oracle_worlds import random_world
 
 import sgstore
 from sgstore.errors import TextSpan
-from sgstore.lang import parse
-from sgstore.lang import syntax as s
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax import tree as s
 from sgstore.model.graph import SceneGraph
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS, columns_needed
 from sgstore.model.vocabulary import normalize_name

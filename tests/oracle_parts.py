@@ -33,8 +33,10 @@ from oracle_after import is_counted, rounded, said
 from oracle_over_time import graph_of
 from oracle_patterns import SIMPLE, Writer
 
-from sgstore.lang import FrameView, StageSearch, bind_query, parse
-from sgstore.lang import syntax as s
+from sgstore.lang.bind import bind_query
+from sgstore.lang.memory import FrameView, StageSearch
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax import tree as s
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
@@ -462,7 +464,7 @@ class PartsWriter(Writer):
 
 def disagreement_of_parts(text: str, world: World) -> tuple[str, int]:
     """What the compiled query and the definition do not agree on; how many rows there are."""
-    from sgstore.lang import compile_query
+    from sgstore.lang.sql import compile_query
 
     statement = compile_query(text, world.catalog).rows()
     wanted = returned(text, world)
@@ -472,7 +474,7 @@ def disagreement_of_parts(text: str, world: World) -> tuple[str, int]:
 
 def disagreement_of_matches(text: str, world: World) -> tuple[str, int]:
     """The same of whole matches, and of the number of frames."""
-    from sgstore.lang import compile_query
+    from sgstore.lang.sql import compile_query
 
     compiled = compile_query(text, world.catalog)
     statement = compiled.rows()

@@ -15,8 +15,10 @@ import numpy as np
 from oracle_over_time import Told, many_ways, names_of, spelled_out, visible_names
 
 from sgstore.errors import QueryError
-from sgstore.lang import Catalog, bind_query, parse
-from sgstore.lang import syntax as s
+from sgstore.lang.bind import bind_query
+from sgstore.lang.catalog import Catalog
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax import tree as s
 from sgstore.model.world import longest_step_ns, tolerance_ns
 from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._offline import TimedRelation, TraceReader

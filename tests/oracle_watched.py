@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from sgstore.apps.demo import RECORDING
 from sgstore.errors import SgstoreError
 from sgstore.ingest import ingest
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 from sgstore.model.config import Config
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator

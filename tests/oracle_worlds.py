@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import duckdb
 import networkx as nx
 
-from sgstore.lang import Catalog, TraceFacts
+from sgstore.lang.catalog import Catalog, TraceFacts
 from sgstore.model.vocabulary import MAP_KINDS
 from sgstore.store._locking import without_faults
 from sgstore.store._schema import schema_sql

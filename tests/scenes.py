@@ -32,7 +32,7 @@ from opendrive_maps import (
     width,
 )
 
-from sgstore.lang import looked_up
+from sgstore.lang.help import looked_up
 from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config
 from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, VEHICLE_LIGHTS
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from sgstore.lang import FrameView
     from sgstore.lang.ir import Query
+    from sgstore.lang.memory import FrameView
     from sgstore.maps.roads import RoadMap
     from sgstore.store import Sealed
 

@@ -20,7 +20,7 @@ from textwrap import dedent
 from typing import Final
 
 from sgstore.errors import QueryError
-from sgstore.lang import parse
+from sgstore.lang.syntax import parse
 
 _SCENARIO: Final = re.compile(r"^\s*Scenario(?: Outline)?:.*$", re.MULTILINE)
 _EXECUTED: Final = re.compile(r'When executing query:\s*"""\n(.*?)"""', re.DOTALL)

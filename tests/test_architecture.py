@@ -42,6 +42,9 @@ LAYERS: tuple[frozenset[str], ...] = (
 TOGETHER = ({"ingest", "pipeline"}, {"matches", "temporal"})
 """Files of the design at the top, and the package each of them belongs to."""
 
+FOLDERS_OF_LANG = ("syntax", "library", "bind", "contrib", "sql", "memory", "help")
+"""Folders of the language, from the ground up."""
+
 OUTER = {"apps", "collection", "draw", "exporters", "testsets"}
 """Packages around the core."""
 
@@ -65,7 +68,7 @@ OWNERS = {
     "rich": {"apps/cli"},
     "networkx": {"model/graph", "exporters"},
     "shapely": {"base/geometry", "maps/roads", "maps/opendrive"},
-    "lark": {"lang"},
+    "lark": {"lang/syntax"},
     "highspy": {"testsets/selection"},
     "sklearn": {"testsets/selection"},
     "threadpoolctl": {"testsets/selection"},
@@ -87,7 +90,7 @@ OWNERS = {
 }
 """Third-party package → the packages or files that import it."""
 
-MASKS_ARE_KNOWN_TO = {"store", "lang/_sql_masks", "lang/_results"}
+MASKS_ARE_KNOWN_TO = {"store", "lang/sql/_masks", "lang/sql/_results"}
 SQL_OF_MASKS = re.compile(r"\bmask\b|\bbit_or\b|\bbit_count\b|<<")
 FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill"}
 FORBIDDEN_CALLS = {"eval", "exec", "__import__"}
@@ -211,6 +214,26 @@ def test_the_core_imports_no_outer_package() -> None:
         return {n.split(".")[1] for n in names if n.startswith("sgstore.")} & OUTER - own
 
     assert offending(outward) == LOOK_OUT
+
+
+def test_folders_of_the_language_import_one_another_in_one_direction() -> None:
+    def upward(path: Path) -> set[str]:
+        own = folder_of(".".join(path.relative_to(PACKAGE).parts[:-1]))
+        if own is None:
+            return set()
+        names = {n.removeprefix("sgstore.") for n in imports_of(path)}
+        return {n for n in names if (folder_of(n) or 0) > own}
+
+    assert offending(upward) == {}
+
+
+def folder_of(name: str) -> int | None:
+    """Place of a folder of ``lang/`` in the order in which they may import one another; files at its top: 0."""
+    package, _, rest = name.partition(".")
+    folder = rest.partition(".")[0]
+    if package != "lang":
+        return None
+    return FOLDERS_OF_LANG.index(folder) + 1 if folder in FOLDERS_OF_LANG else 0
 
 
 def test_files_import_one_another_in_one_direction() -> None:

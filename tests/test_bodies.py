@@ -19,7 +19,7 @@ from test_relations import bodies, flat, footprint, storeys_apart
 
 from sgstore.graphs.online import Frame
 from sgstore.graphs.relations import relations
-from sgstore.lang import FrameView
+from sgstore.lang.memory import FrameView
 from sgstore.model.config import Config, Proximity
 from sgstore.model.vocabulary import KINDS, PROXIMITY, SIGNALS
 from sgstore.model.world import TraceReport

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from sgstore.apps.cli import run
-from sgstore.lang import pattern_named, patterns
-from sgstore.lang.library import search
+from sgstore.lang.library import pattern_named, patterns, search
 from sgstore.query import Store
 
 if TYPE_CHECKING:

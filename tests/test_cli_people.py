@@ -20,7 +20,7 @@ from verb_lines import verbs
 from sgstore.apps.cli import application, run
 from sgstore.apps.cli._examples import EXAMPLES
 from sgstore.apps.cli._output import Format, write_rows
-from sgstore.lang import parse
+from sgstore.lang.syntax import parse
 
 RULE = "CHECK slow: ALWAYS ego.speed < 14"
 FAST = "MATCH (e:Ego) WHERE e.speed > 9"

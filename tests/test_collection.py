@@ -22,9 +22,12 @@ from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _engines as engines
 from sgstore.collection import _worker as worker
 from sgstore.errors import QueryError, QueryNameError, SqlError, StoreError, TextSpan
-from sgstore.lang import _catalog, compile_query, ir, syntax
-from sgstore.lang import _parts as parts
-from sgstore.lang._aggregates import AGGREGATES
+from sgstore.lang import catalog as _catalog
+from sgstore.lang import ir
+from sgstore.lang.bind._aggregates import AGGREGATES
+from sgstore.lang.sql import collection_parts as parts
+from sgstore.lang.sql import compile_query
+from sgstore.lang.syntax import tree as syntax
 from sgstore.query import Store
 from sgstore.store import CATALOGUE, StoreFile, _bundles, write_parquet
 from sgstore.testsets import coverage
@@ -33,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from sgstore.lang import Compiled
+    from sgstore.lang.sql import Compiled
 
 TRACES = 5
 
@@ -467,11 +470,13 @@ UNITS = {
     *("standing", "binding", "owner", "whole", "label", "seconds", "classed", "weather", "clock"),
     *("span", "role", "recording", "own", "counted", "seen", "inside"),
 }
-"""Units: ``counted`` and ``seen`` speak of all traces, and are given to each bundle (lang/_parts.py)."""
+"""Units: ``counted`` and ``seen`` speak of all traces, and are given to each bundle
+(lang/sql/collection_parts.py)."""
 
 
 def test_merging_knows_all_that_a_query_may_say() -> None:
-    """What fails here is new in the language: say in lang/_parts.py how answers of bundles are merged.
+    """What fails here is new in the language: say in lang/sql/collection_parts.py how answers of bundles are
+    merged.
 
     Then say it here, and ask it in ``QUESTIONS``.
     """

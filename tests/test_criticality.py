@@ -21,7 +21,7 @@ from test_pair_numbers import Box, moving
 from thorough import LONG
 
 from sgstore.base.geometry import corners
-from sgstore.lang import FrameView
+from sgstore.lang.memory import FrameView
 from sgstore.model.pair_numbers import COLUMNS, PAIR_FUNCTIONS, PairNumbers, columns_needed
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import sgstore
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 from sgstore.model.config import Config
 from sgstore.pipeline.derive import derive
 from sgstore.temporal import Monitor

@@ -22,7 +22,7 @@ import pytest
 from sgstore.apps.demo import RECORDING
 from sgstore.apps.report import inline, report
 from sgstore.ingest import ingest
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 from sgstore.query import Store
 
 if TYPE_CHECKING:

@@ -22,7 +22,8 @@ import sgstore
 from sgstore.apps.cli import run
 from sgstore.errors import ConfigError, QueryError, TraceError
 from sgstore.ingest import ingest
-from sgstore.lang import Binding, FrameView, ScopeSearch, compile_query
+from sgstore.lang.memory import Binding, FrameView, ScopeSearch
+from sgstore.lang.sql import compile_query
 from sgstore.pipeline.importing import FORMATS, Words, import_graphs
 from sgstore.pipeline.importing._resolve import Understanding, survey
 from sgstore.pipeline.importing._run import Blocks, parts_map

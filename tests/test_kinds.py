@@ -16,7 +16,7 @@ from sgstore import exporters
 from sgstore.exporters import Export, write_export
 from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
-from sgstore.lang import node_of_kind
+from sgstore.lang.syntax import node_of_kind
 from sgstore.model.vocabulary import ENTITY_KINDS, SUPER_KINDS, VEHICLES
 from sgstore.model.world import Clip
 from sgstore.pipeline.importing import import_graphs

@@ -28,7 +28,7 @@ from opendrive_maps import (
 from test_roads_carla import lanes_by_name, name_of
 from thorough import LONG
 
-from sgstore.lang import FrameView
+from sgstore.lang.memory import FrameView
 from sgstore.maps.opendrive import read_map
 from sgstore.maps.roads import PlainLane, lane_text, read_lane_text
 from sgstore.model.config import Config, RangeSettings

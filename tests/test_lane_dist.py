@@ -18,7 +18,7 @@ from thorough import LONG
 
 from sgstore.errors import QueryError
 from sgstore.graphs.online import Frame
-from sgstore.lang import FrameView
+from sgstore.lang.memory import FrameView
 from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config, RangeSettings
 from sgstore.model.graph import LaneDistances

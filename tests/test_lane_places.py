@@ -16,7 +16,7 @@ from test_lane_dist import driven, lane_ways
 from thorough import LONG
 
 from sgstore.errors import QueryError
-from sgstore.lang import FrameView
+from sgstore.lang.memory import FrameView
 from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config
 from sgstore.model.graph import LaneDistances

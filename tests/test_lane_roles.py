@@ -10,7 +10,7 @@ import pytest
 from matching import Matcher
 
 from sgstore.graphs.online import Replay
-from sgstore.lang import compile_query
+from sgstore.lang.sql import compile_query
 from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config
 from sgstore.readers import open_trace

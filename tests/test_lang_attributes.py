@@ -10,25 +10,28 @@ import numpy as np
 import pytest
 from thorough import LONG, some
 
-from sgstore.lang import Attribute, Binding, Type, compile_query
-from sgstore.lang._catalog import (
+from sgstore.lang.bind._precision import Precision, precision_of
+from sgstore.lang.catalog import (
     EDGE_ATTRIBUTES,
     ENV_ATTRIBUTES,
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
     TRACE_ATTRIBUTES,
+    Attribute,
     DisplayUnit,
+    Type,
 )
-from sgstore.lang._evaluate import evaluator
-from sgstore.lang._precision import Precision, precision_of
 from sgstore.lang.ir import FrameAttribute, NodeAttribute, TraceAttribute
+from sgstore.lang.memory import Binding
+from sgstore.lang.memory._evaluate import evaluator
+from sgstore.lang.sql import compile_query
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.model.vocabulary import MAP_KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from sgstore.lang import FrameView
+    from sgstore.lang.memory import FrameView
     from sgstore.query import Store
 
     Found = Callable[[str], Sequence[tuple[Any, ...]]]

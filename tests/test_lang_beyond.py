@@ -10,7 +10,8 @@ import pytest
 from scenes import Scene, actor, along, cone, ego, seen_by, store_of, street
 
 from sgstore.graphs.online import replayed
-from sgstore.lang import Binding, ScopeSearch, compile_query
+from sgstore.lang.memory import Binding, ScopeSearch
+from sgstore.lang.sql import compile_query
 from sgstore.model.config import Config, PairSettings, Proximity, RangeSettings
 from sgstore.temporal import Monitor
 

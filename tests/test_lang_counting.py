@@ -12,15 +12,16 @@ import pytest
 from oracle_worlds import World, random_world
 from thorough import LONG
 
-import sgstore.lang._rewrite as rewrite
-from sgstore.lang import compile_query
-from sgstore.lang._sql_masks import MOST, CountRange, frames_with
+import sgstore.lang.sql._rewrite as rewrite
+from sgstore.lang.sql import compile_query
+from sgstore.lang.sql._masks import MOST, CountRange, frames_with
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sgstore.lang import Catalog, SqlStatement
+    from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import Query
+    from sgstore.lang.sql import SqlStatement
 
 SIGNS: dict[str, Callable[[float, float], bool]] = {
     "=": eq,

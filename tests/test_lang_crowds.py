@@ -9,8 +9,9 @@ import pytest
 from oracle_worlds import random_world
 from test_lang_match import view_of
 
-from sgstore.lang import Binding, compile_query, expression
-from sgstore.lang._evaluate import crowd, crowd_test
+from sgstore.lang.memory import Binding, expression
+from sgstore.lang.memory._evaluate import crowd, crowd_test
+from sgstore.lang.sql import compile_query
 
 NUMBERS = (
     "b.speed",

@@ -11,11 +11,11 @@ import pytest
 from oracle_worlds import SCHEMA
 from test_lang_golden import CATALOG
 
-import sgstore.lang._catalog as catalog
 from sgstore.errors import QueryError
-from sgstore.lang import compile_checks, compile_query, patterns
-from sgstore.lang._functions import FUNCTIONS
-from sgstore.lang.library import predicates
+from sgstore.lang import catalog
+from sgstore.lang.bind import FUNCTIONS
+from sgstore.lang.library import patterns, predicates
+from sgstore.lang.sql import compile_checks, compile_query
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.model.vocabulary import KINDS, RELATIONS
 

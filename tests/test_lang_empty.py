@@ -14,7 +14,7 @@ from thorough import LONG, some
 import sgstore
 from sgstore.errors import SgstoreError
 from sgstore.ingest import ingest
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

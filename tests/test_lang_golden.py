@@ -14,7 +14,10 @@ import pytest
 from oracle_worlds import SCHEMA
 
 from sgstore.errors import QueryError
-from sgstore.lang import Catalog, TraceFacts, bind_checks, compile_query, parse
+from sgstore.lang.bind import bind_checks
+from sgstore.lang.catalog import Catalog, TraceFacts
+from sgstore.lang.sql import compile_query
+from sgstore.lang.syntax import parse
 
 FOLDER = Path(__file__).parent / "golden"
 FILES = sorted(FOLDER.glob("*.txt"))

@@ -7,7 +7,10 @@ import math
 import pytest
 
 from sgstore.errors import QueryError
-from sgstore.lang import Catalog, Horizon, compile_checks, compile_query, horizon, ir
+from sgstore.lang import ir
+from sgstore.lang.bind import Horizon, horizon
+from sgstore.lang.catalog import Catalog
+from sgstore.lang.sql import compile_checks, compile_query
 from sgstore.temporal._known_range import short_range
 
 

@@ -20,7 +20,11 @@ from thorough import LONG
 from sgstore.apps.demo import QUESTIONS
 from sgstore.errors import QueryError
 from sgstore.ingest import ingest
-from sgstore.lang import Catalog, FrameView, compile_query, parse, why_not
+from sgstore.lang.catalog import Catalog
+from sgstore.lang.help import why_not
+from sgstore.lang.memory import FrameView
+from sgstore.lang.sql import compile_query
+from sgstore.lang.syntax import parse
 from sgstore.model.graph import SceneGraph
 from sgstore.query import Store
 

@@ -8,7 +8,7 @@ import pytest
 from test_lang_golden import CATALOG
 
 from sgstore.errors import QueryError, TextSpan
-from sgstore.lang import compile_query, for_people
+from sgstore.lang.sql import compile_query, for_people
 
 
 def refused(text: str, **parameters: object) -> QueryError:

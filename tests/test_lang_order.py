@@ -11,12 +11,14 @@ import pytest
 from oracle import disagreement
 from oracle_worlds import World, random_world
 
-import sgstore.lang._sql_masks as sql
-from sgstore.lang import Catalog, compile_query
+import sgstore.lang.sql._masks as sql
+from sgstore.lang.sql import compile_query
 from sgstore.store._catalog import catalog_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from sgstore.lang.catalog import Catalog
 
 TEXT = "MATCH (a:Car)-[:near]->(b), (b)-[:visible]->(c), (a)-[:inDFrontOf]->(c) RETURN frame.id, a, b, c"
 RELATIONS = ("near", "visible", "inDFrontOf")

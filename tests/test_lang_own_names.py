@@ -10,7 +10,8 @@ from oracle_over_time import worlds
 from test_lang_golden import CATALOG
 
 from sgstore.errors import QueryError
-from sgstore.lang import compile_query, patterns, value_text
+from sgstore.lang.library import patterns
+from sgstore.lang.sql import compile_query, value_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING
 import pytest
 from lark import Lark, UnexpectedInput
 
-import sgstore.lang._parse as tables
+import sgstore.lang.syntax._parse as tables
 from sgstore.errors import QuerySyntaxError
-from sgstore.lang import parse
-from sgstore.lang import syntax as s
-from sgstore.lang._compile import statements_text, tree_text
-from sgstore.lang._parse import MAX_DEPTH, MAX_LENGTH
-from sgstore.lang._syntax_builder import BUILDERS
+from sgstore.lang.sql._compile import statements_text, tree_text
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax import tree as s
+from sgstore.lang.syntax._parse import MAX_DEPTH, MAX_LENGTH
+from sgstore.lang.syntax._tree_builder import BUILDERS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-LANG = resources.files("sgstore.lang")
+LANG = resources.files("sgstore.lang.syntax")
 GRAMMAR = LANG.joinpath(tables.GRAMMAR).read_text(encoding="utf-8")
 
 SENTENCES = [
@@ -60,7 +60,7 @@ def test_the_tables_that_are_shipped_are_those_of_the_grammar() -> None:
 
     made = tables.text_of(tables.made_from(GRAMMAR))
 
-    assert kept == made, "run: python -m sgstore.lang._parse"
+    assert kept == made, "run: python -m sgstore.lang.syntax._parse"
 
 
 def test_every_rule_of_the_grammar_has_a_builder_and_every_builder_a_rule() -> None:

@@ -8,7 +8,7 @@ import networkx as nx
 import pytest
 
 from sgstore.errors import QueryError
-from sgstore.lang import Pattern
+from sgstore.lang.syntax import Pattern
 
 if TYPE_CHECKING:
     from sgstore.query import Store

@@ -27,7 +27,9 @@ from thorough import some as some_of
 from sgstore.apps.demo import RECORDING
 from sgstore.graphs.online import replayed
 from sgstore.ingest import ingest
-from sgstore.lang import Binding, ScopeSearch, compile_query, patterns
+from sgstore.lang.library import patterns
+from sgstore.lang.memory import Binding, ScopeSearch
+from sgstore.lang.sql import compile_query
 from sgstore.model.config import Config, RangeSettings
 from sgstore.query import Store
 from sgstore.temporal import Monitor

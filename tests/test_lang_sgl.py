@@ -10,8 +10,8 @@ import pytest
 
 from sgstore.apps.cli import run
 from sgstore.errors import QueryError
-from sgstore.lang import parse
 from sgstore.lang.contrib.sgsm import translated
+from sgstore.lang.syntax import parse
 
 if TYPE_CHECKING:
     from pathlib import Path

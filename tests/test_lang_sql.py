@@ -12,10 +12,10 @@ import pytest
 from oracle_patterns import Writer
 from oracle_worlds import World, random_world
 
-import sgstore.lang._rewrite as rewrite
+import sgstore.lang.sql._rewrite as rewrite
 from sgstore.errors import QueryError
-from sgstore.lang import SqlStatement, Window, compile_query
-from sgstore.lang._catalog import NODE_ATTRIBUTES, DisplayUnit
+from sgstore.lang.catalog import NODE_ATTRIBUTES, DisplayUnit
+from sgstore.lang.sql import SqlStatement, Window, compile_query
 from sgstore.matches import FIRST_WINDOW, LAST_WINDOW, Windows
 from sgstore.model.pair_numbers import (
     COLUMNS,
@@ -29,7 +29,7 @@ from sgstore.model.pair_numbers import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
 
 NUMBERS = {name: one.column or name for name, one in PAIR_FUNCTIONS.items() if one.sql}
 """Functions of pairs, and what the view ``criticality`` calls them; ``lane_dist`` has tests of its own."""

@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 
 from sgstore.apps.cli import application
 from sgstore.errors import QueryError
-from sgstore.lang import compile_query, parse
+from sgstore.lang.sql import compile_query
+from sgstore.lang.syntax import parse
 
 if TYPE_CHECKING:
     from sgstore.query import Store

@@ -17,9 +17,9 @@ from test_temporal import FORMULAS, FORMULAS_OF_TIME, never, property_named
 from thorough import LONG
 
 from sgstore.errors import QueryError, QueryNameError
-from sgstore.lang import parse, pattern_named, patterns
-from sgstore.lang.library import entries, predicates
-from sgstore.lang.syntax import CheckClause, Define, MatchClause
+from sgstore.lang.library import entries, pattern_named, patterns, predicates
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax.tree import CheckClause, Define, MatchClause
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:

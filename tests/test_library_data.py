@@ -9,7 +9,7 @@ import pytest
 from test_docs_queries import queries_of
 
 from sgstore.ingest import ingest
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 from sgstore.query import Store
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from library_edges import COLLISIONS, EDGES, RULES, Edge
 from library_scenes import SCENES
 from scenes import store_of
 
-from sgstore.lang import patterns
+from sgstore.lang.library import patterns
 from sgstore.model.config import from_dict
 from sgstore.temporal import Monitor
 

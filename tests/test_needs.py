@@ -14,9 +14,8 @@ from recordings import Recorder, car
 from sgstore.apps.cli import run as run_verb
 from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
-from sgstore.lang import Type
-from sgstore.lang._catalog import NODE_ATTRIBUTES
-from sgstore.lang._needs import MEASURED
+from sgstore.lang.bind._needed_values import MEASURED
+from sgstore.lang.catalog import NODE_ATTRIBUTES, Type
 from sgstore.model.vocabulary import VEHICLE_LIGHTS, natural, normalize_name
 from sgstore.query import Store
 from sgstore.temporal import Monitor

@@ -8,8 +8,7 @@ import pytest
 
 from sgstore.apps.cli import run
 from sgstore.apps.sandbox import Sandbox
-from sgstore.lang import Type
-from sgstore.lang._catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES
+from sgstore.lang.catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Type
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,7 +15,8 @@ import pytest
 import sgstore
 from sgstore.errors import ConfigError, QueryError, QueryNameError, StoreError
 from sgstore.ingest import ingest
-from sgstore.lang import Catalog, compile_query
+from sgstore.lang.catalog import Catalog
+from sgstore.lang.sql import compile_query
 from sgstore.model import vocabulary
 from sgstore.model.config import Config, load
 from sgstore.pipeline.importing import Words, import_graphs

@@ -32,8 +32,8 @@ from thorough import LONG
 
 from sgstore.apps.cli import run as run_verb
 from sgstore.errors import QueryError
-from sgstore.lang import pattern_named
 from sgstore.lang.ir import BoundHold, Length
+from sgstore.lang.library import pattern_named
 from sgstore.query import Store
 from sgstore.temporal import _offline, _runs, _sequences, evaluate
 from sgstore.temporal._formula import And

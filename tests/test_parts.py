@@ -11,7 +11,7 @@ from thorough import LONG, some
 
 from sgstore.errors import QueryNameError
 from sgstore.ingest import ingest
-from sgstore.lang import NamedPattern, patterns
+from sgstore.lang.library import NamedPattern, patterns
 from sgstore.query import Store
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from test_lane_dist import lane_ways
 from thorough import LONG
 
 from sgstore.graphs.online import Frame
-from sgstore.lang import FrameView
+from sgstore.lang.memory import FrameView
 from sgstore.maps.lanelet2 import lanelet2_text
 from sgstore.maps.opendrive import read_map
 from sgstore.maps.roads import read_lane_text

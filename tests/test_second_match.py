@@ -9,7 +9,7 @@ from oracle import disagreement
 from oracle_worlds import World, random_world
 from test_lang_golden import CATALOG
 
-from sgstore.lang import compile_query
+from sgstore.lang.sql import compile_query
 
 
 @pytest.fixture(scope="module")

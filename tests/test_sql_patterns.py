@@ -13,7 +13,7 @@ import sgstore
 from sgstore.apps.cli import run as run_verb
 from sgstore.apps.sandbox import Sandbox
 from sgstore.errors import QueryError, SqlError
-from sgstore.lang import pattern_tables
+from sgstore.lang.syntax import pattern_tables
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

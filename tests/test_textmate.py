@@ -18,7 +18,7 @@ def test_the_file_is_made_from_the_grammar() -> None:
 
 
 def test_it_has_the_words_that_the_grammar_quotes() -> None:
-    path = PAGE.parents[1] / "sgstore" / "lang" / "grammar.lark"
+    path = PAGE.parents[1] / "sgstore" / "lang" / "syntax" / "grammar.lark"
     quoted = set(re.findall(r'"([A-Z]{2,})"i', path.read_text(encoding="utf-8")))
     assert quoted <= keywords()
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sgstore.lang import Column
-from sgstore.lang._catalog import Type
+from sgstore.lang.catalog import Type
 from sgstore.lang.ir import WINDOWS, SignalCall, Value
+from sgstore.lang.operators import Column
 from sgstore.temporal._formula import Tick
 from sgstore.temporal._signals import Clock, SignalValues
 from sgstore.temporal._windows import next_window, over_columns, sums, window_value

@@ -14,7 +14,7 @@ from scenes import APART, Scene, along, ego, store_of
 from thorough import LONG, some
 
 from sgstore.errors import QueryError
-from sgstore.lang import pattern_named, patterns
+from sgstore.lang.library import pattern_named, patterns
 from sgstore.maps.lanelet2 import lanelet2_text
 from sgstore.maps.map_files import read_map_file
 from sgstore.maps.opendrive import read_map

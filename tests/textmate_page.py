@@ -13,7 +13,7 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
-from sgstore.lang._parse import tables
+from sgstore.lang.syntax._parse import tables
 
 PAGE: Final = Path(__file__).parents[1] / "editors" / "sgql.tmLanguage.json"
 _CONSTANTS: Final = {"TRUE", "FALSE", "NULL", "INF"}

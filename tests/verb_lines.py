@@ -163,7 +163,7 @@ def _warm() -> None:
     with Path(os.devnull).open("w") as nothing, redirect_stdout(nothing):
         sgstore.apps.cli.run(["config"])
         sgstore.apps.cli.run(["patterns", "show", "cut_in"])
-    sgstore.lang.parse(PATTERN)
+    sgstore.lang.syntax.parse(PATTERN)
     # No simulator answers here, however long one waits.
     readers.connect = partial(readers.connect, timeout_s=0.3)
 

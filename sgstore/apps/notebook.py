@@ -125,8 +125,8 @@ class SgqlCell:
 def _has_checks(text: str) -> bool:
     """True if a text contains rules; invalid texts are classified by the word ``CHECK``."""
     from sgstore.errors import QueryError
-    from sgstore.lang import parse
-    from sgstore.lang.syntax import CheckClause
+    from sgstore.lang.syntax import parse
+    from sgstore.lang.syntax.tree import CheckClause
 
     try:
         return any(isinstance(one, CheckClause) for one in parse(text))

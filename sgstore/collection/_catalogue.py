@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.base.files import working_folder
 from sgstore.collection._place import ABOUT, MissingObjectError, digest_of_file
 from sgstore.errors import ExportError, StoreError
-from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, own_type
+from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts, Type, own_type
 from sgstore.model.vocabulary import NAMES, natural
 from sgstore.store import (
     CATALOGUE,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from sgstore.collection._place import Place
-    from sgstore.lang import Triple
+    from sgstore.lang.catalog import Triple
     from sgstore.store import Facts
 
 FORMAT: Final = 1

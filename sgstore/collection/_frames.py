@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 from sgstore.base.arrays import np
 from sgstore.base.files import working_folder
 from sgstore.collection import _worker as worker
-from sgstore.lang import PARTS
+from sgstore.lang.sql.collection_parts import PARTS
 from sgstore.store import (
     PartFile,
     Rows,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.collection._catalogue import Snapshot
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
     from sgstore.model.world import Floats, Ints
     from sgstore.store import CodedClasses
 

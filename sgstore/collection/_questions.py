@@ -28,23 +28,19 @@ from sgstore.collection._frames import CollectionFrames
 from sgstore.collection._pack import refuse_others
 from sgstore.collection._place import place_at
 from sgstore.errors import QueryError, SqlError, StoreError
-from sgstore.lang import (
-    CLASSES_GIVEN,
-    PARTS,
+from sgstore.lang.bind import CLASSES_GIVEN
+from sgstore.lang.catalog import TableFacts, Type
+from sgstore.lang.sql import (
     Layout,
-    Pruning,
-    TableFacts,
-    Type,
-    class_questions,
     compile_checks,
     compile_query,
     for_people,
     joined_rows,
-    parted,
-    pattern_tables,
     traces_of,
     union_parts,
 )
+from sgstore.lang.sql.collection_parts import PARTS, Pruning, class_questions, parted
+from sgstore.lang.syntax import pattern_tables
 from sgstore.matches import Interval, UnionMatches, merged, row_type
 from sgstore.model.vocabulary import natural
 from sgstore.model.world import Clip, tolerance_ns
@@ -73,7 +69,11 @@ if TYPE_CHECKING:
 
     from sgstore.collection._catalogue import Snapshot
     from sgstore.collection._engines import Engine
-    from sgstore.lang import Catalog, CheckInCatalog, ClassQuestion, Compiled, Pattern, Triple
+    from sgstore.lang.bind import CheckInCatalog
+    from sgstore.lang.catalog import Catalog, Triple
+    from sgstore.lang.sql import Compiled
+    from sgstore.lang.sql.collection_parts import ClassQuestion
+    from sgstore.lang.syntax import Pattern
     from sgstore.model.world import Floats, Ints
     from sgstore.temporal import Verdict
 
@@ -216,7 +216,7 @@ class Collection:
             error shows the place.
         """
         if not isinstance(query, str):
-            from sgstore.lang import Pattern
+            from sgstore.lang.syntax import Pattern
 
             pattern = query if isinstance(query, Pattern) else Pattern.of(query)
             query, parameters = str(pattern), {**pattern.parameters, **parameters}

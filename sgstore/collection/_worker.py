@@ -21,7 +21,9 @@ from sgstore.base.files import working_folder
 from sgstore.collection._cache import bundle_path
 from sgstore.collection._place import place_at
 from sgstore.errors import StoreError
-from sgstore.lang import Compiled, Type, parted
+from sgstore.lang.catalog import Type
+from sgstore.lang.sql import Compiled
+from sgstore.lang.sql.collection_parts import parted
 from sgstore.matches import Interval
 from sgstore.query import Store, UserStatement, matches_of
 from sgstore.store import (
@@ -41,7 +43,7 @@ from sgstore.temporal import CheckRun, Robustness, TemporalMatches, Verdict, Wit
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Mapping
 
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
     from sgstore.matches import Matches
 
 KEPT: Final = 128

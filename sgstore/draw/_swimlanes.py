@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.draw._palette import EGO, FAINT_INK, GROUND, INK, ROAD_EDGE
-from sgstore.lang import parse
-from sgstore.lang.syntax import CheckClause
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax.tree import CheckClause
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

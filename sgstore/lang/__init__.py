@@ -1,9 +1,5 @@
-"""Compiler of the query language: converts query text and a catalog to SQL, without a database.
+"""The query language: text and a catalog in, SQL out; no database inside.
 
-The stages are parse (``_parse``), bind (``_bind``), rewrite (``_rewrite``) and emit (``_results``), each a pure
-function whose result can be printed.
+The stages are parse (``syntax/``), bind (``bind/``), rewrite and emit (``sql/``), each a pure function whose
+result can be printed. ``memory/`` evaluates the same queries over one graph.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -6,7 +6,7 @@ from dataclasses import field
 from typing import TYPE_CHECKING
 
 from sgstore.base.records import dataclass
-from sgstore.lang._catalog import Attribute, Type
+from sgstore.lang.catalog import Attribute, Type
 
 if TYPE_CHECKING:
     from sgstore.errors import TextSpan

@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, Literal, TypeGuard
 
 from sgstore.base.records import dataclass
-from sgstore.lang._catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, RelationScope, Type
 from sgstore.lang._durations import (
     BoundHold,  # noqa: TC001  they are of this module
     Length,  # noqa: F401  # pyright: ignore[reportUnusedImport]
@@ -35,7 +34,8 @@ from sgstore.lang._kind_sets import Kinds as Kinds  # noqa: PLC0414, TC001
 from sgstore.lang._kind_sets import any_kinds as any_kinds  # noqa: PLC0414
 from sgstore.lang._kind_sets import any_relation as any_relation  # noqa: PLC0414
 from sgstore.lang._kind_sets import ego_kinds as ego_kinds  # noqa: PLC0414
-from sgstore.lang._links import StepLink, StepWay
+from sgstore.lang._step_links import StepLink, StepWay
+from sgstore.lang.catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, RelationScope, Type
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -395,7 +395,7 @@ class Result:
         Offsets of clips; ns, negative is earlier.
     keyed : bool
         True if intervals and clips also have the columns that order results of several stores: see
-        :mod:`sgstore.lang._parts`.
+        :mod:`sgstore.lang.sql.collection_parts`.
     """
 
     form: Form = "rows"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.quoting import literal
 from sgstore.graphs.abstractions import SUBSETS
-from sgstore.lang import Catalog, RelationScope, TraceFacts, Type, excluded_kinds, own_type
+from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts, Type, excluded_kinds, own_type
 from sgstore.model.vocabulary import BEYOND, NAMES, RELATIONS
 from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
     from sgstore.graphs.abstractions import Subset
-    from sgstore.lang import Triple
+    from sgstore.lang.catalog import Triple
     from sgstore.store._derive import DerivedSet
 
 
@@ -132,7 +132,7 @@ def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:
 
 
 def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
-    """Return the types of user-defined node or edge attributes; see :func:`sgstore.lang.own_type`.
+    """Return the types of user-defined node or edge attributes; see :func:`sgstore.lang.catalog.own_type`.
 
     In a trace, an attribute is a number or a truth value if all its values are; else it is a text.
     """

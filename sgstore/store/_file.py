@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from mcap.records import Schema
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
     from sgstore.maps.roads import RoadMap
     from sgstore.model.config import Config
     from sgstore.model.graph import SceneGraph

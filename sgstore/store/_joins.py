@@ -25,7 +25,7 @@ from sgstore.base.files import temporary_folder
 from sgstore.base.quoting import literal
 from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
-from sgstore.lang import TableFacts, Type
+from sgstore.lang.catalog import TableFacts, Type
 from sgstore.store._packing import TOLERANCE
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
 
 
 MEMORY: Final = 256 << 20

@@ -1,7 +1,7 @@
 """Partial results of a collection, from Parquet files or memory, as tables of one statement.
 
-The statement comes from :mod:`sgstore.lang._parts`: it sorts rows, or combines the groups of the parts. Data
-beyond the memory limit spill to disk.
+The statement comes from :mod:`sgstore.lang.sql.collection_parts`: it sorts rows, or combines the groups of the
+parts. Data beyond the memory limit spill to disk.
 """
 
 from __future__ import annotations

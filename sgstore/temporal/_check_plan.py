@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Final
 
 import sgstore.temporal._formula as f
 from sgstore.base.records import dataclass
-from sgstore.lang import (
+from sgstore.lang import ir as b
+from sgstore.lang.bind import (
     CONNECTIVES,
-    Type,
     certain,
     has_pairs,
     is_limited,
@@ -27,10 +27,10 @@ from sgstore.lang import (
     spelled_out,
     undecided,
     unknown,
-    unnumbered_text,
     within,
 )
-from sgstore.lang import ir as b
+from sgstore.lang.catalog import Type
+from sgstore.lang.sql import unnumbered_text
 from sgstore.temporal._plan import (
     FALSE,
     MARGINS,

@@ -14,16 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.lang import (
-    compared_in_check,
-    compile_checks,
-    entities,
-    not_computed,
-    of_check,
-    relation,
-    traces_of,
-    value_text,
-)
+from sgstore.lang.bind import not_computed, of_check
+from sgstore.lang.help import compared_in_check
+from sgstore.lang.sql import compile_checks, entities, relation, traces_of, value_text
 from sgstore.matches import Interval, notes_in
 from sgstore.model.vocabulary import natural
 from sgstore.store import IN_NOTEBOOK, scope_of, trace_of
@@ -71,8 +64,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, CheckInCatalog, Window
+    from sgstore.lang.bind import CheckInCatalog
+    from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import Bound, BoundCheck, BoundQuantifier, OverMatch
+    from sgstore.lang.sql import Window
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.store import StoreFile
 

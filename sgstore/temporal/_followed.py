@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 import numpy as np
 
 from sgstore.errors import SgstoreError, StoreError
-from sgstore.lang import Binding, FrameView, ScopeSearch, parts_of
+from sgstore.lang.help import parts_of
+from sgstore.lang.memory import Binding, FrameView, ScopeSearch
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.model.world import INPUTS, POSE
 from sgstore.temporal.truth_lanes import TruthLane, TruthLanes

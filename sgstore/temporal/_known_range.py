@@ -6,13 +6,15 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from sgstore.base.records import dataclass
-from sgstore.lang import Horizon, excluded_kinds, horizon, spoken_kinds
+from sgstore.lang.bind import Horizon, horizon, spoken_kinds
+from sgstore.lang.catalog import excluded_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from sgstore.lang import Catalog, FrameView
+    from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import BoundCheck
+    from sgstore.lang.memory import FrameView
     from sgstore.store import StoreFile
 
 

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.base.json_text import shortest
-from sgstore.lang import Column, expression
 from sgstore.lang import ir as b
+from sgstore.lang.memory import expression
+from sgstore.lang.operators import Column
 from sgstore.temporal._windows import exact, rounded
 
 if TYPE_CHECKING:

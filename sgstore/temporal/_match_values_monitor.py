@@ -19,8 +19,8 @@ from sgstore.temporal._valuation import BindingTable, Valuation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from sgstore.lang import Column
     from sgstore.lang import ir as b
+    from sgstore.lang.operators import Column
     from sgstore.temporal._plan import Plan
     from sgstore.temporal._valuation import Memory, QueryCache, StreamClock
 

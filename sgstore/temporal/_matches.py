@@ -6,23 +6,18 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from sgstore.lang import (
-    MOTION,
-    TOLD_WEATHER,
-    of_query,
-    told_events,
-    told_lanes,
-    traces_with,
-    with_places,
-)
+from sgstore.lang.bind import MOTION, of_query
 from sgstore.lang.ir import BlockValue, OverMatch, walk
+from sgstore.lang.sql import TOLD_WEATHER, told_events, told_lanes, traces_with, with_places
 from sgstore.matches import Matches
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
 
-    from sgstore.lang import Attribute, Catalog, Compiled, Need
+    from sgstore.lang.bind import Need
+    from sgstore.lang.catalog import Attribute, Catalog
     from sgstore.lang.ir import Query
+    from sgstore.lang.sql import Compiled
     from sgstore.store import StoreFile
     from sgstore.temporal._sequences import Finder
 

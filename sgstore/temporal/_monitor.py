@@ -16,22 +16,12 @@ from urllib.parse import urlsplit
 
 from sgstore.errors import QueryError, TraceError
 from sgstore.graphs.online import GcPaused, replayed
-from sgstore.lang import (
-    MOTION,
-    Catalog,
-    FrameView,
-    RelationScope,
-    TraceFacts,
-    bind_checks,
-    bind_query,
-    each_match,
-    not_computed,
-    of_check,
-    of_query,
-    parse,
-    recorded_events,
-)
-from sgstore.lang.syntax import CheckClause, Define, MatchClause, Parameter
+from sgstore.lang.bind import MOTION, bind_checks, bind_query, not_computed, of_check, of_query
+from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts
+from sgstore.lang.memory import FrameView
+from sgstore.lang.sql import each_match, recorded_events
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax.tree import CheckClause, Define, MatchClause, Parameter
 from sgstore.maps.map_files import Maps, lost_lanes
 from sgstore.model.config import Config
 from sgstore.model.world import seconds_of
@@ -48,9 +38,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.graphs.online import Frame
-    from sgstore.lang import Need
+    from sgstore.lang.bind import Need
     from sgstore.lang.ir import BoundCheck, Query
-    from sgstore.lang.syntax import Statement
+    from sgstore.lang.syntax.tree import Statement
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import SceneGraph
     from sgstore.readers import Cameras, Sensor

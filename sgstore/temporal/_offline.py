@@ -15,13 +15,13 @@ import numpy as np
 
 from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
-from sgstore.lang import (
+from sgstore.lang.operators import Column
+from sgstore.lang.sql import (
     BUCKETS,
     CLOCK,
     CLOCK_OF_TRACES,
     TIMES,
     TRACES,
-    Column,
     Window,
     extents,
     relation,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import Bound, Query, SignalCall
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.store import StoreFile

@@ -4,7 +4,7 @@ A :class:`Plan` contains all single-frame data that the expressions of a stateme
 
 * an **atom** is a condition on one frame. It has free variables (keys of nodes) and is a query of its own:
   its matches say in which frames, and for which entities, it is true. A store answers it by SQL; in memory
-  :class:`sgstore.lang._search.ScopeSearch` does, with its scope.
+  :class:`sgstore.lang.memory._search.ScopeSearch` does, with its scope.
 * a **signal** is a value of one frame, of the same kind: a query, and the value that is asked of its matches.
   An edge variable stands for the edges of its relations from its source to its destination in that frame: a
   condition is true if it is of one of these, a value is that of the one whose relation comes first in the
@@ -33,15 +33,18 @@ from typing import TYPE_CHECKING, Final
 import sgstore.temporal._formula as f
 from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
-from sgstore.lang import CONNECTIVES, Type, relation, unnumbered_text, value_text
 from sgstore.lang import ir as b
+from sgstore.lang.bind import CONNECTIVES
+from sgstore.lang.catalog import Type
+from sgstore.lang.sql import relation, unnumbered_text, value_text
 from sgstore.temporal._formula import formula_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from sgstore.lang import Catalog, SqlStatement
+    from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import BoundCheck, BoundHold, BoundStep, Length, StepLink, StepWay
+    from sgstore.lang.sql import SqlStatement
 
 
 _KNOWN: Final = frozenset({"IS NULL", "IS NOT NULL"})

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.lang import value_text
+from sgstore.lang.sql import value_text
 from sgstore.temporal._check_plan import CheckPlan, base_name
 from sgstore.temporal._formula import (
     TRUE,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Column
+    from sgstore.lang.operators import Column
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.temporal._plan import Plan, Test
 

@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Column
     from sgstore.lang.ir import BoundCheck
+    from sgstore.lang.operators import Column
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.temporal._checks import Level
     from sgstore.temporal._formula import Tick

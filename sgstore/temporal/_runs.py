@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.base.records import dataclass
-from sgstore.lang import Column, extents
 from sgstore.lang import ir as b
+from sgstore.lang.operators import Column
+from sgstore.lang.sql import extents
 from sgstore.matches import Windows
 from sgstore.model.world import BUCKET_FRAMES, longest_step_ns, tolerance_ns
 from sgstore.store import BUCKET_BITS, seq_of, trace_of
@@ -38,7 +39,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog, Window
+    from sgstore.lang.catalog import Catalog
+    from sgstore.lang.sql import Window
     from sgstore.model.world import Bools, Ints
     from sgstore.store import StoreFile
     from sgstore.temporal._plan import Ask, Plan, Test

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.base.records import dataclass
-from sgstore.lang import Column, ExternalRelation, Window, relation, value_text
 from sgstore.lang.ir import Bound, OverMatch, Query, SignalCall, StepTime, is_formula
+from sgstore.lang.operators import Column
+from sgstore.lang.sql import ExternalRelation, Window, relation, value_text
 from sgstore.matches import TooMuchError
 from sgstore.model.world import JUMP_NS, seconds_of
 from sgstore.store import BUCKET_BITS
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import BoundHold, Length, StepWay
     from sgstore.model.world import Bools, Ints
     from sgstore.store import StoreFile

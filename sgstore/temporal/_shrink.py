@@ -15,17 +15,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.errors import StoreError
-from sgstore.lang import (
-    CLOCK,
-    CheckInCatalog,
-    Window,
-    compile_checks,
-    extents,
-    parse,
-    union_parts,
-)
+from sgstore.lang.bind import CheckInCatalog
 from sgstore.lang.ir import Tense, walk
-from sgstore.lang.syntax import CheckClause
+from sgstore.lang.sql import CLOCK, Window, compile_checks, extents, union_parts
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax.tree import CheckClause
 from sgstore.model.world import Clip
 from sgstore.store import range_of
 from sgstore.temporal._checks import StoreCheck
@@ -35,7 +29,7 @@ from sgstore.temporal._sequences import Finder
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import Bound, BoundCheck, Query
     from sgstore.store import FrameRef, StoreFile
     from sgstore.temporal._offline import TraceReader

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.base.records import dataclass
-from sgstore.lang import Column, all_known, column_evaluator
 from sgstore.lang import ir as b
+from sgstore.lang.memory import column_evaluator
+from sgstore.lang.operators import Column, all_known
 from sgstore.temporal._formula import (
     TRUE,
     And,
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import Columns
+    from sgstore.lang.memory import Columns
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.temporal._plan import Ask, Test
 
@@ -223,8 +224,9 @@ def _at(places: Places, frame: Places | None) -> Places:
 
 # Values over time as columns: ``prev``, ``delta``, windows, ``run_length``, ``since_true``, ``age``, and terms
 # of them --------------------------------------------------------------------------------------------
-# A column of values, :class:`sgstore.lang.Column`, has a row for each binding and a column for each frame.
-# Values do not cross gaps: after a gap, ``prev`` and ``delta`` are unknown, and runs and windows restart.
+# A column of values, :class:`sgstore.lang.operators.Column`, has a row for each binding and a column for each
+# frame. Values do not cross gaps: after a gap, ``prev`` and ``delta`` are unknown, and runs and windows
+# restart.
 
 NS: Final = 1e9
 

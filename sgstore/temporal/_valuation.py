@@ -19,17 +19,11 @@ import numpy as np
 
 from sgstore.base.json_text import shortest
 from sgstore.errors import QueryError
-from sgstore.lang import (
-    FUTURE,
-    Binding,
-    Column,
-    ScopeSearch,
-    StageSearch,
-    expression,
-    unnumbered_text,
-    value_text,
-)
 from sgstore.lang import ir as b
+from sgstore.lang.bind import FUTURE
+from sgstore.lang.memory import Binding, ScopeSearch, StageSearch, expression
+from sgstore.lang.operators import Column
+from sgstore.lang.sql import unnumbered_text, value_text
 from sgstore.model.vocabulary import RELATIONS
 from sgstore.model.world import JUMP_NS, longest_step_ns, tolerance_ns
 from sgstore.temporal._check_plan import CheckPlan
@@ -50,7 +44,7 @@ from sgstore.temporal._windows import next_window, window_value
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from sgstore.lang import FrameView
+    from sgstore.lang.memory import FrameView
     from sgstore.model.world import Bools, Floats
     from sgstore.temporal._plan import Ask, Plan, Test
 

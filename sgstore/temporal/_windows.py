@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.lang import Column
+from sgstore.lang.operators import Column
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 from sgstore.base.arrays import np
 from sgstore.base.records import dataclass
-from sgstore.lang import parts_of
+from sgstore.lang.help import parts_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
-    from sgstore.lang import PatternPart, TraceFacts
+    from sgstore.lang.catalog import TraceFacts
+    from sgstore.lang.help import PatternPart
     from sgstore.lang.ir import Query
 
 

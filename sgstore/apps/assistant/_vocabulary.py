@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from sgstore.lang import (
+from sgstore.lang.bind import FUNCTIONS
+from sgstore.lang.catalog import (
     EDGE_ATTRIBUTES,
     ENV_ATTRIBUTES,
     FRAME_ATTRIBUTES,
-    FUNCTIONS,
     NODE_ATTRIBUTES,
     TRACE_ATTRIBUTES,
     Attribute,

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.apps.sandbox import plain, serve
 from sgstore.errors import QueryError
-from sgstore.lang import for_people, pattern_named
+from sgstore.lang.library import pattern_named
+from sgstore.lang.sql import for_people
 from sgstore.matches import intervals_for_people
 
 if TYPE_CHECKING:

@@ -158,7 +158,7 @@ def check(
     One row a check and trace: true, false, unknown where it cannot be told, or pending where something is
     still due at the end; and one a violation: by whom, and from when to when.
     """
-    from sgstore.lang import joined
+    from sgstore.lang.syntax import joined
 
     asked, values = statements.asked(files)
     text = joined([*chain.from_iterable(asked.values())])
@@ -313,7 +313,7 @@ def monitor(
     those of check and find over a store. With --serve a page shows
     the scene, a recording in its own time; it stays until Ctrl-C.
     """
-    from sgstore.lang import joined
+    from sgstore.lang.syntax import joined
     from sgstore.model.config import Config
     from sgstore.temporal import Monitor, opened
 
@@ -390,8 +390,9 @@ def _watched_on_a_page(
 
 def _called(asked: Mapping[str, list[str]]) -> list[str]:
     """Return the names of the patterns in events, in query order."""
-    from sgstore.lang import each_match, parse
-    from sgstore.lang.syntax import MatchClause
+    from sgstore.lang.sql import each_match
+    from sgstore.lang.syntax import parse
+    from sgstore.lang.syntax.tree import MatchClause
 
     every: list[str] = []
     for name, texts in asked.items():

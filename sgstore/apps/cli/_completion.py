@@ -86,7 +86,7 @@ def stores(ctx: typer.Context, incomplete: str) -> Offers:
 
 def patterns(ctx: typer.Context) -> Offers:
     """Yield names of the library; predicates only for ``show``, because they cannot be run."""
-    from sgstore.lang import patterns as every
+    from sgstore.lang.library import patterns as every
 
     for one in every().values():
         if one.kind != "predicate" or ctx.info_name == "show":

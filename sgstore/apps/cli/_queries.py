@@ -131,8 +131,9 @@ def find(
 
 def _returns_nothing(text: str) -> bool:
     """True if a query has no ``RETURN``: one row per match and frame."""
-    from sgstore.lang import each_match, parse
-    from sgstore.lang.syntax import MatchClause
+    from sgstore.lang.sql import each_match
+    from sgstore.lang.syntax import parse
+    from sgstore.lang.syntax.tree import MatchClause
 
     asked = each_match(parse(text))
     return all(one.returns is None for one in asked if isinstance(one, MatchClause))
@@ -199,7 +200,7 @@ def _as_shown(
     answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
     """Return columns and rows for a format: readable names in tables; graphs for networkx in JSON."""
-    from sgstore.lang import for_people
+    from sgstore.lang.sql import for_people
 
     if form is Format.table:
         return for_people(answer.columns, rows, graphs=answer.graphs)

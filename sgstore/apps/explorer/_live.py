@@ -26,7 +26,7 @@ from sgstore.apps.explorer._requests import fields_of, taken
 from sgstore.apps.explorer._wire import as_json, packed
 from sgstore.base.json_text import finite
 from sgstore.errors import QueryNameError, StoreError
-from sgstore.lang import why_not
+from sgstore.lang.help import why_not
 from sgstore.model.vocabulary import KIND_CODE, KINDS, LIGHT_STATE_CODE, LIGHT_STATES
 from sgstore.temporal import RecentGraphs
 
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
     from sgstore.apps.explorer._app import Endpoint
-    from sgstore.lang import FrameView
     from sgstore.lang.ir import Query
+    from sgstore.lang.memory import FrameView
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import SceneGraph
     from sgstore.readers import Cameras

@@ -15,14 +15,15 @@ from sgstore.apps.explorer._requests import RequestError
 from sgstore.apps.explorer._wire import packed
 from sgstore.base.json_text import finite
 from sgstore.errors import ExportError, SgstoreError, StoreError
-from sgstore.lang import patterns, words
+from sgstore.lang.help import words
+from sgstore.lang.library import patterns
 from sgstore.maps.opendrive import read_map
 from sgstore.maps.roads import drawn_outlines
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from sgstore.lang import Catalog
+    from sgstore.lang.catalog import Catalog
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import SceneGraph
     from sgstore.query import Store

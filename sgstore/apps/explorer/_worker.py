@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from sgstore.apps.sandbox import plain, rows_found, serve
 from sgstore.errors import QueryError
-from sgstore.lang import WhyNotSteps
+from sgstore.lang.help import WhyNotSteps
 from sgstore.query import Store
 from sgstore.temporal import margin_cells
 

@@ -18,7 +18,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QueryError, TextSpan
-from sgstore.lang import parse, regex
+from sgstore.lang.bind import regex
+from sgstore.lang.syntax import parse
 from sgstore.model.vocabulary import KINDS, LIGHT_STATES, normalize_name, relation_named
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import StoreError, one_store_needed, url_named
-from sgstore.lang import node_of_kind
+from sgstore.lang.syntax import node_of_kind
 from sgstore.model.vocabulary import KINDS
 from sgstore.model.world import longest_step_ns
 from sgstore.query import Store
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from sgstore.collection import Collection, CollectionFrames
-    from sgstore.lang import TraceFacts
+    from sgstore.lang.catalog import TraceFacts
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.store import Abstracted, StoredTrace
 

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.errors import ConfigError
-from sgstore.lang import parse, pattern_named, patterns
-from sgstore.lang.syntax import MatchClause
+from sgstore.lang.library import pattern_named, patterns
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax.tree import MatchClause
 from sgstore.model.world import JUMP_NS
 from sgstore.store import SEQ_BITS, trace_of
 from sgstore.testsets.coverage._features import MOST

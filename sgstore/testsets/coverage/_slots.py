@@ -34,7 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgstore.errors import ConfigError, QueryError
-from sgstore.lang import each_match, parse, syntax
+from sgstore.lang.sql import each_match
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax import tree as syntax
 from sgstore.testsets.coverage._frames import (
     SHARES,
     ReportTable,

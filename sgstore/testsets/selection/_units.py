@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from sgstore.errors import ConfigError, QueryError
-from sgstore.lang import parse
-from sgstore.lang.syntax import Call, MatchClause
+from sgstore.lang.syntax import parse
+from sgstore.lang.syntax.tree import Call, MatchClause
 from sgstore.store import lengths_of_messages, trace_of
 from sgstore.testsets.coverage import (
     UNKNOWN,

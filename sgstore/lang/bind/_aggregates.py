@@ -1,0 +1,153 @@
+"""Aggregates: functions that count, sum or collect values over all matches.
+
+They are allowed after ``RETURN``. Unknown values are ignored. Without values, ``COUNT`` is 0, ``collect`` is
+an empty list, and the others are NULL.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from sgstore.base.records import dataclass
+from sgstore.lang import ir as b
+from sgstore.lang.catalog import Type
+from sgstore.model.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sgstore.lang.bind._symbols import SymbolTable
+    from sgstore.lang.syntax import tree as s
+
+
+PLACE: Final = '":rows".":place"'
+"""Column with the order of matches, which ``collect`` keeps."""
+
+
+@dataclass(frozen=True, slots=True)
+class AggregateFunction:
+    """Aggregate with its SQL and its types.
+
+    Attributes
+    ----------
+    sql : function
+        Function from the SQL of the operand (after ``DISTINCT``, if present) and the share to the SQL of the
+        aggregate.
+    of : frozenset of Type
+        Allowed types of the operand.
+    gives : Type or None
+        Type of the result; ``None`` means the type of the operand.
+    share : bool
+        True if there is a second argument: a percentage.
+    """
+
+    sql: Callable[[str, float], str]
+    of: frozenset[Type] = frozenset({Type.number})
+    gives: Type | None = Type.number
+    share: bool = False
+
+
+_VALUES: Final = frozenset({Type.number, Type.text, Type.boolean, Type.node})
+_ORDERED: Final = frozenset({Type.number, Type.text})
+
+
+def _called(form: str) -> Callable[[str, float], str]:
+    return lambda inner, _: form.format(inner)
+
+
+def _quantile(inner: str, share: float) -> str:
+    return f"quantile_cont({inner}, {share!r})"
+
+
+def _collected(inner: str, _: float) -> str:
+    """Return the SQL of ``collect``: a list, sorted by value for ``DISTINCT``. Without matches it is empty."""
+    value = inner.removeprefix("DISTINCT ")
+    order = PLACE if value == inner else value
+    return f"coalesce(list({inner} ORDER BY {order}) FILTER (WHERE {value} IS NOT NULL), [])"
+
+
+AGGREGATES: Final[dict[str, AggregateFunction]] = {
+    "count": AggregateFunction(_called("count({0})"), _VALUES),
+    "min": AggregateFunction(_called("min({0})"), _ORDERED, None),
+    "max": AggregateFunction(_called("max({0})"), _ORDERED, None),
+    "avg": AggregateFunction(_called("avg({0})")),
+    "sum": AggregateFunction(_called("sum({0})")),
+    "stddev": AggregateFunction(_called("stddev_samp({0})")),
+    "median": AggregateFunction(lambda inner, _: _quantile(inner, 0.5)),
+    "percentile": AggregateFunction(_quantile, share=True),
+    "collect": AggregateFunction(_collected, _VALUES, Type.list),
+}
+"""Aggregates by folded name."""
+
+EXTREMES: Final = frozenset({"min", "max"})
+"""Aggregates whose names are also functions of two or more numbers."""
+
+
+def is_aggregate(e: s.Call) -> bool:
+    """True if a call is an aggregate, and not a function with the same name."""
+    name = normalize_name(e.name)
+    return name in AGGREGATES and (name not in EXTREMES or len(e.arguments) == 1)
+
+
+def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
+    """Bind a call of an aggregate.
+
+    Raises
+    ------
+    QueryError
+        Invalid arguments.
+    """
+    name, session = normalize_name(e.name), names.session
+    function = AGGREGATES[name]
+    wanted = 2 if function.share else 1
+    if len(e.arguments) != wanted:
+        hint = (
+            f"the value below which 95 % lie is {e.name}(x.speed, 95)" if function.share else None
+        )
+        reason = f"{e.name}() takes {wanted} argument{'s' * (wanted > 1)}, found {len(e.arguments)}"
+        session.refuse(reason, e.span, hint)
+    inner = replace(names, aggregates=False, aggregated=True, aliases={})
+    if function.of == frozenset({Type.number}):
+        operand = inner.number(e.arguments[0])
+    else:
+        operand = inner.bind(e.arguments[0])
+        if name in EXTREMES and operand.type not in function.of:
+            session.refuse(f"{e.name}() takes numbers or texts", e.arguments[0].span)
+        if name == "collect" and operand.type not in function.of:
+            session.refuse(f"{e.name}() takes values", e.arguments[0].span)
+    share = _share(e.arguments[1], e, names) if function.share else 0.0
+    return b.Aggregate(name, operand, e.distinct, function.gives or operand.type, share)
+
+
+def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
+    """Return a percentage as a fraction of one."""
+    found = names.bind(written)
+    if not isinstance(found, b.Value) or isinstance(found.value, bool | str | None):
+        names.session.refuse(
+            f"the second argument of {e.name}() is a number, the same for all matches",
+            written.span,
+            f"the value below which 95 % lie is {e.name}(x.speed, 95)",
+        )
+    if not (math.isfinite(found.value) and 0 <= found.value <= 100):
+        names.session.refuse(f"{e.name}() takes a number from 0 to 100", written.span)
+    return found.value / 100
+
+
+def sql_of(one: b.Aggregate, inner: str) -> str:
+    """Return the SQL of an aggregate from the SQL of its operand."""
+    if one.operand is not None and one.operand.type is Type.number and one.word in _REAL:
+        inner = f"CAST({inner} AS DOUBLE)"
+    if one.distinct:
+        inner = f"DISTINCT {inner}"
+    found = AGGREGATES[one.word].sql(inner, one.share)
+    owned = isinstance(one.operand, b.Operation) and one.operand.word == "whose"
+    if not owned or one.word != "collect":
+        return found
+    # Nodes of several traces are distinguished by their owner, but shown as ids.
+    return f'list_sort([struct_extract("one", 2) FOR "one" IN {found}])'
+
+
+_REAL: Final = frozenset({"median", "percentile", "stddev"})
+"""Aggregates that interpolate or take roots. They need floating-point operands."""

@@ -1,0 +1,440 @@
+"""Needs of a query or check: values that a trace must know to answer it.
+
+``in_range(a, b)`` is true if the relations of a pair were computed.
+
+A scene graph relates only the pairs selected by the settings of its trace: the ego and entities in range,
+moving entities and entities near them. For such a pair, a missing edge means that the relation does not hold.
+For any other pair, it means nothing. ``in_range(a, b)`` is expressed by distances and labels, so it is known
+wherever these are known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang.catalog import (
+    NODE_ATTRIBUTES,
+    TRACE_ATTRIBUTES,
+    Attribute,
+    DisplayUnit,
+    RelationScope,
+    Type,
+)
+from sgstore.lang.ir import (
+    Bound,
+    Kinds,
+    LabelTest,
+    NodeAttribute,
+    Operation,
+    PairNumber,
+    TraceAttribute,
+    Value,
+    all_of,
+    any_kinds,
+    any_of,
+    ego_kinds,
+    inverse,
+    is_one_of,
+)
+from sgstore.model.criticality import RECORDED
+from sgstore.model.pair_numbers import COURSES, TOUCH, WAYS, columns_needed
+from sgstore.model.vocabulary import (
+    SIGNALS,
+    VEHICLE_LIGHTS,
+    VEHICLES,
+    entity_kinds,
+    kinds_labelled,
+    normalize_name,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from sgstore.lang.catalog import TraceFacts
+    from sgstore.lang.ir import BoundCheck
+
+
+_SIGNAL: Final = any_kinds().only(frozenset(SIGNALS))
+_VEHICLE: Final = any_kinds().only(frozenset(VEHICLES))
+
+
+def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
+    """Return the condition that the relations of two nodes were computed.
+
+    Parameters
+    ----------
+    a, b : str
+        Keys of the nodes.
+    traces : iterable of TraceFacts
+        Traces to search.
+
+    Returns
+    -------
+    Bound
+        False for nodes other than entities; unknown in traces with unknown settings.
+    """
+    return in_traces(scopes_of(traces), lambda reach: related(a, b, reach))
+
+
+def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
+    """Group traces by the scope of their relations: each scope with the ids of its traces."""
+    of: dict[RelationScope | None, list[int]] = {}
+    for trace in traces:
+        of.setdefault(trace.reach, []).append(trace.trace_id)
+    return tuple((reach, tuple(ids)) for reach, ids in of.items()) or ((RelationScope(), ()),)
+
+
+def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Bound]) -> Bound:
+    """Combine conditions that depend on the relation scope of a trace."""
+    if len(scopes) < 2:
+        return condition(next(reach for reach, _ in scopes))
+    number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
+    return any_of(all_of(is_one_of(number, ids), condition(reach)) for reach, ids in scopes)
+
+
+def related(a: str, b: str, reach: RelationScope | None) -> Bound:
+    """Return the condition that the relations of two nodes were computed under given settings."""
+    if reach is None:
+        return Value(None, Type.boolean)
+    ego = any_of(LabelTest(node, ego_kinds()) for node in (a, b))
+    ways: list[Bound] = []
+    if reach.ego:
+        close = [_up_to(a, b, reach.ego_within, reach)] if reach.ego_within > 0 else []
+        ways.append(all_of(ego, *close))
+    if reach.within > 0:
+        near = _up_to(a, b, reach.within, reach)
+        move = [
+            inverse(test) for node in (a, b) for test in (_still(node), LabelTest(node, _SIGNAL))
+        ]
+        further = [inverse(ego)] if reach.ego else []
+        ways.append(all_of(*further, *move, near))
+        if reach.static:
+            ways.append(all_of(*further, _still(a), _still(b), near))
+    entities = [LabelTest(node, any_kinds().only(entity_kinds())) for node in (a, b)]
+    return all_of(*entities, *_listed(a, b, reach.kinds), any_of(ways))
+
+
+def _listed(a: str, b: str, kinds: Iterable[tuple[str, ...]]) -> list[Bound]:
+    """Return the condition that two nodes have a listed pair of labels. An empty list gives no condition."""
+    listed = [
+        all_of(LabelTest(a, _labelled(one)), LabelTest(b, _labelled(other)))
+        for pair in kinds
+        for one, other in (pair, pair[::-1])
+    ]
+    return [any_of(listed)] if listed else []
+
+
+def bounded(a: str, b: str, names: Iterable[str], reach: RelationScope) -> Bound:
+    """Return the condition that two entities have one of the given distance relations.
+
+    Parameters
+    ----------
+    a, b : str
+        Keys of the nodes.
+    names : iterable of str
+        Distance relations of the settings, and ``overlaps``.
+    reach : RelationScope
+        The settings.
+    """
+    wanted, ways, low = frozenset(names), list[Bound](), list[Bound]()
+    for name, high in reach.rungs:
+        near = _up_to(a, b, high, reach)
+        if name in wanted:
+            ways.append(all_of(near, *low))
+        low = [inverse(near)]
+    near = (
+        [all_of(related(a, b, reach), *_listed(a, b, reach.near_kinds), any_of(ways))]
+        if ways
+        else []
+    )
+    return any_of([*near, _touch(a, b, reach)] if "overlaps" in wanted else near)
+
+
+def _touch(a: str, b: str, reach: RelationScope) -> Bound:
+    """Return the condition that two bodies touch and at least one of them moves."""
+    solid = [inverse(LabelTest(node, _SIGNAL)) for node in (a, b)]
+    moves = any_of(inverse(_still(node)) for node in (a, b))
+    ego = [] if reach.within > 0 else [any_of(LabelTest(node, ego_kinds()) for node in (a, b))]
+    if not (reach.within > 0 or reach.ego):
+        return Value(value=False, type=Type.boolean)
+    listed = _listed(a, b, reach.kinds)
+    return all_of(
+        *solid, moves, *ego, *listed, _no_more(_pair("gap", a, b), Value(TOUCH, Type.number))
+    )
+
+
+def _labelled(label: str) -> Kinds:
+    return (
+        ego_kinds()
+        if normalize_name(label) == "ego"
+        else any_kinds().only(frozenset(kinds_labelled(label) or ()))
+    )
+
+
+def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
+    """Return the condition that two nodes are within a distance. A node without position is near nothing."""
+    limit = Value(bound, Type.number)
+    if reach.between == "origins":
+        return any_of(
+            all_of(*tests, _no_more(distance, limit)) for tests, distance in _between_origins(a, b)
+        )
+    distance = _pair("dist", a, b)
+    if reach.between == "footprints":  # one without extent is a point
+        distance = Operation("coalesce", (_pair("gap", a, b), distance), Type.number)
+    return _no_more(distance, limit)
+
+
+def _between_origins(a: str, b: str) -> Iterable[tuple[list[Bound], Bound]]:
+    """Yield distances of origins with their conditions. The origin of a moving vehicle is on the ground."""
+    for low_a in (True, False):
+        for low_b in (True, False):
+            tests = [_lies_low(a, yes=low_a), _lies_low(b, yes=low_b)]
+            centres = _apart(_number(a, "z"), _number(b, "z"))
+            origins = _apart(_origin(a, low=low_a), _origin(b, low=low_b))
+            dist = _pair("dist", a, b)
+            planar = _of("-", _of("*", dist, dist), _of("*", centres, centres))
+            yield (
+                tests,
+                Operation("sqrt", (_of("+", planar, _of("*", origins, origins)),), Type.number),
+            )
+
+
+def _lies_low(node: str, *, yes: bool) -> Bound:
+    low = all_of(LabelTest(node, _VEHICLE), inverse(_still(node)))
+    return low if yes else inverse(low)
+
+
+def _origin(node: str, *, low: bool) -> Bound:
+    half = _of("/", _number(node, "height"), Value(2, Type.number))
+    return _of("-", _number(node, "z"), half) if low else _number(node, "z")
+
+
+def _apart(a: Bound, b: Bound) -> Bound:
+    return _of("-", b, a)
+
+
+def _no_more(distance: Bound, limit: Bound) -> Bound:
+    near = Operation("<=", (distance, limit), Type.boolean)
+    return Operation("coalesce", (near, Value(value=False, type=Type.boolean)), Type.boolean)
+
+
+def _pair(function: str, a: str, b: str) -> Bound:
+    return PairNumber(function, a, b)
+
+
+def _number(node: str, name: str) -> Bound:
+    return NodeAttribute(node, NODE_ATTRIBUTES[name], Type.number)
+
+
+def _still(node: str) -> Bound:
+    return NodeAttribute(node, NODE_ATTRIBUTES["isstatic"], Type.boolean)
+
+
+def _of(word: str, *operands: Bound) -> Bound:
+    return Operation(word, operands, Type.number)
+
+
+# Needs of questions -----------------------------------------------------------------------------------
+# An unknown condition is not true, and inside temporal operators it is false. So ``ALWAYS ego.speed < 20``
+# would be false for a trace without an ego or without speeds. Such a trace cannot answer: it is left out, and
+# its verdict is unknown. This section finds the *needs* of a question: that there is an ego, and that
+# measured attributes of its variables are known at least once.
+#
+# Only measured attributes count. Some attributes have a meaning even if they are absent (a lane without
+# ``turn`` is not in a junction, a car without ``special`` is an ordinary car); these are never unknown.
+# ``known``, ``IS NULL``, ``coalesce`` and ``CASE`` handle missing values themselves. Variables of blocks must
+# only exist.
+
+MOTION: Final = frozenset({"speed", "vx", "vy", "vz", "accel", "ax", "ay", "az", "yaw_rate"})
+"""Attributes that static nodes do not have."""
+
+MEASURED: Final = MOTION | {
+    *("heading", "pitch", "roll", "length", "width", "height"),
+    *("steer", "throttle", "brake", "gear", "hand_brake", "light_state", "parked"),
+    *("speed_limit", "curvature"),
+    *VEHICLE_LIGHTS,
+}
+"""Measured attributes of nodes, which are unknown if the recording does not have them."""
+
+_TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
+"""Operators with a known value for unknown operands."""
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """Fact that a trace must know.
+
+    Attributes
+    ----------
+    node : str
+        The variable; empty for the frame.
+    kinds : Kinds or None
+        Kinds that the node may have.
+    attribute : Attribute or None
+        Attribute that must be known in at least one frame, if such a node exists. ``None`` means that the
+        node must exist.
+    event : str
+        Kind of event that must be recorded; otherwise empty.
+    lanes : str
+        Lane data that the map must have: ``ways``, ``curvature`` or ``slope``; otherwise empty.
+    """
+
+    node: str
+    kinds: b.Kinds | None
+    attribute: Attribute | None
+    event: str = ""
+    lanes: str = ""
+
+    @property
+    def is_ego(self) -> bool:
+        """True if the need is that an ego exists."""
+        return self.attribute is None and not self.event and not self.lanes
+
+    @property
+    def reason(self) -> str:
+        """Message about a trace that does not meet the need."""
+        if self.lanes:
+            return (
+                "it has no map with heights" if self.lanes == "slope" else "it has no map of lanes"
+            )
+        if self.event:
+            return f"it does not record events of the kind {self.event}"
+        if self.attribute is None:
+            return "it has no ego"
+        of = "" if self.kinds is None else f" of {self.node}"
+        return f"{self.attribute.name}{of} is never known"
+
+
+def of_check(check: BoundCheck) -> tuple[Need, ...]:
+    """Return the needs of a check. The result is empty with ``USING UNKNOWN false``."""
+    if check.unknown_is_false:
+        return ()
+    nodes = check.scope.nodes
+    bound = {node for quantifier in check.quantifiers for node in quantifier.nodes}
+    spoken = [check.formula, *(q.where for q in check.quantifiers if q.where is not None)]
+    spoken += [check.reset] if check.reset is not None else []
+    egos = {Need(key, node.kinds, None) for key, node in nodes.items() if key not in bound}
+    return _ordered(egos | _of_each(spoken, nodes, strict=True))
+
+
+def not_computed(check: BoundCheck, facts: TraceFacts) -> str:
+    """Return a message about relations of a check that a trace lacks, or an empty text."""
+    if check.unknown_is_false:
+        return ""
+    missing = check.relations - facts.answers
+    if facts.reach is not None and facts.reach.without:
+        spoken = (check.formula, *(q.where for q in check.quantifiers if q.where is not None))
+        missing |= facts.reach.without & frozenset().union(*map(_of_entities, spoken))
+    return f"it knows nothing of {', '.join(sorted(missing))}" if missing else ""
+
+
+def _of_entities(expression: Bound) -> frozenset[str]:
+    """Return the relations that an expression uses between entities."""
+    found: set[str] = set()
+    for part in b.walk(expression):
+        match part:
+            case PairNumber(function=function) if function in WAYS:
+                found.add("isIn")
+            case NodeAttribute(attribute=attribute) if attribute is NODE_ATTRIBUTES["injunction"]:
+                found.add("isIn")
+            case b.BlockValue(scope=scope):
+                for edge in scope.edges:
+                    ends = scope.kinds(edge.src).every | scope.kinds(edge.dst).every
+                    if ends & entity_kinds() and edge.relations != b.any_relation():
+                        found |= edge.relations
+                found = found.union(*map(_of_entities, part.inside))
+            case _:
+                pass
+    return frozenset(found)
+
+
+def of_query(query: b.Query) -> tuple[Need, ...]:
+    """Return the needs of a query: the facts that a trace must know to have a match.
+
+    For an ``OR`` without temporal operators, only needs common to all its conditions count.
+    """
+    if query.unknown_is_false:
+        return ()
+    steps = [(step.scope, step.when) for step in query.steps]
+    steps = steps or [(scope, ()) for scope in query.required]
+    needs: list[set[Need]] = []
+    for scope, when in steps:
+        egos = {Need(k, n.kinds, None) for k, n in scope.nodes.items() if n.kinds.one_a_frame}
+        needs.append(egos | _of_each([*scope.where, *when], scope.nodes, strict=False))
+    every = tuple(range(len(steps)))
+    ways = [way.steps for way in query.ways] if query.steps else [every]
+    found = set.intersection(*(set[Need]().union(*(needs[n] for n in way)) for way in ways))
+    # All ego needs of the same kinds are equivalent, so one is sufficient.
+    egos = {need.kinds: need for need in found if need.is_ego}
+    others = {need for need in found if not need.is_ego}
+    return _ordered(others | {*egos.values()})
+
+
+def _ordered(needs: set[Need]) -> tuple[Need, ...]:
+    def rank(need: Need) -> tuple[bool, str, str, str, str]:
+        name = need.attribute.name if need.attribute else ""
+        return need.attribute is not None, need.node, name, need.event, need.lanes
+
+    return tuple(sorted(needs, key=rank))
+
+
+def _of_each(
+    expressions: Iterable[b.Bound], nodes: Mapping[str, b.Node], *, strict: bool
+) -> set[Need]:
+    return {need for e in expressions for need in _needed(e, nodes, strict=strict)}
+
+
+def _needed(  # noqa: C901, PLR0911, PLR0912 - a case each
+    expression: b.Bound, nodes: Mapping[str, b.Node], *, strict: bool
+) -> set[Need]:
+    """Return the needs of an expression. If ``strict``, all its parts count, even in an ``OR``."""
+
+    def of_node(key: str, name: str) -> set[Need]:
+        if key not in nodes or name not in MEASURED:
+            return set()
+        return {Need(key, nodes[key].kinds, NODE_ATTRIBUTES[normalize_name(name)])}
+
+    match expression:
+        case b.Operation(word=word) if word in _TELLS:
+            return set()
+        case b.Operation("OR" | "IMPLIES", operands) if not strict:
+            return set.intersection(*(_needed(one, nodes, strict=False) for one in operands))
+        case b.Operation(operands=operands):
+            return _of_each(operands, nodes, strict=strict)
+        case b.Tense(operands=operands):
+            return _of_each(operands, nodes, strict=True)
+        case b.SignalCall(word="age" | "exists_now"):
+            return set()
+        case b.SignalCall(operand=operand):
+            return _needed(operand, nodes, strict=True)
+        case b.NodeAttribute(node=node, attribute=attribute):
+            return of_node(node, attribute.name)
+        case b.PairNumber(function=function, a=one, b=other):
+            if function in RECORDED:  # unknown if it needs more than the trace has
+                return set()
+            told = function if function in COURSES else "ways"
+            of_map = {Need("", None, None, lanes=told)} if function in WAYS else set[Need]()
+            of_two = zip((one, other), columns_needed(function), strict=True)
+            # Both components of a velocity or an acceleration are known, or neither is.
+            return of_map | {
+                need
+                for node, parts in of_two
+                for name in parts - {"vy", "ay"}
+                for need in of_node(node, name)
+            }
+        case b.FrameAttribute(attribute=attribute) if attribute.unit in {
+            DisplayUnit.weather,
+            DisplayUnit.clock,
+        }:
+            return {Need("", None, attribute)}
+        case b.Happened(kind=kind, table=()):
+            return {Need("", None, None, kind)}
+        case b.BlockValue(scope=scope, value=value):
+            inner = [*scope.where, *([value] if value is not None else [])]
+            return _of_each(
+                inner, {k: n for k, n in nodes.items() if k in scope.outer}, strict=True
+            )
+        case _:
+            return set()

@@ -1,0 +1,169 @@
+"""Named patterns as steps, with renamed variables: ``MATCH cut_in(v = w)``.
+
+A renamed variable has its new name everywhere in the pattern. Other variables keep their names, so the same
+name is the same entity in every step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from sgstore.lang.bind._symbols import RESERVED, THE_EGO
+from sgstore.lang.syntax import tree as s
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.lang.bind._symbols import Session
+
+
+_NAMED = (s.NodePattern, s.EdgePattern, s.StepClause, s.Variable)
+
+
+def values_given(
+    step: s.ScenarioStep, parameters: Mapping[str, str], session: Session
+) -> list[s.Argument]:
+    """Return the arguments that set parameters of a pattern.
+
+    Parameters
+    ----------
+    step : ScenarioStep
+    parameters : mapping of str to str
+        Names of the parameters, each with an example value as text; empty if unknown.
+    session : Session
+
+    Raises
+    ------
+    QueryError
+        The argument of a parameter is a variable.
+    """
+    found = [given for given in step.given if given.name in parameters]
+    for given in found:
+        if isinstance(given.value, s.Variable):
+            default = parameters[given.name]
+            session.refuse(
+                f"'{given.name}' is a parameter of {step.name}, and takes a value",
+                given.span,
+                f"such as {given.name} = {default}" if default else None,
+            )
+    return found
+
+
+def own_names(
+    step: s.ScenarioStep,
+    steps: Sequence[s.StepClause],
+    parameters: Iterable[str],
+    taken: frozenset[str],
+    session: Session,
+) -> dict[str, str]:
+    """Return the new names of the variables of a pattern: old name → new name.
+
+    Variables bound in braces are invisible outside. If their name is already used, they get a name that
+    queries cannot write.
+
+    Parameters
+    ----------
+    step : ScenarioStep
+    steps : sequence of StepClause
+        Steps of the pattern.
+    parameters : iterable of str
+        Parameters of the pattern. They take precedence over variables with the same name.
+    taken : frozenset of str
+        Names bound by the surrounding text.
+    session : Session
+
+    Raises
+    ------
+    QueryNameError
+        Unknown parameter or variable.
+    QueryError
+        The argument of a variable is a value, or two variables would have the same name.
+    """
+    parameters, variables = list(parameters), list(dict.fromkeys(_variables(steps)))
+    names: dict[str, str] = {}
+    for given in step.given:
+        if given.name in parameters:
+            continue
+        if given.name not in variables:
+            known = [*parameters, *variables]
+            session.unknown(f"parameter or variable of {step.name}", given.name, given.span, known)
+        if not isinstance(given.value, s.Variable):
+            session.refuse(
+                f"'{given.name}' is a variable of {step.name}, and takes the name of one of yours",
+                given.span,
+                f"such as {given.name} = a",
+            )
+        new = given.value.name
+        if new in names.values():
+            session.refuse(f"'{new}' is given for two variables of {step.name}", given.span)
+        names[given.name] = new
+    for given in step.given:
+        new = names.get(given.name)
+        if new in variables and new not in names:
+            session.refuse(
+                f"'{new}' is a variable of {step.name} itself",
+                given.span,
+                f"give that one another name, too: {new} = …",
+            )
+    strange = taken.union(names.values()).difference(variables)
+    return names | {name: f"{name}~" for name in strange}
+
+
+def _variables(steps: Sequence[s.StepClause]) -> Iterator[str]:
+    """Yield the names that steps bind (nodes, edges, steps), then the variables that they use."""
+    for step in steps:
+        yield from (name for name in _bound(step.block) if name != THE_EGO)
+        if step.name is not None:
+            yield step.name
+    for step in steps:
+        yield from (n for n in _spoken_of(step.block, ()) if n not in {*RESERVED, THE_EGO})
+
+
+def _bound(block: s.Block) -> list[str]:
+    """Return the names of the nodes and edges of a block."""
+    parts = [part for path in block.paths for part in (*path.nodes, *path.edges)]
+    return [part.name for part in parts if part.name]
+
+
+def _spoken_of(part: Any, own: tuple[str, ...]) -> Iterator[str]:
+    """Yield the variables used in a part of a text, except those bound by enclosing braces."""
+    if isinstance(part, s.Variable):
+        yield from () if part.name in own else (part.name,)
+        return
+    if isinstance(part, s.BlockExpression):
+        own = (*own, *_bound(part.block))
+    inner = part if isinstance(part, tuple) else ()
+    if is_dataclass(part):
+        inner = tuple(getattr(part, field.name) for field in fields(part))
+    for one in inner:  # pyright: ignore[reportUnknownVariableType]
+        yield from _spoken_of(one, own)
+
+
+def names_written(sequence: s.SequenceClause) -> frozenset[str]:
+    """Return the names that a sequence binds or uses."""
+    found: set[str] = set()
+    for step in sequence.steps:
+        if isinstance(step, s.GroupStep):
+            found |= frozenset[str]().union(*map(names_written, step.alternatives))
+        elif isinstance(step, s.StepClause):
+            found |= set(_variables([step]))
+        else:
+            found |= {one.value.name for one in step.given if isinstance(one.value, s.Variable)}
+    return frozenset(found)
+
+
+def renamed(step: s.StepClause, names: Mapping[str, str]) -> s.StepClause:
+    """Return a copy of a step with renamed variables."""
+    return _renamed(step, names) if names else step
+
+
+def _renamed(part: Any, names: Mapping[str, str]) -> Any:
+    if isinstance(part, tuple):
+        return tuple(_renamed(one, names) for one in part)  # pyright: ignore[reportUnknownVariableType]
+    if not is_dataclass(part) or isinstance(part, type):
+        return part
+    changed = {field.name: _renamed(getattr(part, field.name), names) for field in fields(part)}
+    if isinstance(part, _NAMED) and part.name is not None:
+        changed["name"] = names.get(part.name, part.name)
+    return replace(part, **changed)

@@ -1,0 +1,554 @@
+"""Symbol table, datasets, and text tests of the binder.
+
+There are two chains from the inside out. *Names*: a block can use the names around it, the body of a
+predicate can use only its parameters. *Scopes* hold nodes: a node used in an inner scope becomes an outer
+node of every scope between.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import field, replace
+from fnmatch import fnmatchcase
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+from sgstore.base.records import dataclass
+from sgstore.errors import QueryError, QueryNameError
+from sgstore.lang import ir as b
+from sgstore.lang.bind._needed_values import scopes_of
+from sgstore.lang.catalog import PAIR_NAMES, Attribute, DisplayUnit, Home, Type
+from sgstore.lang.ir import Bound, Edge, Kinds, Node, Scope, ego_kinds
+from sgstore.lang.library import predicates
+from sgstore.lang.syntax import condition_hint, hint_at, variable_hint
+from sgstore.lang.syntax import tree as s
+from sgstore.model.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sgstore.errors import TextSpan
+    from sgstore.lang.catalog import Catalog, TableFacts, TraceFacts
+    from sgstore.lang.syntax.tree import Define
+
+
+THE_EGO: Final = "ego"
+"""Name that is always bound to the ego of the frame."""
+
+RESERVED: Final = frozenset({"env", "frame", "trace"})
+"""Names with attributes that are not nodes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Symbol:
+    """Meaning of a name: a node, an edge, or a value (for a predicate parameter)."""
+
+    node: str | None = None
+    edge: str | None = None
+    value: Bound | None = None
+
+
+Binder = Callable[[Any, "SymbolTable"], Bound]
+"""Function that binds one kind of expression."""
+
+Binders = Mapping[type, Binder]
+
+
+@dataclass(slots=True)
+class Session:
+    """State shared by the whole query during binding.
+
+    Attributes
+    ----------
+    text : str
+        Text of the query, for messages.
+    parameters : mapping of str to value
+    binders : mapping of type to Binder
+        Binder of each kind of expression. They are passed as arguments, because calls, blocks and temporal
+        operators contain expressions, and expressions contain them.
+    predicates : dict of str to Define
+        Definitions by folded name.
+    injective : bool
+        True if different nodes of a pattern must be bound to different nodes.
+    used : set of str
+        Parameters that the query uses.
+    relations : set of str
+        Relations that the query names.
+    keys : set of str
+        Used keys in lower case, because the database ignores case.
+    calls : list of str
+        Predicates whose bodies are being bound.
+    classed : tuple of str
+        Abstractions whose frame classes are in the store.
+    tables : mapping of str to TableFacts
+        User tables by name.
+    traces : tuple of TraceFacts
+        Traces of the store.
+    own : mapping of str to Type
+        User-defined attributes, by name.
+    part : bool
+        True if the store is a part of a collection: see :attr:`sgstore.lang.catalog.Catalog.part`.
+    online : bool
+        True if later frames are unknown.
+    dropped : set of str
+        Names that a ``WITH`` does not pass on.
+    maybe : set of str
+        Keys of nodes of an ``OPTIONAL MATCH``, which may be NULL.
+    the_ego : str or None
+        Key of the ego, after its first use as ``ego``.
+    numbers, blocks : int
+        Numbers of unnamed nodes and edges, and of blocks, so far.
+    beyond : Scopes
+        Relation scopes of the traces, if a statement uses data beyond the graphs; otherwise empty.
+    """
+
+    text: str
+    parameters: Mapping[str, Any]
+    binders: Binders
+    predicates: dict[str, Define] = field(default_factory=dict[str, "Define"])
+    injective: bool = True
+    used: set[str] = field(default_factory=set[str])
+    relations: set[str] = field(default_factory=set[str])
+    keys: set[str] = field(default_factory=set[str])
+    calls: list[str] = field(default_factory=list[str])
+    classed: tuple[str, ...] = ()
+    tables: Mapping[str, TableFacts] = field(default_factory=dict[str, "TableFacts"])
+    traces: tuple[TraceFacts, ...] = ()
+    own: Mapping[str, Type] = field(default_factory=dict[str, Type])
+    own_edges: Mapping[str, Type] = field(default_factory=dict[str, Type])
+    part: bool = False
+    online: bool = False
+    dropped: set[str] = field(default_factory=set[str])
+    maybe: set[str] = field(default_factory=set[str])
+    the_ego: str | None = None
+    numbers: int = 0
+    blocks: int = 0
+    beyond: b.Scopes = ()
+
+    def ask(self, catalog: Catalog) -> None:
+        """Copy the needed facts of the store from a catalog."""
+        self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
+        self.own, self.own_edges, self.part = catalog.own, catalog.own_edges, catalog.part
+        self.online = catalog.online
+
+    def look_beyond(self, catalog: Catalog, *, world: bool) -> None:
+        """Set the relation scopes of the traces, if the statement uses data beyond the graphs."""
+        if world and (catalog.world or catalog.online):
+            self.beyond = scopes_of(self.traces)
+
+    def key(self, name: str | None) -> str:
+        """Return an unused key: the name if possible, or ``#1``, ``#2``, … without a name."""
+        self.numbers += name is None
+        wanted = name or f"#{self.numbers}"
+        key, copy = wanted, 2
+        while key.lower() in self.keys:
+            key, copy = f"{wanted}~{copy}", copy + 1
+        self.keys.add(key.lower())
+        return key
+
+    def refuse(self, reason: str, span: TextSpan, hint: str | None = None) -> NoReturn:
+        """Raise a :class:`QueryError` about a part of the text."""
+        raise QueryError(reason, text=self.text, span=span, hint=hint)
+
+    def unknown(
+        self, what: str, name: str, span: TextSpan, known: Iterable[str], hint: str | None = None
+    ) -> NoReturn:
+        """Raise a :class:`QueryNameError` for an unknown name, with similar or known names as a hint."""
+        hint = hint or hint_at(name, known)
+        raise QueryNameError(f"unknown {what} '{name}'", text=self.text, span=span, hint=hint)
+
+
+@dataclass(slots=True)
+class ScopeBuilder:
+    """Scope during binding."""
+
+    session: Session
+    parent: ScopeBuilder | None = None
+    nodes: dict[str, Node] = field(default_factory=dict[str, Node])
+    outer: dict[str, Kinds] = field(default_factory=dict[str, Kinds])
+    edges: list[Edge] = field(default_factory=list[Edge])
+    where: list[Bound] = field(default_factory=list[Bound])
+
+    @property
+    def top(self) -> ScopeBuilder:
+        """The scope of ``MATCH``."""
+        return self.parent.top if self.parent else self
+
+    def kinds(self, key: str) -> Kinds:
+        """Return the kinds that a node may have in this scope."""
+        return self.nodes[key].kinds if key in self.nodes else self.outer[key]
+
+    def mention(self, key: str) -> None:
+        """Record the use of a node of this scope or of an enclosing scope."""
+        if key in self.nodes or key in self.outer or self.parent is None:
+            return
+        self.parent.mention(key)
+        self.outer[key] = self.parent.kinds(key)
+
+    def narrow(self, key: str, kinds: Kinds) -> None:
+        """Restrict a node to some kinds in this scope."""
+        if key in self.outer:
+            self.outer[key] = self.outer[key] & kinds
+        else:
+            node = self.nodes[key]
+            self.nodes[key] = replace(node, kinds=node.kinds & kinds)
+
+    def add(self, name: str | None, kinds: Kinds, span: TextSpan, *, named: bool) -> str:
+        """Add a node and return its key."""
+        key = self.session.key(name)
+        self.nodes[key] = Node(key, kinds, "named" if named else "unnamed", span)
+        return key
+
+    def the_ego(self, span: TextSpan) -> str:
+        """Return the key of the ego node of the ``MATCH``, or add one."""
+        for node in self.nodes.values():
+            if not node.kinds.other:
+                return node.key
+        return self.add(THE_EGO, ego_kinds(), span, named=False)
+
+    def finished(self) -> Scope:
+        """Return the finished scope, with the pairs of nodes that must differ."""
+        where = tuple(self.where)
+        return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
+
+    def distinct(self) -> frozenset[tuple[str, str]]:
+        """Return the pairs of nodes that must differ: own nodes from each other and from outer nodes."""
+        if not self.session.injective:
+            return frozenset()
+        pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
+        for a, other in sorted(pairs):
+            if not self.kinds(a).other and not self.kinds(other).other:
+                self.session.refuse(
+                    "two nodes are both the ego, and different nodes of a pattern are never the same",
+                    self.nodes[a].span,
+                    "a frame has one ego: use one variable, or USING NODES any",
+                )
+        return frozenset(pairs)
+
+
+@dataclass(slots=True)
+class SymbolTable:
+    """Names that a part of a text can use, with its scope.
+
+    Attributes
+    ----------
+    session : Session
+    scope : ScopeBuilder
+    meanings : dict of str to Symbol
+    parent : SymbolTable or None
+        Enclosing names, also visible.
+    aggregates : bool
+        True if aggregates such as ``COUNT(*)`` are allowed here.
+    aggregated : bool
+        True inside an aggregate.
+    over : bool
+        True if values over a match are allowed here.
+    paths : list of PathValue or None
+        Named paths. ``None`` if they are not allowed here.
+    aliases : mapping of str to Bound
+        Values of ``RETURN`` by name, where these can be used. Such a name is not a variable there.
+    """
+
+    session: Session
+    scope: ScopeBuilder
+    meanings: dict[str, Symbol] = field(default_factory=dict[str, Symbol])
+    parent: SymbolTable | None = None
+    aggregates: bool = False
+    aggregated: bool = False
+    over: bool = False
+    paths: list[b.PathValue] | None = None
+    aliases: Mapping[str, Bound] = field(default_factory=dict[str, "Bound"])
+
+    def block(self) -> SymbolTable:
+        """Return the symbol table of a block at this place."""
+        return SymbolTable(self.session, ScopeBuilder(self.session, self.scope), parent=self)
+
+    def body(self, meanings: dict[str, Symbol]) -> SymbolTable:
+        """Return the symbol table for the body of a predicate called at this place."""
+        return SymbolTable(self.session, self.scope, meanings)
+
+    def meaning(self, name: str) -> Symbol | None:
+        """Return the meaning of a name, or None if unknown. The name ``ego`` is not resolved here."""
+        names: SymbolTable | None = self
+        while names is not None:
+            if name in names.meanings:
+                return names.meanings[name]
+            names = names.parent
+        return None
+
+    def node(self, name: str, span: TextSpan) -> str:
+        """Return the key of the node that a name means, and record its use.
+
+        Raises
+        ------
+        QueryNameError
+            Unknown name.
+        QueryError
+            The name is not a node.
+        """
+        meaning = self.meaning(name)
+        if meaning is None and name == THE_EGO:
+            key = self.session.the_ego = self.scope.top.the_ego(span)
+        elif meaning is None:
+            known = {*self.visible(), *self.session.tables}
+            hint = self._hint(name)
+            self.session.unknown("variable", name, span, known, hint)
+        elif meaning.node is None:
+            way = meaning.value is not None and meaning.value.type is Type.list
+            hint = f"of a path there are length({name}) and nodes({name})" if way else None
+            self.session.refuse(f"'{name}' is not a node", span, hint)
+        else:
+            key = meaning.node
+        self.scope.mention(key)
+        return key
+
+    def _hint(self, name: str) -> str | None:
+        """Return a hint for a name that is unknown here."""
+        if self.session.calls:
+            return f"{self.session.calls[-1]}() knows its parameters and ego only"
+        if name in self.session.dropped:
+            return f"WITH does not pass it on: WITH …, {name}"
+        elsewhere = name.lower() in self.session.keys
+        return variable_hint(name, self.visible(), elsewhere) or call_hint(name)
+
+    def bind(self, expression: s.Expression) -> Bound:
+        """Bind an expression of any type.
+
+        Raises
+        ------
+        QueryNameError
+            An unknown name.
+        QueryError
+            Types do not match.
+        """
+        return self.session.binders[type(expression)](expression, self)
+
+    def condition(self, expression: s.Expression) -> Bound:
+        """Bind an expression that is true, false or unknown.
+
+        Raises
+        ------
+        QueryError
+            The expression has another type.
+        """
+        found = self.bind(expression)
+        if found.type not in {Type.boolean, Type.null}:
+            written = self.session.text[expression.span.start : expression.span.end]
+            self.session.refuse(
+                f"expected a condition, but this is a {found.type.value}",
+                expression.span,
+                condition_hint(found.type, written),
+            )
+        return found
+
+    def number(self, expression: s.Expression) -> Bound:
+        """Bind an expression that is a number.
+
+        Raises
+        ------
+        QueryError
+            The expression has another type.
+        """
+        found = self.bind(expression)
+        if found.type is not Type.number:
+            named = expression.name if isinstance(expression, s.Variable) else ""
+            self.session.refuse(
+                f"expected a number, but this is a {found.type.value}",
+                expression.span,
+                f"one of its attributes: {named}.speed" if found.type is Type.node else None,
+            )
+        return found
+
+    def visible(self) -> set[str]:
+        """Return all names that can be used here, except ``frame``, ``trace`` and ``env``."""
+        outside = self.parent.visible() if self.parent else {THE_EGO}
+        return outside | set(self.meanings) | set(self.aliases)
+
+
+def call_hint(name: str) -> str | None:
+    """Return a hint with the signature of a two-entity function or predicate, or None."""
+    word = normalize_name(name)
+    if (found := predicates().get(word)) is not None:
+        formals = ", ".join(formal.name for formal in found.parameters)
+        return f"it is a predicate: {found.name}({formals})"
+    return f"it is a function: {PAIR_NAMES[word]}(a, b)" if word in PAIR_NAMES else None
+
+
+# Datasets in queries: traces selected by a name pattern or by a user table -----
+
+CLASSES_GIVEN: Final = "sgstore_classes"
+"""Table with the frame classes of all parts of a collection: ``dataset`` (empty: all frames),
+``abstraction``, ``class``, ``frames``."""
+
+CLASSES: Final = "datasetclasses"
+"""Folded name of the function after ``IN``: ``frame.class IN dataset_classes('train')``."""
+
+
+def traces_in(
+    name: str,
+    traces: Iterable[TraceFacts],
+    tables: Mapping[str, TableFacts],
+    *,
+    part: bool = False,
+) -> frozenset[int] | None:
+    """Return the ids of the traces of a dataset. ``None`` means an unknown dataset.
+
+    Parameters
+    ----------
+    name : str
+        A user table with one row for each trace, or a pattern of trace names with the wildcards ``*`` and
+        ``?``.
+    traces : iterable of TraceFacts
+    tables : mapping of str to TableFacts
+    part : bool
+        True if other stores may contain the dataset.
+    """
+    if name in tables:
+        return tables[name].traces
+    found = frozenset(t.trace_id for t in traces if fnmatchcase(t.name, name))
+    return found if found or part else None
+
+
+def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
+    """Return the ids of the traces that ``USING DATASET`` selects.
+
+    Raises
+    ------
+    QueryError
+        Unknown dataset, or a table of single frames.
+    """
+    found = traces_in(name, session.traces, session.tables, part=session.part)
+    if found is None and name in session.tables:
+        session.refuse(
+            f"'{name}' is a table of single frames, and USING DATASET chooses traces",
+            span,
+            f"ask for its columns: WHERE {name}.… IS NOT NULL",
+        )
+    return _known(found, name, span, session)
+
+
+def seen_in(
+    classes: b.FrameAttribute, name: str, span: TextSpan, session: Session
+) -> b.FrameAttribute:
+    """Return the condition that the class of a frame occurs in a dataset of traces or frames.
+
+    Raises
+    ------
+    QueryError
+        Unknown dataset.
+    """
+    found = traces_in(name, session.traces, session.tables, part=session.part)
+    table = session.tables.get(name)
+    if found is None and table is not None and not table.joins:
+        session.refuse(f"the rows of '{name}' belong to no frames", span)
+    if table is None:
+        found = _known(found, name, span, session)
+    (abstraction,) = classes.attribute.columns.values()
+    attribute = Attribute(
+        f"class_{abstraction} in {name}",
+        Type.boolean,
+        {Home.state: abstraction},
+        "whether its class is in a dataset",
+        DisplayUnit.seen,
+        table=name if found is None else "",
+        traces=tuple(sorted(found or ())),
+        given=CLASSES_GIVEN if session.part else "",
+    )
+    return b.FrameAttribute(attribute, Type.boolean)
+
+
+def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
+    """Return the number of frames with the class of this frame, in the store or in all parts."""
+    attribute = Attribute(
+        f"class_count({abstraction})",
+        Type.number,
+        {Home.state: abstraction},
+        "frames of its class",
+        DisplayUnit.counted,
+        given=CLASSES_GIVEN if part else "",
+    )
+    return b.FrameAttribute(attribute, Type.number)
+
+
+def abstraction_named(name: str, span: TextSpan, session: Session) -> str:
+    """Return the exact name of an abstraction whose frame classes are in the store.
+
+    Raises
+    ------
+    QueryNameError
+        Unknown abstraction.
+    """
+    found = next(
+        (one for one in session.classed if normalize_name(one) == normalize_name(name)), None
+    )
+    if found is None:
+        session.unknown("abstraction", name, span, session.classed)
+    return found
+
+
+def _known(
+    found: frozenset[int] | None, name: str, span: TextSpan, session: Session
+) -> frozenset[int]:
+    if found is None:
+        known = [*session.tables, *(trace.name for trace in session.traces)]
+        session.unknown("dataset", name, span, known)
+    return found
+
+
+# Text tests: ``CONTAINS`` and similar, and regular expressions -----------------------------
+
+_NOT_RE2: Final = re.compile(r"\(\?(?!:|P<\w+>|[ims]+[:)])|\\[1-9NuUZ]|[*+?}]\+")
+
+
+def text_test(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> b.Operation:
+    """Bind a test of one text by another, such as ``CONTAINS`` or ``=~``.
+
+    Raises
+    ------
+    QueryError
+        A side is not a text, or the text after ``=~`` is not a valid regular expression.
+    """
+    for side, written in ((left, e.left), (right, e.right)):
+        if side.type is not Type.text:
+            names.session.refuse(
+                f"{e.word} compares texts, but this is a {side.type.value}", written.span
+            )
+    if e.word == "=~":
+        _check_regex(right, e.right.span, names)
+    return b.Operation(e.word, (left, right), Type.boolean)
+
+
+def regex(text: str) -> re.Pattern[str]:
+    """Compile a regular expression that Python and the database interpret in the same way.
+
+    Raises
+    ------
+    re.error
+        Invalid, or with a nested set, which they interpret differently: ``[[:alpha:]]``, ``[a&&b]``.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", FutureWarning)
+        try:
+            return re.compile(text)
+        except FutureWarning:
+            raise re.error(
+                "a set in a set; write a backslash before [, -, &, | or ~ in a set"
+            ) from None
+
+
+def _check_regex(pattern: b.Bound, span: TextSpan, names: SymbolTable) -> None:
+    if not isinstance(pattern, b.Value):
+        names.session.refuse("the pattern after =~ must be a constant", span)
+    text = str(pattern.value)
+    try:
+        regex(text)
+    except re.error as error:
+        names.session.refuse(f"not a regular expression: {error}", span)
+    if _NOT_RE2.search(text):
+        names.session.refuse(
+            "not a regular expression that can be searched for",
+            span,
+            "no look-around, no back-references",
+        )

@@ -1,0 +1,151 @@
+"""Notes on texts in a query that no attribute value of the store equals.
+
+A misspelt name finds nothing, without an error. So the notes list the texts that are not values in the store,
+each with the nearest value. The compiler finds the comparisons. The caller looks the texts up in the store.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang.sql import Select, nested
+from sgstore.model.vocabulary import entity_kinds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.lang.ir import BoundCheck
+
+    Ask = Callable[[str, list[object]], Sequence[tuple[Any, ...]]]
+
+
+_ENTITY_NAMES: Final = ("kind || ' ' || node_id", "entity")
+_TEXTS_OF: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
+    "name": (_ENTITY_NAMES, ("name", "map_node")),
+    "ident": (("ident", "entity"),),
+    "type": (("type_name", "entity"), ("lane_type", "map_node")),
+    "type_name": (("type_name", "entity"),),
+    "subkind": (("subkind", "entity"),),
+    "lane_type": (("lane_type", "map_node"),),
+    "road": (("road", "map_node"), ("name", "map_node", "kind = 'road'")),
+    "junction": (("junction", "map_node"), ("name", "map_node", "kind = 'junction'")),
+    "role": (("role", "lane_role"),),
+    "trace.name": (("name", "trace"),),
+    "trace.uri": (("uri", "recording"),),
+    "trace.flavour": (("flavour", "trace"),),
+    "trace.ego": (("ego", "trace"),),
+    "trace.map": (("name", "map"),),
+}
+"""Places of attributes with texts from recordings: column, table, and condition on its rows."""
+
+Compared = tuple[str, str]
+"""Attribute, and a text that it is compared with."""
+
+
+def compared_in_query(query: b.Query) -> list[Compared]:
+    """Return the comparisons with texts in a bound query, without duplicates."""
+    returned = [column.value for column in query.result.columns]
+    found = list(_comparisons(returned, query.scope))
+    for scope in () if query.steps else query.patterns:
+        found += _comparisons(scope.where, scope)
+    for stage in query.stages:
+        if isinstance(stage, b.WithStage):
+            found += _comparisons(stage.expressions, stage.after)
+    for step in query.steps:
+        found += _comparisons([*step.scope.where, *step.when], step.scope)
+    return list(dict.fromkeys(found))
+
+
+def compared_in_check(check: BoundCheck) -> list[Compared]:
+    """Return the comparisons with texts in a bound check, without duplicates."""
+    values = [check.formula, *(one.where for one in check.quantifiers if one.where is not None)]
+    values += [check.reset] if check.reset is not None else []
+    return list(dict.fromkeys(_comparisons([*values, *check.scope.where], check.scope)))
+
+
+def _comparisons(values: Iterable[b.Bound], scope: b.Scope) -> Iterator[Compared]:
+    for value in values:
+        for part in b.walk(value):
+            match part:
+                case b.BlockValue(scope=inner):
+                    yield from _comparisons(part.inside, inner)
+                case b.Operation(word="=" | "<>", operands=(left, right)):
+                    yield from _texts(left, (right,), scope)
+                    yield from _texts(right, (left,), scope)
+                case b.Operation(word="IN", operands=(operand, b.Choices(items=items))):
+                    yield from _texts(operand, items, scope)
+                case _:
+                    pass
+
+
+def _texts(attribute: b.Bound, values: Iterable[b.Bound], scope: b.Scope) -> Iterator[Compared]:
+    match attribute:
+        case b.NodeAttribute(node=node, attribute=about):
+            name = about.name
+            if name == "type" and (node in scope.nodes or node in scope.outer):
+                name = _type_of(scope.kinds(node))
+        case b.TraceAttribute(attribute=about):
+            name = f"trace.{about.name}"
+        case _:
+            return
+    if name in _TEXTS_OF:
+        for value in values:
+            if isinstance(value, b.Value) and isinstance(value.value, str):
+                yield name, value.value
+
+
+def _type_of(kinds: b.Kinds) -> str:
+    if "lane" not in kinds.every:
+        return "type_name"
+    return "type" if kinds.every & entity_kinds() else "lane_type"
+
+
+def notes_on(
+    compared: Iterable[Compared], query: str, parameters: Mapping[str, object], ask: Ask
+) -> tuple[str, ...]:
+    """Return notes about texts in a query that no value of the store equals.
+
+    Parameters
+    ----------
+    compared : iterable of (str, str)
+    query : str
+        Text of the query. Notes cover only texts that occur in it or in a parameter. The predicates of the
+        library name values, such as lane types, that few stores have.
+    parameters : mapping
+    ask : function
+        Function that runs a statement with its values and returns the rows.
+    """
+    written = f"{query} {[*parameters.values()]}"
+    return tuple(
+        _note(name, text, ask)
+        for name, text in compared
+        if text in written and not _there(name, text, ask)
+    )
+
+
+def _there(name: str, text: str, ask: Ask) -> bool:
+    there = Select(["1"], [nested(_all_values(name), "v")], ['"v"."value" = $1'], limit=1)
+    return bool(ask(there.text(), [text]))
+
+
+def _note(name: str, text: str, ask: Ask) -> str:
+    said = f"nothing in the store has the {name} {text!r}"
+    for other in _TEXTS_OF:
+        alike = other.startswith("trace.") == name.startswith("trace.") and other != name
+        if alike and other != "type" and _there(other, text, ask):
+            return f"{said}; it is a value of {other}"
+    # A difference in case is the smallest mistake.
+    near = 'levenshtein(lower("v"."value"), lower($1)), levenshtein("v"."value", $1), "v"."value"'
+    nearest = Select(['"v"."value"'], [nested(_all_values(name), "v")], order=[near], limit=1)
+    rows = ask(nearest.text(), [text])
+    return f"{said}; the nearest is {rows[0][0]!r}" if rows else f"{said}, or any"
+
+
+def _all_values(name: str) -> str:
+    """Return SQL for all values of an attribute."""
+    places = (
+        Select([f'{column} AS "value"'], [table], [f"({column}) IS NOT NULL", *where])
+        for column, table, *where in _TEXTS_OF[name]
+    )
+    return "\nUNION ALL\n".join(place.text() for place in places)

@@ -1,0 +1,677 @@
+"""Explanation of a failed match: the first part of a pattern that a graph does not have.
+
+Parts of bound patterns are printed in the query language, so users can paste them into a query. Nodes and
+edges without a name get one if the text needs it: ``lane`` for a lane, ``lane2`` for the second.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang.catalog import FRAME_ATTRIBUTES, DisplayUnit
+from sgstore.lang.memory import Binding, FrameView, NodePair, ScopeSearch, expression
+from sgstore.lang.operators import INFIX, ROUNDINGS
+from sgstore.lang.sql import TRACE_OF_FRAME, happened_in_frame, leaves, told_events
+from sgstore.model.pair_numbers import as_written
+from sgstore.model.vocabulary import EVENT_KINDS, KINDS, RELATIONS, SUPER_KINDS, entity_kinds
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    Ask = Callable[[str, list[object]], Sequence[tuple[Any, ...]]]
+
+
+_ESCAPES: Final = {"\\": "\\\\", "'": "\\'", "\n": "\\n", "\t": "\\t", "\r": "\\r"}
+
+
+def text_written(text: str) -> str:
+    """Return a text in quotes, with escapes."""
+    return "'" + "".join(_ESCAPES.get(letter, letter) for letter in text) + "'"
+
+
+def label_written(kinds: b.Kinds) -> str:
+    """Return the label for a set of kinds. It is empty if all kinds are allowed."""
+    if kinds == b.any_kinds():
+        return ""
+    if not kinds.other:
+        return "Ego" if kinds.ego == entity_kinds() else f"Ego&({_label(kinds.ego)})"
+    label = _label(kinds.other)
+    if kinds.ego == kinds.other & entity_kinds():
+        return label
+    if not kinds.ego:
+        return f"({label})&!Ego" if "|" in label else f"{label}&!Ego"
+    of_ego = "Ego" if kinds.ego == entity_kinds() else f"(Ego&({_label(kinds.ego)}))"
+    if kinds.ego >= kinds.other & entity_kinds():
+        return f"{label}|{of_ego}"
+    return f"(({label})&!Ego)|{of_ego}"
+
+
+def kind_label(kind: str) -> str:
+    """Return the label for a single kind."""
+    return _label(frozenset({kind}))
+
+
+def _label(kinds: frozenset[str]) -> str:
+    if kinds == frozenset(KINDS):
+        return "%"
+    groups = {name: frozenset(of) for name, of in SUPER_KINDS.items()}
+    whole = [name for name, of in groups.items() if of <= kinds and len(of) > 1]
+    whole = [n for n in whole if not any(groups[n] < groups[other] for other in whole)]
+    rest = kinds.difference(*(groups[name] for name in whole))
+    names = [*whole]
+    if "vehicle" in rest:  # as a label it means all vehicle kinds
+        others = groups["vehicle"] - rest
+        names.append(f"(Vehicle&!({'|'.join(_camel(k) for k in KINDS if k in others)}))")
+        rest -= groups["vehicle"]
+    return "|".join(_camel(name) for name in [*names, *(kind for kind in KINDS if kind in rest)])
+
+
+def _camel(name: str) -> str:
+    if not name.replace("_", "").isalnum() or not name.islower():
+        return name
+    return "".join(part.capitalize() for part in name.split("_"))
+
+
+class Writer:
+    """Writer of the parts of one pattern in the query language.
+
+    Parameters
+    ----------
+    scope : Scope
+        Scope of the whole pattern.
+    """
+
+    def __init__(self, scope: b.Scope) -> None:
+        self._names: dict[str, str] = {}
+        self._spoken_of: set[str] = set()
+        named: list[str] = []
+        for inner in _scopes(scope):
+            named += [key for key in inner.nodes if not key.startswith("#")]
+            named += [edge.key for edge in inner.edges if edge.named]
+            self._spoken_of |= _edges_spoken_of(inner)
+        self._taken = {*named, "ego", "env", "frame", "trace"}
+        for key in named:  # different blocks may use the same name
+            self._names[key] = key if "~" not in key else self._free(key.split("~")[0])
+
+    def _free(self, base: str) -> str:
+        name, number = base, 2
+        while name in self._taken:
+            name, number = f"{base}{number}", number + 1
+        self._taken.add(name)
+        return name
+
+    def name(self, key: str, kinds: b.Kinds | None = None) -> str:
+        """Return the name of a node or an edge."""
+        if key not in self._names:
+            every = kinds.every if kinds else frozenset[str]()
+            self._names[key] = self._free(next(iter(every)) if len(every) == 1 else "any")
+        return self._names[key]
+
+    # Patterns
+
+    def node(self, key: str, kinds: b.Kinds) -> str:
+        """Return a node as text, such as ``(lane:Lane)``."""
+        label = label_written(kinds)
+        return f"({self.name(key, kinds)}{':' if label else ''}{label})"
+
+    def edge(self, edge: b.Edge, scope: b.Scope) -> str:
+        """Return an edge as text, such as ``(e)-[:isIn]->(lane)``, without the labels of its nodes."""
+        ends = (f"({self.name(key, scope.kinds(key))})" for key in (edge.src, edge.dst))
+        return self._arrow(edge).join(ends)
+
+    def _arrow(self, edge: b.Edge) -> str:
+        some = [relation for relation in RELATIONS if relation in edge.relations]
+        label = "" if edge.relations == b.any_relation() else ":" + "|".join(some)
+        times = "" if edge.high == 1 else f"*{edge.low}..{edge.high}"
+        name = self.edge_name(edge.key) if edge.named or edge.key in self._spoken_of else ""
+        return f"-[{name}{label or (':%' if times else '')}{times}]{'-' if edge.both else '->'}"
+
+    def edge_name(self, key: str) -> str:
+        """Return the name of an edge."""
+        if key not in self._names:
+            self._names[key] = self._free("edge")
+        return self._names[key]
+
+    def block(self, scope: b.Scope) -> str:
+        """Return the text in the braces of a block."""
+        tests = [one for one in scope.where if isinstance(one, b.LabelTest)]
+        paths = [self.node(test.node, test.kinds) for test in tests]
+        said = {test.node for test in tests}.union(*((e.src, e.dst) for e in scope.edges))
+        # The own nodes differ from the outer nodes that the block uses.
+        paths += [f"({self.name(key)})" for key in sorted(set(scope.outer) - said)]
+        paths += [self.node(key, node.kinds) for key, node in scope.nodes.items()]
+        paths += [self.edge(edge, scope) for edge in scope.edges]
+        where = [self.expression(one, inner=True) for one in scope.where if one not in tests]
+        return ", ".join(paths) + (f" WHERE {' AND '.join(where)}" if where else "")
+
+    # Expressions
+
+    def expression(self, value: b.Bound, *, inner: bool = False) -> str:
+        """Return an expression as text. ``inner`` adds brackets where neighbouring operators need them."""
+        match value:
+            case b.Value():
+                return _constant(value, inner=inner)
+            case b.Choices(items=items):
+                return "[" + ", ".join(_constant(item, inner=False) for item in items) + "]"
+            case b.Operation():
+                return self._operation(value, inner=inner)
+            case b.BlockValue(word=word, scope=scope, value=told):
+                told_text = "" if told is None else f" | {self.expression(told)}"
+                return f"{word} {{{self.block(scope)}{told_text}}}"
+            case b.LabelTest(node=node, kinds=kinds):
+                return f"EXISTS {{{self.node(node, kinds)}}}"
+            case _:
+                return self._leaf(value)
+
+    def _leaf(self, value: b.Bound) -> str:
+        match value:
+            case b.NodeValue(node=node):
+                text = self.name(node)
+            case b.NodeAttribute(node=node, attribute=attribute):
+                text = f"{self.name(node)}.{attribute.name}"
+            case b.EdgeAttribute(edge=edge, attribute=attribute):
+                text = f"{self.edge_name(edge)}.{attribute.name}"
+            case b.EdgeRelation(edge=edge):
+                text = f"type({self.edge_name(edge)})"
+            case b.PairNumber(function=function, a=one, b=other):
+                text = as_written(function, self.name(one), self.name(other))
+            case b.Happened(kind=kind, nodes=nodes):
+                text = f"HAPPENS {kind}({', '.join(map(self.name, nodes))})"
+            case b.TraceAttribute(attribute=attribute):
+                text = f"trace.{attribute.name}"
+            case b.FrameAttribute():
+                text = _of_frame(value)
+            case _:
+                text = repr(value)
+        return text
+
+    def _operation(self, operation: b.Operation, *, inner: bool) -> str:
+        word, operands = operation.word, operation.operands
+        if word in ROUNDINGS:
+            return self.expression(operands[0], inner=inner)
+        if word == "IS NOT NULL" and isinstance(operands[0], b.NodeValue):
+            return f"known({self.expression(operands[0])})"
+        if word == "case":
+            *pairs, last = (self.expression(operand) for operand in operands)
+            cases = zip(pairs[::2], pairs[1::2], strict=True)
+            told = " ".join(f"WHEN {condition} THEN {value}" for condition, value in cases)
+            return f"CASE {told} ELSE {last} END"
+        if word not in INFIX and word not in {"IS NULL", "IS NOT NULL", "NOT", "negative"}:
+            return f"{word}({', '.join(self.expression(operand) for operand in operands)})"
+        parts = [self.expression(operand, inner=True) for operand in operands]
+        if word in INFIX:
+            text = f" {word} ".join(parts)
+        elif word in {"NOT", "negative"}:
+            text = f"{'NOT ' if word == 'NOT' else '-'}{parts[0]}"
+        else:
+            text = f"{parts[0]} {word}"
+        return f"({text})" if inner else text
+
+
+def _constant(value: b.Value, *, inner: bool) -> str:
+    constant = value.shown
+    if constant is None:
+        return "NULL"
+    if isinstance(constant, bool):
+        return str(constant).upper()
+    if isinstance(constant, str):
+        return text_written(constant)
+    return f"({constant!r})" if inner and constant < 0 else repr(constant)
+
+
+def _of_frame(value: b.FrameAttribute) -> str:
+    attribute = value.attribute
+    (abstraction,) = attribute.columns.values() if attribute.columns else ("",)
+    match attribute.unit:
+        case DisplayUnit.seen:
+            dataset = attribute.name.removeprefix(f"class_{abstraction} in ")
+            classes = f"frame.class('{abstraction}')"
+            return f"{classes} IN dataset_classes({text_written(dataset)})"
+        case DisplayUnit.counted:
+            return f"class_count('{abstraction}')"
+        case DisplayUnit.classed if attribute is not FRAME_ATTRIBUTES["class"]:
+            return f"frame.class('{abstraction}')"
+        case _:
+            return attribute.name if attribute.of_store else f"frame.{attribute.name}"
+
+
+def _scopes(scope: b.Scope) -> Iterator[b.Scope]:
+    yield scope
+    for block in _blocks(scope.where):
+        yield from _scopes(block.scope)
+
+
+def _blocks(conditions: Iterable[b.Bound]) -> Iterator[b.BlockValue]:
+    for condition in conditions:
+        for block in b.blocks_of(condition):
+            yield block
+            if block.value is not None:
+                yield from _blocks([block.value])
+
+
+def _edges_spoken_of(scope: b.Scope) -> set[str]:
+    values = [*scope.where, *(block.value for block in _blocks(scope.where) if block.value)]
+    return {edge for value in values for edge in b.edges_of(value)}
+
+
+# Explanation of a failed match: the first part that fails together with earlier parts
+# ------------------------------------------------------------------------------------------------
+# The parts of a pattern are tested in reading order: its nodes, each edge as soon as both its ends are bound,
+# then the conditions. So the result names one part, and the parts before it hold together.
+
+_WRITTEN_NUMBER: Final = re.compile(
+    r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|--[^\n]*|(?<![\w.])(\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"""
+)
+"""Texts and comments, which are skipped, and numbers."""
+
+
+def _beyond(sign: str, limit: float, value: float) -> float:
+    """Return a number with few digits for which a comparison with a value is true."""
+    if sign == "=":
+        return value
+    up = sign in {"<", "<="}
+    span = abs(value - limit) or abs(value) or 1.0
+    step = 10.0 ** math.floor(math.log10(span))
+    rounded = (math.ceil(value / step) if up else math.floor(value / step)) * step
+    if rounded == value and sign in {"<", ">"}:
+        rounded += step if up else -step
+    return round(rounded, 12)
+
+
+MOST_LOOKED_AT: Final = 10_000
+"""Largest number of bindings of the valid parts that are searched for the nearest match."""
+
+
+@dataclass(frozen=True, slots=True)
+class WhyNot:
+    """Longest part of a pattern that holds in a graph.
+
+    Attributes
+    ----------
+    held : tuple of str
+        Parts of the pattern that hold together, in reading order.
+    failed : str
+        First part that does not hold together with ``held``; empty if the whole pattern holds.
+    nearest : mapping of str to str
+        Binding for which the failed part is nearest to true, or a match if the whole pattern holds.
+    found : str
+        Actual facts: the values in the failed condition, the relations between the two nodes, or the kinds of
+        nodes in the graph.
+
+    All of them are text of the query language. ``held`` and ``failed`` can be used in queries, as patterns
+    after ``MATCH`` and as conditions after ``WHERE``.
+
+    ``gaps`` lists each false comparison with a number in the failed condition, for the nearest binding: the
+    comparison sign, the number in the query, and the actual value.
+    """
+
+    held: tuple[str, ...]
+    failed: str
+    nearest: Mapping[str, str]
+    found: str
+    gaps: tuple[tuple[str, float, float], ...] = ()
+
+    def relaxed(self, text: str) -> Iterator[tuple[int, int, str]]:
+        """Yield replacements for numbers in a query that could make the failed part true.
+
+        Each result is the start, the end and the new text. A number may occur several times in the query, so
+        the caller must test each replacement.
+
+        Parameters
+        ----------
+        text : str
+            Text of the query.
+        """
+        for sign, limit, value in self.gaps:
+            for found in _WRITTEN_NUMBER.finditer(text):
+                if found[1] is not None and float(found[1]) == abs(limit):
+                    new = _beyond(sign, limit, value)
+                    minus = limit < 0 and text[: found.start(1)].rstrip().endswith("-")
+                    if new >= 0 and not minus:
+                        yield found.start(1), found.end(1), f"{new:.12g}"
+                    elif minus:
+                        start = text[: found.start(1)].rstrip().rindex("-")
+                        yield start, found.end(1), f"{new:.12g}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the explanation as plain values."""
+        return {
+            "matches": not self.failed,
+            "held": list(self.held),
+            "failed": self.failed or None,
+            "nearest": dict(self.nearest),
+            "found": self.found or None,
+        }
+
+    def __str__(self) -> str:
+        lines = [f"holds   {part}" for part in self.held]
+        if self.failed:
+            lines.append(f"FAILS   {self.failed}")
+        if self.found:
+            lines.append(f"found   {self.found}")
+        if self.nearest:
+            named = (f"{name}.name = {text_written(node)}" for name, node in self.nearest.items())
+            bound = " AND ".join(named)
+            lines.append(f"{'nearest' if self.failed else 'with   '} {bound}")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True)
+class WhyNotSteps:
+    """Longest part of each sequence step that holds in one graph. Durations and order are ignored.
+
+    Attributes
+    ----------
+    texts : tuple of str
+        Text of each step.
+    steps : tuple of WhyNot
+        Explanation of each step, with its own bindings.
+    """
+
+    texts: tuple[str, ...]
+    steps: tuple[WhyNot, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the explanation as plain values."""
+        pairs = zip(self.texts, self.steps, strict=True)
+        return {"steps": [{"step": text, **step.as_dict()} for text, step in pairs]}
+
+    def __str__(self) -> str:
+        lines: list[str] = []
+        for number, (text, step) in enumerate(zip(self.texts, self.steps, strict=True), start=1):
+            lines += [f"step {number} of {len(self.steps)}: {text}"]
+            lines += [f"  {line}" for line in str(step).splitlines()]
+        return "\n".join(
+            [*lines, "what looks at other frames (FOR, THEN, EVENTUALLY …) is not asked"]
+        )
+
+
+def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
+    """Explain how far a bound pattern holds in a graph. For a sequence, explain each step."""
+    if not query.steps:
+        return _in_frame(query.first, query, view)
+    texts = (" ".join(text[step.span.start : step.span.end].split()) for step in query.steps)
+    steps = tuple(_in_frame(step.scope, query, view) for step in query.steps)
+    return WhyNotSteps(tuple(texts), steps)
+
+
+def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
+    scope, parts, writer = _nothing(asked), _parts(asked), Writer(asked)
+    held: list[str] = []
+    for part, wider in _growing(asked, scope, parts):
+        if not _first(wider, query, view):
+            return _failure(part, scope, query, view, writer, tuple(held))
+        scope = wider
+        held.append(_text(part, scope, writer))
+    at = _first(scope, query, view)
+    return WhyNot(tuple(held), "", _named(at, scope) if at else {}, "")
+
+
+def looked_up(query: b.Query) -> list[b.FrameAttribute]:
+    """Return the frame attributes of a query that only the store has: weather and user tables."""
+    found: dict[str, b.FrameAttribute] = {}
+
+    def look(scope: b.Scope) -> None:
+        for condition in scope.where:
+            for leaf in leaves(condition):
+                if isinstance(leaf, b.BlockValue):
+                    look(leaf.scope)
+                elif isinstance(leaf, b.FrameAttribute) and leaf.attribute.of_store:
+                    found[leaf.attribute.name] = leaf
+
+    for scope in (query.scope, *query.patterns):
+        look(scope)
+    return list(found.values())
+
+
+def events_in(query: b.Query, frame_id: int, ask: Ask) -> dict[str, list[NodePair]]:
+    """Return the events of a frame that a query uses, by kind, with the nodes involved.
+
+    Parameters
+    ----------
+    query : Query
+    frame_id : int
+    ask : function
+        Function that runs a statement with its values and returns the rows.
+
+    Returns
+    -------
+    dict
+        Kind, or name of a user table → nodes. Kinds that the trace does not record are omitted.
+    """
+    found: dict[str, list[NodePair]] = {}
+    for one in _happened_anywhere(query):
+        if one.table or frame_id >> TRACE_OF_FRAME in {
+            row[0] for row in ask(told_events(one.kind), [])
+        }:
+            pairs = ask(happened_in_frame(one), [frame_id])
+            found[one.kind] = [(pair[0], pair[1]) for pair in pairs]
+    return found
+
+
+def _happened_anywhere(query: b.Query) -> list[b.Happened]:
+    """Return the event tests of a query, one for each kind, with the largest number of nodes."""
+    found: dict[str, b.Happened] = {}
+
+    def look(scope: b.Scope) -> None:
+        for leaf in (leaf for condition in scope.where for leaf in leaves(condition)):
+            if isinstance(leaf, b.BlockValue):
+                look(leaf.scope)
+            elif isinstance(leaf, b.Happened):
+                most = "" if leaf.table else "a" * EVENT_KINDS[leaf.kind]
+                wider = leaf if leaf.table else replace(leaf, nodes=tuple(most))
+                known = found.get(leaf.kind, wider)
+                found[leaf.kind] = max(known, wider, key=lambda one: len(one.nodes))
+
+    for scope in (query.scope, *(step.scope for step in query.steps)):
+        look(scope)
+    return list(found.values())
+
+
+_Part = b.Node | b.Edge | b.Bound
+
+
+def _nothing(scope: b.Scope) -> b.Scope:
+    return b.Scope({}, scope.outer, (), (), frozenset())
+
+
+def _parts(scope: b.Scope) -> list[_Part]:
+    parts: list[_Part] = []
+    seen: set[str] = set()
+    edges = list(scope.edges)
+    for key, node in scope.nodes.items():
+        parts.append(node)
+        seen.add(key)
+        complete = [edge for edge in edges if {edge.src, edge.dst} <= seen]
+        edges = [edge for edge in edges if edge not in complete]
+        parts += complete
+    return [*parts, *edges, *scope.where]
+
+
+def _growing(whole: b.Scope, scope: b.Scope, parts: list[_Part]) -> Iterator[tuple[_Part, b.Scope]]:
+    """Yield each part, with the scope of all parts up to it."""
+    for part in parts:
+        if isinstance(part, b.Node):
+            scope = replace(scope, nodes={**scope.nodes, part.key: part})
+            distinct = frozenset(p for p in whole.distinct if set(p) <= set(scope.nodes))
+            scope = replace(scope, distinct=distinct)
+        elif isinstance(part, b.Edge):
+            scope = replace(scope, edges=(*scope.edges, part))
+        else:
+            scope = replace(scope, where=(*scope.where, part))
+        yield part, scope
+
+
+def _bindings(scope: b.Scope, query: b.Query, view: FrameView) -> Iterator[Binding]:
+    at = Binding(view)
+    search = ScopeSearch(scope, injective=query.injective)
+    for _ in search.run(at):
+        yield at
+
+
+def _first(scope: b.Scope, query: b.Query, view: FrameView) -> Binding | None:
+    return next(_bindings(scope, query, view), None)
+
+
+def _failure(
+    part: _Part,
+    scope: b.Scope,
+    query: b.Query,
+    view: FrameView,
+    writer: Writer,
+    held: tuple[str, ...],
+) -> WhyNot:
+    best, nearest, found = math.inf, dict[str, str](), ""
+    gaps: tuple[tuple[str, float, float], ...] = ()
+    if isinstance(part, b.Node):
+        at = _first(scope, query, view)
+        nearest = _named(at, scope) if at else {}
+        return WhyNot(held, _text(part, scope, writer), nearest, _population(view))
+    # A condition on an edge needs a bound edge. A scope without such conditions does not bind it.
+    edges = tuple(replace(edge, named=True) if edge.high == 1 else edge for edge in scope.edges)
+    for at in islice(_bindings(replace(scope, edges=edges), query, view), MOST_LOOKED_AT):
+        short = _apart(part, at) if isinstance(part, b.Edge) else shortfall(part, at, query)
+        if short < best or not found:
+            best, nearest = short, _named(at, scope)
+            between = isinstance(part, b.Edge)
+            found = _between(part, at, writer) if between else _values(part, at, query, writer)
+            gaps = () if between else tuple(_gaps(part, at, query))
+    return WhyNot(held, _text(part, scope, writer), nearest, found, gaps)
+
+
+def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str, float, float]]:
+    """Yield the false comparisons with a number in a condition: sign, number and actual value."""
+    for part in b.walk(condition):
+        match part:
+            case b.Operation(word=word, operands=(left, right)) if word in _COMPARED:
+                if isinstance(_constant_of(left), float):
+                    word, left, right = _MIRRORED[word], right, left
+                limit = _constant_of(right)
+                if limit is None or _value(part, at, query) is not False:
+                    continue
+                value = _value(left, at, query)
+                if isinstance(value, int | float) and not isinstance(value, bool):
+                    yield word, limit, float(value)
+            case _:
+                pass
+
+
+def _constant_of(value: b.Bound) -> float | None:
+    """Return the number of a constant expression, or None."""
+    match value:
+        case b.Value(shown=int() | float() as number) if not isinstance(number, bool):
+            return float(number)
+        case b.Operation(word="negative", operands=(b.Value(value=int() | float() as number),)):
+            return -float(number)
+        case _:
+            return None
+
+
+_MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "="}
+
+
+def shortfall(condition: b.Bound, at: Binding, query: b.Query) -> float:
+    """Return the distance of a condition from being true: 0 if it is true, inf if it is unknown."""
+    if _value(condition, at, query) is True:
+        return 0.0
+    match condition:
+        case b.Operation(word="AND", operands=operands):
+            return sum(shortfall(operand, at, query) for operand in operands)
+        case b.Operation(word="OR", operands=operands):
+            return min(shortfall(operand, at, query) for operand in operands)
+        case b.Operation(word=word, operands=(left, right)) if word in _COMPARED:
+            one, other = _value(left, at, query), _value(right, at, query)
+            numbers = all(isinstance(v, int | float) for v in (one, other))
+            return abs(one - other) if numbers else math.inf
+        case _:
+            return math.inf
+
+
+_COMPARED: Final = frozenset({"<", "<=", ">", ">=", "="})
+
+
+def _value(of: b.Bound, at: Binding, query: b.Query) -> Any:
+    return expression(of, injective=query.injective)(at)
+
+
+def _apart(edge: b.Edge, at: Binding) -> float:
+    """Return the distance between the ends of an edge, or inf if unknown."""
+    distance = at.view.pair("dist", at.nodes[edge.src], at.nodes[edge.dst])
+    return math.inf if distance is None else distance
+
+
+# Text of parts in the query language --------------------------------------------------------------------------
+
+
+def _text(part: _Part, scope: b.Scope, writer: Writer) -> str:
+    """Return a part as text in the query language, with names for unnamed nodes."""
+    if isinstance(part, b.Node):
+        return writer.node(part.key, part.kinds)
+    return writer.edge(part, scope) if isinstance(part, b.Edge) else writer.expression(part)
+
+
+def _named(at: Binding, scope: b.Scope) -> dict[str, str]:
+    """Return the names of the nodes bound to the named variables."""
+    return {
+        key: _name(at.view, at.nodes[key])
+        for key, node in scope.nodes.items()
+        if node.role == "named" and key in at.nodes
+    }
+
+
+def _name(view: FrameView, node: int) -> str:
+    return str(view.nodes[node].get("name", node))
+
+
+def _population(view: FrameView) -> str:
+    counts = Counter(attributes["kind"] for attributes in view.nodes.values())
+    found = [(kind_label(kind), counts[kind]) for kind in KINDS if counts[kind]]
+    return " AND ".join(f"COUNT {{(:{label})}} = {many}" for label, many in found)
+
+
+def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
+    """Return the relations between the ends of an edge in both directions, as text."""
+    src, dst = at.nodes[edge.src], at.nodes[edge.dst]
+    called = {src: writer.name(edge.src), dst: writer.name(edge.dst)}
+    ways = []
+    for one, other in ((src, dst), (dst, src)):
+        there = at.view.linked(edge).links.get((one, other), {})
+        if there:
+            relations = "|".join(relation for relation in RELATIONS if relation in there)
+            ways.append(f"({called[one]})-[:{relations}]->({called[other]})")
+    distance = at.view.pair("dist", src, dst)
+    apart = f"dist({called[src]}, {called[dst]}) = {distance:.4g}" if distance is not None else ""
+    if not ways:
+        nothing = f"NOT EXISTS {{({called[src]})--({called[dst]})}}"
+        ways, apart = (
+            [f"({name})" for name in called.values()],
+            " AND ".join(filter(None, [nothing, apart])),
+        )
+    return ", ".join(ways) + (f" WHERE {apart}" if apart else "")
+
+
+def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> str:
+    """Return the values in a condition, as text of the query language."""
+    texts: dict[str, str] = {}
+    for leaf in leaves(condition):
+        name = writer.expression(leaf)
+        if isinstance(leaf, b.NodeValue):
+            texts[name] = f"{name}.name = {text_written(_name(at.view, at.nodes[leaf.node]))}"
+        else:
+            texts[name] = _shown(name, _value(leaf, at, query))
+    return " AND ".join(texts.values())
+
+
+def _shown(name: str, value: Any) -> str:
+    """Return a value as text, such as ``e.speed = 5.697``."""
+    if value is None:
+        return f"{name} IS NULL"
+    if isinstance(value, bool):
+        return name if value else f"NOT {name}"
+    return f"{name} = {text_written(value) if isinstance(value, str) else f'{value:.4g}'}"

@@ -1,0 +1,5 @@
+"""Evaluation in memory: patterns and expressions over one graph."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

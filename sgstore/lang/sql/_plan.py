@@ -1,0 +1,382 @@
+"""Query plan: the phase of each condition, and the order of rows.
+
+The first phase works on bit masks, the second on single frames. A node that only the second phase needs is
+bound there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.base.quoting import quoted
+from sgstore.base.records import dataclass
+from sgstore.lang.bind import Profile
+from sgstore.lang.catalog import DisplayUnit
+from sgstore.lang.ir import (
+    BlockValue,
+    Bound,
+    EdgeAttribute,
+    EdgeRelation,
+    Happened,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    Query,
+    Scope,
+    TraceAttribute,
+    blocks_of,
+    nodes_of,
+    walk,
+)
+from sgstore.lang.sql._formulas import Leaf, Select, leaves, nested
+from sgstore.lang.sql._rewrite import counted_block, is_lasting, stands_alone
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.lang.catalog import Catalog
+    from sgstore.lang.ir import FrameAttribute
+    from sgstore.lang.sql._formulas import BoundValues
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Range of buckets from ``low`` up to, not including, ``high``. ``traces`` limits it to some traces."""
+
+    low: int
+    high: int
+    traces: tuple[int, ...] | None = None
+
+    @classmethod
+    def of(cls, extents: Sequence[tuple[int, int]]) -> Window:
+        """Return the window of whole traces, or of a part of one trace."""
+        low, high = min(first for first, _ in extents), max(first + many for first, many in extents)
+        traces = tuple(first >> TRACE_OF_BUCKET for first, _ in extents)
+        return cls(low, high, traces if len(traces) > 1 else None)
+
+    def whole(self, extents: Iterable[tuple[int, int]]) -> Window:
+        """Return the window as a plain range if no other trace begins inside it."""
+        if self.traces is None:
+            return self
+        many = sum(self.low <= first < self.high for first, _ in extents)
+        return Window(self.low, self.high) if many == len(self.traces) else self
+
+    def __contains__(self, bucket: int) -> bool:
+        inside = self.low <= bucket < self.high
+        return inside and (self.traces is None or bucket >> TRACE_OF_BUCKET in self.traces)
+
+
+@dataclass(frozen=True, slots=True)
+class Gathered:
+    """Temporary table of a statement, with matches that were computed outside the database.
+
+    Attributes
+    ----------
+    name : str
+    types : mapping of str to str
+        Database type of each column.
+    block : function
+        Function that returns the columns of the matches in a window of whole traces.
+    """
+
+    name: str
+    types: Mapping[str, str]
+    block: Callable[[Window | None], list[list[Any]]]
+
+
+@dataclass(frozen=True, slots=True)
+class SharedRelation:
+    """Relation shared by parts of a statement: masks of the first phase, or known matches.
+
+    Attributes
+    ----------
+    name : str
+    nodes, edges : frozenset of str
+        Keys bound by the relation.
+    told : mapping of FrameAttribute to str
+        Extra values and their columns.
+    runs : bool
+        True if a row stands for all frames from ``first`` to ``last`` of a bucket, instead of for one frame.
+    """
+
+    name: str
+    nodes: frozenset[str]
+    edges: frozenset[str]
+    told: Mapping[FrameAttribute, str] = field(default_factory=dict["FrameAttribute", str])
+    runs: bool = False
+
+    def frames(self, alias: str) -> str:
+        """Return the relation for ``FROM``, with one row for each frame."""
+        if not self.runs:
+            return f"{quoted(self.name)} AS {quoted(alias)}"
+        every = ['unnest(range("first", "last" + 1)) AS "frame_id"', '* EXCLUDE ("first", "last")']
+        return nested(Select(every, [quoted(self.name)]).text(), alias)
+
+
+@dataclass(slots=True)
+class Phases:
+    """Conditions of a scope, grouped by the way they are evaluated.
+
+    Attributes
+    ----------
+    blocks : list
+        ``EXISTS``, ``NOT EXISTS`` and comparisons of ``COUNT`` with a number: evaluated by masks.
+    single : dict
+        Conditions on attributes of a single node, by node: evaluated by masks.
+    lane : dict
+        Conditions on attributes of a single edge, by edge: evaluated by masks.
+    direct : list
+        Conditions on node ids, relations and constants: evaluated in the join of the edges.
+    alone : list of BlockValue
+        Blocks that become their own relations and are joined as edges.
+    happened : list of Happened
+        Required events: joined as edges.
+    trace : list
+        Conditions on the trace: evaluated for the bucket.
+    rest : list
+        Conditions evaluated in the second phase.
+    late : set of str
+        Nodes bound in the second phase.
+    empty : bool
+        True if the first phase has no conditions.
+    """
+
+    blocks: list[Bound] = field(default_factory=list[Bound])
+    single: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
+    lane: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
+    direct: list[Bound] = field(default_factory=list[Bound])
+    alone: list[BlockValue] = field(default_factory=list[BlockValue])
+    happened: list[Happened] = field(default_factory=list[Happened])
+    trace: list[Bound] = field(default_factory=list[Bound])
+    rest: list[Bound] = field(default_factory=list[Bound])
+    late: set[str] = field(default_factory=set[str])
+    empty: bool = False
+
+
+def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
+    """Group the conditions of a scope by the way they are evaluated."""
+    parts = Phases()
+    for condition in scope.where:
+        if stands_alone(condition, catalog):
+            parts.alone.append(condition)
+        else:
+            _file(condition, parts)
+    parts.late = set(_late(scope, parts, query, catalog))
+    for key in parts.late & set(parts.single):
+        parts.rest += parts.single.pop(key)
+    parts.rest += [c for c in parts.direct if nodes_of(c) & parts.late]
+    parts.direct = [c for c in parts.direct if not nodes_of(c) & parts.late]
+    tied = scope.outer or scope.edges or parts.blocks or parts.happened or parts.alone
+    first = tied or set(scope.nodes) - parts.late
+    parts.empty = bool(parts.late) and not first
+    if parts.empty:
+        parts.rest += parts.trace + parts.direct
+        parts.trace, parts.direct = [], []
+    return parts
+
+
+def _file(condition: Bound, parts: Phases) -> None:
+    if is_masked(condition):
+        parts.blocks.append(condition)
+        return
+    if isinstance(condition, Happened):
+        parts.happened.append(condition)
+        return
+    found = set(leaves(condition))
+    if all(_is_direct(leaf) for leaf in found):
+        parts.direct.append(condition)
+    elif any(
+        isinstance(leaf, NodeAttribute | EdgeAttribute)
+        and leaf.attribute.unit in {DisplayUnit.role, DisplayUnit.own, DisplayUnit.inside}
+        for leaf in found
+    ):
+        parts.rest.append(condition)
+    elif all(isinstance(leaf, NodeAttribute) for leaf in found) and len(nodes_of(condition)) == 1:
+        parts.single.setdefault(next(iter(nodes_of(condition))), []).append(condition)
+    elif all(isinstance(leaf, TraceAttribute) for leaf in found):
+        parts.trace.append(condition)
+    elif (edge := _edge_alone(found)) is not None and not _of_null(condition):
+        parts.lane.setdefault(edge, []).append(condition)
+    else:
+        parts.rest.append(condition)
+
+
+def is_masked(condition: Bound) -> bool:
+    """True if a condition is ``EXISTS`` or ``NOT EXISTS``, or compares a count with a number."""
+    match condition:
+        case BlockValue(word="EXISTS") | Operation("NOT", (BlockValue(word="EXISTS"),)):
+            return True
+        case _:
+            return counted_block(condition) is not None
+
+
+def _is_direct(leaf: Leaf) -> bool:
+    match leaf:
+        case NodeValue() | EdgeRelation():
+            return True
+        case NodeAttribute(attribute=attribute):
+            return attribute.unit is DisplayUnit.binding
+        case _:
+            return False
+
+
+def _edge_alone(found: set[Leaf]) -> str | None:
+    edges = {leaf.edge if isinstance(leaf, EdgeAttribute) else None for leaf in found}
+    return edges.pop() if len(edges) == 1 else None
+
+
+def _of_null(condition: Bound) -> bool:
+    """True if a condition may be true for a missing row, as of an edge without attributes."""
+    return any(
+        isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce", "case"}
+        for part in walk(condition)
+    )
+
+
+def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterator[str]:
+    """Yield nodes to bind in the second phase: without edges or blocks, but used in values.
+
+    Otherwise, all states would be grouped into masks and then expanded again.
+    """
+    bound_nodes = {key for edge in scope.edges for key in (edge.src, edge.dst)}
+    bound_nodes |= {key for one in parts.happened for key in one.nodes}
+    compared = {key for condition in parts.rest for key in nodes_of(condition)}
+    whole = scope is query.scope
+    alone = whole and len(scope.nodes) == 1
+    if whole:
+        told = (leaf for value in query.result.values for leaf in leaves(value))
+        fleeting = (leaf for leaf in told if not is_lasting(leaf, scope, catalog))
+        compared |= {key for leaf in fleeting for key in nodes_of(leaf)}
+    spoken_of = blocked(query)
+    for key in scope.nodes:
+        profile = Profile.of(scope.kinds(key), catalog)
+        if profile.fixed or profile.mapped or key in bound_nodes or key in spoken_of:
+            continue
+        if alone or key in compared:
+            yield key
+
+
+def blocked(query: Query) -> frozenset[str]:
+    """Return outer nodes that blocks use, anywhere in a query."""
+    return frozenset(_blocked((*query.scope.where, *query.result.values)))
+
+
+def _blocked(expressions: tuple[Bound, ...]) -> Iterator[str]:
+    for expression in expressions:
+        for block in blocks_of(expression):
+            yield from block.scope.outer
+            yield from _blocked(block.inside)
+
+
+def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]]:
+    """Return ids of the selected traces (None means all), and of traces that cannot answer."""
+    chosen = None
+    if query.ego is not None:
+        chosen = {trace.trace_id for trace in catalog.traces if trace.ego == query.ego}
+    if catalog.only is not None:
+        chosen = set(catalog.only) if chosen is None else chosen & catalog.only
+    left: set[int] = set()
+    if not query.unknown_is_false:
+        left = {t.trace_id for t in catalog.traces if not query.relations <= t.answers}
+        left |= catalog.unknowing
+    return (None if chosen is None else chosen - left), left
+
+
+def apart(scope: Scope, nodes: set[str], new: set[str]) -> Iterator[tuple[str, str]]:
+    """Yield pairs of bound nodes that must differ, with at least one newly bound node.
+
+    Pairs with disjoint kinds differ anyway and are omitted.
+    """
+    for a, b in sorted(scope.distinct):
+        if {a, b} <= nodes and {a, b} & new:
+            one, other = scope.kinds(a), scope.kinds(b)
+            if (one & other).every:
+                yield a, b
+
+
+# Default order of traces: by name, ``run2`` before ``run10`` ----
+# Trace ids are digests, so their order has no meaning. A catalog has its traces in order (see
+# :attr:`sgstore.lang.catalog.Catalog.traces`). Rows are sorted by the index of their trace in the catalog,
+# never by name.
+
+TRACE_OF_BUCKET: Final = 18
+"""``bucket >> 18`` is the trace id of a bucket."""
+
+TRACE_OF_FRAME: Final = 24
+"""``frame_id >> 24`` is the trace id of a frame. The lower bits are its position in the trace."""
+
+
+def extents(catalog: Catalog) -> list[tuple[int, int]]:
+    """Return the first bucket and number of buckets of each trace, in trace order."""
+    return [trace.extent for trace in catalog.traces]
+
+
+def frame_key(
+    select: Select, frame: str, catalog: Catalog, window: Window | None, values: BoundValues
+) -> str:
+    """Return the sort key for frames: by trace order, then by frame order.
+
+    The key is one number, which sorts fastest: the frame id, with the index of the trace instead of its id.
+    If the ids are already in trace order, the key is the frame id.
+
+    Parameters
+    ----------
+    select : Select
+        Statement to which the indexes of the traces are joined.
+    frame : str
+        Column of the frame id.
+    catalog : Catalog
+    window : Window or None
+        Window of the statement.
+    values : BoundValues
+        Bound values of the statement.
+    """
+    order = [trace.trace_id for trace in catalog.traces]
+    if window is not None:
+        low, high = window.low >> TRACE_OF_BUCKET, (window.high - 1) >> TRACE_OF_BUCKET
+        chosen = range(low, high + 1) if window.traces is None else set(window.traces)
+        order = [trace for trace in order if trace in chosen]
+    if order == sorted(order):
+        return frame
+    firsts = [place << TRACE_OF_FRAME for place in range(len(order))]
+    _join(select, ":order", ("BIGINT", order), firsts, f"{frame} >> {TRACE_OF_FRAME}", values)
+    return f'":order".":first" + ({frame} & {(1 << TRACE_OF_FRAME) - 1})'
+
+
+def name_key(
+    select: Select, number: int, column: str, catalog: Catalog, values: BoundValues
+) -> str:
+    """Return the sort key that replaces a column with trace names.
+
+    Parameters
+    ----------
+    select : Select
+        Statement to which the indexes of the traces are joined.
+    number : int
+        Number that makes this key unique in the statement.
+    column : str
+    catalog : Catalog
+    values : BoundValues
+        Bound values of the statement.
+    """
+    names, alias = [trace.name for trace in catalog.traces], f":order {number}"
+    _join(select, alias, ("VARCHAR", names), list(range(len(names))), column, values)
+    return f'"{alias}".":first"'
+
+
+def _join(
+    select: Select,
+    alias: str,
+    known: tuple[str, Sequence[int | str]],
+    firsts: list[int],
+    column: str,
+    values: BoundValues,
+) -> None:
+    """Join a number to each row, by the value of a column."""
+    kind, keys = known
+    text = (
+        f'SELECT unnest(CAST({values.add(list(keys))} AS {kind}[])) AS ":trace",'
+        f' unnest(CAST({values.add(firsts)} AS BIGINT[])) AS ":first"'
+    )
+    select.join(nested(text, alias), [f'"{alias}".":trace" = {column}'], "LEFT JOIN")

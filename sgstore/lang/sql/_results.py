@@ -1,0 +1,860 @@
+"""SQL of results: rows, frames, intervals, clips and counts.
+
+A node id is unique within a trace, or, if negative, within a map. So an entity is identified by trace and id,
+a part of a map by map and id. Traces may share a map.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.base.quoting import quoted
+from sgstore.lang.bind import Profile
+from sgstore.lang.catalog import (
+    FRAME_ATTRIBUTES,
+    NODE_ATTRIBUTES,
+    TRACE_ATTRIBUTES,
+    Attribute,
+    Catalog,
+    DisplayUnit,
+    Type,
+)
+from sgstore.lang.ir import (
+    CLIP_COLUMNS,
+    FRAME_COLUMNS,
+    INTERVAL_COLUMNS,
+    Aggregate,
+    Bound,
+    EdgeRelation,
+    FrameAttribute,
+    GroupKey,
+    NodeAttribute,
+    NodeValue,
+    Operation,
+    Query,
+    Result,
+    ReturnColumn,
+    Sampling,
+    TraceAttribute,
+    Value,
+    is_counted,
+    is_passed_on,
+    passed_values,
+    walk,
+    with_operands,
+)
+from sgstore.lang.sql._formulas import (
+    Leaf,
+    Select,
+    column_of,
+    columns_of,
+    expression_text,
+    frame_text,
+    leaves,
+    nested,
+    owner_text,
+    seconds_text,
+)
+from sgstore.lang.sql._frames import frames as frames_of
+from sgstore.lang.sql._frames import in_masks, masks, phases
+from sgstore.lang.sql._masks import SqlBuilder, number_of_frames
+from sgstore.lang.sql._plan import TRACE_OF_BUCKET, frame_key, name_key, traces_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from sgstore.lang.sql._plan import Gathered, Window
+
+
+_TRACE_KEYS: Final = (TRACE_ATTRIBUTES["id"], TRACE_ATTRIBUTES["name"], FRAME_ATTRIBUTES["id"])
+"""Attributes that identify the trace, and therefore the owner of node ids."""
+
+
+OWNER: Final = Attribute("owner", Type.number, {}, "whose number the node id is", DisplayUnit.owner)
+"""Owner of a node id, which distinguishes nodes of several traces: the trace of an entity, or the map of a
+map part. Traces may share a map. Queries cannot use this attribute."""
+
+
+def owner_of(node: str) -> NodeAttribute:
+    """Return the owner attribute of a node: a trace or a map."""
+    return NodeAttribute(node, OWNER, Type.number)
+
+
+def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[NodeAttribute]:
+    """Return the owners needed to distinguish the nodes in some values.
+
+    Empty if only one trace is searched, or if a value identifies the trace.
+    """
+    values = list(values)
+    if _tells_trace(values) or not _several(query, catalog):
+        return []
+    return list(dict.fromkeys(owner_of(v.node) for v in values if isinstance(v, NodeValue)))
+
+
+def with_owners(result: Result) -> Result:
+    """Return a result with extra columns: the owner of each returned node, if rows have no frame."""
+    if result.names:
+        return result
+    owners = (
+        ReturnColumn(f":owner {place}", owner_of(column.value.node))
+        for place, column in enumerate(result.columns)
+        if isinstance(column.value, NodeValue)
+    )
+    return replace(result, columns=(*result.columns, *owners))
+
+
+def counted_apart(query: Query, catalog: Catalog) -> Query:
+    """Return a query in which ``COUNT(DISTINCT v)`` counts nodes separately for each trace or map."""
+    keys = [column.value for column in query.result.columns]
+    if _tells_trace(keys) or not _several(query, catalog):
+        return query
+    return replace(query, result=query.result.changed(_apart))
+
+
+def _apart(value: Bound) -> Bound:
+    match value:
+        case Aggregate(distinct=True, operand=NodeValue(node=node) as operand):
+            whose = Operation("whose", (operand, owner_of(node)), Type.node)
+            return replace(value, operand=whose)
+        case _:
+            return with_operands(value, _apart)
+
+
+def _tells_trace(keys: Iterable[Bound]) -> bool:
+    return any(
+        isinstance(k, FrameAttribute | TraceAttribute) and k.attribute in _TRACE_KEYS for k in keys
+    )
+
+
+def _several(query: Query, catalog: Catalog) -> bool:
+    if catalog.part:  # other parts have traces, too
+        return True
+    chosen, _ = traces_of(query, catalog)
+    return len(catalog.traces if chosen is None else chosen) != 1
+
+
+# Runs of frames from masks ----------------------------------------------------------------------
+# A frame *continues* a run if the same keys hold in the frame before it, without a gap in the recording
+# between the two (``bucket.joined``). A frame of a mask that continues no run is the first of a run. A frame
+# that no frame continues is the last. So runs are found bucket by bucket, and only their ends are read as
+# frames.
+
+FIRST, OWNER_KEY, TOP_OWNER = ":first frame", ":owner", ":top owner"
+"""Extra columns of intervals with ``keyed``: the id of the first frame, and the owners of the nodes used as
+sampling keys."""
+
+_LAST: Final = 59
+"""Bit of the last frame of a bucket."""
+
+
+def runs(masks: str, keys: list[str], apart: list[str]) -> str:
+    """Return SQL for the longest runs of consecutive frames of a trace with the same keys.
+
+    Parameters
+    ----------
+    masks : str
+        Relation with the columns ``bucket``, ``mask`` and the key columns. Each bucket and combination of
+        keys occurs once.
+    keys : list of str
+        Quoted key columns.
+    apart : list of str
+        Key columns that can differ within a trace.
+
+    Returns
+    -------
+    str
+        Relation with the key columns, ``":from"`` and ``":to"``: ids of the first and the last frame.
+    """
+    trace = f'"bucket" >> {TRACE_OF_BUCKET}'
+    same = f'PARTITION BY {", ".join([trace, *apart])} ORDER BY "bucket"'
+    joined = Select(['":masks".*', '":bucket"."joined"'])
+    joined.join(nested(masks, ":masks"), [])
+    joined.join('"bucket" AS ":bucket"', ['":bucket"."bucket" = ":masks"."bucket"'])
+
+    beside = Select(["*"], [nested(joined.text(), ":joined")])
+    beside.columns += [
+        f'CASE WHEN lag("bucket") OVER ({same}) = "bucket" - 1'
+        f' THEN lag("mask") OVER ({same}) >> {_LAST} ELSE 0 END AS "before"',
+        f'CASE WHEN lead("bucket") OVER ({same}) = "bucket" + 1'
+        f' THEN lead("mask" & "joined") OVER ({same}) & 1 ELSE 0 END AS "after"',
+    ]
+    going = Select(["*"], [nested(beside.text(), ":beside")])
+    going.columns.append('"mask" & "joined" & (("mask" << 1) | "before") AS "going"')
+
+    ends = Select(['"bucket"', *keys], [nested(going.text(), ":going")])
+    ends.columns.append('"mask" & ~"going" AS "firsts"')
+    ends.columns.append(f'"mask" & ~(("going" >> 1) | ("after" << {_LAST})) AS "lasts"')
+
+    last = f'CASE WHEN "lasts" <> 0 THEN {_first_of("lasts")} END'
+    following = f"OVER ({same} ROWS BETWEEN 1 FOLLOWING AND UNBOUNDED FOLLOWING)"
+    later = Select(["*", f'min({last}) {following} AS "later"'], [nested(ends.text(), ":ends")])
+
+    from_here = Select([*keys, '"later"', '"bucket" * 64 + ":bit"."bit" AS ":from"'])
+    from_here.columns += ['"bucket"', '"lasts" & ~(":bit"."m" - 1) AS "lasts"']
+    from_here.join(nested(later.text(), ":later"), [])
+    from_here.join('"bits" AS ":bit"', ['("firsts" & ":bit"."m") <> 0'])
+
+    to = f'CASE WHEN "lasts" <> 0 THEN {_first_of("lasts")} ELSE "later" END AS ":to"'
+    return Select([*keys, '":from"', to], [nested(from_here.text(), ":from here")]).text()
+
+
+def _first_of(mask: str) -> str:
+    """Return the SQL of the first frame of a mask: its lowest bit."""
+    return f'"bucket" * 64 + bit_count(("{mask}" & -"{mask}") - 1)'
+
+
+# Statements for the results of a query -------------------------------------------------------------
+# Rows are sorted by trace, frame and binding, unless the query has an order. An *interval* is a longest run
+# of consecutive frames of one trace with the same binding. A gap of more than 2.5 median periods ends it.
+
+CONSTANTS: Final = """
+SELECT node_id, ident, type_name, lifetime, {parked} AS parked FROM inside.entity WHERE trace_id = ?
+"""
+"""Constants of the entities of a trace that are not stored with frames."""
+
+LOG_TIME: Final = "log_time_ns"
+
+_NAME: Final = NODE_ATTRIBUTES["name"]
+_TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
+_FRAME: Final = '":frame"'
+_TRACE: Final = '":trace"'
+_ROWS: Final = '":rows"'
+_T: Final = seconds_text('{0} - ":trace"."start_ns"')
+
+
+@dataclass(frozen=True, slots=True)
+class SqlStatement:
+    """SQL with its bound values, column names and temporary tables.
+
+    Attributes
+    ----------
+    stages : tuple of (str, str)
+        Named relations that ``last`` uses. A relation may use earlier ones. ``sql`` combines all of them in
+        one statement.
+    last : str
+    """
+
+    sql: str
+    values: tuple[Any, ...]
+    columns: tuple[str, ...]
+    gathered: tuple[Gathered, ...] = ()
+    stages: tuple[tuple[str, str], ...] = ()
+    last: str = ""
+
+    def steps(self) -> list[tuple[str, dict[str, Any]]]:
+        """Return separate statements with their values: a temporary table for each stage, then the last.
+
+        The result is the same as that of ``sql``. But the database plans each step with the exact number of
+        rows of earlier steps. In one statement, it estimated 40 million rows for a pattern with 180, and
+        chose a slow join.
+        """
+        made = [
+            f"CREATE OR REPLACE TEMP TABLE {quoted(name)} AS {body}" for name, body in self.stages
+        ]
+        return [(text, self._bound(text)) for text in (*made, self.last or self.sql)]
+
+    def _bound(self, text: str) -> dict[str, Any]:
+        """Return the values bound by a part of the statement."""
+        numbers = {found[1] for found in _BOUND.finditer(text) if found[1]}
+        return {number: self.values[int(number) - 1] for number in sorted(numbers)}
+
+
+_BOUND: Final = re.compile(r"""'(?:[^']|'')*'|"(?:[^"]|"")*"|\$(\d+)""")
+"""Quoted text or name, or number of a bound value."""
+
+Span = tuple[Leaf, Leaf]
+"""Values of the first and the last ``frame_id`` of a match over several frames."""
+
+
+def names_of(query: Query) -> tuple[str, ...]:
+    """Return the names of the result columns of a query."""
+    result, scope = query.result, query.scope
+    names = list(result.names)
+    if result.form == "rows" and result.whole:
+        for key, node in scope.nodes.items():
+            if node.role == "named":
+                names += [f"{key}.id" if key in result.names else key, f"{key}.name"]
+        names += [edge.key for edge in scope.edges if edge.named]
+    return (*names, *(column.name for column in result.columns))
+
+
+def rows(
+    query: Query,
+    catalog: Catalog,
+    window: Window | None = None,
+    writer: SqlBuilder | None = None,
+    span: Span | None = None,
+) -> SqlStatement:
+    """Return the SQL for the results of a query, in any form.
+
+    Parameters
+    ----------
+    query : Query
+    catalog : Catalog
+    window : Window, optional
+    writer : SqlBuilder, optional
+        Builder with the matches. The default searches the pattern.
+    span : Span, optional
+        Span values, for a query whose matches are intervals.
+    """
+    if query.result.form in {"intervals", "clips"}:
+        return intervals(query, catalog, window, writer, span)
+    query = counted_apart(_spelled(query, catalog), catalog)
+    return _RowStatement(query, writer or SqlBuilder(query, catalog, window)).statement()
+
+
+def frames(
+    query: Query, catalog: Catalog, window: Window | None = None, writer: SqlBuilder | None = None
+) -> SqlStatement:
+    """Return the SQL for the matching frames, without duplicates, with their log times."""
+    writer = writer or SqlBuilder(query, catalog, window)
+    relation = frames_of(writer, query.scope, None, frozenset())
+    outputs = [*_frame_columns(), (LOG_TIME, f'{_FRAME}."{LOG_TIME}"')]
+    select = Select([_named(text, name) for name, text in outputs])
+    _from_frames(select, relation)
+    frame = f'{_ROWS}."frame_id"'
+    select.order = [frame_key(select, frame, catalog, window, writer.values)]
+    return finished(writer, select.text(), [name for name, _ in outputs])
+
+
+def count(
+    query: Query, catalog: Catalog, window: Window | None = None, writer: SqlBuilder | None = None
+) -> SqlStatement:
+    """Return the SQL for the number of matching frames."""
+    told, writer = writer is not None, writer or SqlBuilder(query, catalog, window)
+    parts = phases(writer, query.scope)
+    if parts.rest or parts.late or told:
+        relation = frames_of(writer, query.scope, None, frozenset())
+        text = Select(['count(*) AS "frames"'], [nested(relation, ":rows")]).text()
+    else:
+        text = number_of_frames(masks(writer, query.scope, parts, None, frozenset()))
+    return finished(writer, text, ("frames",))
+
+
+def intervals(
+    query: Query,
+    catalog: Catalog,
+    window: Window | None = None,
+    writer: SqlBuilder | None = None,
+    span: Span | None = None,
+) -> SqlStatement:
+    """Return the SQL for intervals in which the returned values stay the same."""
+    query = _spelled(query, catalog)
+    return _IntervalStatement(query, writer or SqlBuilder(query, catalog, window), span).statement()
+
+
+def about_frame(attributes: Sequence[FrameAttribute]) -> str:
+    """Return SQL for attributes of one frame, selected by its id: one row."""
+    texts = [frame_text(one, _FRAME, _TRACE, '":map"') for one in attributes]
+    select = Select(
+        [f"{text} AS {quoted(column_of(a))}" for text, a in zip(texts, attributes, strict=True)]
+    )
+    select.join(f'"frame" AS {_FRAME}', [])
+    select.where.append(f'{_FRAME}."frame_id" = ?')
+    return select.text()
+
+
+def with_bindings(query: Query) -> Query:
+    """Return a query for intervals with the bindings and the names of bound nodes as columns."""
+    columns: list[ReturnColumn] = []
+    for node in query.scope.nodes.values():
+        if node.role == "named":
+            columns.append(ReturnColumn(node.key, NodeValue(node.key)))
+            columns.append(
+                ReturnColumn(f"{node.key}.name", NodeAttribute(node.key, _NAME, Type.text))
+            )
+    columns += [ReturnColumn(e.key, EdgeRelation(e.key)) for e in query.scope.edges if e.named]
+    return replace(query, result=Result(form="intervals", columns=tuple(columns), whole=False))
+
+
+def told_apart_by(query: Query) -> list[FrameAttribute]:
+    """Return values passed by ``WITH`` that distinguish the rows of a query."""
+    result = query.result
+    if result.whole:
+        return [one.value for one in result.columns if is_passed_on(one.value)]
+    return [] if result.distinct or result.framed else [*passed_values(query)]
+
+
+class _RowStatement:
+    """Builder of the SQL for results in rows."""
+
+    def __init__(self, query: Query, writer: SqlBuilder) -> None:
+        self.query, self.result = query, query.result
+        self.writer = writer
+        scope = query.scope
+        counted = not self.result.distinct and not self.result.framed
+        roles = {"named", "unnamed"} if counted and not self.result.whole else {"named"}
+        self.nodes = frozenset(k for k, node in scope.nodes.items() if node.role in roles)
+        self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
+        if (
+            query.stages and writer.found is not None
+        ):  # variables that WITH does not pass on count too
+            self.nodes, self.edges = writer.found.nodes, writer.found.edges
+        if self.result.framed or self.result.distinct:
+            self.nodes, self.edges = frozenset(), frozenset()
+        if self.result.whole:
+            self.nodes = frozenset(k for k, n in scope.nodes.items() if n.role == "named")
+            self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
+        # A row stands for several frames.
+        listed = self.result.framed or self.result.whole
+        self.grouped = (self.result.distinct or self.result.aggregated) and not listed
+        # Sampling keys, and keys of ``LIMIT … PER``.
+        self.owners, self.top_owners = (
+            [] if per is None else owners_of([per], query, writer.catalog)
+            for per in (_per(self.result, one) for one in (self.result.sample, self.result.top))
+        )
+        self.texts = dict[str, str]()  # SQL of the grouping columns
+        # 32-bit numbers are grouped by value, and shown with their shortest decimal text.
+        self.shortened = {
+            quoted(column.name): _named(shortest_text(quoted(column.name)), column.name)
+            for column in self.result.columns
+            if column.single and self.grouped
+        }
+        # Values passed by WITH also distinguish matches.
+        self.passed = told_apart_by(query)
+
+    def statement(self) -> SqlStatement:
+        values = [column.value for column in self.result.columns]
+        keys = [c.value for c in self.result.columns if not _aggregates(c)]
+        apart: list[NodeAttribute] = []
+        if self.grouped:
+            apart = owners_of(keys, self.query, self.writer.catalog)
+        values += apart
+        values += self.result.values[len(self.result.columns) :]
+        values += self.owners + self.top_owners
+        values += [name for _, name in self._names()]
+        wanted = [leaf for value in values for leaf in leaves(value)]
+        wanted += self.passed
+        relation = frames_of(self.writer, self.query.scope, None, self.nodes, self.edges, wanted)
+        if any(in_order(part) for value in values for part in walk(value)):
+            relation = self._placed(relation)
+        outputs = self._outputs()
+        names = [name for name, _ in outputs]
+        select = Select([_named(text, name) for name, text in outputs])
+        if self.result.whole or self.result.framed:
+            _from_frames(select, relation)
+        else:
+            select.join(nested(relation, ":rows"), [])
+        select.distinct = self.result.distinct or self.result.framed
+        if self.result.aggregated:
+            listed = enumerate(self.result.columns, start=1)
+            select.group = [str(place) for place, column in listed if not _aggregates(column)]
+            select.group += [_column(owner) for owner in dict.fromkeys([*apart, *self.top_owners])]
+            if self.result.having is not None:
+                select.having.append(self._text(self.result.having))
+        tops = self._tops()
+        select.columns += [f"{text} AS {quoted(name)}" for name, text in tops.items()]
+        if apart and not self.result.aggregated:
+            select = _told_apart(select, [*names, *tops], apart)
+        text = self._ordered(select, list(map(quoted, names)), list(map(quoted, tops)))
+        return finished(self.writer, text, tuple(names))
+
+    def _tops(self) -> dict[str, str]:
+        """Return the extra columns for ``LIMIT … PER``."""
+        top = self.result.top
+        per = [] if top is None or top.per is None or isinstance(top.per, str) else [top.per]
+        values = [*per, *self.top_owners]
+        return {f":top {number}": self._text(value) for number, value in enumerate(values)}
+
+    def _placed(self, relation: str) -> str:
+        """Return SQL for matches with their position in the default order."""
+        select = Select([f"{_ROWS}.*"])
+        select.join(nested(relation, ":rows"), [])
+        frame, writer = f'{_ROWS}."frame_id"', self.writer
+        order = [frame_key(select, frame, writer.catalog, writer.window, writer.values)]
+        order += [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
+        order += [_column(one) for one in self.passed]
+        select.columns.append(f'row_number() OVER (ORDER BY {", ".join(order)}) AS ":place"')
+        return select.text()
+
+    def _outputs(self) -> list[tuple[str, str]]:
+        """Return the names and SQL texts of the columns."""
+        texts: list[str] = []
+        if self.result.whole or self.result.framed:
+            texts += [text for _, text in _frame_columns()]
+        for key, name in self._names():
+            texts += [f"{_ROWS}.{quoted(f'{key}.id')}", self._text(name)]
+        if self.result.whole:
+            edges = (edge.key for edge in self.query.scope.edges if edge.key in self.edges)
+            texts += [f"{_ROWS}.{quoted(f'{key}.type')}" for key in edges]
+        for column in self.result.columns:
+            whole = self.result.aggregated and not _aggregates(column)
+            text = self._of_group(column.name) if whole else self._text(column.value)
+            texts.append(shortest_text(text) if column.single and not self.grouped else text)
+        return list(zip(names_of(self.query), texts, strict=True))
+
+    def _names(self) -> list[tuple[str, Bound]]:
+        if not self.result.whole:
+            return []
+        return [
+            (k, _name_of(k, self.query, self.writer.catalog))
+            for k in self.query.scope.nodes
+            if k in self.nodes
+        ]
+
+    def _text(self, value: Bound) -> str:
+        return expression_text(value, self._leaf, self.writer.values)
+
+    def _leaf(self, leaf: Leaf) -> str:
+        return self._of_group(leaf.name) if isinstance(leaf, GroupKey) else _column(leaf)
+
+    def _of_group(self, name: str) -> str:
+        """Return the SQL of a grouping value. It is the same at each use, with the same bound values."""
+        if name not in self.texts:
+            value = next(c.value for c in self.result.columns if c.name == name)
+            self.texts[name] = self._text(value)
+        return self.texts[name]
+
+    def _ordered(self, select: Select, names: list[str], tops: list[str]) -> str:
+        """Return SQL for the sorted and limited rows: in query order, then in default order."""
+        keys = [directed(self._key(k.value), k.descending) for k in self.result.order]
+        frame, own, writer = f'{_ROWS}."frame_id"', len(keys), self.writer
+        grouped = self.grouped
+        once = self.result.framed or (self.result.distinct and not grouped)  # with their frames
+        if not grouped:
+            keys.append(frame_key(select, frame, writer.catalog, writer.window, writer.values))
+        if once and keys[own] == frame:  # the frame is the first of the names
+            del keys[own]
+        moved = once and len(keys) > own
+        bindings = [f"{_ROWS}.{column}" for column in columns_of(self.nodes, self.edges)]
+        bindings += [_column(one) for one in self.passed]
+        if self.query.steps:  # several matches may have the same binding in their last frame
+            bindings += [self._text(column.value) for column in self.result.columns]
+        keys += names if once or grouped else bindings
+        sample, top = self.result.sample, self.result.top
+        named = self._named_traces(keys, own) if grouped else []
+        shown = [self.shortened.get(name, name) for name in names]
+        if sample is not None:
+            per = [] if sample.per is None else [self._key(sample.per)]
+            per += [self._text(owner) for owner in self.owners]
+            chosen = Chosen(sample.number, per, frame, first=own)
+            select, keys = sampled(select, [*shown, *tops], names, keys, chosen)
+        elif moved or named or top is not None or self.shortened:
+            order = keyed(select, names, keys)
+            select = Select([*shown, *tops], [nested(select.text(), ":all")])
+            for place in named:
+                order[place] = name_key(select, place, keys[place], writer.catalog, writer.values)
+            keys = order
+        if top is not None:
+            per = [quoted(top.per)] if isinstance(top.per, str) else []
+            chosen = Chosen(top.number, [*per, *tops])
+            select, keys = sampled(select, names, names, keys, chosen)
+        select.order = keys
+        select.limit, select.offset = self.result.limit, self.result.skip
+        return select.text()
+
+    def _named_traces(self, keys: list[str], own: int) -> list[int]:
+        """Return the sort keys with trace names whose alphabetical order differs from the trace order."""
+        known = [trace.name for trace in self.writer.catalog.traces]
+        if known == sorted(known):
+            return []
+        told = {quoted(c.name) for c in self.result.columns if c.value == _TRACE_NAME}
+        return [place for place in range(own, len(keys)) if keys[place] in told]
+
+    def _key(self, value: Bound | str) -> str:
+        return quoted(value) if isinstance(value, str) else self._text(value)
+
+
+class _IntervalStatement:
+    """Builder of the SQL for results in intervals or clips.
+
+    The *keys* of an interval stay the same: the returned values, or the parts of a composed name.
+    """
+
+    def __init__(self, query: Query, writer: SqlBuilder, span: Span | None) -> None:
+        self.query, self.result = query, query.result
+        self.writer, self.span = writer, span
+        kept = [value for column in self.result.columns for value in _kept(column.value)]
+        distinct = enumerate(dict.fromkeys(kept))
+        self.keys = {value: quoted(f"key {number}") for number, value in distinct}
+        # In a trace, an id has only one kind.
+        implied = {kind for c in self.result.columns for kind in _kept(c.value)[:-1]}
+        self.apart = [key for value, key in self.keys.items() if value not in implied]
+
+    def statement(self) -> SqlStatement:
+        columns = self.result.columns
+        wanted = [leaf for column in columns for leaf in leaves(column.value)]
+        spans = self._spans(wanted)
+        clips = self.result.form == "clips"
+        own = self._clip_columns() if clips else self._interval_columns()
+        told = dict(own) | {column.name: self._shown(column) for column in columns}
+        hidden = self._hidden(told) if self.result.keyed else {}
+        select = Select([_named(text, name) for name, text in (told | hidden).items()])
+        select.join(nested(self._between(spans), ":runs"), [])
+        select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = ":runs"."trace_id"'])
+        first = '":runs"."first"'
+        order = [directed(_named_key(k.value), k.descending) for k in self.result.order]
+        writer = self.writer
+        order.append(frame_key(select, first, writer.catalog, writer.window, writer.values))
+        order += [self._told(column.value) for column in columns]
+        order += (
+            ['"max seq"'] if self.span is not None else []
+        )  # several intervals may begin in one frame
+        names = (*(name for name, _ in own), *(column.name for column in columns), *hidden)
+        if self.result.having is not None:
+            select.where.append(self._having(self.result.having, told))
+        shown, keys = [quoted(name) for name in names], len(self.result.order)
+        sample, top = self.result.sample, self.result.top
+        tops = {f'":top {n}"': text for n, text in enumerate(self._per(top, told))}
+        select.columns += [f"{text} AS {name}" for name, text in tops.items()]
+        if sample is not None:
+            chosen = Chosen(sample.number, self._per(sample, told), first, first=keys)
+            select, order = sampled(select, [*shown, *tops], shown, order, chosen)
+        if top is not None:
+            select, order = sampled(select, shown, shown, order, Chosen(top.number, [*tops]))
+        select.order = order
+        select.limit, select.offset = self.result.limit, self.result.skip
+        return finished(self.writer, select.text(), names)
+
+    def _hidden(self, told: dict[str, str]) -> dict[str, str]:
+        """Return extra columns that order intervals of several stores: first frames and owners of nodes."""
+        hidden = {FIRST: '":runs"."first"'}
+        for name, chosen in ((OWNER_KEY, self.result.sample), (TOP_OWNER, self.result.top)):
+            for owner in self._per(chosen, told)[1:]:
+                hidden[name] = owner
+        return hidden
+
+    def _having(self, condition: Bound, columns: dict[str, str]) -> str:
+        """Return the SQL of the condition on an interval, from its columns."""
+
+        def leaf(found: Leaf) -> str:
+            assert isinstance(found, GroupKey)  # noqa: S101 - guaranteed by the binder
+            return columns[found.name]
+
+        return expression_text(condition, leaf, self.writer.values)
+
+    def _per(self, chosen: Sampling | None, told: dict[str, str]) -> list[str]:
+        """Return the SQL texts of the sampling key and of the owner of its node."""
+        if chosen is None or chosen.per is None:
+            return []
+        assert isinstance(chosen.per, str)  # noqa: S101 - the binder knows the names of intervals only
+        per = [told[chosen.per]]
+        value = _per(self.result, chosen)
+        if isinstance(value, NodeValue):
+            profile = Profile.of(self.query.scope.kinds(value.node), self.writer.catalog)
+            owner = owner_text(per[0], profile, f'{_TRACE}."trace_id"', f'{_TRACE}."map_id"')
+            absent = bool(self.query.stages)
+            per.append(f"CASE WHEN {per[0]} IS NOT NULL THEN {owner} END" if absent else owner)
+        return per
+
+    def _told(self, value: Bound) -> str:
+        """Return the SQL of a returned value, in terms of the keys."""
+        if value in self.keys and not isinstance(value, NodeAttribute):
+            return self.keys[value]
+        return expression_text(value, self.keys.__getitem__, self.writer.values)
+
+    def _shown(self, column: ReturnColumn) -> str:
+        text = self._told(column.value)
+        return shortest_text(text) if column.single else text
+
+    def _keys(self) -> dict[str, str]:
+        """Return the SQL of the constant value of each key column."""
+        # A word of the vocabulary stays an internal number until it is returned.
+        texts = [
+            _column(value)
+            if isinstance(value, NodeAttribute)
+            else expression_text(value, _column, self.writer.values)
+            for value in self.keys
+        ]
+        return dict(zip(self.keys.values(), texts, strict=True))
+
+    def _spans(self, wanted: list[Leaf]) -> str:
+        """Return SQL for the first and last frame of each interval, with the keys."""
+        scope = self.query.scope
+        if self.span is not None:
+            wanted = [*wanted, *self.span]
+            relation = frames_of(self.writer, scope, None, frozenset(), frozenset(), wanted)
+            ends = [_column(leaf) for leaf in self.span]
+            select = Select([f'{ends[0]} AS ":from"', f'{ends[1]} AS ":to"'])
+            select.columns += [f"{text} AS {key}" for key, text in self._keys().items()]
+            select.join(nested(relation, ":rows"), [])
+            select.distinct = True
+            return select.text()
+        keys = list(self.keys.values())
+        return runs(in_masks(self.writer, scope, wanted, self._keys()), keys, self.apart)
+
+    def _between(self, spans: str) -> str:
+        """Return SQL for columns of the first and last frame of each interval."""
+        select = Select(['":from"."trace_id" AS "trace_id"', *self.keys.values()])
+        select.columns += ['":from"."frame_id" AS "first"']
+        select.columns += ['":to"."seq" - ":from"."seq" + 1 AS "frames"']
+        for column, name in (("seq", "seq"), ("time_ns", "time"), ("log_time_ns", "log")):
+            select.columns += [f'":from".{quoted(column)} AS {quoted(f"min {name}")}']
+            select.columns += [f'":to".{quoted(column)} AS {quoted(f"max {name}")}']
+        select.join(nested(spans, ":spans"), [])
+        select.join('"frame" AS ":from"', ['":from"."frame_id" = ":spans".":from"'])
+        select.join('"frame" AS ":to"', ['":to"."frame_id" = ":spans".":to"'])
+        return select.text()
+
+    def _interval_columns(self) -> list[tuple[str, str]]:
+        since = [_T.format(quoted(f"{end} time")) for end in ("min", "max")]
+        texts = [f'{_TRACE}."name"', '"min seq"', '"max seq"', '"min time"', '"max time"', *since]
+        return list(zip(INTERVAL_COLUMNS, [*texts, '":runs"."frames"'], strict=True))
+
+    def _clip_columns(self) -> list[tuple[str, str]]:
+        start = f'"min log" + {self.result.before}'
+        end = f'"max log" + {self.result.after}'
+        return list(zip(CLIP_COLUMNS, [f'{_TRACE}."name"', start, end], strict=True))
+
+
+def _column(leaf: Leaf) -> str:
+    return f"{_ROWS}.{quoted(column_of(leaf))}"
+
+
+def _kept(value: Bound) -> tuple[Bound, ...]:
+    """Return the columns that determine a value."""
+    return (
+        tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
+    )
+
+
+def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
+    """Return the name of a node. The name of an entity is composed late, from its kind and id."""
+    name = NodeAttribute(node, _NAME, Type.text)
+    profile = Profile.of(query.scope.kinds(node), catalog)
+    if query.steps or query.stages or profile.mapped or profile.places != 1:
+        return name
+    kind: Bound = NodeAttribute(node, NODE_ATTRIBUTES["kind"], Type.text)
+    if len(profile.kinds) == 1:
+        kind = Value(next(iter(profile.kinds)), Type.text, closed=True)
+    return Operation("name", (kind, NodeValue(node)), Type.text)
+
+
+def _spelled(query: Query, catalog: Catalog) -> Query:
+    """Return a query that composes node names as late as possible."""
+
+    def spelled(value: Bound) -> Bound:
+        match value:
+            case NodeAttribute(node=node, attribute=attribute) if (
+                attribute.unit is DisplayUnit.label
+            ):
+                return _name_of(node, query, catalog)
+            case Operation():
+                return with_operands(value, spelled)
+            case _:
+                return value
+
+    return replace(query, result=query.result.changed(spelled))
+
+
+def _frame_columns() -> list[tuple[str, str]]:
+    time = f'{_FRAME}."time_ns"'
+    texts = [f'{_FRAME}."frame_id"', f'{_TRACE}."name"', f'{_FRAME}."seq"', time, _T.format(time)]
+    return list(zip(FRAME_COLUMNS, texts, strict=True))
+
+
+def _from_frames(select: Select, relation: str) -> None:
+    select.join(nested(relation, ":rows"), [])
+    select.join(f'"frame" AS {_FRAME}', [f'{_FRAME}."frame_id" = {_ROWS}."frame_id"'])
+    select.join(f'"trace" AS {_TRACE}', [f'{_TRACE}."trace_id" = {_FRAME}."trace_id"'])
+
+
+def shortest_text(text: str) -> str:
+    """Return the SQL that converts a 32-bit number to a 64-bit number with the same shortest text."""
+    return f"CAST(CAST(CAST({text} AS FLOAT) AS VARCHAR) AS DOUBLE)"
+
+
+def _named(text: str, name: str) -> str:
+    return f"{text} AS {quoted(name)}"
+
+
+def _named_key(value: Bound | str) -> str:
+    assert isinstance(value, str), value  # noqa: S101 - the binder knows the names of intervals only
+    return quoted(value)
+
+
+def directed(text: str, descending: bool) -> str:  # noqa: FBT001
+    return f"{text} {'DESC' if descending else 'ASC'} NULLS LAST"
+
+
+def _per(result: Result, chosen: Sampling | None) -> Bound | None:
+    """Return the value of a sampling key, or None."""
+    per = chosen and chosen.per
+    if isinstance(per, str):
+        return next((column.value for column in result.columns if column.name == per), None)
+    return per
+
+
+def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) -> Select:
+    """Return a statement with distinct rows, where nodes of different owners count as different."""
+    select.columns += [f'{_column(one)} AS ":owner {i}"' for i, one in enumerate(apart)]
+    return Select([quoted(name) for name in names], [nested(select.text(), ":distinct")])
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """Selection of a number of rows for each combination of some values.
+
+    Without a frame, or with ``first`` sort keys, the first rows are selected. Otherwise, rows are selected by
+    a pseudo-random number computed from the frame.
+    """
+
+    number: int
+    per: list[str]
+    frame: str | None = None
+    first: int = 0
+
+
+def sampled(
+    select: Select, columns: list[str], names: list[str], keys: list[str], chosen: Chosen
+) -> tuple[Select, list[str]]:
+    """Return the statement for the selected rows, and its sort keys."""
+    partition = [f'":per {place}"' for place in range(len(chosen.per))]
+    if chosen.frame is not None:
+        select.columns.append(f'{chosen.frame} % 1000003 * 48271 % 2147483647 AS ":mixed"')
+    select.columns += [
+        f"{text} AS {name}" for text, name in zip(chosen.per, partition, strict=True)
+    ]
+    order = keyed(select, names, keys)
+    mixed = chosen.frame is not None and not chosen.first
+    over = ", ".join(['":mixed"', *order] if mixed else order)
+    by = f"PARTITION BY {', '.join(partition)} " if partition else ""
+    ranked = Select(["*", f'row_number() OVER ({by}ORDER BY {over}) AS ":rank"'])
+    ranked.join(nested(select.text(), ":all"), [])
+    outer = Select([*columns], [nested(ranked.text(), ":ranked")])
+    outer.where.append(f'":rank" <= {chosen.number}')
+    return outer, order
+
+
+def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
+    """Add sort keys to a statement as columns. Return the keys for an outer statement."""
+    ordered = [key.removesuffix(" NULLS LAST") for key in keys]
+    plain = [key.removesuffix(" ASC").removesuffix(" DESC") for key in ordered]
+    inner = [key if key in names else f'":key {i}"' for i, key in enumerate(plain)]
+    select.columns += [
+        f"{key} AS {name}" for key, name in zip(plain, inner, strict=True) if name not in names
+    ]
+    down = [key.endswith(" DESC") for key in ordered]
+    return [directed(name, descending) for name, descending in zip(inner, down, strict=True)]
+
+
+def in_order(part: Bound) -> bool:
+    """True if an expression depends on the order of matches, as ``collect`` does."""
+    return isinstance(part, Aggregate) and part.word == "collect" and not part.distinct
+
+
+def _aggregates(column: ReturnColumn) -> bool:
+    return is_counted(column.value)
+
+
+def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatement:
+    """Return the final statement, with the shared relations before it."""
+    shadows = [
+        (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows
+    ]
+    shared = [(f"{quoted(name)} AS", body) for name, body in writer.shared]
+    sql, last = _preceded([*shadows, *shared], text), _preceded(shadows, text)
+    stages = tuple((name, _preceded(shadows, body)) for name, body in writer.shared)
+    values = tuple(writer.values.items)
+    return SqlStatement(sql, values, tuple(columns), writer.gathered, stages, last)
+
+
+def _preceded(relations: Iterable[tuple[str, str]], text: str) -> str:
+    """Return a statement with its relations before it in a ``WITH`` clause."""
+    before = ",\n".join(
+        f"{head} (\n" + "\n".join(f"  {line}" for line in body.splitlines()) + "\n)"
+        for head, body in relations
+    )
+    return f"WITH {before}\n{text}" if before else text

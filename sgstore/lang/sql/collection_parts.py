@@ -1,0 +1,686 @@
+"""Queries for the parts of a collection, and SQL that merges their answers.
+
+A trace is in one part. So the rows, intervals and clips of the collection are those of its parts. Only their
+order and their number must be adjusted. Each row has *hidden* columns, named ``:0``, ``:1``, …, which hold
+the sort keys of a single store. Counts and sums are computed in each part, group by group, and then over the
+parts. Distinct values come from each part as a set.
+
+The merging statements use the tables ``parts``, ``parts 1``, …, one for each query sent to the parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import count
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.base.quoting import quoted
+from sgstore.base.records import dataclass
+from sgstore.errors import QueryError
+from sgstore.lang.bind import PLACE, sql_of
+from sgstore.lang.catalog import FRAME_ATTRIBUTES, TRACE_ATTRIBUTES, Catalog, DisplayUnit, Type
+from sgstore.lang.ir import (
+    Aggregate,
+    BlockValue,
+    Bound,
+    BoundCheck,
+    EdgeRelation,
+    FrameAttribute,
+    GroupKey,
+    NodeValue,
+    Query,
+    Result,
+    ReturnColumn,
+    Sampling,
+    SortKey,
+    TraceAttribute,
+    WithStage,
+    is_counted,
+    is_passed_on,
+    walk,
+    with_operands,
+)
+from sgstore.lang.sql._compile import Compiled, Layout
+from sgstore.lang.sql._formulas import BoundValues, Select, expression_text, nested
+from sgstore.lang.sql._plan import frame_key, name_key
+from sgstore.lang.sql._results import (
+    FIRST,
+    OWNER_KEY,
+    TOP_OWNER,
+    Chosen,
+    directed,
+    keyed,
+    names_of,
+    owner_of,
+    sampled,
+    told_apart_by,
+    with_bindings,
+    with_owners,
+)
+from sgstore.lang.sql._rewrite import FALSE, kinds_left, possible, rewritten
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from sgstore.lang.catalog import Triple
+
+PARTS: Final = "parts"
+"""Table with the answers to the first query. The other tables have a number after this name."""
+
+LOG_TIME_COLUMN: Final = ":log_time_ns"
+
+_FRAME_ID: Final = FrameAttribute(FRAME_ATTRIBUTES["id"], Type.number)
+_LOG_TIME: Final = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
+_TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
+
+_WITNESSES: Final = 32
+"""Largest number of remembered sets of triples and kinds that are sufficient for a match."""
+
+Terms = list[str]
+"""Expressions of an ``ORDER BY``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parted:
+    """Queries sent to each part, and the merging of their answers.
+
+    Attributes
+    ----------
+    queries : tuple of Query
+        Queries sent to each part. The answers to the first are in table ``parts``, to the second in ``parts
+        1``, ….
+    columns : tuple of str
+        Columns of the merged rows.
+    merge : function
+        Function from the catalog of the collection and the bound values to the merging statement.
+    """
+
+    queries: tuple[Query, ...]
+    columns: tuple[str, ...]
+    merge: Callable[[Catalog, BoundValues], str]
+
+    def compiled(self, whole: Compiled) -> tuple[Compiled, ...]:
+        """Return the queries, compiled against the catalog of a compiled query."""
+        found: list[Compiled] = []
+        for query in self.queries:
+            ready = query if query.steps else rewritten(query, whole.catalog)
+            found.append(replace(whole, bound=query, query=ready))
+        return tuple(found)
+
+    def statement(self, catalog: Catalog) -> tuple[str, tuple[Any, ...]]:
+        """Return the merging SQL statement and the values that it binds."""
+        values = BoundValues()
+        text = self.merge(catalog, values)
+        return text, tuple(values.items)
+
+
+def parted(compiled: Compiled, form: str = "rows", before: int = 0, after: int = 0) -> Parted:
+    """Return the queries for the parts of a collection, and the merging of their answers.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        Query compiled against the collection or against a part. The result is the same.
+    form : str
+        ``rows``: the result of the query; ``apart``: the same, with extra columns that distinguish nodes of
+        different traces with the same id. Other forms replace the ``RETURN``: ``frames``, ``intervals``,
+        ``bound`` (intervals of bindings), ``clips`` or ``subgraphs``.
+    before, after : int
+        Time added to clips at both ends, unless the query has offsets; ns.
+
+    Raises
+    ------
+    QueryError
+        No rule exists for merging the answers.
+    """
+    query = compiled.whole
+    _refuse_strange(query.result)
+    match form:
+        case "frames":
+            query = _frames(query)
+        case "apart":
+            query = replace(query, result=with_owners(query.result))
+        case "subgraphs":
+            query = Layout.of(compiled.bound).query
+        case "bound":
+            query = with_bindings(query)
+        case "intervals":
+            query = _intervals(query, graphs=compiled.layout is not None)
+        case "clips" if query.result.form != "clips":
+            clips = Result(form="clips", whole=False, before=-before, after=after)
+            query = replace(query, result=clips)
+        case _:
+            pass
+    result = query.result
+    if result.form in {"intervals", "clips"}:
+        return _parted_intervals(query)
+    if result.aggregated:
+        return _Grouping(query).parted()
+    if result.distinct and not (result.whole or result.framed):
+        return _parted_sets(query)
+    return _parted_rows(query)
+
+
+MERGED: Final = frozenset(
+    {
+        *("form", "columns", "whole", "framed", "distinct", "having", "order", "sample", "top"),
+        *("skip", "limit", "before", "after", "keyed"),
+    }
+)
+"""Fields of :class:`Result` with a rule for merging the answers of parts."""
+
+SUMMED: Final = frozenset({"count", "sum", "min", "max", "avg"})
+"""Aggregates that are computed in each part and then merged."""
+
+LISTED: Final = frozenset({"stddev", "median", "percentile", "collect"})
+"""Aggregates for which each part returns all values."""
+
+
+def _refuse_strange(result: Result) -> None:
+    """Reject a result with a field that has no merging rule, to avoid wrong answers."""
+    for one in fields(result):
+        if one.name not in MERGED and getattr(result, one.name) != one.default:
+            raise QueryError(
+                f"a collection cannot say what '{one.name}' of a query is over all its bundles",
+                hint="'sgstore collection unpack' makes one store of all, which can be asked",
+            )
+
+
+def _frames(query: Query) -> Query:
+    """Return a query for the matching frames with log times. With ``LIMIT``: the frame of each row."""
+    result, time = query.result, ReturnColumn(LOG_TIME_COLUMN, _LOG_TIME)
+    if not result.chooses or result.form != "rows" or result.aggregated:
+        return replace(query, result=Result(whole=False, framed=True, columns=(time,)))
+    framed = replace(result, framed=True, columns=(*result.columns, time))
+    return replace(query, result=framed)
+
+
+def _intervals(query: Query, *, graphs: bool) -> Query:
+    result = query.result
+    if result.whole or result.aggregated or graphs:
+        return with_bindings(query)
+    if result.form == "intervals":
+        return query
+    return replace(query, result=Result(form="intervals", columns=result.columns, whole=False))
+
+
+# Which parts may answer -----------------------------------------------------------------------------
+
+
+class Pruning:
+    """Filter of the parts of a collection that may answer a query, by their triples and kinds.
+
+    The filter uses the narrowing of the compiler: a pattern that becomes false for the content of a part has
+    no match there.
+
+    Parameters
+    ----------
+    compiled : Compiled
+        Query compiled against the collection.
+
+    Notes
+    -----
+    Triples that no edge of the pattern can have are ignored. Then most parts look alike, and one decision is
+    valid for all of them. Extra content never removes a match. So one comparison accepts a part that has all
+    the content that was sufficient in another part.
+    """
+
+    def __init__(self, compiled: Compiled) -> None:
+        query = compiled.query
+        steps, ways = query.steps, query.ways if query.steps else ()
+        self._ways = [tuple(steps[n].scope for n in way.happen) for way in ways]
+        self._ways = self._ways or [tuple(query.required)]
+        self._known: dict[frozenset[Any], bool] = {}
+        self._enough: list[frozenset[Any]] = []
+        self._edges = [
+            (edge, scope.kinds(edge.src), scope.kinds(edge.dst))
+            for scopes in self._ways
+            for scope in scopes
+            for edge in scope.edges
+            if edge.high == 1
+        ]
+
+    def matters(self, triple: Triple) -> bool:
+        """True if an edge of the pattern can have this triple."""
+        return any(True for of in self._edges for _ in possible(*of, (triple,)))
+
+    def may_answer(self, held: frozenset[Triple], kinds: Sequence[frozenset[str]]) -> bool:
+        """True if a part may have a match.
+
+        Parameters
+        ----------
+        held : frozenset of Triple
+            The relevant triples that occur in the part.
+        kinds : sequence of frozenset
+            Moving kinds, fixed kinds and map kinds of the part.
+        """
+        every = held.union(*kinds)
+        known = self._known.get(every)
+        if known is None:
+            known = any(enough <= every for enough in self._enough)
+            if not known and self._possible(every):
+                known = True
+                if len(self._enough) < _WITNESSES:
+                    self._enough.append(self._least(every))
+            self._known[every] = known
+        return known
+
+    def _possible(self, every: frozenset[Any]) -> bool:
+        """True if a match is possible with these triples and kinds."""
+        triples = [one for one in every if isinstance(one, tuple)]
+        return any(
+            all(s.where != (FALSE,) and kinds_left(s, triples, every) is not None for s in scopes)
+            for scopes in self._ways
+        )
+
+    def _least(self, every: frozenset[Any]) -> frozenset[Any]:
+        """Return a minimal set of triples and kinds with which a match is still possible."""
+        for one in every:
+            if self._possible(every - {one}):
+                every -= {one}
+        return every
+
+
+@dataclass(frozen=True, slots=True)
+class ClassQuestion:
+    """Frame classes used by a query, which must be collected from all parts.
+
+    Attributes
+    ----------
+    abstraction : str
+    dataset : str
+        Dataset with the required classes. Empty means the number of frames of each class in all traces.
+    traces : tuple of int
+        Traces of the dataset.
+    table : str
+        Table of single frames of the dataset; empty for a dataset of traces.
+    """
+
+    abstraction: str
+    dataset: str = ""
+    traces: tuple[int, ...] = ()
+    table: str = ""
+
+
+def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
+    """Return the frame classes that a query or a check uses, without duplicates."""
+    if isinstance(asked, BoundCheck):
+        values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
+        values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]
+        values += [column.value for column in asked.returns]
+    else:
+        values = [*asked.scope.where, *asked.result.values]
+        for stage in asked.stages:
+            values += stage.expressions if isinstance(stage, WithStage) else stage.scope.where
+        values += [v for step in asked.steps for v in (*step.scope.where, *step.when)]
+    return tuple(dict.fromkeys(_class_questions(values)))
+
+
+def _class_questions(values: Iterable[Bound]) -> Iterator[ClassQuestion]:
+    for part in (part for value in values for part in walk(value)):
+        if isinstance(part, BlockValue):
+            yield from _class_questions(part.inside)
+        if not isinstance(part, FrameAttribute) or is_passed_on(part):
+            continue
+        attribute = part.attribute
+        (column,) = attribute.columns.values()
+        if attribute.unit is DisplayUnit.counted:
+            yield ClassQuestion(column)
+        elif attribute.unit is DisplayUnit.seen:
+            dataset = attribute.name.removeprefix(f"class_{column} in ")
+            yield ClassQuestion(column, dataset, attribute.traces, attribute.table)
+
+
+# Rows: in the order of the query, otherwise ordered by trace, frame and binding --------------------------
+
+
+def _parted_rows(query: Query) -> Parted:
+    result, hidden = query.result, _Hidden()
+    own = [directed(hidden.key(k.value), k.descending) for k in result.order]
+    pers = _per(result, result.sample, hidden), _per(result, result.top, hidden)
+    framed = result.whole or result.framed
+    frame = quoted("frame_id") if framed else hidden.add(_FRAME_ID)
+    visible = names_of(query)
+    rest = list(map(quoted, visible))
+    if not (result.framed or result.distinct):
+        told = rest if query.steps else []
+        rest = [*_bindings(query, hidden), *told]
+    asked = _of_part(replace(result, columns=(*result.columns, *hidden.columns)))
+
+    def merge(catalog: Catalog, values: BoundValues) -> str:
+        names = list(map(quoted, visible))
+        select = Select(list(names), [quoted(PARTS)])
+        keys = [*own, frame_key(select, frame, catalog, None, values)]
+        keys += [key for key in rest if key != keys[-1]]
+        return _chosen(result, select, (names, keys, frame), pers)
+
+    return Parted((replace(query, result=asked),), visible, merge)
+
+
+Placed = tuple[Terms, Terms, str]
+"""Column names of rows, their sort keys, and the column of their frames."""
+
+
+def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, Terms]) -> str:
+    """Return the SQL for the sorted, sampled and limited rows of a statement.
+
+    ``pers``: the ``PER`` columns of ``SAMPLE`` and those of ``LIMIT … PER``.
+    """
+    (names, keys, frame), (per, top_per) = placed, pers
+    tops = [f'":top {number}"' for number in range(len(top_per))]
+    select.columns += [f"{text} AS {name}" for text, name in zip(top_per, tops, strict=True)]
+    if result.sample is not None:
+        chosen = Chosen(result.sample.number, per, frame, first=len(result.order))
+        select, keys = sampled(select, [*names, *tops], names, keys, chosen)
+    if result.top is not None:
+        select, keys = sampled(select, names, names, keys, Chosen(result.top.number, tops))
+    if result.sample is None and result.top is None:
+        keys = keyed(select, names, keys)
+        select = Select(names, [nested(select.text(), ":all")])
+    select.order = keys
+    select.limit, select.offset = result.limit, result.skip
+    return select.text()
+
+
+def _of_part(result: Result) -> Result:
+    """Return the result clause for a part, with enough rows for the final selection.
+
+    A sample of one part can differ from the sample of the collection, so a limited number of its rows is not
+    enough.
+    """
+    if result.sample is not None:
+        return replace(result, top=None, skip=0, limit=None)
+    if result.top is not None:
+        return replace(result, skip=0, limit=None)
+    if result.limit is not None:
+        return replace(result, skip=0, limit=result.skip + result.limit)
+    return replace(result, order=(), skip=0)
+
+
+def _bindings(query: Query, hidden: _Hidden) -> Terms:
+    """Return sort keys for the rows of one frame: the nodes and edges that identify a match.
+
+    A store sorts relations by their enumeration, but returns them as texts.
+    """
+    roles = {"named"} if query.result.whole else {"named", "unnamed"}
+    nodes = sorted(key for key, node in query.scope.nodes.items() if node.role in roles)
+    edges = sorted(edge.key for edge in query.scope.edges if edge.named)
+    return [
+        *(hidden.add(NodeValue(key)) for key in nodes),
+        *(f"CAST({hidden.add(EdgeRelation(key))} AS relation)" for key in edges),
+        *map(hidden.add, told_apart_by(query)),
+    ]
+
+
+def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
+    """Return the columns that group the rows for ``SAMPLE`` or ``LIMIT … PER``."""
+    if chosen is None or chosen.per is None:
+        return []
+    value = _value_of(result, chosen.per)
+    per = [hidden.key(chosen.per)]
+    if isinstance(value, NodeValue):
+        per.append(hidden.add(owner_of(value.node)))
+    return per
+
+
+def _value_of(result: Result, per: Bound | str) -> Bound | str:
+    """Return the value of a named result column. Other values are returned unchanged."""
+    if not isinstance(per, str):
+        return per
+    return next((column.value for column in result.columns if column.name == per), per)
+
+
+class _Hidden:
+    """Hidden columns of rows, in addition to the shown columns."""
+
+    def __init__(self, first: int = 0) -> None:
+        self.columns: list[ReturnColumn] = []
+        self._numbers = count(first)
+
+    def add(self, value: Bound) -> str:
+        """Add a hidden column with a value, and return its quoted name."""
+        column = ReturnColumn(f":{next(self._numbers)}", value)
+        self.columns.append(column)
+        return quoted(column.name)
+
+    def key(self, value: Bound | str) -> str:
+        """Return the quoted column of a sort key: a result column, or a new hidden column."""
+        return quoted(value) if isinstance(value, str) else self.add(value)
+
+
+# Intervals and clips ---------------------------------------------------------------------------------
+
+
+def _parted_intervals(query: Query) -> Parted:
+    result = query.result
+    asked = _of_part(replace(result, keyed=True))
+    visible = names_of(query)
+
+    def merge(catalog: Catalog, values: BoundValues) -> str:
+        names = list(map(quoted, visible))
+        select = Select(list(names), [quoted(PARTS)])
+        own = [directed(_name(key), key.descending) for key in result.order]
+        first = quoted(FIRST)
+        keys = [*own, frame_key(select, first, catalog, None, values)]
+        keys += [quoted(column.name) for column in result.columns]
+        keys.append(quoted("end_ns"))  # several matches of a sequence may begin in one frame
+        pers = (
+            _per_of_intervals(result, result.sample, OWNER_KEY),
+            _per_of_intervals(result, result.top, TOP_OWNER),
+        )
+        return _chosen(result, select, (names, keys, first), pers)
+
+    return Parted((replace(query, result=asked),), visible, merge)
+
+
+def _per_of_intervals(result: Result, chosen: Sampling | None, owner: str) -> Terms:
+    if chosen is None or chosen.per is None:
+        return []
+    assert isinstance(chosen.per, str)  # noqa: S101 - the binder knows the names of intervals only
+    owned = isinstance(_value_of(result, chosen.per), NodeValue)
+    return [quoted(chosen.per), *([quoted(owner)] if owned else [])]
+
+
+def _name(key: SortKey) -> str:
+    assert isinstance(key.value, str)  # noqa: S101 - the binder knows the names of intervals only
+    return quoted(key.value)
+
+
+# Sets and groups -----------------------------------------------------------------------------------------
+
+
+def _parted_sets(query: Query) -> Parted:
+    result, hidden = query.result, _Hidden()
+    owners = {
+        column.name: hidden.add(owner_of(column.value.node))
+        for column in result.columns
+        if isinstance(column.value, NodeValue)
+    }
+    asked = replace(result, columns=(*result.columns, *hidden.columns), top=None)
+    asked = _of_part(asked) if result.top is None else replace(asked, order=(), skip=0, limit=None)
+    visible = names_of(query)
+
+    def merge(catalog: Catalog, values: BoundValues) -> str:
+        every = Select(["*"], [quoted(PARTS)], distinct=True)
+        own = [directed(_name(key), key.descending) for key in result.order]
+        return _in_names(every.text(), visible, own, result, (catalog, values), owners)
+
+    return Parted((replace(query, result=asked),), visible, merge)
+
+
+def _in_names(
+    text: str,
+    visible: Sequence[str],
+    own: Terms,
+    result: Result,
+    bound: tuple[Catalog, BoundValues],
+    owners: Mapping[str, str],
+) -> str:
+    """Return SQL for rows in query order, then sorted by columns, with ``run2`` before ``run10``.
+
+    ``owners``: the columns with the owners of the nodes in a column.
+    """
+    catalog, values = bound
+    names = list(map(quoted, visible))
+    select = Select(list(names), [nested(text, ":rows")])
+    keys = [*own, *names]
+    known = [trace.name for trace in catalog.traces]
+    told = {quoted(c.name) for c in result.columns if c.value == _TRACE_NAME}
+    for place in range(len(own), len(keys)) if known != sorted(known) else ():
+        if keys[place] in told:
+            keys[place] = name_key(select, place, keys[place], catalog, values)
+    per = result.top and result.top.per
+    tops = [quoted(per), *([owners[per]] if per in owners else [])] if isinstance(per, str) else []
+    return _chosen(result, select, (names, keys, ""), ([], tops))
+
+
+class _Grouping:
+    """Split of an aggregating query into queries for the parts of a collection.
+
+    The first query for a part has a column for each grouping value, and one or two summable columns for each
+    aggregate. An aggregate over *distinct* values needs its own query, which returns the set of values for
+    each group. An aggregate over all values needs its own query too, with one row for each match.
+    """
+
+    def __init__(self, query: Query) -> None:
+        self._query, self._result = query, query.result
+        self._groups, self._numbers = _Hidden(), _Hidden(1_000)
+        self._more: list[tuple[Query, Callable[[Catalog, BoundValues], str]]] = []
+        self._known: dict[Aggregate, str] = {}
+        self._partial: list[ReturnColumn] = []
+        self._keys: dict[str, str] = {}
+        self._owners: dict[str, str] = {}
+        for column in self._result.columns:
+            if not is_counted(column.value):
+                self._keys[column.name] = self._groups.add(column.value)
+        for column in self._result.columns:
+            if isinstance(column.value, NodeValue):
+                self._owners[column.name] = self._groups.add(owner_of(column.value.node))
+
+    def parted(self) -> Parted:
+        result = self._result
+        outputs = [(column.name, self._column(column)) for column in result.columns]
+        own: Terms = []
+        for i, key in enumerate(result.order):
+            if not isinstance(key.value, str):
+                outputs.append((f":order {i}", self._text(key.value)))
+            name = key.value if isinstance(key.value, str) else f":order {i}"
+            own.append(directed(quoted(name), key.descending))
+        having = None if result.having is None else self._text(result.having)
+        if not self._partial:  # the part must return its groups
+            self._part(Aggregate("count", None, distinct=False, type=Type.number))
+        columns = (*self._groups.columns, *self._partial)
+        first = Result(columns=columns, whole=False)
+        queries = (replace(self._query, result=first), *(query for query, _ in self._more))
+        visible = names_of(self._query)
+        owners = {name: f'":whose {i}"' for i, name in enumerate(self._owners)}
+
+        def merge(catalog: Catalog, values: BoundValues) -> str:
+            select = Select([f"{_sql(v, values)} AS {quoted(n)}" for n, v in outputs])
+            whose = zip(self._owners.values(), owners.values(), strict=True)
+            select.columns += [f"{column} AS {name}" for column, name in whose]
+            select.tables = [nested(self._every(catalog, values), ":every")]
+            select.group = [quoted(column.name) for column in self._groups.columns]
+            select.having = [] if having is None else [_sql(having, values)]
+            return _in_names(select.text(), visible, own, result, (catalog, values), owners)
+
+        return Parted(queries, visible, merge)
+
+    def _column(self, column: ReturnColumn) -> Bound:
+        if column.name in self._keys:
+            return EdgeRelation(self._keys[column.name])
+        return self._text(column.value)
+
+    def _text(self, value: Bound) -> Bound:
+        """Replace aggregates and grouping values by columns of the merged parts."""
+        match value:
+            case GroupKey(name=name):
+                return EdgeRelation(self._keys[name])
+            case Aggregate():
+                return EdgeRelation(self._number(value))
+            case _:
+                return with_operands(value, self._text)
+
+    def _number(self, number: Aggregate) -> str:
+        """Return the SQL of an aggregate, computed from columns of the parts."""
+        if number not in self._known:
+            self._known[number] = self._merged(number)
+        return self._known[number]
+
+    def _merged(self, number: Aggregate) -> str:
+        if number.word in {"min", "max"}:
+            return f"{number.word}({self._part(replace(number, distinct=False))})"
+        if number.word in LISTED or (number.distinct and number.word in SUMMED):
+            found = f"any_value({self._each(number)})"
+            if number.word == "count":
+                return f"CAST(coalesce({found}, 0) AS BIGINT)"
+            return f"coalesce({found}, [])" if number.word == "collect" else found
+        if number.word not in SUMMED:
+            raise QueryError(
+                f"a collection cannot say what {number.word}() is over all its bundles",
+                hint="'sgstore collection unpack' makes one store of all, which can be asked",
+            )
+        if number.word == "avg":
+            total = self._part(replace(number, word="sum"))
+            many = self._part(replace(number, word="count"))
+            return f"(CAST(sum({total}) AS DOUBLE) / nullif(sum({many}), 0))"
+        column = self._part(number)
+        if number.word == "count":
+            return f"CAST(coalesce(sum({column}), 0) AS BIGINT)"
+        return f"{number.word}({column})"
+
+    def _part(self, number: Aggregate) -> str:
+        name = self._numbers.add(number)
+        self._partial.append(self._numbers.columns[-1])
+        return name
+
+    def _each(self, number: Aggregate) -> str:
+        """Return the column of an aggregate that needs all values, or all distinct values."""
+        assert number.operand is not None  # noqa: S101 - COUNT(*) alone has none
+        hidden = _Hidden(2_000)
+        value = hidden.add(number.operand)
+        if isinstance(number.operand, NodeValue):
+            hidden.add(owner_of(number.operand.node))
+        ordered = number.word == "collect" and not number.distinct
+        frame = hidden.add(_FRAME_ID) if ordered else ""
+        bindings = _bindings(self._query, hidden) if ordered else []
+        columns = (*self._groups.columns, *hidden.columns)
+        result = Result(columns=columns, whole=False, distinct=number.distinct)
+        groups = [quoted(column.name) for column in self._groups.columns]
+        place = len(self._more) + 1
+        name, table = quoted(f":each {place}"), quoted(f"{PARTS} {place}")
+
+        def text(catalog: Catalog, values: BoundValues) -> str:
+            rows = Select(["*"], [table], distinct=number.distinct)
+            rows.where = [f"{value} IS NOT NULL"] if number.distinct else []
+            made = sql_of(replace(number, distinct=False), value)
+            if ordered:
+                order = [frame_key(rows, frame, catalog, None, values), *bindings]
+                rows.columns.append(f"row_number() OVER (ORDER BY {', '.join(order)}) AS {_PLACE}")
+            elif number.word == "collect":
+                made = f"list({value} ORDER BY {value})"
+            made = made.replace(PLACE, _PLACE)
+            select = Select([*groups, f"{made} AS {name}"], [nested(rows.text(), ":each")])
+            select.group = list(groups)
+            return select.text()
+
+        self._more.append((replace(self._query, result=result), text))
+        return name
+
+    def _every(self, catalog: Catalog, values: BoundValues) -> str:
+        """Return the SQL of the rows of all parts: partial aggregates, and aggregates over all values."""
+        rows = [Select(["*"], [quoted(PARTS)]).text()]
+        rows += [text(catalog, values) for _, text in self._more]
+        return "\nUNION ALL BY NAME\n".join(f"({text})" for text in rows)
+
+
+_PLACE: Final = '":place"'
+
+
+def _sql(value: Bound, values: BoundValues) -> str:
+    """Return the SQL of an expression whose leaves are already columns."""
+
+    def leaf(found: Any) -> str:
+        return found.edge
+
+    return expression_text(value, leaf, values)

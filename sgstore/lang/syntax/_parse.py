@@ -1,0 +1,555 @@
+"""Parser of the query language, with prepared LALR(1) tables.
+
+Lark needs about 200 ms to compute the tables of ``grammar.lark``. They are stored in ``grammar.json``, with
+the digest of the grammar, and load in 6 ms. If the file is missing or outdated, the tables are computed again
+in memory.
+
+``python -m sgstore.lang.syntax._parse`` writes the file. A test fails if the file is outdated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from functools import cache, lru_cache, partial
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.base.records import dataclass
+from sgstore.errors import QuerySyntaxError, TextSpan
+from sgstore.lang.syntax._hints import bracket_hint, places, slip_hint
+from sgstore.lang.syntax._tree_builder import BUILDERS, BuildError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from sgstore.lang.syntax.tree import Statement
+
+
+GRAMMAR: Final = "grammar.lark"
+TABLES: Final = "grammar.json"
+_WORD: Final = re.compile(r"\w")
+
+
+@dataclass(frozen=True, slots=True)
+class Terminal:
+    """Terminal symbol of the grammar, with its literal or pattern.
+
+    Attributes
+    ----------
+    name : str
+    literal : str
+        Text in capitals; empty if the terminal is a pattern.
+    pattern : re.Pattern or None
+    priority : int
+        Priority among terminals that match the same text.
+    """
+
+    name: str
+    literal: str
+    pattern: re.Pattern[str] | None
+    priority: int
+
+    def length_at(self, text: str, start: int) -> int:
+        """Return the length of the match at ``start``, or 0 without a match. Words must match as a whole."""
+        if self.pattern is None:
+            end = start + len(self.literal)
+            length = len(self.literal) if text[start:end].upper() == self.literal else 0
+        else:
+            found = self.pattern.match(text, start)
+            length = found.end() - start if found else 0
+        end = start + length
+        broken = length and _WORD.match(text, end) and _WORD.match(text, end - 1)
+        return 0 if broken else length
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Grammar rule, as the parser reduces it.
+
+    Attributes
+    ----------
+    origin, name : str
+        The symbol that the rule produces, and the name of the builder.
+    size : int
+        Number of symbols.
+    keep : tuple of bool
+        For each symbol: true if it is passed to the builder as a child.
+    absent : tuple of int
+        Number of absent children before each symbol and after the last; empty if there are none.
+    inline : bool
+        True if a single child is returned without a builder.
+    """
+
+    origin: str
+    name: str
+    size: int
+    keep: tuple[bool, ...]
+    absent: tuple[int, ...]
+    inline: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Tables:
+    """Tables of an LALR(1) parser.
+
+    Attributes
+    ----------
+    terminals : dict of str to Terminal
+    rules : tuple of Rule
+    states : tuple of dict
+        For each state, symbol → action: ``n >= 0`` goes to state n, ``-1 - n`` reduces rule n.
+    start, end : int
+        The first state and the final state.
+    """
+
+    terminals: dict[str, Terminal]
+    rules: tuple[Rule, ...]
+    states: tuple[dict[str, int], ...]
+    start: int
+    end: int
+
+
+@cache
+def tables() -> Tables:
+    """Return the tables of the bundled grammar."""
+    folder = resources.files("sgstore.lang.syntax")
+    grammar = folder.joinpath(GRAMMAR).read_text(encoding="utf-8")
+    kept = folder.joinpath(TABLES)
+    plain = json.loads(kept.read_text(encoding="utf-8")) if kept.is_file() else {}
+    if plain.get("digest") != _digest(grammar):
+        plain = made_from(grammar)
+    return _read_tables(plain)
+
+
+def keywords() -> list[str]:
+    """Return the keywords of the language in alphabetical order."""
+    terminals = tables().terminals.values()
+    written = [one.pattern.pattern if one.pattern else one.literal for one in terminals]
+    return sorted({word for text in written for word in re.findall("[A-Z]{2,}", text)})
+
+
+def made_from(grammar: str) -> dict[str, Any]:
+    """Return the tables of a grammar as JSON data. The same grammar always gives the same tables."""
+    from lark import Lark
+    from lark.grammar import Rule as LarkRule
+    from lark.lexer import TerminalDef
+
+    data, memo = Lark(grammar, parser="lalr", maybe_placeholders=True).memo_serialize(
+        [TerminalDef, LarkRule]
+    )
+    table: dict[str, Any] = data["parser"]["parser"]
+    rules = sorted(
+        {json.dumps(_rule(value)) for value in memo.values() if value["__type__"] == "Rule"}
+    )
+    number = {
+        key: rules.index(json.dumps(_rule(value)))
+        for key, value in memo.items()
+        if value["__type__"] == "Rule"
+    }
+    states = {
+        state: {
+            table["tokens"][symbol]: -1 - number[target["@"]] if reduces else target
+            for symbol, (reduces, target) in actions.items()
+        }
+        for state, actions in table["states"].items()
+    }
+    order = _walk(states, table["start_states"]["start"])
+    return {
+        "digest": _digest(grammar),
+        "start": 0,
+        "end": order[table["end_states"]["start"]],
+        "terminals": sorted(
+            _terminal(value) for value in memo.values() if value["__type__"] == "TerminalDef"
+        ),
+        "rules": [json.loads(rule) for rule in rules],
+        "states": [_numbered(states[state], order) for state in order],
+    }
+
+
+def _walk(states: dict[int, dict[str, int]], start: int) -> dict[int, int]:
+    """Return new state numbers that depend only on the grammar. The numbers of lark change from run to run."""
+    order = {start: 0}
+    waiting = [start]
+    while waiting:
+        actions = states[waiting.pop(0)]
+        for _, target in sorted(actions.items()):
+            if target >= 0 and target not in order:
+                order[target] = len(order)
+                waiting.append(target)
+    return order
+
+
+def _numbered(actions: dict[str, int], order: dict[int, int]) -> dict[str, int]:
+    return {s: order[t] if t >= 0 else t for s, t in sorted(actions.items())}
+
+
+def _rule(rule: dict[str, Any]) -> list[Any]:
+    options = rule["options"]
+    origin, alias = rule["origin"]["name"], rule["alias"]
+    keep = [
+        options["keep_all_tokens"] or not symbol.get("filter_out", False)
+        for symbol in rule["expansion"]
+    ]
+    holes = "".join("1" if hole else "0" for hole in options["empty_indices"])
+    absent = [len(ones) for ones in holes.split("0")] if holes else []
+    names = [symbol["name"] for symbol in rule["expansion"]]
+    return [origin, alias or origin, keep, absent, bool(options["expand1"] and not alias), names]
+
+
+def _terminal(terminal: dict[str, Any]) -> list[Any]:
+    pattern = terminal["pattern"]
+    literal = pattern["__type__"] == "PatternStr"
+    value: str = pattern["value"]
+    return [
+        terminal["name"],
+        value.upper() if literal else "",
+        "" if literal else value,
+        terminal["priority"],
+    ]
+
+
+def _read_tables(plain: dict[str, Any]) -> Tables:
+    return Tables(
+        {
+            name: Terminal(
+                name, literal, re.compile(regex, re.IGNORECASE) if regex else None, priority
+            )
+            for name, literal, regex, priority in plain["terminals"]
+        },
+        tuple(
+            Rule(origin, name, len(keep), tuple(keep), tuple(absent), inline)
+            for origin, name, keep, absent, inline, _ in plain["rules"]
+        ),
+        tuple(plain["states"]),
+        plain["start"],
+        plain["end"],
+    )
+
+
+def _digest(grammar: str) -> str:
+    return hashlib.sha256(grammar.encode()).hexdigest()[:16]
+
+
+def text_of(plain: dict[str, Any]) -> str:
+    """Return the tables as JSON text, with one state on each line."""
+    states = ",\n".join(json.dumps(state, separators=(",", ":")) for state in plain["states"])
+    rest = {key: value for key, value in plain.items() if key != "states"}
+    return f'{json.dumps(rest, separators=(",", ":"))[:-1]},\n"states":[\n{states}\n]}}\n'
+
+
+if __name__ == "__main__":
+    here = Path(__file__).parent
+    grammar_text = (here / GRAMMAR).read_text(encoding="utf-8")
+    (here / TABLES).write_text(text_of(made_from(grammar_text)), encoding="utf-8")
+
+
+# Text → syntax tree: an LALR(1) parser that runs the tables of ``grammar.lark`` -----------------
+# The parser guides the lexer: the lexer takes the longest of the terminals allowed at a place. So a word is a
+# keyword only where a keyword is allowed. Error messages list the same allowed terminals.
+
+MAX_LENGTH: Final = 100_000
+"""Longest text that the parser accepts; characters."""
+
+MAX_DEPTH: Final = 200
+"""Largest stack of the parser. It limits nesting before any recursion."""
+
+_END: Final = "$END"
+_BLANK: Final = re.compile(r"\s+")
+_COMMENT: Final = re.compile(r"--[^\n]*|/\*.*?\*/", re.DOTALL)
+_NEXT: Final = re.compile(
+    r"""\w+|<?--+>?|&&|\|\||\]\s*>|-\(|'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|\S""", re.DOTALL
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Token:
+    """Token read from the text."""
+
+    name: str
+    text: str
+    span: TextSpan
+
+
+@dataclass(slots=True)
+class _StackEntry:
+    """Entry of the parser's stack: the state after a symbol, its result, and its place in the text."""
+
+    state: int
+    value: Any
+    span: TextSpan
+
+
+def parse(text: str) -> tuple[Statement, ...]:
+    """Return the statements of a text. The results for recent short texts are cached.
+
+    Raises
+    ------
+    QuerySyntaxError
+        The text does not match the grammar.
+    """
+    return _parsed_once(text) if len(text) <= _SHORT else _parsed(text)
+
+
+_SHORT: Final = 4_000
+"""Longest text whose statements are cached; characters."""
+
+
+@lru_cache(maxsize=64)
+def _parsed_once(text: str) -> tuple[Statement, ...]:
+    return _parsed(text)
+
+
+def _parsed(text: str) -> tuple[Statement, ...]:
+    if len(text) > MAX_LENGTH:
+        reason = f"the text has {len(text)} characters, more than {MAX_LENGTH}"
+        raise QuerySyntaxError(reason)
+    machine = tables()
+    stack = [_StackEntry(machine.start, None, TextSpan(0, 0))]
+    position = 0
+    while True:
+        token = _read(machine, stack, text, position)
+        _take(machine, stack, token, text)
+        if stack[-1].state == machine.end:
+            return stack[-1].value
+        position = token.span.end
+
+
+def joined(texts: Sequence[str]) -> str:
+    """Join the statements of several texts into one text. A single text is returned unchanged.
+
+    Raises
+    ------
+    QuerySyntaxError
+        One of the texts does not match the grammar.
+    """
+    if len(texts) == 1:
+        return texts[0]
+    written = (text[s.span.start : s.span.end] for text in texts for s in parse(text))
+    return "\n;\n".join(written)  # on separate lines, because a statement may end in a comment
+
+
+def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -> Token:
+    """Return the next token that is allowed after the stack."""
+    actions = machine.states[stack[-1].state]
+    allowed = [machine.terminals[name] for name in actions if name in machine.terminals]
+    while True:
+        if blank := _BLANK.match(text, position):
+            position = blank.end()
+        best = max(allowed, key=partial(_rank, text, position), default=None)
+        edge = _reads_as_edge(text, position, actions)
+        comment = None if edge else _COMMENT.match(text, position)
+        # Between nodes, two dashes are an edge. In an expression, they begin a comment.
+        signs = comment is not None and best is not None and best.name == "SIGN"
+        if best and not signs and (length := best.length_at(text, position)):
+            span = TextSpan(position, position + length)
+            return Token(best.name, text[position : position + length], span)
+        if not comment:
+            break
+        position = comment.end()
+    if position == len(text) and _END in actions:
+        return Token(_END, "", TextSpan(position, position))
+    raise _unexpected(machine, stack, text, position)
+
+
+def _reads_as_edge(text: str, position: int, actions: Mapping[str, int]) -> bool:
+    """True if two dashes at this place are an edge, and not the start of a comment."""
+    if text.startswith("-->", position):
+        return True
+    behind = text[position - 1 : position] == ")" or text.startswith("--[", position)
+    return behind and "BARE_ANY" in actions and text.startswith("--", position)
+
+
+def _rank(text: str, position: int, terminal: Terminal) -> tuple[int, int, bool]:
+    return terminal.length_at(text, position), terminal.priority, bool(terminal.literal)
+
+
+_CLOSING: Final = "RPAR"
+
+
+def _take(machine: Tables, stack: list[_StackEntry], token: Token, text: str) -> None:
+    """Reduce all rules that end before the token, then push the token."""
+    before = [*stack]
+    while True:
+        action = machine.states[stack[-1].state].get(token.name)
+        if action is None:
+            # A closing bracket reduces all open rules, even without an opening bracket.
+            shown = before if token.name == _CLOSING else stack
+            raise _unexpected(machine, shown, text, token.span.start)
+        if action >= 0:
+            break
+        rule = machine.rules[-1 - action]
+        _reduce(machine, stack, rule, text)
+        if stack[-1].state == machine.end:
+            return
+    if len(stack) > MAX_DEPTH:
+        raise QuerySyntaxError("nested too deeply", text=text, span=token.span)
+    stack.append(_StackEntry(action, token, token.span))
+
+
+def _reduce(machine: Tables, stack: list[_StackEntry], rule: Rule, text: str) -> None:
+    first = len(stack) - rule.size
+    parts = stack[first:]
+    del stack[first:]
+    end = stack[-1].span.end  # the end of the previous part, used for an empty part
+    span = TextSpan(parts[0].span.start, parts[-1].span.end) if parts else TextSpan(end, end)
+    value = _built(rule, _children(rule, parts), span, text)
+    state = machine.states[stack[-1].state][rule.origin]
+    stack.append(_StackEntry(state, value, span))
+
+
+def _children(rule: Rule, parts: list[_StackEntry]) -> list[Any]:
+    """Return the children of a rule: no signs, flattened repetitions, ``None`` for absent parts."""
+    children: list[Any] = []
+    for index, part in enumerate(parts):
+        if rule.absent:
+            children += [None] * rule.absent[index]
+        if isinstance(part.value, list):
+            children += part.value
+        elif rule.keep[index]:
+            children.append(part.value)
+    if rule.absent:
+        children += [None] * rule.absent[-1]
+    return children
+
+
+def _built(rule: Rule, children: list[Any], span: TextSpan, text: str) -> Any:
+    if rule.origin.startswith("_"):
+        return children
+    if rule.inline and len(children) == 1:
+        return children[0]
+    try:
+        return BUILDERS[rule.name](span, children)
+    except BuildError as error:
+        raise QuerySyntaxError(
+            error.reason, text=text, span=error.span or span, hint=error.hint
+        ) from None
+
+
+# Errors -------------------------------------------------------------------------------------------
+
+_OPERATORS: Final = frozenset(
+    {"COMPARE", "SIGN", "STAR", "SLASH", "PERCENT", "AND", "OR", "XOR", "IMPLIES", "IS", "IN"}
+    | {"STARTS", "ENDS", "CONTAINS", "EQUAL", "UNTIL_OP", "UNTIL_LINK", "NOT", "OVER"}
+)
+_EDGES: Final = frozenset({"BARE_RIGHT", "BARE_LEFT", "BARE_ANY", "_OPEN", "_OPEN_LEFT"})
+_LATER: Final = frozenset(
+    {
+        "HOLDS",
+        "CHECK",
+        "FOR",
+        "THEN",
+        "UNTIL_LINK",
+        "WHILE",
+        "UNTIL_OP",
+        "TEMPORAL",
+        "RESET",
+        "SEMICOLON",
+    }
+    | {"_ARROW", "_GROUP", "HAVING", "OPTIONAL", "PATH_NAME", "SKIP", "UNION", "WITH"}
+)
+"""Terminals left out of suggestions to keep the list short: temporal words and synonyms."""
+
+_STARTS: Final = frozenset({"NUMBER", "STRING", "PARAM", "TRUTH", "NULL", "EXISTS"})
+_SAID: Final = {
+    "NAME": ("a name",),
+    "NUMBER": ("a number",),
+    "STRING": ("a text in quotes",),
+    "DURATION": ("a duration such as 2s",),
+    "PARAM": ("a parameter such as $x",),
+    "COMPARE": ("a comparison",),
+    "BARE_RIGHT": ("'-->'",),
+    "BARE_LEFT": ("'<--'",),
+    "BARE_ANY": ("'--'",),
+    "UPTO": ("'..'",),
+    "SIGN": ("'+'", "'-'"),
+    "TRUTH": ("TRUE", "FALSE"),
+    "DIRECTION": ("ASC", "DESC"),
+    "QUANTIFIER": ("FORALL", "FORSOME"),
+    "DEF_KIND": ("PREDICATE", "SCENARIO"),
+    "AGGREGATE": ("MIN", "MAX", "AVG", "SUM"),
+    "BOUND": ("a bound such as [0s, 2s]",),
+    _END: ("the end",),
+}
+"""Descriptions of terminals."""
+
+_MANY: Final = 8
+_LONGEST: Final = 40
+
+
+def _unexpected(
+    machine: Tables, stack: list[_StackEntry], text: str, position: int
+) -> QuerySyntaxError:
+    if blank := _BLANK.match(text, position):
+        position = blank.end()
+    found = _NEXT.match(text, position)
+    span = TextSpan(position, found.end() if found else position)
+    names = [name for name in machine.states[stack[-1].state] if name.isupper() or name == _END]
+    names = [name for name in names if _leads_on(machine, stack, name)]
+    here = f"found {_shown(found[0])}" if found else "the text ends"
+    reason = f"expected {_listed(machine, names)}, but {here}"
+    return QuerySyntaxError(reason, text=text, span=span, hint=_hint(machine, names, text, span))
+
+
+def _shown(found: str) -> str:
+    """Return a part of the text for a message, shortened and with all characters visible."""
+    if not found.isprintable():
+        return " ".join(f"U+{ord(character):04X}" for character in found[:8])
+    short = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}…"
+    return short if len(found) > 1 and found[0] in "'\"" else f"'{short}'"
+
+
+def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
+    """True if the parser would accept the terminal after all pending reductions."""
+    states = [entry.state for entry in stack]
+    while (action := machine.states[states[-1]].get(name)) is not None:
+        if action >= 0:
+            return True
+        rule = machine.rules[-1 - action]
+        del states[len(states) - rule.size :]
+        states.append(machine.states[states[-1]][rule.origin])
+        if states[-1] == machine.end:
+            return name == _END
+    return False
+
+
+def _listed(machine: Tables, names: list[str]) -> str:
+    """Return the expected terminals in words. Operators are grouped, and so are starts of values."""
+    left = set(names) - _LATER or set(names)
+    said: list[str] = []
+    if "RETURN" in left:  # a second MATCH is allowed wherever RETURN is
+        left -= {"MATCH"}
+    if left >= _EDGES:
+        said.append("an edge")
+        left -= _EDGES
+    if "MATCH" in left:
+        left -= {"NOT"}
+    if left >= _STARTS:
+        said += ["a value", "a condition"]
+        left -= _STARTS | {"NAME", "LPAR", "LSQB", "COUNT", "AGGREGATE", "DURATION", "TEMPORAL"}
+        left -= {"CASE", "HAPPENS"}
+        left -= {"SIGN", "NOT"}
+    elif {"SIGN", "STAR"} <= left:
+        said.append("an operator")
+        left -= _OPERATORS | {"_RESEMBLES", "DOT"}
+    said += sorted(word for name in left for word in _said(machine, name))
+    if len(said) > _MANY:
+        said = [*said[:_MANY], "…"]
+    return " or ".join([", ".join(said[:-1]), said[-1]]) if len(said) > 1 else "".join(said)
+
+
+def _said(machine: Tables, name: str) -> tuple[str, ...]:
+    terminal = machine.terminals.get(name)
+    if name in _SAID or terminal is None or not terminal.literal:
+        return _SAID.get(name, (name,))
+    return (terminal.literal if terminal.literal.isalpha() else f"'{terminal.literal}'",)
+
+
+def _hint(machine: Tables, names: list[str], text: str, span: TextSpan) -> str | None:
+    bracket = bracket_hint(text, span.start, text[span.start : span.end])
+    if bracket:
+        return bracket
+    words = [machine.terminals[name].literal for name in names if name in machine.terminals]
+    return slip_hint(text, span.start, span.end, places(names), words)

@@ -1,0 +1,718 @@
+"""Builders of the syntax tree: one function for each grammar rule.
+
+A builder has the name of its rule, or of the alias of an alternative. It takes the span and the children and
+returns a part of the syntax tree. Signs and keywords are not passed as children. An absent optional part is
+``None``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from sgstore.errors import TextSpan
+from sgstore.lang.syntax import tree as s
+from sgstore.lang.syntax._hints import said_of
+from sgstore.model.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+Children = list[Any]
+
+_ESCAPES: Final = {"n": "\n", "t": "\t", "r": "\r", "\\": "\\", "'": "'", '"': '"'}
+_ESCAPED: Final = re.compile(r"\\(.)", re.DOTALL)
+_DURATION: Final = re.compile(r"([\d.]+)\s*(\w+)")
+
+
+class BuildError(Exception):
+    """Text that matches the grammar, but is not valid in the language."""
+
+    def __init__(self, reason: str, span: TextSpan | None = None, hint: str | None = None) -> None:
+        self.reason = reason
+        self.span = span
+        self.hint = hint
+        super().__init__(reason)
+
+
+# Values -------------------------------------------------------------------------------------------
+
+
+def _number(span: TextSpan, children: Children) -> s.Constant:
+    text: str = children[0].text
+    value = int(text) if text.isdigit() else float(text)
+    if abs(value) > 1e300:
+        raise BuildError("too large a number")
+    if isinstance(value, int) and value >= 2**63:
+        value = float(value)
+    return s.Constant(value, span)
+
+
+def _whole(token: Any) -> int:
+    if not token.text.isdigit():
+        raise BuildError("expected a whole number", token.span)
+    if len(token.text) > 9:
+        raise BuildError("too large a number", token.span, "at most 9 digits")
+    return int(token.text)
+
+
+def _string(span: TextSpan, children: Children) -> s.Constant:
+    return s.Constant(_unquoted(children[0].text), span)
+
+
+def _unquoted(text: str) -> str:
+    r"""Return the text between the quotes. Unknown escapes such as ``\d`` keep their backslash."""
+    return _ESCAPED.sub(lambda found: _ESCAPES.get(found[1], found[0]), text[1:-1])
+
+
+def _truth(span: TextSpan, children: Children) -> s.Constant:
+    return s.Constant(children[0].text.upper() == "TRUE", span)
+
+
+def _duration(span: TextSpan, children: Children) -> s.Duration | s.Parameter:
+    token = children[0]
+    if token.name == "PARAM":
+        return s.Parameter(token.text[1:], span)
+    return _length(token.text, span)
+
+
+def _length(text: str, span: TextSpan) -> s.Duration:
+    found = _DURATION.fullmatch(text)
+    assert found is not None, text  # noqa: S101 - the lexer's pattern is narrower
+    if (amount := float(found[1])) > s.LONGEST:
+        raise BuildError(s.TOO_LONG, span)
+    return s.Duration(amount, found[2].lower(), span)
+
+
+def _parameter(span: TextSpan, children: Children) -> s.Parameter:
+    return s.Parameter(children[0].text[1:], span)
+
+
+def _variable(span: TextSpan, children: Children) -> s.Variable:
+    return s.Variable(children[0].text, span)
+
+
+def _attribute(span: TextSpan, children: Children) -> s.AttributeOf:
+    owner, name = children
+    if not isinstance(owner, s.Variable):
+        inner = owner.name if isinstance(owner, s.AttributeOf) else ""
+        hint = said_of("attributes", inner) or "what is of a value is a function: abs(x), lower(x)"
+        if isinstance(owner, s.Call):
+            hint = f"the attribute stands in the brackets: {owner.name}(x.{name.text})"
+        raise BuildError(
+            f"only variables have attributes, so '.{name.text}' has no meaning here", hint=hint
+        )
+    return s.AttributeOf(owner, name.text, span)
+
+
+def _attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
+    """Build ``frame.class('E')``, which means ``frame.class_E``."""
+    owner, name, value = children
+    if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
+        hint = said_of("methods", name.text) or f"what is called stands first: {name.text}(x)"
+        raise BuildError(
+            f"'.{name.text}' takes nothing in parentheses; only frame.class does", hint=hint
+        )
+    return s.AttributeOf(owner, f"class_{_unquoted(value.text)}", span)
+
+
+def _all(_: TextSpan, children: Children) -> tuple[Any, ...]:
+    return tuple(children)
+
+
+def _list(span: TextSpan, children: Children) -> s.ListOf:
+    return s.ListOf(children[0] or (), span)
+
+
+def _call(span: TextSpan, children: Children) -> s.Call:
+    name, arguments = children
+    return s.Call(name.text, arguments or (), distinct=False, name_span=name.span, span=span)
+
+
+def _call_of_distinct(span: TextSpan, children: Children) -> s.Call:
+    name, _, arguments = children
+    return s.Call(name.text, arguments, distinct=True, name_span=name.span, span=span)
+
+
+def _happens(span: TextSpan, children: Children) -> s.HappensExpression:
+    _, kind, arguments = children
+    return s.HappensExpression(kind.text, arguments or (), kind.span, span)
+
+
+def _count_all(span: TextSpan, _: Children) -> s.CountAll:
+    return s.CountAll(span)
+
+
+def _count_values(span: TextSpan, children: Children) -> s.Call:
+    distinct, value = children
+    return s.Call(
+        "count", (value,), distinct is not None, TextSpan(span.start, span.start + 5), span
+    )
+
+
+def _over_match(span: TextSpan, children: Children) -> s.OverExpression:
+    return s.OverExpression(children[0], None, None, span)
+
+
+def _over_steps(span: TextSpan, children: Children) -> s.OverExpression:
+    value, *names = children
+    start, end = (name and s.Variable(name.text, name.span) for name in names)
+    return s.OverExpression(value, start, end, span)
+
+
+# Conditions ---------------------------------------------------------------------------------------
+
+
+def _logic(
+    word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"], span: TextSpan, children: Children
+) -> s.Logic:
+    return s.Logic(word, tuple(children), span)
+
+
+def _compare(span: TextSpan, children: Children) -> s.Comparison:
+    left, sign, right = children
+    return s.Comparison("<>" if sign.text == "!=" else sign.text, left, right, span)
+
+
+def _comparison(word: str, span: TextSpan, children: Children) -> s.Comparison:
+    return s.Comparison(word, children[0], children[1], span)
+
+
+def _null_test(span: TextSpan, children: Children, *, negated: bool) -> s.NullTest:
+    return s.NullTest(children[0], negated, span)
+
+
+def _membership(span: TextSpan, children: Children, *, negated: bool) -> s.Membership:
+    return s.Membership(children[0], children[1], negated, span)
+
+
+def _arithmetic(span: TextSpan, children: Children) -> s.Arithmetic:
+    pairs = zip(children[1::2], children[2::2], strict=True)
+    return s.Arithmetic(children[0], tuple((sign.text, term) for sign, term in pairs), span)
+
+
+def _sign(span: TextSpan, children: Children) -> s.Expression:
+    sign, operand = children
+    return s.Negative(operand, span) if sign.text == "-" else operand
+
+
+def _when(span: TextSpan, children: Children) -> s.When:
+    condition, value = children
+    return s.When(condition, value, span)
+
+
+def _case(span: TextSpan, children: Children) -> s.Case:
+    """Build a ``CASE``. With ``CASE x WHEN y``, each branch has the condition ``x = y``."""
+    subject, *branches, otherwise = children
+    if subject is not None:
+        branches = [
+            s.When(
+                s.Comparison("=", subject, one.condition, one.condition.span), one.value, one.span
+            )
+            for one in branches
+        ]
+    return s.Case(tuple(branches), otherwise, span)
+
+
+def _temporal(span: TextSpan, children: Children) -> s.Temporal:
+    word, bound, operand = children
+    return s.Temporal(word.text.upper(), (operand,), TextSpan(span.start, word.span.end), bound)
+
+
+def _temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
+    left, word, bound, right = children
+    return s.Temporal(word.text.upper(), (left, right), word.span, bound)
+
+
+def _bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
+    """Build a time bound: ``[0s, 2s]``, or ``WITHIN 2s``, which starts at 0."""
+    (found,) = children
+    if isinstance(found, s.Duration | s.Parameter):
+        return s.Duration(0, "s", span), found
+    low, high = (part.strip() for part in found.text[1:-1].split(","))
+    return _end(low, span), None if high.upper() == "INF" else _end(high, span)
+
+
+def _end(text: str, span: TextSpan) -> s.Duration | s.Parameter:
+    if text.startswith("$"):
+        return s.Parameter(text[1:], span)
+    return _length(text, span)
+
+
+def _block_expression(word: str, span: TextSpan, children: Children) -> s.BlockExpression:
+    return s.BlockExpression(word, children[0], None, span)
+
+
+def _aggregate_block(span: TextSpan, children: Children) -> s.BlockExpression:
+    word, block, value = children
+    return s.BlockExpression(word.text.upper(), block, value, span)
+
+
+# Patterns -----------------------------------------------------------------------------------------
+
+
+def _label(span: TextSpan, children: Children) -> s.Label:
+    return s.Label(children[0].text, span)
+
+
+def _label_any(span: TextSpan, _: Children) -> s.Label:
+    return s.Label("%", span)
+
+
+def _label_logic(word: Literal["!", "&", "|"], span: TextSpan, children: Children) -> s.LabelLogic:
+    return s.LabelLogic(word, tuple(children), span)
+
+
+def _prop(_: TextSpan, children: Children) -> s.Property:
+    name, value = children
+    return s.Property(name.text, value, name.span)
+
+
+def _only(_: TextSpan, children: Children) -> Any:
+    return children[0]
+
+
+def _node(span: TextSpan, children: Children) -> s.NodePattern:
+    name, label, props, where = children
+    name_span = name.span if name else span
+    return s.NodePattern(name and name.text, label, props or (), where, name_span, span)
+
+
+def _edge_body(span: TextSpan, children: Children) -> tuple[Any, ...]:
+    name, label, star, props, where = children
+    return name and name.text, label, star, props or (), where, span
+
+
+_Direction = Literal["right", "left", "any"]
+
+
+def _edge(direction: _Direction, span: TextSpan, children: Children) -> s.EdgePattern:
+    (name, label, star, props, where, _), repeat = children
+    if star and repeat:
+        raise BuildError("an edge is repeated twice, by '*' and by '{…}'")
+    low, high = star or repeat or (None, None)
+    return s.EdgePattern(name, label, low, high, props, where, direction, span)
+
+
+def _bare(direction: _Direction, span: TextSpan, _: Children) -> s.EdgePattern:
+    return s.EdgePattern(None, None, None, None, (), None, direction, span)
+
+
+def _star(span: TextSpan, children: Children) -> tuple[int, int]:
+    number, upto = children
+    digits = upto.text[2:].strip() if upto else ""
+    if not number and not upto:
+        raise _unbounded(span)
+    if upto and not digits:
+        raise _unbounded(span)
+    low = _whole(number) if number else 1
+    return _range(low, int(digits[:9]) if upto else low, span)
+
+
+def _repeat(span: TextSpan, children: Children) -> tuple[int, int]:
+    low, high = children
+    if high is None:
+        raise _unbounded(span)
+    return _range(_whole(low), _whole(high), span)
+
+
+def _repeat_exactly(span: TextSpan, children: Children) -> tuple[int, int]:
+    return _range(_whole(children[0]), _whole(children[0]), span)
+
+
+MAX_EDGES: Final = 10
+"""Longest path that one edge pattern can match, in edges."""
+
+
+def _unbounded(span: TextSpan) -> BuildError:
+    return BuildError(
+        "a repeated edge needs an upper bound", span, f"write *1..{MAX_EDGES} for 1 to {MAX_EDGES}"
+    )
+
+
+def _range(low: int, high: int, span: TextSpan) -> tuple[int, int]:
+    if not 1 <= low <= high:
+        raise BuildError(f"an edge cannot be repeated {low} to {high} times", span, "write *1..3")
+    if high > MAX_EDGES:
+        raise BuildError(f"a repeated edge stands for at most {MAX_EDGES} edges", span)
+    return low, high
+
+
+def _path(_: TextSpan, children: Children) -> s.Path:
+    return s.Path(tuple(children[::2]), tuple(children[1::2]))
+
+
+def _named_path(_: TextSpan, children: Children) -> s.Path:
+    name, path = children
+    return replace(path, name=name.text, name_span=name.span)
+
+
+def _block_body(span: TextSpan, children: Children) -> s.Block:
+    paths, where = children
+    return s.Block(paths, where, span)
+
+
+# Statements ---------------------------------------------------------------------------------------
+
+
+def _match_step(span: TextSpan, children: Children) -> s.StepClause:
+    paths, where, *further, hold, name = children
+    for more, condition in further:
+        paths += more
+        where = _both(where, condition)
+    end = where.span.end if where else span.end
+    block = s.Block(paths, where, TextSpan(span.start, end))
+    return s.StepClause(block, absent=False, hold=hold, name=name, span=span)
+
+
+def _further(_: TextSpan, children: Children) -> tuple[Any, Any]:
+    """Build a second ``MATCH`` for the same frame: its paths and its condition."""
+    paths, where = children
+    return paths, where
+
+
+def _both(one: s.Expression | None, other: s.Expression | None) -> s.Expression | None:
+    if one is None or other is None:
+        return one or other
+    return s.Logic("AND", (one, other), TextSpan(one.span.start, other.span.end))
+
+
+def _holds_step(span: TextSpan, children: Children) -> s.StepClause:
+    condition, hold, name = children
+    block = s.Block((), condition, condition.span)
+    return s.StepClause(block, absent=False, hold=hold, name=name, span=span)
+
+
+def _absent_step(span: TextSpan, children: Children) -> s.StepClause:
+    (step,) = children
+    if step.hold or step.name:
+        raise BuildError("what must not happen has no duration and no name", step.span)
+    return s.StepClause(step.block, absent=True, hold=None, name=None, span=span)
+
+
+def _group_step(span: TextSpan, children: Children) -> s.GroupStep:
+    *alternatives, often = children
+    low, high = often or (1, 1)
+    return s.GroupStep(tuple(alternatives), low, high, span)
+
+
+def _often(span: TextSpan, children: Children) -> tuple[int, int]:
+    low, high = children
+    least = _whole(low)
+    most = least if high is None else _whole(high)
+    if not 1 <= least <= most:
+        reason = f"steps cannot be repeated {least} to {most} times"
+        raise BuildError(reason, span, "write {2}, or {1,3}")
+    return least, most
+
+
+def _scenario_step(span: TextSpan, children: Children) -> s.ScenarioStep:
+    name, *given = children
+    values = tuple(value for value in given if value is not None)
+    named = [normalize_name(value.name) for value in values]
+    if len(set(named)) < len(named):
+        raise BuildError("a parameter is given twice", span)
+    return s.ScenarioStep(name.text, values, name.span, span)
+
+
+def _given(span: TextSpan, children: Children) -> s.Argument:
+    name, value = children
+    if not isinstance(value, s.Constant | s.Duration):
+        named = value.name == "NAME"
+        value = (
+            s.Variable(value.text, value.span) if named else s.Parameter(value.text[1:], value.span)
+        )
+    return s.Argument(name.text, value, span)
+
+
+def _hold(span: TextSpan, children: Children) -> s.HoldClause:
+    *comparison, duration, inclusive = children
+    word = comparison[0].text if comparison else "="
+    if word in {"<>", "!="}:
+        raise BuildError("a step lasts for >=, >, =, < or <= a time", span)
+    return s.HoldClause(word, duration, inclusive is not None, span)
+
+
+def _step_name(_: TextSpan, children: Children) -> str:
+    return children[0].text
+
+
+def _link(span: TextSpan, children: Children) -> s.LinkClause:
+    kind, after, within = children[0] or ("then", None, None)
+    return s.LinkClause(kind, after, within, span)
+
+
+def _immediately(_: TextSpan, __: Children) -> tuple[str, None, None]:
+    return "immediately", None, None
+
+
+def _other_link(kind: Literal["until", "while"], span: TextSpan, _: Children) -> s.LinkClause:
+    return s.LinkClause(kind, None, None, span)
+
+
+def _sequence(span: TextSpan, children: Children) -> s.SequenceClause:
+    return s.SequenceClause(tuple(children[::2]), tuple(children[1::2]), span)
+
+
+def _match(span: TextSpan, children: Children) -> s.MatchClause:
+    settings, sequence, later, returns, order, sample, top, skip, limit = children
+    if any(part is not None for part in children[3:]):
+        every = (s.Item("all", None, None, 0, 0, span),)
+        distinct, items, having, at = returns or (False, every, None, span)
+        returns = s.Returns(distinct, items, order or (), sample, limit, at, having, top, skip or 0)
+    return s.MatchClause(settings or (), sequence, returns, span, later or ())
+
+
+def _later_match(span: TextSpan, children: Children, *, optional: bool) -> s.LaterMatch:
+    paths, where = children
+    return s.LaterMatch(s.Block(paths, where, span), optional, span)
+
+
+def _with(span: TextSpan, children: Children) -> s.WithClause:
+    distinct, items, order, skip, limit, where = children
+    for item in items:
+        if item.form not in {"value", "all"}:
+            raise BuildError("WITH passes values and variables on", item.span, "WITH e, v, …")
+    return s.WithClause(distinct is not None, items, order or (), skip or 0, limit, where, span)
+
+
+def _union(span: TextSpan, children: Children) -> s.UnionClause:
+    words = {" ".join(word.text.upper().split()): word for word in children[1::2]}
+    if len(words) > 1:
+        last = [*words.values()][-1]
+        raise BuildError("one of UNION and UNION ALL in a query", last.span)
+    return s.UnionClause(tuple(children[::2]), "UNION" in words, span)
+
+
+def _check(span: TextSpan, children: Children) -> s.CheckClause:
+    settings, name, *quantifiers, formula, reset, robustness, returns = children
+    called, quantified = name and name.text, tuple(quantifiers)
+    distinct, items, having, at = returns or (False, (), None, span)
+    if distinct or having:
+        word = "DISTINCT" if distinct else "HAVING"
+        raise BuildError(f"violations are told one by one, so {word} has no meaning", at)
+    if any(item.form != "value" for item in items):
+        reason = "a CHECK returns values of its violations"
+        raise BuildError(reason, at, "RETURN MIN(gap(ego, v)) OVER match AS closest")
+    asked = robustness is not None
+    return s.CheckClause(settings or (), called, quantified, formula, reset, asked, items, span)
+
+
+def _quantifier(span: TextSpan, children: Children) -> s.QuantifierClause:
+    word, *nodes, where, absent = children
+    return s.QuantifierClause(word.text.upper(), tuple(nodes), where, absent is not False, span)
+
+
+def _quantified(span: TextSpan, children: Children) -> s.QuantifiedNode:
+    name, label = children
+    return s.QuantifiedNode(name.text, label, span)
+
+
+def _absent(_: TextSpan, children: Children) -> bool:
+    return children[0].text.upper() == "TRUE"
+
+
+def _setting(span: TextSpan, children: Children) -> s.Setting:
+    name, value = children
+    if value.name == "PARAM":
+        return s.Setting(name.text, s.Parameter(value.text[1:], value.span), span)
+    text = _unquoted(value.text) if value.name == "STRING" else value.text
+    return s.Setting(name.text, text, span)
+
+
+def _define(span: TextSpan, children: Children) -> s.Define:
+    _, name, parameters, body = children
+    formals: tuple[s.Formal, ...] = parameters or ()
+    named = [normalize_name(formal.name) for formal in formals]
+    if len(set(named)) < len(named):
+        raise BuildError("two parameters have one name", span)
+    if not isinstance(body, s.SequenceClause) and any(formal.default for formal in formals):
+        raise BuildError("the parameters of a predicate are names, without a value", span)
+    return s.Define(name.text, formals, body, name.span, span)
+
+
+def _param(span: TextSpan, children: Children) -> s.Formal:
+    name, label, default = children
+    if label:
+        raise BuildError("the parameters of a definition are names, without a label")
+    return s.Formal(name.text, default, span)
+
+
+def _statements(_: TextSpan, children: Children) -> tuple[Any, ...]:
+    return tuple(child for child in children if child is not None)
+
+
+# Results ------------------------------------------------------------------------------------------
+
+
+def _item(span: TextSpan, children: Children) -> s.Item:
+    value, name = children
+    return s.Item("value", value, name and name.text, 0, 0, span)
+
+
+def _form(
+    form: Literal["all", "frames", "intervals", "subgraphs"], span: TextSpan, _: Children
+) -> s.Item:
+    return s.Item(form, None, None, 0, 0, span)
+
+
+def _clips(span: TextSpan, children: Children) -> s.Item:
+    return s.Item("clips", None, None, children[0], children[1], span)
+
+
+def _offset(span: TextSpan, children: Children) -> int:
+    sign, duration = children
+    if not isinstance(duration, s.Duration) or duration.unit == "frames":
+        raise BuildError("the ends of clips are times such as -3s and +5s", span)
+    return -duration.ns if sign and sign.text == "-" else duration.ns
+
+
+def _sort(_: TextSpan, children: Children) -> s.Sort:
+    value, direction = children
+    return s.Sort(value, bool(direction and direction.text.upper() == "DESC"))
+
+
+def _sample(span: TextSpan, children: Children) -> s.Sample:
+    return s.Sample(_whole(children[0]), children[1], span)
+
+
+def _top(span: TextSpan, children: Children) -> s.Sample:
+    return s.Sample(_whole(children[0]), children[1], span)
+
+
+def _limit(_: TextSpan, children: Children) -> int:
+    return _whole(children[0])
+
+
+def _returns(span: TextSpan, children: Children) -> tuple[Any, ...]:
+    distinct, items, having = children
+    return distinct is not None, items, having, span
+
+
+BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
+    "start": _statements,
+    "define": _define,
+    "params": _all,
+    "param": _param,
+    "match": _match,
+    "later": _all,
+    "optional": partial(_later_match, optional=True),
+    "again": partial(_later_match, optional=False),
+    "with": _with,
+    "union": _union,
+    "check": _check,
+    "quantifier": _quantifier,
+    "qvar": _quantified,
+    "absent": _absent,
+    "reset": _only,
+    "using": _all,
+    "setting": _setting,
+    "sequence": _sequence,
+    "absent_step": _absent_step,
+    "match_step": _match_step,
+    "further": _further,
+    "holds_step": _holds_step,
+    "group_step": _group_step,
+    "often": _often,
+    "scenario_step": _scenario_step,
+    "given": _given,
+    "hold": _hold,
+    "step_name": _step_name,
+    "link": _link,
+    "until_link": partial(_other_link, "until"),
+    "while_link": partial(_other_link, "while"),
+    "within": lambda _, children: ("then", None, children[0]),
+    "after": lambda _, children: ("then", *children),
+    "immediately": _immediately,
+    "where": _only,
+    "patterns": _all,
+    "path": _path,
+    "named_path": _named_path,
+    "node": _node,
+    "edge_right": partial(_edge, "right"),
+    "edge_left": partial(_edge, "left"),
+    "edge_any": partial(_edge, "any"),
+    "bare_right": partial(_bare, "right"),
+    "bare_left": partial(_bare, "left"),
+    "bare_any": partial(_bare, "any"),
+    "edge_body": _edge_body,
+    "star": _star,
+    "repeat": _repeat,
+    "repeat_exactly": _repeat_exactly,
+    "label_expr": _only,
+    "label_or": partial(_label_logic, "|"),
+    "label_and": partial(_label_logic, "&"),
+    "label_neg": partial(_label_logic, "!"),
+    "label": _label,
+    "label_any": _label_any,
+    "props": _all,
+    "prop": _prop,
+    "implies": partial(_logic, "IMPLIES"),
+    "disjunction": partial(_logic, "OR"),
+    "exclusion": partial(_logic, "XOR"),
+    "conjunction": partial(_logic, "AND"),
+    "negation": partial(_logic, "NOT"),
+    "temporal": _temporal,
+    "temporal_pair": _temporal_pair,
+    "bound": _bound,
+    "compare": _compare,
+    "equal": partial(_comparison, "="),
+    "is_null": partial(_null_test, negated=False),
+    "is_known": partial(_null_test, negated=True),
+    "is_in": partial(_membership, negated=False),
+    "is_not_in": partial(_membership, negated=True),
+    "starts_with": partial(_comparison, "STARTS WITH"),
+    "ends_with": partial(_comparison, "ENDS WITH"),
+    "contains": partial(_comparison, "CONTAINS"),
+    "resembles": partial(_comparison, "=~"),
+    "sum": _arithmetic,
+    "product": _arithmetic,
+    "times": _only,
+    "sign": _sign,
+    "attribute": _attribute,
+    "attribute_in": _attribute_in,
+    "over_match": _over_match,
+    "over_steps": _over_steps,
+    "timespan": _duration,
+    "parameter": _parameter,
+    "variable": _variable,
+    "call": _call,
+    "call_of_distinct": _call_of_distinct,
+    "happens": _happens,
+    "count_all": _count_all,
+    "count_values": _count_values,
+    "exists": partial(_block_expression, "EXISTS"),
+    "count_block": partial(_block_expression, "COUNT"),
+    "aggregate_block": _aggregate_block,
+    "case": _case,
+    "when": _when,
+    "otherwise": _only,
+    "arguments": _all,
+    "list": _list,
+    "block": _only,
+    "block_body": _block_body,
+    "number": _number,
+    "string": _string,
+    "truth": _truth,
+    "null": lambda span, _: s.Constant(None, span),
+    "duration": _duration,
+    "returns": _returns,
+    "items": _all,
+    "item": _item,
+    "item_all": partial(_form, "all"),
+    "item_frames": partial(_form, "frames"),
+    "item_intervals": partial(_form, "intervals"),
+    "item_subgraphs": partial(_form, "subgraphs"),
+    "item_clips": _clips,
+    "offset": _offset,
+    "order": _all,
+    "sort": _sort,
+    "sample": _sample,
+    "top": _top,
+    "skip": _limit,
+    "limit": _limit,
+    "having": _only,
+}

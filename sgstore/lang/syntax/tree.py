@@ -1,0 +1,584 @@
+"""Syntax tree of a query as written. Each part has its position in the text.
+
+Words are not checked against a vocabulary here; the binder does that. :mod:`sgstore.lang.syntax._parse` makes
+these trees from text.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Literal
+
+from sgstore.base.records import dataclass
+
+if TYPE_CHECKING:
+    from sgstore.errors import TextSpan
+
+
+# Expressions --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """Number, text, truth value or ``NULL`` in a query."""
+
+    value: int | float | str | bool | None
+    span: TextSpan
+
+
+LONGEST: Final = 1e18
+"""Largest amount of a :class:`Duration`. No trace is this long in any unit."""
+TOO_LONG: Final = "no length of time that a trace may have"
+"""Message for a duration above the limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Duration:
+    """Duration: ``amount`` in ``ms``, ``s``, ``min`` or ``frames``."""
+
+    amount: float
+    unit: str
+    span: TextSpan
+
+    @property
+    def ns(self) -> int:
+        """Duration in nanoseconds. Not valid for a duration in frames."""
+        return round(self.amount * {"ms": 1e6, "s": 1e9, "min": 60e9}.get(self.unit, 0))
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """Query parameter ``$name``. Its value is passed with the query."""
+
+    name: str
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """Name bound by a pattern, or ``ego``, ``frame`` or ``trace``."""
+
+    name: str
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class AttributeOf:
+    """Attribute access: ``owner.name``."""
+
+    owner: Variable
+    name: str
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """Function call: ``name(arguments)``. ``COUNT(DISTINCT x)`` is also a call."""
+
+    name: str
+    arguments: tuple[Expression, ...]
+    distinct: bool
+    name_span: TextSpan
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class CountAll:
+    """The expression ``COUNT(*)``."""
+
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class ListOf:
+    """List: ``[a, b, …]``."""
+
+    items: tuple[Expression, ...]
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Logic:
+    """Logical expression: ``NOT a``, ``a AND b AND …``, ``OR``, ``XOR`` or ``a IMPLIES b``."""
+
+    word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"]
+    operands: tuple[Expression, ...]
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Comparison such as ``a = b``, ``STARTS WITH``, ``ENDS WITH``, ``CONTAINS`` or ``=~``."""
+
+    word: str
+    left: Expression
+    right: Expression
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class NullTest:
+    """Null test: ``a IS NULL``, or ``a IS NOT NULL`` if ``negated``."""
+
+    operand: Expression
+    negated: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Membership:
+    """Membership test: ``a IN list``, or ``a NOT IN list`` if ``negated``."""
+
+    operand: Expression
+    choices: Expression
+    negated: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Arithmetic:
+    """Chain of operators of equal precedence, evaluated from left to right: ``a + b - c``."""
+
+    first: Expression
+    rest: tuple[tuple[str, Expression], ...]
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Negative:
+    """Negation of a number: ``-a``."""
+
+    operand: Expression
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class BlockExpression:
+    """Block with braces: ``EXISTS {…}``, ``COUNT {…}``, or ``MIN``, ``MAX``, ``AVG``, ``SUM {… | value}``."""
+
+    word: str
+    block: Block
+    value: Expression | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class When:
+    """Branch of a ``CASE``: ``WHEN condition THEN value``."""
+
+    condition: Expression
+    value: Expression
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Expression ``CASE WHEN condition THEN value … ELSE value END``.
+
+    ``CASE x WHEN y`` is read as ``CASE WHEN x = y``.
+    """
+
+    branches: tuple[When, ...]
+    otherwise: Expression | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Temporal:
+    """Temporal operator with its operands and its time bound. ``None`` means unbounded.
+
+    The upper end of a bound is ``None`` for ``INF``.
+    """
+
+    word: str
+    operands: tuple[Expression, ...]
+    span: TextSpan
+    bound: tuple[Duration | Parameter, Duration | Parameter | None] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OverExpression:
+    """Function over a match or over its steps: ``call OVER match``, ``call OVER start..end``."""
+
+    call: Expression
+    start: Variable | None
+    end: Variable | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class HappensExpression:
+    """Event test: ``HAPPENS kind(arguments)`` is true if the frame has a recorded event."""
+
+    kind: str
+    arguments: tuple[Expression, ...]
+    kind_span: TextSpan
+    span: TextSpan
+
+
+Expression = (
+    Constant
+    | Duration
+    | Parameter
+    | Variable
+    | AttributeOf
+    | Call
+    | CountAll
+    | ListOf
+    | Logic
+    | Comparison
+    | NullTest
+    | Membership
+    | Arithmetic
+    | Negative
+    | BlockExpression
+    | Case
+    | Temporal
+    | OverExpression
+    | HappensExpression
+)
+
+
+Given = Constant | Duration | Parameter | Variable
+"""Expressions that can be arguments of a scenario."""
+
+
+# Patterns -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """Label in a pattern. The name ``%`` means any label."""
+
+    name: str
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class LabelLogic:
+    """Combination of labels: ``!a``, ``a & b`` or ``a | b``."""
+
+    word: Literal["!", "&", "|"]
+    operands: tuple[LabelExpression, ...]
+    span: TextSpan
+
+
+LabelExpression = Label | LabelLogic
+
+
+@dataclass(frozen=True, slots=True)
+class Property:
+    """Property in braces of a pattern: ``name: value``."""
+
+    name: str
+    value: Expression
+    name_span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class NodePattern:
+    """Node pattern: ``(name:label {properties} WHERE condition)``. Each part is optional."""
+
+    name: str | None
+    label: LabelExpression | None
+    properties: tuple[Property, ...]
+    where: Expression | None
+    name_span: TextSpan
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class EdgePattern:
+    """Edge pattern: ``-[name:label*low..high {properties} WHERE condition]->``."""
+
+    name: str | None
+    label: LabelExpression | None
+    low: int | None
+    high: int | None
+    properties: tuple[Property, ...]
+    where: Expression | None
+    direction: Literal["right", "left", "any"]
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Path: nodes with edges between them, such as ``name = (a)-->(b)``. The name is optional."""
+
+    nodes: tuple[NodePattern, ...]
+    edges: tuple[EdgePattern, ...]
+    name: str | None = None
+    name_span: TextSpan | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Paths and a condition: the content of a ``MATCH`` or of braces."""
+
+    paths: tuple[Path, ...]
+    where: Expression | None
+    span: TextSpan
+
+
+# Statements ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """Query setting: ``USING name value``."""
+
+    name: str
+    value: str | Parameter
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """Item to return: a named value, ``*``, ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``.
+
+    ``before`` and ``after`` are the two offsets of ``CLIPS``; ns, negative is earlier.
+    """
+
+    form: Literal["value", "all", "frames", "intervals", "subgraphs", "clips"]
+    value: Expression | None
+    name: str | None
+    before: int
+    after: int
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Sort:
+    """Sort key: ``value ASC`` or ``value DESC``."""
+
+    value: Expression
+    descending: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Sampling clause: ``SAMPLE number PER value``."""
+
+    number: int
+    per: Expression | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Returns:
+    """Return clause: ``RETURN DISTINCT items HAVING … ORDER BY … SAMPLE … LIMIT n PER … SKIP … LIMIT …``.
+
+    ``top`` is ``LIMIT n PER value``.
+    """
+
+    distinct: bool
+    items: tuple[Item, ...]
+    order: tuple[Sort, ...]
+    sample: Sample | None
+    limit: int | None
+    span: TextSpan
+    having: Expression | None = None
+    top: Sample | None = None
+    skip: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class HoldClause:
+    """Minimum or maximum duration of a step: ``FOR >= duration INCLUSIVE``."""
+
+    comparison: str
+    duration: Duration | Parameter
+    inclusive: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class StepClause:
+    """Step of a sequence.
+
+    Attributes
+    ----------
+    block : Block
+        Pattern after ``MATCH``. For ``HOLDS (condition)``: a block without paths.
+    absent : bool
+        True for ``NOT MATCH``.
+    hold : HoldClause or None
+    name : str or None
+        Name after ``AS``.
+    span : TextSpan
+    """
+
+    block: Block
+    absent: bool
+    hold: HoldClause | None
+    name: str | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class ScenarioStep:
+    """Call of a named scenario as a step: ``MATCH name(parameter = value, …)``."""
+
+    name: str
+    given: tuple[Argument, ...]
+    name_span: TextSpan
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """Argument of a scenario, ``name = value``: a parameter value, or a new name for a variable."""
+
+    name: str
+    value: Given
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class LinkClause:
+    """Time relation between two steps of a sequence.
+
+    Attributes
+    ----------
+    kind : str
+        ``then``, ``immediately``, ``until`` or ``while``.
+    after, within : Duration, Parameter or None
+        Shortest and longest time of ``then``.
+    span : TextSpan
+    """
+
+    kind: Literal["then", "immediately", "until", "while"]
+    after: Duration | Parameter | None
+    within: Duration | Parameter | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class GroupStep:
+    """Group of alternative sequences with a repeat count: ``(A | B THEN C){2,3}``.
+
+    Attributes
+    ----------
+    alternatives : tuple of SequenceClause
+    low, high : int
+        Smallest and largest number of repetitions.
+    span : TextSpan
+    """
+
+    alternatives: tuple[SequenceClause, ...]
+    low: int
+    high: int
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceClause:
+    """Steps with links between them. There is one step more than links."""
+
+    steps: tuple[StepClause | ScenarioStep | GroupStep, ...]
+    links: tuple[LinkClause, ...]
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class LaterMatch:
+    """``OPTIONAL MATCH …``, or a ``MATCH …`` after an ``OPTIONAL MATCH`` or a ``WITH``."""
+
+    block: Block
+    optional: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class WithClause:
+    """``WITH`` clause: ``WITH DISTINCT items ORDER BY … SKIP … LIMIT … WHERE …``."""
+
+    distinct: bool
+    items: tuple[Item, ...]
+    order: tuple[Sort, ...]
+    skip: int
+    limit: int | None
+    where: Expression | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class MatchClause:
+    """Complete query: ``USING … MATCH … WHERE … THEN … OPTIONAL MATCH … WITH … RETURN …``."""
+
+    settings: tuple[Setting, ...]
+    sequence: SequenceClause
+    returns: Returns | None
+    span: TextSpan
+    later: tuple[LaterMatch | WithClause, ...] = ()
+
+    @property
+    def block(self) -> Block:
+        """Pattern of the first step. If the step is a scenario, the pattern is empty."""
+        first = self.sequence.steps[0]
+        return first.block if isinstance(first, StepClause) else Block((), None, first.span)
+
+
+@dataclass(frozen=True, slots=True)
+class UnionClause:
+    """Union of queries: ``MATCH … UNION MATCH …``, or ``UNION ALL`` if not ``distinct``."""
+
+    parts: tuple[MatchClause, ...]
+    distinct: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Formal:
+    """Formal parameter of a definition. A parameter of a scenario may have a default value."""
+
+    name: str
+    default: Constant | Duration | None
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Define:
+    """Definition of a predicate or scenario: ``DEFINE PREDICATE name(parameters) AS condition``."""
+
+    name: str
+    parameters: tuple[Formal, ...]
+    body: Expression | SequenceClause
+    name_span: TextSpan
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class QuantifiedNode:
+    """Quantified variable ``name:label`` after ``FORALL`` or ``FORSOME``."""
+
+    name: str
+    label: LabelExpression
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class QuantifierClause:
+    """Quantifier: ``FORALL (a:Label, b:Label WHERE condition ABSENT AS TRUE)``, or ``FORSOME``."""
+
+    word: str
+    nodes: tuple[QuantifiedNode, ...]
+    where: Expression | None
+    absent: bool
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class CheckClause:
+    """Check: ``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items``."""
+
+    settings: tuple[Setting, ...]
+    name: str | None
+    quantifiers: tuple[QuantifierClause, ...]
+    formula: Expression
+    reset: Expression | None
+    robustness: bool
+    returns: tuple[Item, ...]
+    span: TextSpan
+
+
+Statement = MatchClause | UnionClause | Define | CheckClause
