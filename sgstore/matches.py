@@ -11,7 +11,7 @@ import copy
 import re
 from collections import namedtuple
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from heapq import merge
 from itertools import chain, islice
@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from sgstore.base.quoting import quoted
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, SgstoreError
 from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
 from sgstore.lang.sql import (

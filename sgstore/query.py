@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
-from sgstore.base.records import dataclass
 from sgstore.errors import StoreError, place_named, url_named
 from sgstore.lang.sql import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches

@@ -10,7 +10,7 @@ from dataclasses import fields
 from itertools import chain
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from sgstore.base.arrays import np
+import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
-from sgstore.base.arrays import np
+import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -11,7 +11,8 @@ from contextlib import contextmanager, nullcontext
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
-from sgstore.base.arrays import np
+import numpy as np
+
 from sgstore.base.files import working_folder
 from sgstore.collection import _worker as worker
 from sgstore.lang.sql.collection_parts import PARTS

@@ -264,7 +264,7 @@ def _values_of(verdict: Verdict) -> list[Any]:
 
 def as_verdict(values: list[Any]) -> Verdict:
     """Rebuild a verdict from its values."""
-    from sgstore.base.arrays import np
+    import numpy as np
 
     check, trace, word, violations, witnesses, status, reason, margin, absent = values
     return Verdict(
@@ -325,7 +325,7 @@ def _features(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
     """Write features of the graphs of frames in an abstraction; frames are numbered as in the task."""
-    from sgstore.base.arrays import np
+    import numpy as np
 
     def rows() -> Iterator[tuple[int, str, int]]:
         frame_id = np.array(task["frames"], np.int64)
@@ -345,7 +345,7 @@ def _margins(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
     """Write the margin of each frame, or of its trace, for a check."""
-    from sgstore.base.arrays import np
+    import numpy as np
 
     run = CheckRun(file, catalog, task["text"], task["parameters"])
     found = ((ids, np.broadcast_to(margins, len(ids))) for ids, margins in run.margins())

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
-
-from sgstore.base.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from sgstore.base.records import dataclass
 from sgstore.lang.catalog import Attribute, Type
 
 if TYPE_CHECKING:

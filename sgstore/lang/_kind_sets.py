@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from sgstore.base.records import dataclass
+from dataclasses import dataclass
+
 from sgstore.model.vocabulary import KINDS, RELATIONS, entity_kinds
 
 

@@ -12,12 +12,11 @@ them in ``map_node``. For the last two, table ``node`` holds the frames in which
 from __future__ import annotations
 
 import math
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.records import dataclass
 from sgstore.model.criticality import RECORDED
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS, UNEVEN
 from sgstore.model.vocabulary import (

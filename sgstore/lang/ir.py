@@ -9,10 +9,9 @@ nodes begin with ``#``.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal, TypeGuard
 
-from sgstore.base.records import dataclass
 from sgstore.lang._durations import (
     BoundHold,  # noqa: TC001  they are of this module
     Length,  # noqa: F401  # pyright: ignore[reportUnusedImport]

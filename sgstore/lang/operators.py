@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 import operator
 import re
+from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.arrays import np
+import numpy as np
+
 from sgstore.base.json_text import float32
-from sgstore.base.records import dataclass
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -11,13 +11,13 @@ belong to the road map (:mod:`sgstore.maps.roads`).
 from __future__ import annotations
 
 import math
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
-from sgstore.base.arrays import np
+import numpy as np
+
 from sgstore.base.columns import taken
 from sgstore.base.geometry import wrapped
-from sgstore.base.records import dataclass
 from sgstore.mcap import Findings, Loss
 
 if TYPE_CHECKING:

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.records import dataclass
 from sgstore.graphs.abstractions import (
     AT_INGEST,
     Classes,

@@ -6,6 +6,7 @@ The module returns the stored states as generator input, and stores the result o
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
@@ -14,7 +15,6 @@ import numpy as np
 
 import sgstore.store._packing as packing
 import sgstore.store._schema as shape
-from sgstore.base.records import dataclass
 from sgstore.errors import AbstractionError, StoreError
 from sgstore.model.graph import SceneGraph
 from sgstore.model.vocabulary import normalize_name

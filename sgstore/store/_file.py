@@ -12,8 +12,9 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
 import sgstore.store._rows as rows
-from sgstore.base.arrays import np
 from sgstore.errors import SgstoreError, StoreError, TraceError
 from sgstore.model.world import Channel, MessageRefs
 from sgstore.store._encounters import recorded_measures

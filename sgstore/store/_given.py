@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.arrays import np
+import numpy as np
+
 from sgstore.base.quoting import quoted
 from sgstore.store._encounters import show_recorded
 from sgstore.store._steps import interruptible

@@ -15,7 +15,7 @@ from __future__ import annotations
 import re
 import secrets
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,7 +23,6 @@ import duckdb
 
 from sgstore.base.files import temporary_folder
 from sgstore.base.quoting import literal
-from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
 from sgstore.lang.catalog import TableFacts, Type
 from sgstore.store._packing import TOLERANCE

@@ -10,13 +10,12 @@ import os
 import secrets
 import shutil
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
-from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import NAMES
 from sgstore.store._joins import tables_folder

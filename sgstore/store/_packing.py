@@ -10,7 +10,8 @@ import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from sgstore.base.arrays import np
+import numpy as np
+
 from sgstore.base.columns import ascending, taken
 from sgstore.model.world import (
     BUCKET_FRAMES,

@@ -12,6 +12,7 @@ import json
 import math
 import os
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,7 +20,6 @@ import duckdb
 
 import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
-from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
 from sgstore.store._locking import (
     BLOCK_SIZE,

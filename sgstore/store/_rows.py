@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 import duckdb
+import numpy as np
 
-from sgstore.base.arrays import np
 from sgstore.base.files import without_controls, working_folder, written_at, written_text
 from sgstore.base.json_text import shortest
 from sgstore.base.quoting import literal, quoted

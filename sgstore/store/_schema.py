@@ -20,8 +20,8 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
 
 import duckdb
+import numpy as np
 
-from sgstore.base.arrays import np
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
 from sgstore.model.pair_numbers import pairs_view

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 import duckdb
 import numpy as np
 
-from sgstore.base.records import dataclass
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import NAMES
 from sgstore.store._columns import (

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.arrays import np
+import numpy as np
+
 from sgstore.base.quoting import quoted
 from sgstore.errors import StoreError
 from sgstore.store._packing import frame_ids, seq_of

@@ -8,11 +8,10 @@ import os
 import re
 from collections import Counter
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.records import dataclass
 from sgstore.errors import SgstoreError, StoreError, place_named, url_named
 from sgstore.model.pair_numbers import UNEVEN
 from sgstore.model.vocabulary import natural, suggestion

@@ -11,11 +11,10 @@ the frames in which a condition is true. If absence counts as true, the negated 
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import sgstore.temporal._formula as f
-from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang.bind import (
     CONNECTIVES,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.records import dataclass
 from sgstore.lang.bind import Horizon, horizon, spoken_kinds
 from sgstore.lang.catalog import excluded_kinds
 

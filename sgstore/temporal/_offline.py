@@ -7,13 +7,12 @@ bindings at once.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import (

@@ -26,12 +26,11 @@ as far back as ``delta`` needs.
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
 import sgstore.temporal._formula as f
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang.bind import CONNECTIVES

@@ -7,13 +7,12 @@ grow with the number of traces. A value over a run is read only for the rows of 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import extents

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.records import dataclass
 from sgstore.lang.ir import Bound, OverMatch, Query, SignalCall, StepTime, is_formula
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import ExternalRelation, Window, relation, value_text

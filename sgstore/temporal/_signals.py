@@ -6,12 +6,12 @@ next frame in its bound at which its right side holds, and the next frame at whi
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache, partial, reduce
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang.memory import column_evaluator
 from sgstore.lang.operators import Column, all_known

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from sgstore.base.arrays import np
-from sgstore.base.records import dataclass
+import numpy as np
+
 from sgstore.lang.help import parts_of
 
 if TYPE_CHECKING:

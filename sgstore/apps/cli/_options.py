@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from collections import Counter
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args, get_type_hints
@@ -20,7 +20,6 @@ import sgstore.apps.cli._completion as completion
 from sgstore.apps.cli._completion import STORE
 from sgstore.apps.cli._output import LONG_TABLE, Format, say, say_json, talk, write_rows
 from sgstore.apps.cli._process import set_deadline
-from sgstore.base.records import dataclass
 from sgstore.errors import ConfigError, url_named
 
 if TYPE_CHECKING:

@@ -11,12 +11,12 @@ import math
 import shutil
 import sys
 from contextlib import contextmanager
+from dataclasses import dataclass
 from enum import StrEnum
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.files import without_controls, working_folder, written_text
-from sgstore.base.records import dataclass
 from sgstore.errors import ExportError
 
 if TYPE_CHECKING:

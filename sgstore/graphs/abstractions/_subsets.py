@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.records import dataclass
 from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
 
 if TYPE_CHECKING:

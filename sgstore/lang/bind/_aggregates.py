@@ -7,10 +7,9 @@ an empty list, and the others are NULL.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang.catalog import Type
 from sgstore.model.vocabulary import normalize_name

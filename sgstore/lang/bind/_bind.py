@@ -6,10 +6,9 @@ The binder and the parser find all errors of the user, before any SQL is built.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang import ir as o

@@ -13,10 +13,9 @@ with a limited range.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.model.vocabulary import PROXIMITY, SIGNALS, entity_kinds
 

@@ -10,12 +10,11 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang import ir as b
 from sgstore.lang.bind._needed_values import scopes_of

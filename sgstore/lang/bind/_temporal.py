@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import re
 from contextlib import contextmanager
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang import ir as o

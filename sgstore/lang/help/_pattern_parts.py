@@ -8,10 +8,9 @@ if all parts hold in it.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryNameError
 from sgstore.lang import ir as b
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Type

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import cache, partial
 from importlib import resources
@@ -28,7 +28,6 @@ from itertools import takewhile
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import Define

@@ -10,13 +10,12 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang.catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, Type
 from sgstore.lang.operators import OPERATORS, Column

@@ -6,12 +6,11 @@ neighbours of a bound node. Each condition is tested as soon as all its variable
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sgstore.base.records import dataclass
 from sgstore.lang import ir as b
 from sgstore.lang.memory._evaluate import (
     Attributes,

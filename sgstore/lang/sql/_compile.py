@@ -11,13 +11,12 @@ is written, and a mark ``either_way``.
 from __future__ import annotations
 
 import re
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import sgstore.lang.sql._results as results
 from sgstore.base.logs import logger
-from sgstore.base.records import dataclass
 from sgstore.lang.bind import bind_checks, bind_query, traces_in
 from sgstore.lang.catalog import (
     EDGE_ATTRIBUTES,

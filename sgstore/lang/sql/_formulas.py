@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.quoting import literal, quoted
-from sgstore.base.records import dataclass
 from sgstore.lang.bind import sql_of
 from sgstore.lang.catalog import DERIVED, Attribute, DisplayUnit, Home, Type
 from sgstore.lang.ir import (

@@ -6,12 +6,11 @@ Presence and single-node conditions become masks, with one relation for each tab
 from __future__ import annotations
 
 import math
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Final
 
 from sgstore.base.quoting import quoted
-from sgstore.base.records import dataclass
 from sgstore.lang.bind import Profile, alias_of, edge_conditions, homes_of, kind_conditions
 from sgstore.lang.catalog import Home
 from sgstore.lang.ir import (

@@ -6,11 +6,10 @@ bound there.
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.quoting import quoted
-from sgstore.base.records import dataclass
 from sgstore.lang.bind import Profile
 from sgstore.lang.catalog import DisplayUnit
 from sgstore.lang.ir import (

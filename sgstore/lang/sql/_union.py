@@ -7,11 +7,10 @@ joins their answers.
 from __future__ import annotations
 
 import re
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from sgstore.base.quoting import quoted
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, TextSpan
 from sgstore.lang.catalog import TRACE_ATTRIBUTES, Type
 from sgstore.lang.ir import TraceAttribute

@@ -10,12 +10,11 @@ The merging statements use the tables ``parts``, ``parts 1``, …, one for each 
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.quoting import quoted
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError
 from sgstore.lang.bind import PLACE, sql_of
 from sgstore.lang.catalog import FRAME_ATTRIBUTES, TRACE_ATTRIBUTES, Catalog, DisplayUnit, Type

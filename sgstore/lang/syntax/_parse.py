@@ -12,12 +12,12 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.records import dataclass
 from sgstore.errors import QuerySyntaxError, TextSpan
 from sgstore.lang.syntax._hints import bracket_hint, places, slip_hint
 from sgstore.lang.syntax._tree_builder import BUILDERS, BuildError

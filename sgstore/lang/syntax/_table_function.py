@@ -6,10 +6,10 @@ The SQL statement is not parsed. Texts, quoted names and comments are skipped, s
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sgstore.base.quoting import quoted
-from sgstore.base.records import dataclass
 from sgstore.errors import QueryError, TextSpan
 
 if TYPE_CHECKING:

@@ -6,9 +6,8 @@ these trees from text.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
-
-from sgstore.base.records import dataclass
 
 if TYPE_CHECKING:
     from sgstore.errors import TextSpan

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import shapely
 
-from sgstore.base.records import dataclass
 from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from sgstore.base.arrays import np
+import numpy as np
+
 from sgstore.base.quoting import literal
-from sgstore.base.records import dataclass
 from sgstore.errors import ConfigError
 from sgstore.model.vocabulary import MAP_KINDS, SIGNALS
 

@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping
 from functools import cache, reduce
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from sgstore.base.arrays import np
+import numpy as np
+
 from sgstore.model.pair_numbers._levels import OPTIONAL
 from sgstore.model.pair_numbers._table import EXPRESSIONS
 

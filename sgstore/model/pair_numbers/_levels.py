@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.arrays import np
+import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Callable
