@@ -63,18 +63,6 @@ def test_importing_the_package_imports_nothing_that_is_large() -> None:
     assert done.stdout.strip() == ""
 
 
-def test_finding_needs_neither_lark_nor_networkx(store: Store) -> None:
-    code = (
-        "import sys, sgstore; store = sgstore.open(sys.argv[1]); store.find('MATCH (e:Ego)').count();"
-        "print(*sorted({'networkx', 'lark', 'shapely'} & set(sys.modules)))"
-    )
-    command = [sys.executable, "-c", code, str(store.file.path)]
-
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-
-    assert done.stdout.strip() == ""
-
-
 def test_the_public_names_are_few_and_all_there() -> None:
     assert len(sgstore.__all__) <= 30
     assert dir(sgstore) == sorted(sgstore.__all__)

@@ -10,6 +10,39 @@ Ray, Spark) then runs ``_worker`` on each bundle that may have results. ``_quest
 results.
 """
 
-import lazy_loader
+from sgstore.collection._frames import CollectionFrames
+from sgstore.collection._landing import commit, land
+from sgstore.collection._open import open
+from sgstore.collection._pack import CollectionFaults, Commit, Garbage, gc, pack, unpack, verify
+from sgstore.collection._place import ABOUT
+from sgstore.collection._questions import (
+    Collection,
+    PartedChecks,
+    PartedMatches,
+    PartedRows,
+    PartedUnion,
+    PartialAnswerError,
+)
+from sgstore.collection._remake import rebuild
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "ABOUT",
+    "Collection",
+    "CollectionFaults",
+    "CollectionFrames",
+    "Commit",
+    "Garbage",
+    "PartedChecks",
+    "PartedMatches",
+    "PartedRows",
+    "PartedUnion",
+    "PartialAnswerError",
+    "commit",
+    "gc",
+    "land",
+    "open",
+    "pack",
+    "rebuild",
+    "unpack",
+    "verify",
+]

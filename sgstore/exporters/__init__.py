@@ -6,6 +6,37 @@ packages add formats with an entry point of the group ``sgstore.exporters``: the
 and an :class:`Exporter`.
 """
 
-import lazy_loader
+from sgstore.exporters._clips import WrittenClip, WrittenFile, check_folder
+from sgstore.exporters._frames import cloud_of
+from sgstore.exporters._labels import FEW, ClipFrames, Export, Labels, parse_labels
+from sgstore.exporters._nx import graphs_of
+from sgstore.exporters._recorder import Recorder, Written
+from sgstore.exporters._registry import EXPORTERS, GROUP, Exporter, Write, exporter_named, exporters
+from sgstore.exporters._transforms import Mount, parse_mounts
+from sgstore.exporters._write import around_frames, labelled, write_export
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "EXPORTERS",
+    "FEW",
+    "GROUP",
+    "ClipFrames",
+    "Export",
+    "Exporter",
+    "Labels",
+    "Mount",
+    "Recorder",
+    "Write",
+    "Written",
+    "WrittenClip",
+    "WrittenFile",
+    "around_frames",
+    "check_folder",
+    "cloud_of",
+    "exporter_named",
+    "exporters",
+    "graphs_of",
+    "labelled",
+    "parse_labels",
+    "parse_mounts",
+    "write_export",
+]

@@ -1,5 +1,84 @@
 """Guarded reader of MCAP files and rosbag2 bags."""
 
-import lazy_loader
+from sgstore.mcap._chunks import (
+    HEAD,
+    IDS,
+    MESSAGE_HEAD,
+    READ_ERRORS,
+    Messages,
+    Recording,
+    RecordPlace,
+    Records,
+    parse_records,
+    read_chunk_head,
+    read_records,
+)
+from sgstore.mcap._fetch import (
+    METADATA,
+    BagPart,
+    bag_folder,
+    check_name,
+    digest_of,
+    mark_of,
+    mark_of_open,
+    message_at,
+    messages_at,
+    near,
+    open_regular,
+    part_at,
+    parts_of,
+    read_and_digest,
+    remote_names,
+)
+from sgstore.mcap._findings import MAX_LOSSES, Findings, Loss
+from sgstore.mcap._order import OutOfOrder
+from sgstore.mcap._read_ahead import MAGIC, read_summary
+from sgstore.mcap._reader import CLIP, RUN_MESSAGES, McapFile
+from sgstore.mcap._remote import (
+    fetch_object,
+    object_store_at,
+    object_stores,
+    reason_of_object_store,
+)
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "CLIP",
+    "HEAD",
+    "IDS",
+    "MAGIC",
+    "MAX_LOSSES",
+    "MESSAGE_HEAD",
+    "METADATA",
+    "READ_ERRORS",
+    "RUN_MESSAGES",
+    "BagPart",
+    "Findings",
+    "Loss",
+    "McapFile",
+    "Messages",
+    "OutOfOrder",
+    "RecordPlace",
+    "Recording",
+    "Records",
+    "bag_folder",
+    "check_name",
+    "digest_of",
+    "fetch_object",
+    "mark_of",
+    "mark_of_open",
+    "message_at",
+    "messages_at",
+    "near",
+    "object_store_at",
+    "object_stores",
+    "open_regular",
+    "parse_records",
+    "part_at",
+    "parts_of",
+    "read_and_digest",
+    "read_chunk_head",
+    "read_records",
+    "read_summary",
+    "reason_of_object_store",
+    "remote_names",
+]

@@ -1,5 +1,83 @@
 """Readers of recordings: one package per flavour, and their common base."""
 
-import lazy_loader
+from sgstore.readers._base import FramesTrace, MessageTrace, TraceMessage, channels_of
+from sgstore.readers._blocks import NAN, POSE, EntityTable, FrameRows, MessageDecoder
+from sgstore.readers._cameras import Cameras, LiveCameras, RecordedCameras
+from sgstore.readers._media import Media, picture_form, png, read_carried, record_reader
+from sgstore.readers._registry import (
+    ENDINGS,
+    READERS,
+    RecordingFile,
+    RecordingReader,
+    is_recording,
+    on_map,
+    open_recording,
+    open_trace,
+    read_message,
+    read_messages,
+    readers,
+)
+from sgstore.readers._roles import channel_rank
+from sgstore.readers._ros2 import decode, parse_definition
+from sgstore.readers.carla._live import (
+    LiveWorld,
+    Sensor,
+    SensorCloud,
+    SensorPicture,
+    SensorReading,
+    Sensors,
+    connect,
+    load_sensors,
+)
+from sgstore.readers.commonroad._file import CommonRoadFile
+from sgstore.readers.foxglove._messages import DERIVED
+from sgstore.readers.osi._file import OsiFile
+from sgstore.readers.osi._schema import add_fields, descriptors, message_class
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "DERIVED",
+    "ENDINGS",
+    "NAN",
+    "POSE",
+    "READERS",
+    "Cameras",
+    "CommonRoadFile",
+    "EntityTable",
+    "FrameRows",
+    "FramesTrace",
+    "LiveCameras",
+    "LiveWorld",
+    "Media",
+    "MessageDecoder",
+    "MessageTrace",
+    "OsiFile",
+    "RecordedCameras",
+    "RecordingFile",
+    "RecordingReader",
+    "Sensor",
+    "SensorCloud",
+    "SensorPicture",
+    "SensorReading",
+    "Sensors",
+    "TraceMessage",
+    "add_fields",
+    "channel_rank",
+    "channels_of",
+    "connect",
+    "decode",
+    "descriptors",
+    "is_recording",
+    "load_sensors",
+    "message_class",
+    "on_map",
+    "open_recording",
+    "open_trace",
+    "parse_definition",
+    "picture_form",
+    "png",
+    "read_carried",
+    "read_message",
+    "read_messages",
+    "readers",
+    "record_reader",
+]

@@ -17,6 +17,165 @@ Collections: ``_bundles`` copies traces into new stores and describes their cont
 before that, and ``_merge`` merges the results of several bundles.
 """
 
-import lazy_loader
+from sgstore.store._bundles import (
+    CATALOGUE,
+    Facts,
+    answers_of,
+    facts_of,
+    join_bundles,
+    maps_of_traces,
+    names_of_traces,
+    parquet_rows,
+    write_bundle,
+)
+from sgstore.store._catalog import relations_of_set, subset_catalogs
+from sgstore.store._classes import Abstracted, CodedClasses, Triples
+from sgstore.store._clients import duckdb
+from sgstore.store._contents import (
+    DIGEST_BYTES,
+    WINDOW,
+    Mark,
+    MessagePlaces,
+    graph_digests,
+    lengths_of_messages,
+    marks,
+    messages_of,
+)
+from sgstore.store._encounters import measured
+from sgstore.store._file import StoreFile
+from sgstore.store._given import Given, GivenTable
+from sgstore.store._joins import UserTables
+from sgstore.store._landed import split_segment, whole_segment
+from sgstore.store._locking import Folder, refuse_name
+from sgstore.store._merge import (
+    PartFile,
+    merged_arrays,
+    merged_classes,
+    merged_file,
+    merged_parts,
+    write_classes,
+    write_coded,
+    write_part,
+    write_rows,
+)
+from sgstore.store._packing import BUCKET_BITS, SEQ_BITS, begins, frame_ids, seq_of, trace_of
+from sgstore.store._publish import PresentError
+from sgstore.store._rebuild import OldMap, OldTrace, Remains, named_as, remains_of, take_place
+from sgstore.store._rows import (
+    IN_NOTEBOOK,
+    Batches,
+    ParquetTable,
+    Rows,
+    Tabular,
+    arrow_file,
+    as_told,
+    as_told_batches,
+    count_parquet,
+    write_batches,
+    write_csv,
+    write_parquet,
+)
+from sgstore.store._schema import SCHEMA_VERSION
+from sgstore.store._similarity import Example, SimilarFrames, example_of, frames_like, most_like
+from sgstore.store._staging import Sealed
+from sgstore.store._traces import (
+    FrameRef,
+    Identity,
+    StoredTrace,
+    free_name,
+    range_of,
+    scope_of,
+    scope_text,
+    trace_among,
+    trace_id_of,
+)
+from sgstore.store._verify import verify_file
+from sgstore.store._write import OnMap, Segment
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "BUCKET_BITS",
+    "CATALOGUE",
+    "DIGEST_BYTES",
+    "IN_NOTEBOOK",
+    "SCHEMA_VERSION",
+    "SEQ_BITS",
+    "WINDOW",
+    "Abstracted",
+    "Batches",
+    "CodedClasses",
+    "Example",
+    "Facts",
+    "Folder",
+    "FrameRef",
+    "Given",
+    "GivenTable",
+    "Identity",
+    "Mark",
+    "MessagePlaces",
+    "OldMap",
+    "OldTrace",
+    "OnMap",
+    "ParquetTable",
+    "PartFile",
+    "PresentError",
+    "Remains",
+    "Rows",
+    "Sealed",
+    "Segment",
+    "SimilarFrames",
+    "StoreFile",
+    "StoredTrace",
+    "Tabular",
+    "Triples",
+    "UserTables",
+    "answers_of",
+    "arrow_file",
+    "as_told",
+    "as_told_batches",
+    "begins",
+    "count_parquet",
+    "duckdb",
+    "example_of",
+    "facts_of",
+    "frame_ids",
+    "frames_like",
+    "free_name",
+    "graph_digests",
+    "join_bundles",
+    "lengths_of_messages",
+    "maps_of_traces",
+    "marks",
+    "measured",
+    "merged_arrays",
+    "merged_classes",
+    "merged_file",
+    "merged_parts",
+    "messages_of",
+    "most_like",
+    "named_as",
+    "names_of_traces",
+    "parquet_rows",
+    "range_of",
+    "refuse_name",
+    "relations_of_set",
+    "remains_of",
+    "scope_of",
+    "scope_text",
+    "seq_of",
+    "split_segment",
+    "subset_catalogs",
+    "take_place",
+    "trace_among",
+    "trace_id_of",
+    "trace_of",
+    "verify_file",
+    "whole_segment",
+    "write_batches",
+    "write_bundle",
+    "write_classes",
+    "write_coded",
+    "write_csv",
+    "write_parquet",
+    "write_part",
+    "write_rows",
+]

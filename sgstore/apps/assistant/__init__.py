@@ -4,6 +4,11 @@
 for prompts, and ``_server`` connects them to the protocol.
 """
 
-import lazy_loader
+from sgstore.apps.assistant._server import serve, server_of
+from sgstore.apps.assistant._tools import StoreTools
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "StoreTools",
+    "serve",
+    "server_of",
+]

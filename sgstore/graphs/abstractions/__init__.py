@@ -5,6 +5,45 @@ An abstraction is a function from columns (:class:`GraphColumns`) to columns (:c
 entry point of the group ``sgstore.abstractions``. ``_classes`` defines classes.
 """
 
-import lazy_loader
+from sgstore.graphs.abstractions._classes import Classes, classes_of, contents_of
+from sgstore.graphs.abstractions._columns import (
+    GraphColumns,
+    Labelled,
+    MapColumns,
+    found,
+    lane_roles,
+)
+from sgstore.graphs.abstractions._features import GraphFeatures, of_frames, without
+from sgstore.graphs.abstractions._registry import (
+    ABSTRACTIONS,
+    AT_INGEST,
+    Abstraction,
+    abstraction_named,
+    abstractions,
+    check_name,
+    register,
+)
+from sgstore.graphs.abstractions._subsets import SUBSETS, Subset
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "ABSTRACTIONS",
+    "AT_INGEST",
+    "SUBSETS",
+    "Abstraction",
+    "Classes",
+    "GraphColumns",
+    "GraphFeatures",
+    "Labelled",
+    "MapColumns",
+    "Subset",
+    "abstraction_named",
+    "abstractions",
+    "check_name",
+    "classes_of",
+    "contents_of",
+    "found",
+    "lane_roles",
+    "of_frames",
+    "register",
+    "without",
+]

@@ -6,6 +6,81 @@ table of ``docs/relations.md``, pictures, and the law tests: no self edges; symm
 symmetric; the result does not change when the world is moved or turned, or frame by frame.
 """
 
-import lazy_loader
+from sgstore.graphs.relations._contact import contacts, contacts_of
+from sgstore.graphs.relations._extent import Areas, EgoPoses, Extent
+from sgstore.graphs.relations._following import Parking, gaps
+from sgstore.graphs.relations._hitches import Hitches
+from sgstore.graphs.relations._map_context import LaneContact, waypoints_of
+from sgstore.graphs.relations._pairs import (
+    NEAR,
+    TOUCHING,
+    Crowds,
+    StillPairs,
+    gathered,
+    joined_pairs,
+    near_pairs,
+    of_kinds,
+    pieces,
+    related_pairs,
+)
+from sgstore.graphs.relations._registry import (
+    Keeping,
+    as_markdown,
+    relations,
+    relations_under,
+    renamed,
+)
+from sgstore.graphs.relations._scene import (
+    IS_SIGNAL,
+    IS_UPRIGHT,
+    IS_USER,
+    BlockScene,
+    Bodies,
+    BodyPairs,
+    EdgeRoom,
+    MapContext,
+    Relation,
+    Standing,
+    edges_between,
+    edges_to_map,
+)
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "IS_SIGNAL",
+    "IS_UPRIGHT",
+    "IS_USER",
+    "NEAR",
+    "TOUCHING",
+    "Areas",
+    "BlockScene",
+    "Bodies",
+    "BodyPairs",
+    "Crowds",
+    "EdgeRoom",
+    "EgoPoses",
+    "Extent",
+    "Hitches",
+    "Keeping",
+    "LaneContact",
+    "MapContext",
+    "Parking",
+    "Relation",
+    "Standing",
+    "StillPairs",
+    "as_markdown",
+    "contacts",
+    "contacts_of",
+    "edges_between",
+    "edges_to_map",
+    "gaps",
+    "gathered",
+    "joined_pairs",
+    "near_pairs",
+    "of_kinds",
+    "pieces",
+    "related_pairs",
+    "relations",
+    "relations_under",
+    "renamed",
+    "waypoints_of",
+]

@@ -1,5 +1,65 @@
 """From syntax trees to the bound query: names, types, units, and what a trace must know."""
 
-import lazy_loader
+from sgstore.lang.bind._aggregates import PLACE, sql_of
+from sgstore.lang.bind._beyond import is_limited, within
+from sgstore.lang.bind._bind import CheckInCatalog, bind_checks, bind_query
+from sgstore.lang.bind._functions import FUNCTIONS
+from sgstore.lang.bind._horizon import Horizon, horizon, spoken_kinds
+from sgstore.lang.bind._kinds import (
+    Profile,
+    alias_of,
+    edge_conditions,
+    entities_of_pairs,
+    homes_of,
+    kind_conditions,
+)
+from sgstore.lang.bind._needed_values import MOTION, Need, not_computed, of_check, of_query
+from sgstore.lang.bind._symbols import CLASSES_GIVEN, regex, traces_in
+from sgstore.lang.bind._temporal import FUTURE
+from sgstore.lang.bind._unknowns import (
+    CONNECTIVES,
+    certain,
+    has_pairs,
+    negated,
+    pushed,
+    spelled_out,
+    undecided,
+    unknown,
+)
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "CLASSES_GIVEN",
+    "CONNECTIVES",
+    "FUNCTIONS",
+    "FUTURE",
+    "MOTION",
+    "PLACE",
+    "CheckInCatalog",
+    "Horizon",
+    "Need",
+    "Profile",
+    "alias_of",
+    "bind_checks",
+    "bind_query",
+    "certain",
+    "edge_conditions",
+    "entities_of_pairs",
+    "has_pairs",
+    "homes_of",
+    "horizon",
+    "is_limited",
+    "kind_conditions",
+    "negated",
+    "not_computed",
+    "of_check",
+    "of_query",
+    "pushed",
+    "regex",
+    "spelled_out",
+    "spoken_kinds",
+    "sql_of",
+    "traces_in",
+    "undecided",
+    "unknown",
+    "within",
+]

@@ -1,5 +1,22 @@
 """Help for people: why a frame does not match, notes on a query, words for completion."""
 
-import lazy_loader
+from sgstore.lang.help._completion import words
+from sgstore.lang.help._notes import Compared, compared_in_check, compared_in_query, notes_on
+from sgstore.lang.help._pattern_parts import PatternPart, has_nodes, parts_of
+from sgstore.lang.help._why_not import WhyNot, WhyNotSteps, events_in, looked_up, why_not
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "Compared",
+    "PatternPart",
+    "WhyNot",
+    "WhyNotSteps",
+    "compared_in_check",
+    "compared_in_query",
+    "events_in",
+    "has_nodes",
+    "looked_up",
+    "notes_on",
+    "parts_of",
+    "why_not",
+    "words",
+]

@@ -1,5 +1,19 @@
 """The library: predicates, concepts, scenarios and properties that have names."""
 
-import lazy_loader
+from sgstore.lang.library._entries import (
+    NamedPattern,
+    entries,
+    pattern_named,
+    patterns,
+    predicates,
+    search,
+)
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "NamedPattern",
+    "entries",
+    "pattern_named",
+    "patterns",
+    "predicates",
+    "search",
+]

@@ -1,5 +1,16 @@
 """Evaluation in memory: patterns and expressions over one graph."""
 
-import lazy_loader
+from sgstore.lang.memory._evaluate import Binding, Columns, FrameView, NodePair, column_evaluator
+from sgstore.lang.memory._search import ScopeSearch, expression
+from sgstore.lang.memory._stage_search import StageSearch
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "Binding",
+    "Columns",
+    "FrameView",
+    "NodePair",
+    "ScopeSearch",
+    "StageSearch",
+    "column_evaluator",
+    "expression",
+]

@@ -1,5 +1,27 @@
 """From text to syntax trees: the grammar, the parser, and hints for mistakes."""
 
-import lazy_loader
+from sgstore.lang.syntax._hints import (
+    comparison_hint,
+    condition_hint,
+    hint_at,
+    said_of,
+    variable_hint,
+)
+from sgstore.lang.syntax._parse import joined, keywords, parse
+from sgstore.lang.syntax._table_function import pattern_tables
+from sgstore.lang.syntax._written_patterns import Pattern, node_of_kind, pattern_of
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "Pattern",
+    "comparison_hint",
+    "condition_hint",
+    "hint_at",
+    "joined",
+    "keywords",
+    "node_of_kind",
+    "parse",
+    "pattern_of",
+    "pattern_tables",
+    "said_of",
+    "variable_hint",
+]

@@ -12,6 +12,11 @@ Source: the tagging rules of Lanelet2 (``LaneletAndAreaTagging.md``, ``Regulator
 ``LinestringTagging.md``), Karlsruhe Institute of Technology, BSD-3.
 """
 
-import lazy_loader
+from sgstore.maps.lanelet2._lanes import lanelet2_text
+from sgstore.maps.lanelet2._projection import Projection, read_projector_info
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "Projection",
+    "lanelet2_text",
+    "read_projector_info",
+]

@@ -14,6 +14,14 @@ several pictures. There is no cache on disk: a town is read in a tenth of a seco
 file would need the same checks.
 """
 
-import lazy_loader
+from sgstore.maps.opendrive._objects import kind_of_object
+from sgstore.maps.opendrive._read import SIGNS, parse_map, read_map
+from sgstore.maps.opendrive._signals import kind_of_signal
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "SIGNS",
+    "kind_of_object",
+    "kind_of_signal",
+    "parse_map",
+    "read_map",
+]

@@ -6,6 +6,45 @@ patterns and the monitor. The measures here need the complete drive: the tracks 
 frames.
 """
 
-import lazy_loader
+from sgstore.model.criticality._closest import dce_recorded, ttce_recorded
+from sgstore.model.criticality._collision import ttc_recorded
+from sgstore.model.criticality._encounter import Encounter, Track
+from sgstore.model.criticality._encroachment import Encroachment, encroachment, et_recorded, pet
+from sgstore.model.criticality._exposure import tet, tit
+from sgstore.model.criticality._headway import headway_recorded
+from sgstore.model.criticality._potential import cpi, crash_probability
+from sgstore.model.criticality._recorded import (
+    FIXED_KINDS,
+    KNOWN,
+    RECORDED,
+    TRACKS,
+    RecordedMeasure,
+    encounters,
+    recorded,
+    tracks_of,
+)
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "FIXED_KINDS",
+    "KNOWN",
+    "RECORDED",
+    "TRACKS",
+    "Encounter",
+    "Encroachment",
+    "RecordedMeasure",
+    "Track",
+    "cpi",
+    "crash_probability",
+    "dce_recorded",
+    "encounters",
+    "encroachment",
+    "et_recorded",
+    "headway_recorded",
+    "pet",
+    "recorded",
+    "tet",
+    "tit",
+    "tracks_of",
+    "ttc_recorded",
+    "ttce_recorded",
+]

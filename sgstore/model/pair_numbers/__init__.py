@@ -13,6 +13,70 @@ acceleration, or in the worst case of bounded accelerations. Shared expressions 
 with the usual symbols of the literature (``v1``, ``a2``).
 """
 
-import lazy_loader
+from sgstore.model.pair_numbers._arrays import COLUMNS, PairNumbers, gap
+from sgstore.model.pair_numbers._declared import PairFunction
+from sgstore.model.pair_numbers._levels import (
+    HUNG,
+    OPTIONAL,
+    STOREY,
+    TOUCH,
+    UNEVEN,
+    UPRIGHT,
+    all_level,
+    climb,
+    low_and_high,
+    low_and_high_sql,
+)
+from sgstore.model.pair_numbers._table import (
+    MARKS,
+    PAIR_FUNCTIONS,
+    STOREYS,
+    columns_needed,
+    needed_for,
+    pair_sql,
+    pairs_view,
+    parts_of,
+    stage_of,
+)
+from sgstore.model.pair_numbers._ways import (
+    COURSES,
+    LANE_DIST,
+    NEXT_PARTS,
+    OF_ONE,
+    PART_DIST,
+    WAYS,
+    as_written,
+)
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "COLUMNS",
+    "COURSES",
+    "HUNG",
+    "LANE_DIST",
+    "MARKS",
+    "NEXT_PARTS",
+    "OF_ONE",
+    "OPTIONAL",
+    "PAIR_FUNCTIONS",
+    "PART_DIST",
+    "STOREY",
+    "STOREYS",
+    "TOUCH",
+    "UNEVEN",
+    "UPRIGHT",
+    "WAYS",
+    "PairFunction",
+    "PairNumbers",
+    "all_level",
+    "as_written",
+    "climb",
+    "columns_needed",
+    "gap",
+    "low_and_high",
+    "low_and_high_sql",
+    "needed_for",
+    "pair_sql",
+    "pairs_view",
+    "parts_of",
+    "stage_of",
+]

@@ -9,6 +9,12 @@ geometry. Functions of poses are therefore unknown in such frames. The view ``im
 of each frame.
 """
 
-import lazy_loader
+from sgstore.pipeline.importing._resolve import Words
+from sgstore.pipeline.importing._run import FORMATS, Imported, import_graphs
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "FORMATS",
+    "Imported",
+    "Words",
+    "import_graphs",
+]

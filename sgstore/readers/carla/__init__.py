@@ -1,5 +1,3 @@
 """Reader of CARLA recordings, and access to a running CARLA simulator."""
 
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = []

@@ -1,5 +1,3 @@
 """Reader of SUMO floating-car data."""
 
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = []

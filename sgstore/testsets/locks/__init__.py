@@ -4,6 +4,28 @@
 again. ``_sets`` has union, intersection and difference. ``_verify`` finds changes.
 """
 
-import lazy_loader
+from sgstore.testsets.locks._cases import CasePart, cases_of, frames_of_lock, lock_of, store_beside
+from sgstore.testsets.locks._sets import intersect, meets, minus, union
+from sgstore.testsets.locks._text import ENDING, Lock, LockedCase, LockedTrace, made_with, read_lock
+from sgstore.testsets.locks._verify import Difference, verify, verify_case
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "ENDING",
+    "CasePart",
+    "Difference",
+    "Lock",
+    "LockedCase",
+    "LockedTrace",
+    "cases_of",
+    "frames_of_lock",
+    "intersect",
+    "lock_of",
+    "made_with",
+    "meets",
+    "minus",
+    "read_lock",
+    "store_beside",
+    "union",
+    "verify",
+    "verify_case",
+]

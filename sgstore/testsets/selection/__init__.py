@@ -5,6 +5,63 @@
 compare a selection with random order.
 """
 
-import lazy_loader
+from sgstore.testsets.selection._apfd import FaultDetection, failure_curve, fault_detection
+from sgstore.testsets.selection._choose import (
+    Curve,
+    Selection,
+    SelectionSpec,
+    Strategy,
+    curve,
+    listed,
+    locked_selection,
+    parse_split,
+    select,
+    split,
+    split_table,
+)
+from sgstore.testsets.selection._cover import Cover, Fitted, minimal, within
+from sgstore.testsets.selection._prioritize import (
+    MEASURES,
+    Prioritized,
+    Priority,
+    PrioritySpec,
+    failed_in_order,
+    locked_order,
+    prioritize,
+)
+from sgstore.testsets.selection._sets import SetFamily
+from sgstore.testsets.selection._units import Budget, Measure, SelectionUnit, Units, units_of
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__all__ = [
+    "MEASURES",
+    "Budget",
+    "Cover",
+    "Curve",
+    "FaultDetection",
+    "Fitted",
+    "Measure",
+    "Prioritized",
+    "Priority",
+    "PrioritySpec",
+    "Selection",
+    "SelectionSpec",
+    "SelectionUnit",
+    "SetFamily",
+    "Strategy",
+    "Units",
+    "curve",
+    "failed_in_order",
+    "failure_curve",
+    "fault_detection",
+    "listed",
+    "locked_order",
+    "locked_selection",
+    "minimal",
+    "parse_split",
+    "prioritize",
+    "select",
+    "split",
+    "split_table",
+    "units_of",
+    "within",
+]
