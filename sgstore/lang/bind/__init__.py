@@ -1,4 +1,4 @@
-"""From syntax trees to the bound query: names, types, units, and what a trace must know."""
+"""Binder: converts syntax trees to bound queries, and finds the values that a trace must know."""
 
 from sgstore.lang.bind._aggregates import PLACE, sql_of
 from sgstore.lang.bind._beyond import is_limited, within

@@ -1,1 +1,1 @@
-"""Queries that other tools write, translated into the query language."""
+"""Translators from query languages of other tools to the query language."""

@@ -1,4 +1,4 @@
-"""The library: predicates, concepts, scenarios and properties that have names."""
+"""Library of named predicates, concepts, scenarios and properties."""
 
 from sgstore.lang.library._entries import (
     NamedPattern,

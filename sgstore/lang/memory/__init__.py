@@ -1,4 +1,4 @@
-"""Evaluation in memory: patterns and expressions over one graph."""
+"""Evaluation of patterns and expressions on one graph in memory."""
 
 from sgstore.lang.memory._evaluate import Binding, Columns, FrameView, NodePair, column_evaluator
 from sgstore.lang.memory._search import ScopeSearch, expression

@@ -1,4 +1,4 @@
-"""From the bound query to SQL: rewriting, the plan, and the statements of each phase."""
+"""SQL compiler: rewrites bound queries, plans them, and writes the statements of each phase."""
 
 from sgstore.lang.sql._compile import (
     Compiled,

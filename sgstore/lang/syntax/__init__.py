@@ -1,4 +1,4 @@
-"""From text to syntax trees: the grammar, the parser, and hints for mistakes."""
+"""Parser of the query language: grammar, syntax trees, and hints for mistakes."""
 
 from sgstore.lang.syntax._hints import (
     comparison_hint,
