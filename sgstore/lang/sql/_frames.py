@@ -444,7 +444,7 @@ def frames(
 def _needless(
     catalog: Catalog, pairs: Iterable[PairNumber], users: frozenset[str]
 ) -> frozenset[str]:
-    """Return marks that no needed pair number uses in these traces."""
+    """Return the pair marks that need no computation for the entities in these traces."""
     uneven = 0
     for trace in catalog.traces:
         uneven |= trace.uneven
