@@ -208,7 +208,7 @@ class Matches(Tabular):
                 continue
             try:
                 small = thumbnail(self._file, frame)
-            except SgstoreError:  # no packages for drawing, or the recording is elsewhere
+            except SgstoreError:  # drawing packages or the recording are missing
                 return
             yield html_media(small, "image/jpeg", f"{frame.trace}#{frame.seq}, {frame.t:.1f} s")
             left -= 1
@@ -331,7 +331,7 @@ class Matches(Tabular):
         See :meth:`sgstore.Store.parts`.
         """
         from sgstore.temporal.truth_lanes import (
-            truth_lanes,  # with numpy, which a question does without
+            truth_lanes,  # imports numpy, which a query does not need
         )
 
         with self._compiled() as compiled:
@@ -455,7 +455,7 @@ class Matches(Tabular):
             return write_batches(as_told_batches(self.columns, (columns, found)), Path(path))
 
     def _record_batches(self) -> Generator[Any]:
-        """Yield the columns, then Arrow batches of rows.
+        """Yield the columns, then the rows in Arrow batches.
 
         Yield nothing if Arrow and Python values would differ.
         """
@@ -760,7 +760,7 @@ class UnionMatches(Matches):
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
         """Return the steps that create a temporary table of all rows; see :meth:`Matches.as_table`."""
         if self.graphs:
-            return self._parts[0].as_table(name, apart=apart)  # which refuses
+            return self._parts[0].as_table(name, apart=apart)  # which raises an error
         asked = self._joined()
         made = f"CREATE OR REPLACE TEMP TABLE {quoted(name)} AS {asked['sql']}"
         return [*asked["given"], (made, asked["parameters"])]

@@ -62,7 +62,7 @@ class StoreFrame:
 
         try:
             return _png(self.show())
-        except MissingExtraError:  # then its repr is shown
+        except MissingExtraError:  # the repr is shown instead
             return None
 
     @property
@@ -315,7 +315,7 @@ class Store:
         QueryError
             The text has no checks, or has an unknown name. The message gives the place.
         """
-        from sgstore.temporal import CheckRun  # with numpy: only for who asks
+        from sgstore.temporal import CheckRun  # imports numpy: only on demand
 
         return CheckRun(
             self.file, self.file.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status
@@ -736,7 +736,7 @@ class Store:
         """
         from sgstore.lang.help import (
             WhyNot,
-            why_not,  # with numpy: only for who asks
+            why_not,  # imports numpy: only on demand
         )
 
         with self.file.snapshot():

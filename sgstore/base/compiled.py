@@ -44,7 +44,7 @@ def use_loops(after: float = WORTH) -> bool:
 def _numba() -> Any:
     try:
         return import_module("numba")
-    except ImportError:  # it is not there, or does not work with this numpy
+    except ImportError:  # numba is missing, or incompatible with this numpy
         return None
 
 
@@ -56,5 +56,5 @@ def compiled(loop: Loop) -> Loop:
     options = {"error_model": "numpy", "nogil": True}
     try:
         return numba.njit(loop, cache=True, **options)
-    except RuntimeError:  # there is no place where it may be kept
+    except RuntimeError:  # no writable cache folder
         return numba.njit(loop, **options)

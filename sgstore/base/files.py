@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 try:
     import fcntl
-except ImportError:  # not on Windows: there a folder in use cannot be removed anyway
+except ImportError:  # not on Windows: a folder in use cannot be removed there
     fcntl = None
 
 
@@ -94,7 +94,7 @@ class HeldFolder:
             return False
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
-        except OSError:  # a file system without locks, on which nobody takes it for dead
+        except OSError:  # a file system without locks: no process removes the folder
             os.close(lock)
             return True
         with suppress(FileNotFoundError):
@@ -132,9 +132,7 @@ def sweep(parent: Path, prefix: str, undo: Callable[[Path], None] | None = None)
     with suppress(OSError), os.scandir(parent) as entries:
         names = [entry.name for entry in entries if entry.name.startswith(prefix)]
     for name in names:
-        with suppress(
-            OSError
-        ):  # its process lives, it is another user's, or someone else removed it
+        with suppress(OSError):  # it is in use, belongs to another user, or is already removed
             _remove_dead(parent / name, undo)
 
 
@@ -201,7 +199,7 @@ def working_folder(name: str) -> Generator[Path]:
 def _root() -> Path:
     try:
         return Path(tempfile.gettempdir()).resolve()
-    except FileNotFoundError:  # none of the usual places can be written, or their disks are full
+    except FileNotFoundError:  # no usual place is writable, or the disks are full
         return Path(os.environ.get("TMPDIR") or "/tmp").resolve()  # noqa: S108  only names it
 
 
@@ -263,7 +261,7 @@ class Stream(io.RawIOBase):
         self.lost = False
 
     def writable(self) -> bool:
-        """Return true."""
+        """True: the stream is writable."""
         return True
 
     def seekable(self) -> bool:
@@ -293,7 +291,7 @@ class Stream(io.RawIOBase):
         while left and not self.lost:
             try:
                 left = left[os.write(self._descriptor, left) :]
-            except BlockingIOError:  # somebody else made it so; we can wait
+            except BlockingIOError:  # another process made it non-blocking: wait
                 select.select([], [self._descriptor], [])
             except OSError as error:
                 self._fail(error)
@@ -476,7 +474,7 @@ def _told(to: Path) -> Generator[None]:
         yield
     except OSError as error:
         raise ExportError(f"{to}: {error.strerror or error}") from error
-    except ValueError as error:  # a name with a zero byte in it
+    except ValueError as error:  # a name with a null character
         raise ExportError(f"{str(to)!r}: {error}") from error
 
 
@@ -512,7 +510,7 @@ def _descriptor(to: Path) -> int:
     mine = _open_here(to, to.stat())
     if mine is None:
         return os.open(to, os.O_WRONLY)
-    for stream in (sys.stdout, sys.stderr):  # what was said before comes before
+    for stream in (sys.stdout, sys.stderr):  # keeps the order of outputs
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()
     return os.dup(mine)

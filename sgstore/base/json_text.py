@@ -34,7 +34,7 @@ def finite(value: Any, word: Callable[[float], str | None] = lambda _: None) -> 
         return {str(key): finite(item, word) for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
     if isinstance(value, list | tuple):
         return [finite(item, word) for item in value]  # pyright: ignore[reportUnknownVariableType]
-    if hasattr(value, "tolist"):  # of numpy
+    if hasattr(value, "tolist"):  # a numpy value
         return finite(value.tolist(), word)
     if isinstance(value, float) and not math.isfinite(value):
         return word(value)

@@ -125,9 +125,7 @@ class RangeSettings:
         check(
             self.world >= 0, "range.world", self.world, "a length of 0 or more, in metres, or inf"
         )
-        object.__setattr__(
-            self, "world", min(self.world, MOST_LENGTH)
-        )  # beyond it there is nothing
+        object.__setattr__(self, "world", min(self.world, MOST_LENGTH))  # no data beyond it
         for name in ("front", "rear", "side"):
             value = getattr(self, name)
             _check_length(value >= 0, f"range.{name}", value, "a length of 0 or more, in metres")
@@ -217,7 +215,7 @@ class Proximity:
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """Angular relations.
+    """Angular relations between entities, such as ``inFrontOf``.
 
     The first one with an upper bound at or above the absolute bearing holds; else the last.
     """
@@ -387,7 +385,7 @@ class Config:
         both = set(self.proximity.names) & set(self.direction.names)
         check(not both, "direction.names", self.direction.names, "other names than proximity.names")
         for name in self.without:
-            relation_named(name)  # those of other packages are looked for
+            relation_named(name)  # looks for plugins of other packages
             _check_name("without", name, [r for r in RELATIONS if r not in MAP_ONLY])
         right = one_of(ORIENTATIONS)
         check(self.orientation in ORIENTATIONS, "orientation", self.orientation, right)
@@ -497,7 +495,7 @@ def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
     check(pairs and 3 <= len(corners) <= MOST_CORNERS, name, corners, right)
     near = all(abs(number) <= MOST_LENGTH for corner in corners for number in corner)
     check(near, name, corners, f"corners up to {MOST_LENGTH:.0f} m away")
-    from sgstore.base.geometry import is_simple  # it comes with numpy, which most configs need not
+    from sgstore.base.geometry import is_simple  # imports numpy, which most configs do not need
 
     right = "sides that meet at the corners only, one after another"
     check(is_simple(corners), name, corners, right)

@@ -290,7 +290,7 @@ def graph_of_records(
     **about
         Attributes of the graph.
     """
-    import networkx as nx  # half a second to import: only when asked for
+    import networkx as nx  # imports in half a second: only on demand
 
     graph: nx.MultiDiGraph[Any] = nx.MultiDiGraph(**about)
     for node in nodes:
@@ -321,7 +321,7 @@ def named_graph(
         Names as nodes, with the attributes ``name`` and ``base_class``; edges with the attribute ``label``,
         which is also the key if it occurs once between two nodes.
     """
-    import networkx as nx  # half a second to import: only when asked for
+    import networkx as nx  # imports in half a second: only on demand
 
     graph: nx.MultiDiGraph[str] = nx.MultiDiGraph(**about)
     for name, label in nodes.items():
@@ -682,7 +682,7 @@ class SceneGraph:
             relation. An edge between entities has the attribute ``lane_dist`` if known (:meth:`lane_dist`). The
             graph's attributes are ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``ego``.
         """
-        import networkx as nx  # half a second to import: only when asked for
+        import networkx as nx  # imports in half a second: only on demand
 
         graph: nx.MultiDiGraph[int] = nx.MultiDiGraph(
             frame_id=self.frame_id,
@@ -703,7 +703,7 @@ class SceneGraph:
                 more = known[src, dst]
             about = {"relation": relation, **attributes, **more}
             graph.add_edge(src, dst, key=relation)
-            graph.edges[src, dst, relation].update(about)  # whose names may be anything
+            graph.edges[src, dst, relation].update(about)  # names can be arbitrary
         return graph
 
 

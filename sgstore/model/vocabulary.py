@@ -358,7 +358,7 @@ def are_entities(codes: NDArray[np.int8]) -> NDArray[np.bool_]:
 @cache
 def _add_plugins() -> None:
     for name in plugins.RELATIONS.others():
-        with suppress(ValueError):  # it is refused where relations are computed
+        with suppress(ValueError):  # the relation generator raises the error
             add_relation(name)
 
 
@@ -366,7 +366,7 @@ def relation_named(name: str) -> str | None:
     """Return the relation for a user's word, or ``None`` if unknown."""
     found = _meant("relation", name)
     if found is None:
-        _add_plugins()  # looking for them takes a while
+        _add_plugins()  # the search takes time
         found = _meant("relation", name)
     return found
 

@@ -257,7 +257,7 @@ class Sight(NamedTuple):
 
 
 class Life(NamedTuple, Generic[AnyEntity]):
-    """One entity among those that share an id. ``seen`` is its last place; ``None`` means unknown."""
+    """Entity that shares its id with others over time. ``seen`` is its last place; ``None`` means unknown."""
 
     entity: AnyEntity
     kind: int
@@ -572,7 +572,7 @@ class FrameBlock:
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A channel of a trace.
+    """Message channel of a recording.
 
     Attributes
     ----------

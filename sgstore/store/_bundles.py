@@ -132,7 +132,7 @@ def _join(
     ):
         names = [f"store {number}" for number in range(len(sources))]
         for name, source in zip(names, sources, strict=True):
-            with Access(source).reading():  # what is no store as ours are is refused
+            with Access(source).reading():  # rejects an invalid store
                 pass
             Access(source).close()
             place = literal(str(source.absolute()))
@@ -161,7 +161,7 @@ def _copied(
             if table in _ONCE or table == "manifest":
                 rows = f"SELECT DISTINCT * FROM ({rows})"
             order = f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in _SORTED else " ORDER BY ALL"
-            if table in {"map", "map_node"}:  # texts of maps are long, and rows of one map few
+            if table in {"map", "map_node"}:  # map texts are long, and a map has few rows
                 order = f" ORDER BY map_id{', node_id DESC' * (table == 'map_node')}"
             connection.execute(f"INSERT INTO fresh.inside.{table} BY NAME {rows}{order}")
     ((found,),) = connection.execute("SELECT count(*) FROM fresh.inside.trace").fetchall()

@@ -236,7 +236,7 @@ def _derived(
         f"SELECT kind, bucket, node_id, mask FROM derived_node WHERE set_name = {word} AND NOT moves"
     )
     states = 'SELECT s.* FROM inside."state"'
-    if whole.beyond:  # the range of a set may be larger than that of the graphs
+    if whole.beyond:  # the range of a set may exceed the range of the graphs
         states = "SELECT s.* EXCLUDE (in_graph) FROM inside.known_state"
         shadows["lane_state"] = "SELECT * EXCLUDE (in_graph) FROM inside.known_lane_state"
     shadows["state"] = (
@@ -284,9 +284,7 @@ def _relations(
     and a map. Without a map, the set lacks only the relations that the traces can answer in the store.
     """
     if any("abstraction" in one.settings for one in of):
-        return (
-            None  # a function of ours or a client's made it, of which we only know what it has made
-        )
+        return None  # made by an abstraction function: only its result is known
     numbers = {one.trace_id for one in of}
     answered = frozenset(relation for one in of for relation in one.answers)
     told = connection.execute("SELECT trace_id FROM trace WHERE map_id IS NOT NULL").fetchall()

@@ -203,7 +203,7 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
         if types_of(table)[name] in TEXTS:
             key = rank[key]
         elif key.dtype.kind == "i" and (missing := missing_of(table, name, key)) is not None:
-            key = np.where(missing, np.iinfo(key.dtype).max, key)  # NULL comes last
+            key = np.where(missing, np.iinfo(key.dtype).max, key)  # NULL sorts last
         key = key >> shift if shift else key
         keys.append(-key.astype(np.int64) if down else key)
     if not keys or len(keys[0]) < 2:
@@ -354,10 +354,10 @@ def _mix(words: Words, spare: Words) -> None:
 
 
 def _words(values: NDArray[Any], out: Words) -> None:
-    """Write the bits of values as 64-bit words."""
+    """Convert values to 64-bit words for the checksum."""
     plain = np.ma.getdata(values)
     if plain.dtype.kind == "f":
-        plain = plain + plain.dtype.type(0)  # one zero: DuckDB 1.5 does not keep the sign of it
+        plain = plain + plain.dtype.type(0)  # merges -0 and 0: DuckDB 1.5 drops the sign
         out[:] = plain.view(np.uint32 if plain.dtype.itemsize == 4 else np.uint64)
     else:
         out.view(np.int64)[:] = plain

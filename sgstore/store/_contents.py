@@ -85,7 +85,7 @@ TOGETHER: Final = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Settings and map behind the graphs of a trace.
+    """Settings and map used for the graphs of a trace.
 
     Attributes
     ----------
@@ -163,12 +163,14 @@ def _rows(
         f'enum_code(v."{name}") AS "{name}"' if name in labels else f'v."{name}"'
         for name in columns
     )
-    span = f"v.frame_id BETWEEN {wanted[0]} AND {wanted[-1]}"  # what a scan of a table can skip by
+    span = (
+        f"v.frame_id BETWEEN {wanted[0]} AND {wanted[-1]}"  # the column that lets a scan skip rows
+    )
     sql = f"SELECT v.frame_id, {listed} FROM {view} v JOIN {_WANTED} ON w.frame_id = v.frame_id WHERE {span}"
     found = file.arrays(sql, {"frames": wanted.tolist()})
     frame_id = found.pop("frame_id").astype(np.int64)
     told = [_words(values, labels.get(name)) for name, values in found.items()]
-    order = np.lexsort((*told[2::-1], frame_id))  # what tells rows apart stands in front
+    order = np.lexsort((*told[2::-1], frame_id))  # the most selective column first
     if _like_before(order, frame_id, *told[:3]).any():
         order = np.lexsort((*told[::-1], frame_id))
         order = order[~_like_before(order, frame_id, *told)]
@@ -200,7 +202,7 @@ def _words(values: NDArray[Any], labels: Words | None) -> Words:
     if labels is not None:
         words = labels[np.where(missing, 0, plain)]
     elif plain.dtype.kind == "f":
-        numbers = plain.astype(np.float64) + 0.0  # one zero
+        numbers = plain.astype(np.float64) + 0.0  # merges -0 and 0
         missing = missing | np.isnan(numbers)
         words = numbers.view(np.uint64)
     elif plain.dtype.kind in "biu":
@@ -222,7 +224,7 @@ def _add(digest: Any, rows: tuple[Ints, Words], group: Ints, *, always: bool) ->
     low = int(np.searchsorted(frame_id, group[0]))
     high = int(np.searchsorted(frame_id, group[-1], side="right"))
     own = words[low:high]
-    if len(group) < group[-1] - group[0] + 1:  # others may lie between
+    if len(group) < group[-1] - group[0] + 1:  # other frames may lie between
         own = own[np.isin(frame_id[low:high], group)]
     if not len(own) and not always:
         return

@@ -413,7 +413,7 @@ class _StateReader:
         frames = self._connection.execute(_FRAMES, where).fetchnumpy()
         states = self._connection.execute(_STATES, where).fetchnumpy()
         ids = frames["frame_id"].astype(np.int64)
-        end = int(np.searchsorted(self._due, high))  # those that are due before
+        end = int(np.searchsorted(self._due, high))  # entities introduced earlier
         rows = slice(self._next, end)
         entities, scenery = self._introduced(rows)
         self._next = end

@@ -71,7 +71,7 @@ class _Known:
         self.states += 0 if track is None else len(track)
 
     def forget(self) -> None:
-        """Clear all tracks if they have too many states."""
+        """Clear the cached tracks if they have too many states."""
         if self.states > MOST_STATES:
             self.tracks.clear()
             self.whole.clear()
@@ -117,7 +117,7 @@ class _MeasuredQuestion:
         a, b = (self._track(nodes, trace, node) for node in (src, dst))
         if a is None or b is None:
             return None
-        from sgstore.model.criticality import Encounter  # with numpy
+        from sgstore.model.criticality import Encounter  # imports numpy
 
         value = RECORDED[measure.removeprefix(KNOWN)].value(Encounter(a, b))
         return None if math.isnan(value) else value
@@ -196,7 +196,9 @@ def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
         _known.popitem(last=False)
     token = next(_tokens)
     _questions[token] = _MeasuredQuestion(connection, known)
-    with suppress(duckdb.CatalogException, duckdb.NotImplementedException):  # it is there
+    with suppress(
+        duckdb.CatalogException, duckdb.NotImplementedException
+    ):  # the function already exists
         # DuckDB does not move a function with side effects before other conditions.
         connection.create_function(
             _FUNCTION,

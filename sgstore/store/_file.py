@@ -74,7 +74,7 @@ T = TypeVar("T")
 
 
 def _damage(connection: DuckDBPyConnection, path: Path) -> str:
-    from sgstore.store._verify import damage  # only where something is wrong
+    from sgstore.store._verify import damage  # imported only after a fault
 
     return damage(connection, path)
 
@@ -136,7 +136,7 @@ class StoreFile:
         self._abstracted: Abstracted | None = None
         self._known: tuple[Stamp, Catalog] | None = None
         if not made:
-            with self.access.reading():  # what is no store of ours is refused there
+            with self.access.reading():  # rejects an invalid store
                 pass
 
     @classmethod
@@ -392,7 +392,7 @@ class StoreFile:
     def catalog(self) -> Catalog:
         """Return the catalog for the query compiler. It is cached until the file changes."""
         if self._known is not None and self._known[0] == stamp_of(self.path):
-            return self._known[1]  # to open the store costs more than to compile a query
+            return self._known[1]  # opening the store takes longer than compiling a query
         from sgstore.store._catalog import catalog_of
 
         with self.access.reading() as connection:
@@ -558,7 +558,7 @@ class StoreFile:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
                 "SELECT m.name, m.text FROM trace t JOIN map m ON m.map_id = t.map_id"
-                " WHERE t.trace_id = ? AND m.text IS NOT NULL"  # one of named parts has none
+                " WHERE t.trace_id = ? AND m.text IS NOT NULL"  # a map of named parts has no text
             )
             return connection.execute(sql, [trace_id]).fetchone()
 

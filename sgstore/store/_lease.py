@@ -28,7 +28,9 @@ from sgstore.base.quoting import literal, quoted
 
 try:
     import fcntl
-except ImportError:  # not on Windows: there nobody could ask for a file that is kept, so none is
+except (
+    ImportError
+):  # not on Windows: a writer cannot request an open file there, so files close at once
     fcntl = None
 
 if TYPE_CHECKING:
@@ -81,7 +83,7 @@ def _wanted(path: Path) -> bool:
         return True
     finally:
         os.close(gate)
-    return False  # one that was killed left it
+    return False  # left by a killed process
 
 
 class AttachedFile:
@@ -121,7 +123,7 @@ class AttachedFile:
         return connection
 
     def close(self) -> None:
-        """Detach the file."""
+        """Detach the file from the database instance."""
         self._instance.cursor().execute(f"DETACH {quoted(self.name)}")
 
 
@@ -198,12 +200,12 @@ class OpenFile:
 
     @mine.setter
     def mine(self, count: int) -> None:
-        self.held.count = max(count, 0)  # a reading may end in another thread than it began in
+        self.held.count = max(count, 0)  # a reading may end in another thread
 
     def close(self) -> None:
         """Close the database instance if it has no readers."""
         if not self.readers and self.instance is not None:
-            instance, self.instance = self.instance, None  # gone even if closing it is interrupted
+            instance, self.instance = self.instance, None  # cleared even if close() is interrupted
             self.spoiled = False
             instance.close()
 
@@ -249,7 +251,7 @@ class _Watch:
         self.begin()
 
     def begin(self) -> None:
-        """Reset to no files and no thread."""
+        """Reset the watcher: no files and no thread."""
         self.kept: set[OpenFile] = set()
         self.running = False
         self._lock = threading.Lock()
@@ -264,7 +266,7 @@ class _Watch:
                 self.running = True
                 try:
                     thread.start()
-                except RuntimeError:  # no more threads may be had
+                except RuntimeError:  # no further thread can start
                     self.running = False
                     return False
             self.kept.add(file)
@@ -281,7 +283,7 @@ class _Watch:
     def _look(self, file: OpenFile) -> None:
         """Close an idle connection if a writer waits or the timeout passed."""
         if not file.changed.acquire(blocking=False):
-            return  # somebody comes or goes
+            return  # a reading starts or ends right now
         try:
             bundle = isinstance(file.instance, AttachedFile)
             late = not bundle and time.monotonic() - file.used > LEASE_S

@@ -104,7 +104,7 @@ def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...
     endings = ("", ".wal", ".wal.checkpoint", ".wal.recovery")
     ((spill,),) = connection.execute("SELECT current_setting('temp_directory')").fetchall()
     names = [str(folder.absolute()) for folder in folders]
-    places = [*names, *map(escape, names), spill]  # to read one takes a pattern
+    places = [*names, *map(escape, names), spill]  # reading one needs a pattern
     connection.execute("SET allowed_paths = $1", [[whole + ending for ending in endings]])
     connection.execute("SET allowed_directories = $1", [places])
     connection.execute("SET autoload_known_extensions = false")
@@ -202,7 +202,7 @@ def spill_fault(message: str) -> str | None:
 
 try:
     import fcntl
-except ImportError:  # not on Windows: there writers and readers take their turns as they come
+except ImportError:  # not on Windows: without a gate, access is first come, first served
     fcntl = None
 
 
@@ -252,7 +252,7 @@ def without_faults(connection: DuckDBPyConnection) -> None:
     connection.execute(f"SET disabled_optimizers = {literal(','.join(off))}")
     if old:
         return
-    with suppress(duckdb.CatalogException):  # a later version may have no such setting
+    with suppress(duckdb.CatalogException):  # a later version may lack this setting
         # GLOBAL is necessary, because every reading has its own session.
         connection.execute("SET GLOBAL enable_caching_operators = false")
 
@@ -297,7 +297,7 @@ def _file_at(path: Path) -> OpenFile:
     with _files_lock:
         known = files.get(place)
         file = known or files.setdefault(place, OpenFile(place))
-    if known is None:  # once in the life of a process
+    if known is None:  # only at the first access in a process
         remove_left_behind(path)
     return file
 
@@ -306,7 +306,7 @@ def trust(path: Path, made: os.stat_result) -> None:
     """Mark a file as checked if this process has just created it."""
     stamp = stamp_of(path)
     if len(stamp) != 1:
-        return  # there is somebody's log beside it
+        return  # another process has left a log
     if stamp[0][:4] == (made.st_dev, made.st_ino, made.st_size, made.st_mtime_ns):
         _file_at(path).good = stamp
 
@@ -391,7 +391,7 @@ class Access:
             with translated(self.path):
                 yield connection
             failed = False
-        except GeneratorExit:  # somebody has enough
+        except GeneratorExit:  # the caller stopped reading
             failed = False
             raise
         except _SURPRISES as error:
@@ -421,11 +421,11 @@ class Access:
             trace = trace.tb_next
         where = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__", ""))
         if where == __name__ or not where.startswith(("sgstore.", "json", "numpy")):
-            return ""  # the fault of who called us
+            return ""  # an error of the caller
         instance = self._file.instance
         if isinstance(instance, AttachedFile):
             return self._diagnose(instance.cursor(shape.INSIDE), self.path)
-        connection.execute(f"USE {shape.INSIDE}")  # it may have been open for public names
+        connection.execute(f"USE {shape.INSIDE}")  # it may have been opened with public names
         return self._diagnose(connection, self.path)
 
     def restart(self) -> bool:
@@ -451,7 +451,9 @@ class Access:
 
     def _enter(self, deadline: _Deadline, *, public: bool, idle: bool) -> DuckDBPyConnection:
         file = self._file
-        if not file.mine:  # a nested one must not wait for a writer who waits for the outer one
+        if (
+            not file.mine
+        ):  # a nested reading must not wait for a writer that waits for the outer one
             _pass_gate(self.path, deadline)
         with file.changed:
             free = file.changed.wait_for(
@@ -477,7 +479,9 @@ class Access:
                 if idle or not isinstance(instance, AttachedFile):
                     connection = instance.cursor()
                     if inside and not idle:
-                        connection.execute(f"USE {shape.INSIDE}")  # a cursor does not inherit it
+                        connection.execute(
+                            f"USE {shape.INSIDE}"
+                        )  # a cursor does not inherit the setting
                 else:
                     connection = instance.cursor(shape.INSIDE if inside else "main")
             except BaseException:
@@ -495,7 +499,7 @@ class Access:
         file = self._file
         with file.changed:
             file.spoiled |= failed
-            if connection in file.cursors:  # not in a process that was forked off meanwhile
+            if connection in file.cursors:  # not in a process forked meanwhile
                 file.cursors.remove(connection)
                 file.mine -= 1
                 file.readers -= 1
@@ -517,7 +521,7 @@ class Access:
             instance = self._opened(deadline)
             if stamp == stamp_of(self.path):
                 break
-            instance.close()  # another file has taken its place, and nobody knows which of the two this is
+            instance.close()  # the file was replaced meanwhile, so this may be either file
         file.instance, file.opened, file.checked = instance, stamp, False
         _log.debug("%s: opened to read", self.path)
         return instance
@@ -593,7 +597,7 @@ class Access:
                 # The error was already raised, and the caller closes the connection anyway.
                 with suppress(duckdb.Error):
                     connection.execute("DETACH store")
-                    if checked:  # what came into it is ours
+                    if checked:  # the new content is from this process
                         self._file.good = stamp_of(self.path)
 
     @contextmanager
@@ -610,7 +614,7 @@ class Access:
                 )
                 if not free:
                     raise StoreError(f"{self.path}: another thread has been using it for too long")
-                file.close()  # it may have been kept open
+                file.close()  # it may still be open
                 file.writing = True
             finally:
                 file.waiting -= 1
@@ -623,7 +627,7 @@ class Access:
 
     def _attach(self, connection: DuckDBPyConnection, deadline: _Deadline) -> None:
         while True:
-            refuse_special(self.path)  # ATTACH would make an empty one if there is none
+            refuse_special(self.path)  # ATTACH would create a missing file
             try:
                 with translated(self.path):
                     connection.execute(
@@ -643,7 +647,7 @@ def transaction(connection: DuckDBPyConnection) -> Generator[None]:
         yield
         connection.execute("COMMIT")
     except BaseException:
-        with suppress(duckdb.Error):  # a transaction that broke has been undone already
+        with suppress(duckdb.Error):  # a failed transaction is already rolled back
             connection.execute("ROLLBACK")
         raise
     # The checkpoint removes the write-ahead log. If it fails, the log stays, and its data are safe.
@@ -726,7 +730,7 @@ class _Deadline:
         if isinstance(error, HeldHereError):
             if time.monotonic() - self._start > _HELD_HERE_S:
                 raise error
-            gc.collect()  # it may be one that nobody has any more
+            gc.collect()  # the connection may be unreferenced garbage
         if not self.left():
             raise error
         time.sleep(min(self._next, self.left()))
@@ -754,7 +758,7 @@ def _closed_gate(path: Path, deadline: _Deadline) -> Generator[None]:
         yield
         return
     gate = _Gate(path)
-    atexit.register(gate.remove)  # should an interrupt come at an odd moment
+    atexit.register(gate.remove)  # in case of an interrupt before the finally block
     try:
         gate.close(deadline)
         yield
@@ -798,7 +802,7 @@ class _Gate:
         if fcntl is None or not self._begun:
             return
         with suppress(OSError):
-            if self._lock < 0:  # an interrupt came before its number was noted
+            if self._lock < 0:  # an interrupt came before the assignment
                 self._lock = os.open(gate_of(self._path), os.O_RDWR)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if self._is_there():

@@ -58,7 +58,7 @@ _PLAIN: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class PartFile:
-    """Rows of one partial result.
+    """Rows of a partial result of a collection query.
 
     Attributes
     ----------

@@ -138,7 +138,7 @@ def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints
     if not len(bits):
         return np.zeros(0, np.intp), np.zeros(0, np.int64)
     number = packed(keys)
-    if number is None:  # ids that are far apart: their ranks instead
+    if number is None:  # sparse ids: use their ranks
         number = np.unique(np.stack(keys), axis=1, return_inverse=True)[1].reshape(-1)
     order = ascending(number)
     ranked = number[order]
@@ -175,7 +175,7 @@ def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
 
 
 def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
-    """Return table ``frame``."""
+    """Return the rows of table ``frame`` as columns."""
     frames = graph.frames
     return {
         "frame_id": frame_ids(trace_id, frames.seq),
@@ -216,7 +216,7 @@ def state_columns(
 
 
 def node_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds) -> Columns:
-    """Return table ``node``. Kinds are codes."""
+    """Return the rows of table ``node`` as columns. Kinds are codes."""
     seq = graph.frames.seq[graph.presence.frame]
     kind, bucket, node = (
         kinds.of(graph.presence.node),
@@ -236,7 +236,7 @@ def edge_columns(
     if count <= 1:
         yield _edge_columns(graph, edges, trace_id, kinds)
         return
-    piece = (edges.src % count).astype(np.int32)  # what becomes one row has one source
+    piece = (edges.src % count).astype(np.int32)  # edges merged into one row have one source
     for which in range(count):
         rows = np.flatnonzero(piece == which)
         yield _edge_columns(graph, taken(edges, rows), trace_id, kinds)
@@ -302,7 +302,7 @@ def gap_columns(graph: GraphBlock | WorldBlock, trace_id: int) -> Columns:
 
 
 def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
-    """Return table ``entity``. Kinds are codes."""
+    """Return the rows of table ``entity`` as columns. Kinds are codes."""
     entities, scenery = graph.frames.entities, graph.frames.scenery
     rows = scenery.node - entities.first
     if len(rows) and not 0 <= rows.min() <= rows.max() < len(entities):

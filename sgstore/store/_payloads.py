@@ -47,7 +47,7 @@ class Periods:
     counts: dict[int, int] = field(default_factory=dict[int, int])
 
     def see(self, channel: int, log_time_ns: Ints) -> None:
-        """Add messages to the estimate."""
+        """Add message times to the estimate of periods."""
         count = self.counts.get(channel, 0)
         if count <= _SAMPLE and len(log_time_ns):
             piece = log_time_ns[: _SAMPLE + 1 - count]
@@ -167,7 +167,7 @@ def _chosen(
         order = np.lexsort(tuple(some[name] for name in reversed(_PLACE)))
         said = np.stack([some[name][order] for name in _PLACE])
         last = np.append(said[0, 1:] != said[0, :-1], True)
-        said = np.hstack([said[:, last], _none(1)])  # and one that stands for none
+        said = np.hstack([said[:, last], _none(1)])  # and one placeholder for "no message"
         time = said[0, :-1]
         below = np.searchsorted(time, frames.time, side="right") - 1
         above = np.searchsorted(time, frames.time)

@@ -82,10 +82,10 @@ def publish_each(
                         with translated(access.path), transaction(connection):
                             name = _publish(connection, access.path, one, replace=replace)
                         found.append(name)
-                    except PresentError as error:  # nothing is wrong with the store
+                    except PresentError as error:  # the store itself is intact
                         found.append(error)
         except SgstoreError as error:
-            if len(found) < len(sealed):  # the others are tried with another connection
+            if len(found) < len(sealed):  # the remaining traces use another connection
                 found.append(error)
     return found
 
@@ -300,7 +300,7 @@ def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, 
         WHERE database_name = $1 AND schema_name = 'inside' AND list_contains($2, table_name)
         GROUP BY table_name ORDER BY table_name
         """,
-        [database, [*shape.expected().tables]],  # others may have tables of their own there
+        [database, [*shape.expected().tables]],  # user tables may exist there
     ).fetchall()
     for table, columns in rows:
         found = next((column for column in _OWNED if column in columns), None)

@@ -218,7 +218,7 @@ def _traces(reader: _TableReader, path: Path) -> tuple[OldTrace, ...]:
     if reader.has("recording"):
         rows = reader.rows("trace", f"{_TRACE} recording_id", needed=True)
         rows = [row | recordings[row["recording_id"]] for row in rows]
-    else:  # a store of before, where each trace has its own
+    else:  # an old store: each trace has its own
         rows = reader.rows("trace", f"{_TRACE} {_RECORDING}", needed=True)
     rows.sort(key=lambda row: (row["ingested_at"].isoformat(), str(row["name"])))
     found = tuple(_trace(row, settings, path) for row in rows)
@@ -312,7 +312,7 @@ def _name(place: Path, path: Path) -> None:
         os.link(place, path)
     except FileExistsError:
         pass
-    except OSError:  # a file system that has no links
+    except OSError:  # a file system without links
         try:
             if not path.exists():
                 place.rename(path)
@@ -358,7 +358,7 @@ def _make_empty(place: Path) -> None:
     with duckdb.connect(":memory:") as connection:
         connection.execute(f"ATTACH {file} AS fresh ({_NEW})")
         connection.execute("USE fresh")
-        connection.begin()  # one: of its own, each of the 130 statements would be written through
+        connection.begin()  # one transaction: otherwise each of the 130 statements would be synced to disk
         connection.execute(schema_sql())
         about = {
             "schema_version": SCHEMA_VERSION,

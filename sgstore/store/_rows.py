@@ -368,7 +368,7 @@ def as_told(
     arrow = _package("pyarrow")
     table = arrow.concat_tables(tables).slice(0, most)
     wide = {arrow.int32(): arrow.int64(), arrow.float32(): arrow.float64()}
-    columns_told = (  # the shortest text of 32 bits, as in Python
+    columns_told = (  # shortest text of a float32, as in Python
         column.cast(arrow.string()) if column.type == arrow.float32() else column
         for column in table.columns
     )
@@ -401,7 +401,7 @@ def arrays(
     given = parameters or None
     described = [] if plain else connection.execute(f"DESCRIBE {sql}", given).fetchall()
     listed = [quoted(str(row[0])) for row in described if "ENUM" in str(row[1])]
-    if listed:  # as enumerations they would come as categories of pandas
+    if listed:  # enumerations would become pandas categories
         texts = ", ".join(f"{name}::VARCHAR AS {name}" for name in listed)
         sql = f"SELECT * REPLACE ({texts}) FROM ({sql})"
 
@@ -644,7 +644,7 @@ class ParquetTable:
             folder = stack.enter_context(working_folder("table"))
             rows = duckdb.connect(str(folder / "rows.duckdb"))
             self._connection = stack.enter_context(rows)
-            rows.execute("SET threads = 1")  # so that row groups come in one order
+            rows.execute("SET threads = 1")  # keeps the order of row groups
             rows.execute(f"CREATE TABLE output ({named})")
             self._open = stack.pop_all()
 
@@ -660,7 +660,7 @@ class ParquetTable:
                 )
 
     def add(self, columns: Mapping[str, NDArray[Any] | Sequence[Any]]) -> None:
-        """Append rows given as columns.
+        """Append rows. The data are given as columns.
 
         Parameters
         ----------
@@ -776,7 +776,7 @@ def record_batches(
     def more() -> Any:
         try:
             return next(reader, None)
-        except (OSError, ValueError) as error:  # so Arrow tells an error of the database
+        except (OSError, ValueError) as error:  # Arrow wraps a database error
             stopped = "INTERRUPT" in str(error)
             raise (duckdb.InterruptException if stopped else duckdb.Error)(str(error)) from error
 

@@ -258,9 +258,9 @@ def about_store(
         return None
     if not _is_known(objects):
         made = _statement(told)
-        own, added = expected().tables["store_info"], {"NOT", "NULL"}  # to its columns, since
+        own, added = expected().tables["store_info"], {"NOT", "NULL"}  # later added to its columns
         if [word for word in made if word not in added] != [w for w in own if w not in added]:
-            return {}  # whatever it is, it is not read
+            return {}  # an unknown table is not read
     rows = connection.execute(f"SELECT key, value FROM {quoted(database)}.{schema}.store_info")
     return {str(key): str(value) for key, value in rows.fetchall()}
 
@@ -603,7 +603,9 @@ def _attached(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
                 " WHERE database_name = ?",
                 [database],
             ).fetchall()
-        except duckdb.CatalogException:  # DuckDB 1.5 has no triggers, and reads no store that has
+        except (
+            duckdb.CatalogException
+        ):  # DuckDB 1.5 has no triggers, and rejects a store with triggers
             continue
         for schema, table, name in rows:
             ours = {*expected().tables, *expected().views, *expected().inner}

@@ -529,8 +529,10 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
         "autoinstall_known_extensions": False,
     }
     connection = duckdb.connect(":memory:", config=config)
-    with suppress(duckdb.InvalidInputException):  # Jupyter without ipywidgets has none, and refuses
-        connection.execute("SET enable_progress_bar = false")  # where Python is interactive
+    with suppress(
+        duckdb.InvalidInputException
+    ):  # Jupyter without ipywidgets has no progress bar, and raises an error
+        connection.execute("SET enable_progress_bar = false")  # in interactive Python
     without_faults(connection)
     return connection
 

@@ -55,7 +55,7 @@ def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
             pass
     except BaseException:
         while not task.is_over():
-            with suppress(BaseException):  # whoever asks twice does not leave a statement behind
+            with suppress(BaseException):  # a second interrupt must not leave a running statement
                 task.ended.wait(_AGAIN_S)
                 interrupt(connection)
         task.forget()
@@ -142,7 +142,7 @@ class _StepThread:
             thread = threading.Thread(target=_do_all, args=(self._tasks,), daemon=True)
             try:
                 thread.start()
-            except RuntimeError:  # no more threads may be had
+            except RuntimeError:  # no further thread can start
                 return not task.take()
             self._thread = thread
         self._tasks.put(task)
@@ -151,7 +151,7 @@ class _StepThread:
 
 def _do_all(tasks: SimpleQueue[_Task[Any]]) -> None:
     while True:
-        tasks.get().run()  # not by a name, which would hold the connection until the next task
+        tasks.get().run()  # no variable: it would keep the connection alive until the next task
 
 
 _step_thread: Final = _StepThread()

@@ -102,7 +102,7 @@ class Identity:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Identity:
         """Restore an identity from plain values."""
-        from sgstore.model.config import Payloads  # many settings: not for who only reads a store
+        from sgstore.model.config import Payloads  # slow import, not needed to read a store
 
         payloads: Any = Payloads(**values["payloads"])
         return cls(**(values | {"payloads": payloads}))

@@ -118,7 +118,7 @@ class ObligationState:
 
     @property
     def terms(self) -> list[Term]:
-        """Return all open terms."""
+        """Return all open obligations of the state."""
         found = [term for term, _ in self.past]
         found += [term for _, entries in self.past for *_, term in entries]
         for duty in self.duties:
@@ -146,7 +146,7 @@ class ObligationState:
 
 @dataclass(frozen=True, slots=True)
 class ObligationStep:
-    """Transition of a state by one frame.
+    """Result of a state after one frame: the next state, and the changes of violations.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ class Automaton:
         tick: Tick,
         seen: dict[tuple[ObligationState, int], ObligationStep],
     ) -> ObligationStep:
-        """Return the transition of a state by one frame.
+        """Return the next state after one frame, and the changes of violations.
 
         Parameters
         ----------
@@ -377,7 +377,7 @@ class _CheckEntry:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Second evaluation of a binding, which differs because of an unknown condition.
+    """Alternative state of a binding, with an unknown condition counted against the check.
 
     Attributes
     ----------
@@ -488,7 +488,7 @@ class CheckMonitor:
     # Online, frame by frame
 
     def step(self, here: FrameTime) -> list[MonitorEvent]:
-        """Process the next frame after its queries, and return the new events."""
+        """Process the next frame, and return the new events. Its query results must be ready."""
         if self._margins is not None:
             self._margins.step()
         self._count_full()
@@ -541,7 +541,7 @@ class CheckMonitor:
         letter: int,
         here: FrameTime,
     ) -> Doubt | None:
-        """Return the second evaluation of a binding. ``None`` means that both evaluations agree."""
+        """Return the alternative state of a binding. ``None`` means that unknown conditions change nothing."""
         old = before.doubt
         broken = step.started or (self._compat and not step.state.ended)
         own = entry.since is not None or len(entry.over) > len(before.over)
@@ -562,7 +562,7 @@ class CheckMonitor:
         self._full += all(questions.here[k] == len(questions.met(k)) for k in self._kinds)
 
     def _return(self, grown: list[tuple[Partial, int]]) -> None:
-        """Compute the returned values of the violations that ended with this frame."""
+        """Compute the values that a check returns for violations that ended with this frame."""
         self._values.step()
         for row, before in grown:
             entry = self._known.of(row)
@@ -574,7 +574,7 @@ class CheckMonitor:
         self._values.forget((self._pulse.tick.number, *since))
 
     def _values_of(self, key: Partial, span: Span) -> dict[str, Any]:
-        """Compute the returned values of a violation."""
+        """Compute the values that a check returns for a violation."""
         binding = dict(zip(self._variables, key, strict=True))
         start, end = (one.seq for one in span)
 
@@ -594,7 +594,7 @@ class CheckMonitor:
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
     ) -> _CheckEntry:
-        """Return the entry of a binding in SGSM mode: violated while the trace may not end."""
+        """Return the state of a binding in SGSM mode: violated while the trace must not end."""
         since, over = entry.since, entry.over
         if not step.state.ended:
             since = since or here
@@ -633,7 +633,7 @@ class CheckMonitor:
                         yield replace(event, values=values)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
-        """Yield the bindings of known entities that share this entry."""
+        """Yield the bindings of known entities that share this state."""
         if None not in row:
             yield row  # type: ignore[misc]
             return
@@ -808,7 +808,7 @@ class CheckMonitor:
     def _at_end(
         self, last: FrameTime, *, holds: bool, bindings: Keys, spans: list[list[Span]]
     ) -> Iterator[MonitorEvent]:
-        """Yield the violations without an event so far."""
+        """Yield events for violations that have no event yet."""
         if holds:
             return
         if not self._immediate:

@@ -85,7 +85,7 @@ class Reading:
 
     @property
     def contrary(self) -> Reading:
-        """Reading under a negation."""
+        """Rules for unknown and absent values under a negation."""
         absent = None if self.absent is None else not self.absent
         return Reading(_CONTRARY[self.unknown], not self.positive, absent)
 
@@ -101,7 +101,7 @@ CERTAIN: Final = Reading("", absent=False)
 
 
 def base_name(name: str) -> str:
-    """Return the name of a proposition without the sign of its evaluation."""
+    """Return the name of a proposition without its suffix ``+`` or ``-``."""
     return name.rstrip("+-")
 
 
@@ -152,7 +152,7 @@ class CheckPlan(Plan):
                 return self.read(expression, CERTAIN)
 
     def read(self, expression: b.Bound, reading: Reading) -> f.Formula:
-        """Return the formula of a condition under a reading."""
+        """Return the formula of a condition, with the given rules for unknown and absent values."""
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -274,7 +274,7 @@ class CheckPlan(Plan):
         return found
 
     def _asked(self, wanted: b.Bound, things: frozenset[str], sign: str) -> f.Formula:
-        """Return the formula for "true", or for "true or unknown" in the evaluation with this sign."""
+        """Return the formula that a condition is true, or unknown if unknown values count as true."""
         if isinstance(wanted, b.Value) and not things:
             return f.TruthConstant(wanted.value is True)
         found = f.Proposition(self._ask(certain(wanted, decided=self._decided), things))
@@ -340,7 +340,7 @@ class CheckPlan(Plan):
         return ways[0] if ways else None
 
     def _open_courses(self, expression: b.Bound) -> bool:
-        """True if a condition inside a course may be unknown."""
+        """True if a condition inside a time function may be unknown."""
         parts = (part for part in b.walk(expression) if isinstance(part, b.SignalCall))
         return any(self._open(p.operand) for p in parts if p.word in _OF_CONDITIONS)
 
@@ -434,7 +434,7 @@ class CheckPlan(Plan):
                 for operand in operands:
                     self._measure(operand, test)
             case b.Operation("IS NOT NULL", (b.Operation() as difference,)) if test.signals:
-                self._measure(difference, test)  # the value of a margin, which is asked anyway
+                self._measure(difference, test)  # the margin is queried anyway
             case _:
                 Plan._measure(self, expression, test)  # noqa: SLF001 - of the base class
 
@@ -458,7 +458,7 @@ class CheckPlan(Plan):
     def margin(  # noqa: PLR0911 - a case each
         self, expression: b.Bound, reading: Reading
     ) -> f.Formula:
-        """Return the formula over margins of a condition under a reading; see :meth:`Plan.quantity`."""
+        """Return the formula of a condition's margin, with rules for unknown and absent values."""
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -505,7 +505,7 @@ class CheckPlan(Plan):
     def _differences(
         self, difference: b.Bound, meaning: b.Operation, reading: Reading
     ) -> f.Formula:
-        """Return the difference by which a comparison holds, in all readings of its courses."""
+        """Return the margin of a comparison for all treatments of unknown values in its time functions."""
         counted = self._counted(self._things(meaning), reading)
 
         def told(ways: Iterable[b.Bound], *, either: bool) -> f.Formula:
@@ -538,7 +538,7 @@ _OF_CONDITIONS: Final = frozenset({"run_length", "since_true", "robustness"})
 
 
 def _with_possible(expression: b.Bound) -> b.Bound:
-    """Return the expression with course conditions that count unknown as true."""
+    """Return the expression with unknown conditions of time functions counted as true."""
     match expression:
         case b.SignalCall(word=word, operand=operand) if word in _OF_CONDITIONS:
             return replace(expression, operand=_boolean(POSSIBLY, operand))
@@ -593,7 +593,7 @@ PlannedCheck = tuple[CheckPlan, f.Formula, "f.Formula | None", dict[int, f.Formu
 
 
 def empty_plan(check: BoundCheck) -> CheckPlan:
-    """Return the plan of a check without queries."""
+    """Return a new plan of a check, still without queries."""
     words = tuple((q.word if q.absent else "false", frozenset(q.nodes)) for q in check.quantifiers)
     return CheckPlan(query_of_check(check), variables_of(check), words=words, limit=check.limit)
 

@@ -454,7 +454,7 @@ def columns_returned(returned: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
 
 def cell_of(value: Any) -> str:
-    """Format a returned value for readers."""
+    """Format a returned value for display."""
     if value is None:
         return "unknown"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -640,7 +640,7 @@ class CheckRun:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Verdict codes of bindings.
+    """Verdict codes and violations of the bindings of a check.
 
     Attributes
     ----------
@@ -1105,7 +1105,7 @@ class StoreCheck:
     def _values_of(
         self, trace: TraceReader, binding: Keys, spans: Sequence[Violation]
     ) -> list[dict[str, Any]]:
-        """Return the returned values of each violation of a binding."""
+        """Return the values that a check returns for each violation of a binding."""
         if not self._returned.parts:
             return [self._returned.told(lambda _: None) for _ in spans]
         values = PlanValues(self._values, trace, self._variables, binding)

@@ -122,13 +122,13 @@ class ExpressionMonitor(SequenceMonitor):
     def _may_be_earlier(
         self, standing: _Standing, frames: tuple[int, ...], *, before: bool
     ) -> bool:
-        """True if a match from this standing can still have earlier frames than the given ones."""
+        """True if a partial match can still complete with earlier frames than the given ones."""
         way, at, binding, place = standing
         if at == len(way.links):
-            return False  # what has ended is known
+            return False  # an ended match is already known
         following, link, open_ended = self._next_step(way, at, binding, place)
         ends = following == len(way.steps)
-        if ends or len(frames) == 1:  # what goes on is later
+        if ends or len(frames) == 1:  # a longer match is later
             return ends and open_ended and (before or len(frames) > 1)
         now, least = self._pulse.tick.number + 1, place.number + (link.kind != "while")
         if not self._closed(place, link, None, NEVER) and max(least, now) <= frames[1]:

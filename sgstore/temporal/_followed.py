@@ -69,14 +69,14 @@ class FollowedMatch:
         self._spans: list[list[tuple[int, int]]] = [[] for _ in self._parts]
         self._search = [
             None
-            if part.query.steps  # it is about other frames, too
+            if part.query.steps  # it also depends on other frames
             else ScopeSearch(part.query.scope, injective=part.query.injective)
             for part in self._parts
         ]
         self.begun = self.seen = -1
 
     def look(self, views: Iterable[FrameView]) -> None:
-        """Evaluate the new frames."""
+        """Evaluate the pattern in the new frames."""
         for view in views:
             seq = view.frame["seq"]
             if seq <= self.seen:
@@ -173,7 +173,7 @@ class RecentGraphs:
             one.look([view])
 
     def view(self, seq: int) -> FrameView:
-        """Return a stored frame.
+        """Return a recent frame that is still stored.
 
         Raises
         ------

@@ -58,21 +58,21 @@ class Proposition:
 
 @dataclass(frozen=True, slots=True)
 class Not:
-    """Negation."""
+    """Negation of a formula."""
 
     operand: Formula
 
 
 @dataclass(frozen=True, slots=True)
 class And:
-    """Conjunction."""
+    """Conjunction of formulas."""
 
     operands: tuple[Formula, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Or:
-    """Disjunction."""
+    """Disjunction of formulas."""
 
     operands: tuple[Formula, ...]
 
@@ -338,7 +338,7 @@ class Term:
             self.begins = tuple(since for operand in operands for since in operand.begins)
 
     def bounds(self) -> Iterator[tuple[Bound, int]]:
-        """Yield the bounds that have begun in the term, and the start of each."""
+        """Yield the time bounds that have begun in these obligations, and the start of each."""
         if self.word == "duty":
             if self.timed:
                 yield self.operands[0].bound, self.operands[1]
@@ -347,13 +347,13 @@ class Term:
                 yield from operand.bounds()
 
     def implies(self, other: Term) -> bool:
-        """True if the term implies another term of the same shape. Both must have sense 1 or -1."""
+        """True if these obligations imply other obligations of the same structure."""
         pairs = zip(self.begins, other.begins, strict=True)
         return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
 
     @property
     def ended(self) -> bool:
-        """Value of the term if no frame follows."""
+        """Truth value of the obligations if no frame follows."""
         match self.word:
             case "true" | "false":
                 return self.word == "true"
@@ -368,7 +368,7 @@ class Term:
 
 
 def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
-    """True if the term is true or still open when this frame is the last.
+    """True if the obligations are fulfilled or still open when this frame is the last.
 
     A forward operator is open if its bound is not over, and so is ``NEXT``. An operator without an upper bound
     has failed.
@@ -396,7 +396,7 @@ def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
 
 
 class Terms:
-    """Table of all terms in use."""
+    """Table of all combinations of obligations in use."""
 
     def __init__(self) -> None:
         self._known: WeakValueDictionary[tuple[Any, ...], Term] = WeakValueDictionary()
@@ -414,7 +414,7 @@ class Terms:
         return term
 
     def constant(self, value: bool) -> Term:  # noqa: FBT001 - it is the value
-        """Return the term of a constant truth value."""
+        """Return the obligation that is always true, or always false."""
         return self.true if value else self.false
 
     def duty(self, formula: Formula, since: int | None, *, weak: bool) -> Term:
@@ -425,7 +425,7 @@ class Terms:
         return self._made("duty", (formula, since, weak), (id(formula), since, weak))
 
     def negated(self, term: Term) -> Term:
-        """Return the negation of a term."""
+        """Return the negation of a combination of obligations."""
         if term is self.true or term is self.false:
             return self.constant(term is self.false)
         if term.word == "not":
@@ -433,7 +433,7 @@ class Terms:
         return self._made("not", (term,), (id(term),))
 
     def joined(self, word: str, terms: Iterable[Term]) -> Term:
-        """Return the conjunction or disjunction of terms, without redundant terms.
+        """Return the conjunction or disjunction of obligations, without redundant ones.
 
         A term and its negation are not simplified; later frames decide them. The offline verdicts
         (:mod:`sgstore.temporal._verdicts`) do the same, and both must agree.
@@ -456,7 +456,7 @@ class Terms:
 
 
 def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
-    """Remove redundant terms from a conjunction or disjunction.
+    """Remove redundant obligations from a conjunction or disjunction.
 
     So a repeated obligation of an ``ALWAYS`` is stored once.
     """
@@ -587,7 +587,7 @@ class ProgressionFrame:
             self._entries.append(kept)
 
     def now(self, formula: Formula, since: int | None = None) -> Term:
-        """Return the term of a formula at this frame.
+        """Return the obligations of a formula at this frame.
 
         ``since`` is the start of an *until* bound, by default here.
         """
@@ -634,7 +634,7 @@ class ProgressionFrame:
         return terms.joined("or", (right, terms.joined("and", (left, later))))
 
     def resolved(self, term: Term) -> Term:
-        """Resolve the obligations in a term of the previous frame."""
+        """Update the obligations of the previous frame with the data of this frame."""
         if term not in self._resolved:
             self._resolved[term] = self._resolve(term)
         return self._resolved[term]
@@ -654,7 +654,7 @@ class ProgressionFrame:
     def _of_past(
         self, part: Formula, before: Term, entries: tuple[Entry, ...]
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """Return the value of a past operator at this frame, and the entries for the next frame."""
+        """Return the value of a past operator at this frame, and its memory for the next frame."""
         terms, before = self._terms, self.resolved(before)
         if isinstance(part, Previous):
             return before, ()
@@ -670,7 +670,7 @@ class ProgressionFrame:
     def _known_past(
         self, part: Since, entries: tuple[Entry, ...], right: Term
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """Evaluate a *since* with known sides. Its entries are the frames in which the right side was true."""
+        """Evaluate a *since* with known sides. Its memory is the frames in which the right side was true."""
         bound = part.bound
         if right is self._terms.true:
             # Without a lower bound, the latest entry suffices.
@@ -682,7 +682,7 @@ class ProgressionFrame:
                 old += 1
         entries = entries[old:] if old else entries
         if bound.high is None and len(entries) > 1:
-            entries = entries[:1]  # of these the earliest is as good as any after it
+            entries = entries[:1]  # the earliest of these suffices
         holds = bool(entries) and self._tick.begun(bound, self._age(part, entries[0]))
         return self._terms.constant(holds), entries
 

@@ -139,7 +139,7 @@ class SeenRange:
     fastest: float = 0.0
 
     def see(self, view: FrameView) -> None:
-        """Add a frame."""
+        """Update the seen range with a frame."""
         self.cut = self.cut or view.graph.out_of_world > 0
         self.excluded |= view.graph.excluded
         speeds = (about.get("speed", 0.0) for about in view.nodes.values())

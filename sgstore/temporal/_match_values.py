@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class ReturnedValues:
-    """Returned values of a match, computed from aggregates and step times.
+    """Values that a query returns for a match, computed from aggregates and step times.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class ReturnedValues:
                 return b.Value(seconds(value.step), value.type)
             return b.with_operands(value, known)
 
-        nothing: Any = None  # constants are asked of no frame
+        nothing: Any = None  # constants need no query
         told = {
             name: expression(known(value), injective=False)(nothing)
             for name, value in self._columns
@@ -99,7 +99,7 @@ AT_FRAME: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """Frame intervals, each with its binding.
+    """Frame intervals of matches, each with its binding.
 
     Attributes
     ----------
@@ -279,7 +279,7 @@ class Fold:
         )
 
     def told(self, word: str, start: int, end: int) -> Any:
-        """Return the aggregate over a range of frames; see :meth:`Stretches.told`."""
+        """Return the aggregate of the value over a range of frames."""
         match word:
             case "first":
                 return self.first if self.start == start else None

@@ -51,7 +51,7 @@ class _Course:
         self._known: BindingTable[Entry] = BindingTable(self._valuation.lattice, begun)
 
     def step(self) -> None:
-        """Process the next frame after its queries."""
+        """Process the next frame. Its query results must be ready."""
         known, word, number = self._known, self._word, self._pulse.tick.number
         letters, memories = self._valuation.read(known.held, lambda row: known.of(row)[0])
         values = self._told(self._test, len(letters))
@@ -134,7 +134,7 @@ class MatchValues:
                 self._courses[course] = made
 
     def step(self) -> None:
-        """Process the next frame after its queries."""
+        """Process the next frame. Its query results must be ready."""
         for course in self._courses.values():
             course.step()
 

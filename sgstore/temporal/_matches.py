@@ -131,6 +131,8 @@ class TemporalMatches(Matches):
             return f"{text}\n\n---- plan\n{finder.text(places)}"
 
     def _finder(self, compiled: Compiled) -> Finder:
-        from sgstore.temporal._sequences import Finder  # with numpy: only for several frames
+        from sgstore.temporal._sequences import (
+            Finder,
+        )  # imports numpy: only for multi-frame queries
 
         return Finder(self._file, compiled.query, compiled.catalog)

@@ -114,7 +114,7 @@ def opened(
         with _live(source, ego, sensors) as told:
             yield told
         return
-    from sgstore.readers import RecordedCameras  # with it the media of messages are loaded
+    from sgstore.readers import RecordedCameras  # it loads the media of messages
 
     path = Path(source)
     with open_trace(path, ego=ego or config.ego) as trace:
@@ -154,7 +154,7 @@ def _live(source: str, ego: str, sensors: Sequence[Sensor]) -> Generator[FrameSo
         LiveCameras,
         LiveWorld,
         Sensors,
-        connect,  # a large package: only for who asks
+        connect,  # a large package: import on demand
     )
 
     try:
@@ -174,7 +174,7 @@ def _live(source: str, ego: str, sensors: Sequence[Sensor]) -> Generator[FrameSo
             for seq in count():
                 live.world.wait_for_tick()
                 frame = live.frame()
-                frame.recorded = frozenset()  # its sensors tell no events
+                frame.recorded = frozenset()  # CARLA sensors report no events
                 told.warnings[:] = live.warnings
                 if cameras is not None:
                     cameras.take(seq, frame.time_ns)
@@ -306,7 +306,7 @@ class Monitor:
         ValueError
             The frame is inconsistent; see :meth:`sgstore.sgg.SceneGraphGenerator.steps`. It is ignored.
         """
-        with GcPaused():  # the graphs are let go within
+        with GcPaused():  # the graphs are freed inside
             return self._step(frame)
 
     def _step(self, frame: Frame) -> tuple[MonitorEvent, ...]:
@@ -379,7 +379,7 @@ class Monitor:
 
     @property
     def patterns(self) -> dict[str, Query]:
-        """Bound patterns by name."""
+        """Patterns by name, with resolved names."""
         return {follow.name: follow.query for _, follow, _ in self._follows}
 
     @property
@@ -420,7 +420,7 @@ class Monitor:
                 if self._last is not None and duration_s is not None and self._last.t >= duration_s:
                     break
         except KeyboardInterrupt:
-            pass  # what was seen until then has its verdicts
+            pass  # the frames so far still get verdicts
         return self.finish()
 
     def finish(self) -> tuple[Verdict, ...]:
@@ -485,7 +485,7 @@ class _PendingEvents:
         if need.lanes:
             return people.has_lanes(need.lanes)
         if need.kinds is None:
-            return False  # nobody tells it while a trace goes on
+            return False  # unknown while a trace runs
         present = people.of(need.kinds)
         if need.attribute is None:
             return bool(present)
@@ -499,7 +499,7 @@ class _PendingEvents:
 
 
 def _names(called: str | Sequence[str], count: int) -> Sequence[str]:
-    """Return a name for each pattern."""
+    """Return a name for each pattern in events."""
     if isinstance(called, str):
         return [called] if count == 1 else [f"{called} {i + 1}" for i in range(count)]
     if len(called) != count:
@@ -510,7 +510,7 @@ def _names(called: str | Sequence[str], count: int) -> Sequence[str]:
 def _bound(
     text: str, catalog: Catalog, parameters: Mapping[str, Any]
 ) -> tuple[list[BoundCheck], list[Query]]:
-    """Return the bound checks and patterns of a text."""
+    """Parse a text, and return its checks and patterns with resolved names."""
     statements = [*each_match(parse(text))]
     written = [one for one in statements if not isinstance(one, MatchClause)]
     named = {name for one in statements for name in _parameters(one)}

@@ -132,7 +132,7 @@ class TimedRelation:
         return found
 
     def column(self, places: Ints, length: int, number: int = 0) -> Column:
-        """Return the value of each key in each frame."""
+        """Return the value of each binding in each frame."""
         told = self.values[number]
         plain = np.ma.getdata(told)
         kind = np.float64 if plain.dtype.kind in "iuf" else plain.dtype
@@ -276,7 +276,7 @@ class PlanValues(SignalValues):
         self._tests: dict[str, Column] = {}
 
     def evaluation(self, counted: str) -> PlanValues:
-        """Return a copy for the other evaluation of a check. Shared values are reused."""
+        """Return a copy with unknown conditions counted the other way. Shared values are reused."""
         found = copy(self)
         found._counted = counted  # noqa: SLF001 - of one's own kind
         return found
@@ -502,7 +502,7 @@ def _ordered(file: StoreFile, sql: str, low: int, high: int) -> dict[str, Ints]:
     found = {name: np.ma.getdata(column).astype(np.int64) for name, column in asked}
     first = next(iter(found.values()))
     if np.any(np.diff(first) < 0):
-        order = np.argsort(first, kind="stable")  # a merge of the traces, each of which is in order
+        order = np.argsort(first, kind="stable")  # merges traces that are sorted already
         return {name: column[order] for name, column in found.items()}
     return found
 

@@ -110,7 +110,7 @@ class Ask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Test:
-    """Expression over values of several frames.
+    """Expression that uses values of several frames.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Test:
     quantities: dict[b.Bound, f.Formula] = field(default_factory=dict[b.Bound, f.Formula])
     presence: dict[str, str] = field(default_factory=dict[str, str])
 
-    __test__ = False  # it is no test of pytest's
+    __test__ = False  # not a pytest test class
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""Robustness: the margin by which a formula is true or false.
+"""Robustness of a formula: its distance from being true or false.
 
 A comparison of numbers has a **margin**: positive if it holds, negative if it fails. Any other condition has an
 infinite margin. Negation changes the sign, *and* is the minimum, *or* the maximum, and time operators are
@@ -55,7 +55,7 @@ MARGIN_CELLS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Robustness:
-    """Margin by which a trace satisfies a check, and the condition and frame that decide it.
+    """Robustness of a check on a trace, with the condition and frame that decide it.
 
     Attributes
     ----------
@@ -359,7 +359,7 @@ def _unbounded(left: Floats, right: Floats) -> Floats:
         for ends in (low, high):
             np.minimum(inner[at], ends[at + 1], out=ends[at])
             np.maximum(outer[at], ends[at], out=ends[at])
-    later = np.full((rows, blocks), -np.inf)  # what comes behind each block
+    later = np.full((rows, blocks), -np.inf)  # the value after each block
     for block in range(blocks - 2, -1, -1):
         whole = np.minimum(high[0, :, block + 1], later[:, block + 1])
         later[:, block] = np.maximum(low[0, :, block + 1], whole)

@@ -570,7 +570,7 @@ class RobustnessMonitor:
         self._rows: dict[Partial, int] = {}
 
     def step(self) -> None:
-        """Process the next frame after its queries."""
+        """Process the next frame. Its query results must be ready."""
         if self._without is not None:
             self._without.step()
         valuation, known = self._valuation, self._memories

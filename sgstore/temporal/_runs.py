@@ -155,7 +155,7 @@ class FrameLine:
         found = np.repeat(start, np.diff(first, append=len(ids))) + seq_of(ids)
         np.minimum(found, len(self.ids) - 1, out=found)
         elsewhere = np.flatnonzero(self.ids[found] != ids)
-        if len(elsewhere):  # of a trace that is not asked, or of one without some of its frames
+        if len(elsewhere):  # of another trace, or of a missing frame
             wanted = ids[elsewhere]
             there = np.minimum(np.searchsorted(self.ids, wanted), len(self.ids) - 1)
             found[elsewhere] = np.where(self.ids[there] == wanted, there, -1)
@@ -335,7 +335,7 @@ class RunFinder:
                 plain = not b.is_temporal(operand) and self._is_of_rows(operand)
                 return plain and b.nodes_of(operand) == self._window_nodes
             case _ if b.is_formula(value):
-                return False  # where what is unknown is false
+                return False  # a formula counts unknown as false
             case b.Operation(operands=operands) if b.is_temporal(value):
                 return all(map(self._is_of_rows, operands))
             case b.StepTime():
@@ -474,7 +474,7 @@ def _order(columns: Sequence[Ints]) -> Ints:
     bits = rows.bit_length()
     if size.bit_length() + bits > 62:
         return np.argsort(code, kind="stable")
-    code <<= bits  # numbers that say their rows, too, are sorted much faster than rows by numbers
+    code <<= bits  # sorting numbers that include their row index is much faster
     code |= np.arange(rows)
     code.sort()
     code &= (1 << bits) - 1

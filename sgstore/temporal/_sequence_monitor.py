@@ -165,7 +165,9 @@ class StepState:
         self._pulse, self._hold = pulse, hold
         self.places: list[StepFrame] = []
         self.open: deque[Needs] = deque()
-        self._queue: deque[tuple[int, int, bool]] = deque()  # their numbers, times, and gaps before
+        self._queue: deque[tuple[int, int, bool]] = (
+            deque()
+        )  # number, time, and gap before each frame
         self._run: Run | None = None
         self._waiting: list[StepFrame] = []
         self._start = (0, 0)
@@ -178,14 +180,14 @@ class StepState:
 
     @property
     def oldest(self) -> int:
-        """First frame of the stored or possible runs. :data:`NEVER` means that there are none."""
+        """First frame of the stored or possible runs. :data:`NEVER` means no frame."""
         runs = [place.run.number for place in self.places[:1]]
         runs += [self._run.number] if self._run is not None else []
         return min([*runs, self.undecided])
 
     @property
     def undecided(self) -> int:
-        """Number of the first undecided frame. :data:`NEVER` means that there is none."""
+        """Number of the first undecided frame. :data:`NEVER` means no frame."""
         if self._waiting:
             return self._waiting[0].number
         return self._queue[0][0] if self._queue else NEVER
@@ -199,7 +201,7 @@ class StepState:
         yield from (number for number, _, _ in self._queue)
 
     def ask(self, holds: Needs, *, gap: bool) -> None:
-        """Add the next frame with its open conditions."""
+        """Add the next frame of the step, with conditions that are still open."""
         self._queue.append((self._pulse.tick.number, self._pulse.tick.time, gap))
         self.open.append(holds)
 
@@ -333,7 +335,7 @@ class SequenceMonitor:
     # Online, frame by frame
 
     def step(self, here: FrameTime, people: NodeNames) -> list[MonitorEvent]:
-        """Process the next frame after its queries, and return the new events."""
+        """Process the next frame, and return the new events. Its query results must be ready."""
         self._conditions.step()
         gap = self._pulse.breaks(bridge=self.query.gaps == "bridge")
         for number in range(len(self._steps)):
@@ -556,14 +558,14 @@ class SequenceMonitor:
         way, binding, places = found
         happen = self._happen[way]
         steps = tuple(self._moment(place) for place in places)
-        bound: dict[str, Any] = binding  # of parts, some may be absent, and keys are numbered
+        bound: dict[str, Any] = binding  # parts may have absent nodes, and numbered keys
         known = {key: node for key, node in bound.items() if node is not None}
         nodes = {key.partition("~")[0]: n for key, n in known.items() if key in self._named}
         names = {name: self._names.get(node, str(node)) for name, node in nodes.items()}
 
         def part(value: OverMatch) -> Any:
             if not {value.start, value.end} <= {None, AT_FRAME, *happen}:
-                return None  # of a step of other sequences
+                return None  # belongs to a step of another alternative
             return self._values.value(value, binding, self._span(value, happen, places))
 
         def seconds(step: int) -> float | None:
@@ -733,7 +735,7 @@ class _Conditions:
         self._frames: dict[Partial, ProgressionFrame] = {}
 
     def step(self) -> None:
-        """Process the next frame after its queries."""
+        """Process the next frame. Its query results must be ready."""
         if not any(self._asked):
             return
         known = self._known

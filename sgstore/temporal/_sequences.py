@@ -107,7 +107,7 @@ class BindingLine:
         ]  # before the clock jumps
 
     def frame(self, places: Ints) -> Ints:
-        """Return the frame of each position."""
+        """Return the frame number of each position in the line."""
         return places % self.stride
 
     def run_ends(self, places: Ints) -> Ints:
@@ -280,7 +280,7 @@ class JoinedBindings:
     places: Ints
 
     def parts(self, relations: Sequence[TimedRelation]) -> Iterator[JoinedBindings]:
-        """Split the bindings into parts with a limited number of rows."""
+        """Split the bindings into groups with a limited number of rows."""
         if not len(self.bindings):
             return
         rows = np.zeros(len(self.bindings), np.int64)
@@ -404,7 +404,7 @@ class Finder:
         self._file, self._query, self._catalog = file, query, catalog
         self._plan = plan_of_steps(query, query.steps)
         self._when = [tuple(map(self._plan.formula, step.when)) for step in query.steps]
-        self._first = frozenset(self._plan.asks)  # what must be known before there are matches
+        self._first = frozenset(self._plan.asks)  # queries needed before the matches
         self._kept = tuple(sorted(query.scope.nodes))
         self._tied = frozenset({*self._kept, *tied_in_steps(query)[0]})
         self._steps = asks_of_steps(query, query.steps, self._tied)
@@ -559,7 +559,7 @@ class Finder:
             about[:, 1], about[:, 2] = line.frame(runs), number
             tables.append(np.column_stack((keys, about, frames)))
         rows = np.concatenate(tables)
-        one_each = rows[:, : -width - 1]  # a binding, a step, and a run of it
+        one_each = rows[:, : -width - 1]  # group: binding, step, run
         if self._query.policy == "first":
             one_each = rows[:, : -width - 3]
         begin, rest = rows[:, -width], rows[:, rows.shape[1] - width + 1 :]
@@ -727,7 +727,9 @@ class Finder:
             if isinstance(place, StepTime) and place.step in happen:
                 times = trace.times[frames[:, happen.index(place.step)]] - trace.start
                 found[place] = [seconds_of(time) for time in times.tolist()]
-            found.setdefault(place, [None] * len(owners))  # of a step of other sequences
+            found.setdefault(
+                place, [None] * len(owners)
+            )  # belongs to a step of another alternative
         return [found[place] for place in places]
 
     # Values

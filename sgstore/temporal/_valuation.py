@@ -123,7 +123,7 @@ def _both(one: Partial, other: Partial) -> Partial | None:
 
 
 class BindingTable(Generic[T]):
-    """Values by binding. A binding without an entry inherits from its generalisation.
+    """Values by binding. A binding without a value inherits it from its generalisation.
 
     Parameters
     ----------
@@ -471,7 +471,7 @@ class SignalState:
             for condition, formula in test.formulas.items():
                 self.conditions[condition] = Progression(formula)
         self._frames: deque[tuple[int, int]] = deque()  # times and numbers since the last gap
-        self._begun = 0  # the number of the first frame behind it
+        self._begun = 0  # number of the first frame after the gap
         deltas = [c for c in self.places if isinstance(c, b.SignalCall) and c.word == "delta"]
         self._back = max((c.by for c in deltas if not c.frames), default=0)
         self._many = max((c.by for c in deltas if c.frames), default=0)
@@ -483,7 +483,7 @@ class SignalState:
         return (*(None for _ in self.places), *pasts)
 
     def step(self) -> None:
-        """Process the next frame after the clock."""
+        """Process the next frame. The clock must be up to date."""
         tick = self.pulse.tick
         if self.gap:
             self._frames.clear()
@@ -816,7 +816,7 @@ class Valuation:
         *,
         closed: bool = False,
     ) -> tuple[dict[Partial, int], Mapping[Partial, Memory]]:
-        """Process the next frame after its queries.
+        """Process the next frame. Its query results must be ready.
 
         Parameters
         ----------
@@ -893,7 +893,7 @@ class Valuation:
         letters: dict[Partial, int],
         memory: Callable[[Partial], Memory | None],
     ) -> dict[Partial, Memory]:
-        """Add the true tests to the letters of the bindings, and return the new memories."""
+        """Set the bits of true tests for each binding, and return the new memory of each binding."""
         self._courses.step()
         columns: dict[str, Bools] = {}
 

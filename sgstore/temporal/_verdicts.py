@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way
-    """A formula is too deep for evaluation as columns. The caller uses another method."""
+    """A formula is nested too deeply for the fast evaluation. The caller uses the slow one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +176,7 @@ def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
             true = met(_course(right, table).rising, sides, bound, table)
             start = true == here
             return PrefixVerdicts(start, np.where(start, frames, true)[None])
-        case _:  # of the past, about the future
+        case _:  # a past operator over a future one
             raise TooDeep
 
 
@@ -499,7 +499,7 @@ class Settled:
                 past = frame.past()
                 ended[number:following] = term.ended
                 if plain and term is before:
-                    break  # nothing changes as long as the letter stays the same
+                    break  # no change while the letter is the same
         return ended
 
     def violations(self, reset: Bools | None, *, weak: bool = False) -> list[Violation]:

@@ -181,7 +181,7 @@ def next_window(
     if value is not None and (math.isfinite(value) or not summed):
         if summed:
             total += exact(value)
-        else:  # what is no less, or no greater, and older is never told again
+        else:  # an older value that is not better can never win again
             sign = 1 if word == "max_over" else -1
             kept = len(points)
             while kept and sign * points[kept - 1][2] <= sign * value:
