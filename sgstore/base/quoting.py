@@ -12,7 +12,7 @@ _STATEMENT: Final = re.compile(
 
 
 def is_statement(text: str) -> bool:
-    """True if the text is a SQL statement rather than a query, judged by its first word after comments."""
+    """True if the text is a SQL statement, judged by its first word after comments."""
     return _STATEMENT.match(text) is not None
 
 

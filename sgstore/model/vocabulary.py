@@ -393,7 +393,7 @@ def kind_named(word: str) -> str | None:
 
 
 def vague_kind(type_name: str) -> str:
-    """Return the fallback kind of an unknown type name: ``vehicle`` if the name contains it, else ``unknown``.
+    """Return the kind of an unmapped type name: ``vehicle`` for vehicle types, else ``unknown``.
 
     OSI uses ``TYPE_VEHICLE``; names of CARLA and nuScenes begin with ``vehicle.``.
     """

@@ -158,7 +158,7 @@ def _rows(
     labels: Mapping[str, Words],
     wanted: Ints,
 ) -> tuple[Ints, Words]:
-    """Return the rows of a view as frame ids and hash words, in an order that depends only on the values."""
+    """Return the rows of a view as frame ids and hash words, sorted by value."""
     listed = ", ".join(
         f'enum_code(v."{name}") AS "{name}"' if name in labels else f'v."{name}"'
         for name in columns

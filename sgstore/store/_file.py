@@ -141,7 +141,7 @@ class StoreFile:
 
     @classmethod
     def together(cls, path: str | Path) -> StoreFile:
-        """Open a store in one database shared with its neighbours in the folder. This is four times faster.
+        """Open a store in one database shared with the other stores of its folder. This is four times faster.
 
         Raises
         ------
@@ -403,7 +403,7 @@ class StoreFile:
             return catalog
 
     def traces(self) -> tuple[StoredTrace, ...]:
-        """Return all traces in the order of their ingest."""
+        """Return all traces by name in natural order (``run2`` before ``run10``)."""
         with self.access.reading() as connection:
             return stored_traces(connection, self.path, self.access.root)
 
@@ -442,7 +442,7 @@ class StoreFile:
             return frame_named(connection, ref)
 
     def graph(self, ref: int | str) -> SceneGraph:
-        """Return the scene graph of a frame with all data of the public views; see :meth:`frame`.
+        """Return the scene graph of a frame, with all data of the public views.
 
         Raises
         ------
@@ -538,7 +538,7 @@ class StoreFile:
             return places(connection)
 
     def log_times(self, trace: int | str, first: int, last: int) -> NDArray[np.int64]:
-        """Return the log times of a range of frames of a trace; ns."""
+        """Return the log times of a range of frames; ns."""
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = "SELECT log_time_ns FROM frame WHERE trace_id = ? AND seq BETWEEN ? AND ? ORDER BY seq"

@@ -131,7 +131,7 @@ _EDGES_TOGETHER: Final = 2_000_000
 
 
 class Graphs:
-    """Reader of the graphs of a store in groups of frames: as columns, or one scene graph at a time.
+    """Reader of the graphs of a store, as columns of many frames or as scene graphs.
 
     Recently used maps are cached.
     """

@@ -17,7 +17,7 @@ MAP_TABLES: Final = frozenset(SHARED["map"])
 
 
 def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
-    """Copy a sealed segment with its road map apart, and return the map digest, or an empty string.
+    """Split a sealed segment into trace and road map, and return the map digest, or an empty string.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
 
 
 def whole_segment(segment: Path, of_map: Path | None, to: Path) -> Sealed:
-    """Return a sealed segment in a new folder, combined from a segment without a map and a map.
+    """Combine a segment without a map and its map to a sealed segment in a new folder.
 
     Raises
     ------

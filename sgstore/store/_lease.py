@@ -324,7 +324,7 @@ _of_parents: Final[list[object]] = []
 
 
 def _begin_anew() -> None:
-    """Reset the state inherited from the parent process after a fork."""
+    """Reset the state that a forked process inherits from its parent."""
     _watch.begin()
     _of_parents.extend(_instances.values())
     _instances.clear()

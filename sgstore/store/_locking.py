@@ -172,7 +172,7 @@ def refuse_odd_name(store: Path) -> None:
 
 
 def engine_fault(error: duckdb.Error) -> str | None:
-    """Return one line about an internal DuckDB error. ``None`` means another error."""
+    """Return one line about an internal DuckDB error, or ``None`` for another error."""
     if not isinstance(error, duckdb.InternalException | duckdb.FatalException):
         return None
     reason = str(error).strip().partition("\n")[0].removeprefix("INTERNAL Error: ")
@@ -180,7 +180,7 @@ def engine_fault(error: duckdb.Error) -> str | None:
 
 
 def spill_fault(message: str) -> str | None:
-    """Return the message for a query that exceeds its memory and disk limits. ``None`` means another error."""
+    """Return the message for a query beyond its memory and disk limits, or ``None`` for another error."""
     if not message.startswith("Out of Memory Error"):
         return None
     return (

@@ -360,7 +360,7 @@ _WIDTHS: Final = (
 
 
 def _common(kinds: set[str]) -> str:
-    """Return the common type for several types of one column. A part may have no value of it."""
+    """Return the common type for several types of one column."""
     enums = {_enum_of(kind) for kind in kinds if kind.startswith("ENUM")}
     if enums:
         return enums.pop() if len(enums) == 1 and len(kinds - {_NOTHING}) >= 1 else "VARCHAR"

@@ -106,7 +106,7 @@ def trace_of(frame_id: Ints) -> Ints:
 
 
 def seq_of(frame_id: Ints) -> Ints:
-    """Return the number in its trace of each frame id."""
+    """Return the frame number of each frame id."""
     bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
     return bucket * BUCKET_FRAMES + (frame_id & ((1 << FRAME_BITS) - 1))
 

@@ -158,7 +158,7 @@ def _own(
 def _chosen(
     frames: FrameTimes, messages: Iterable[Columns], allowed: int, *, nearest: bool
 ) -> Columns:
-    """Return for each frame the nearest message in log time (the earlier of two), or the latest message.
+    """Return the nearest or the latest message of each frame, by log time.
 
     Among messages of equal time, the last one in the file counts.
     """

@@ -56,7 +56,7 @@ SHARED: Final = {
 
 
 class PresentError(StoreError):
-    """The store already has the trace, read with the same settings.
+    """The store already has this trace with the same settings and map.
 
     Attributes
     ----------

@@ -502,7 +502,7 @@ def _statement(sql: str) -> Tokens:
 
 
 def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
-    """Yield the tokens of a table, with each enumeration expanded to all its values, as DuckDB prints it."""
+    """Yield the tokens of a table, with enumerations expanded to their values, as DuckDB prints them."""
     before = ""
     for number, word in enumerate(words):
         # A type follows the name of a column. Both can be equal.

@@ -197,14 +197,14 @@ def _blocks(
 
 
 def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
-    """Return the first and last number of the frames near a frame in time."""
+    """Return the numbers of the first and last frame near a given frame in time."""
     sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
     found = connection.execute(sql, [frame.trace_id, frame.t, BESIDE_S]).fetchone()
     return found or (0, -1)
 
 
 class _RunSearch:
-    """Search for the best runs, overall or per trace, with a heap whose first item is the worst."""
+    """Search for the best runs, overall or per trace."""
 
     def __init__(self, example: Example, limit: int, *, each_trace: bool) -> None:
         self.example = Counter(example.features)

@@ -112,7 +112,7 @@ def names_of_nodes(connection: DuckDBPyConnection, trace_id: int) -> dict[int, t
 
 
 def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str, list[str]]]:
-    """Return for each trace its origin (m, in map axes), the digest of its map, and its camera topics.
+    """Return origin (m, in map axes), map digest and camera topics of each trace.
 
     One statement reads all traces, because there may be thousands. Cameras are the sorted topics of pictures.
     """

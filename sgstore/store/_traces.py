@@ -283,7 +283,7 @@ def located(
 
 
 def scope_of(reports: Iterable[Mapping[str, Any]], *, world: bool | None) -> dict[str, Any]:
-    """Return counts of the data that the settings of some traces exclude from a query, or an empty dict.
+    """Return counts of the data that settings exclude from a query, or an empty dict.
 
     Parameters
     ----------

@@ -346,7 +346,7 @@ def damage(connection: DuckDBPyConnection, path: Path) -> str:
 
 
 def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
-    """Yield faults: rows without a trace or map, such as unused settings, names and mask bits."""
+    """Yield faults: unreadable settings, duplicate names or ids, and a wrong table of mask bits."""
     for number, text in connection.execute("SELECT config_id, settings FROM config").fetchall():
         try:
             from_dict(json.loads(text))

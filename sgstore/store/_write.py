@@ -1,4 +1,4 @@
-"""Writer of a trace: builds it outside the store, block by block, and publishes it in a short transaction.
+"""Writer of a trace: builds it outside the store, and publishes it in one transaction.
 
 Only the publication changes the store: it adds a complete trace, or nothing.
 """

@@ -264,7 +264,7 @@ class CheckPlan(Plan):
                 return f.LOGIC[word](*(self.read(one, reading) for one in operands))
 
     def _by_levels(self, found: f.Formula, things: frozenset[str], reading: Reading) -> f.Formula:
-        """Extend a formula for absent entities. The outermost quantifier decides."""
+        """Add the rules for absent entities to a formula. The outermost quantifier decides."""
         for word, nodes in reversed(self._levels):
             if nodes & things and word != "false" and (word == "FORALL") == reading.positive:
                 away = [f.Not(self.present(node)) for node in sorted(nodes & things)]
@@ -367,7 +367,7 @@ class CheckPlan(Plan):
         )
 
     def _state(self, expression: b.Bound) -> b.Bound:
-        """Return the state of an expression: 0 if all values are known, else more; NULL if one is absent."""
+        """Return 0 if all values of an expression are known, more if not, NULL if one is absent."""
         parts = list(dict.fromkeys(self._states(expression)))
         now = [part for part in parts if isinstance(part, b.Operation) and part.word == STATE]
         rest = self._things(expression) - frozenset().union(*map(self._things, now))
@@ -558,7 +558,7 @@ def _in_favour(expression: b.Bound) -> b.Bound:
 
 
 def _absence_tried(expression: b.Bound, *, counted: bool) -> b.Bound:
-    """Return the condition that either reading of absence is true, or both if not counted."""
+    """Combine both treatments of absent entities: one must be true if ``counted``, else both."""
     other = _in_favour(expression)
     if other == expression:
         return expression

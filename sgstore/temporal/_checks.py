@@ -1038,7 +1038,7 @@ class StoreCheck:
         return bindings[first], members.reshape(-1)
 
     def _evaluated(self, trace: TraceReader, bindings: Keys) -> tuple[Codes, list[_BindingVerdict]]:
-        """Return the codes of bindings, and details of the bindings behind the verdict."""
+        """Return verdict codes of bindings, and details of the bindings that decide the verdict."""
         values = PlanValues(self._plan, trace, self._variables, bindings)
         codes, told = self._in_evaluation(trace, values, len(bindings))
         doubts = [name for name in propositions(self._formula) if name[-1] in SIGNS]
@@ -1056,7 +1056,7 @@ class StoreCheck:
     def _in_evaluation(
         self, trace: TraceReader, values: PlanValues, rows: int, among: Bools | None = None
     ) -> tuple[Codes, list[_BindingVerdict]]:
-        """Return the result of one of the two evaluations for the bindings in ``among``."""
+        """Return verdict codes and details of bindings, for one treatment of unknown conditions."""
         columns = values.columns(self._formula)
         truths = values.formula(self._formula)[:, 0]
         resets = values.formula(self._reset) if self._reset is not None else None

@@ -150,7 +150,7 @@ class ExpressionMonitor(SequenceMonitor):
     def _next_step(
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
     ) -> tuple[int, StepLink, bool]:
-        """Return the next step that must occur, its link, and True if an absent step between is undecided."""
+        """Return the next required step, its link, and True if a forbidden step between is undecided."""
         following, link = at + 1, way.links[at]
         if not self._steps[way.steps[following]].absent:
             return following, link, False
@@ -219,7 +219,7 @@ class ExpressionMonitor(SequenceMonitor):
         return found
 
     def _open_ended(self, way: StepWay) -> bool:
-        """True if each continuation of a later frame of the first step also continues its first frame."""
+        """True if the first frame of a run has every continuation that later frames have."""
         if not way.links:
             return False
         link = way.links[0]

@@ -77,7 +77,7 @@ class _Course:
         return reduce(Fold.joined, inside).told(self._word, start, end) if inside else None
 
     def forget(self, kept: Sequence[int]) -> None:
-        """Merge old frames. ``kept`` holds the ascending frames at which a later range may begin or end."""
+        """Merge the values of old frames. ``kept`` holds the frames at which a later range may begin or end."""
         held = {
             row: (memory, _merged(folds, kept)) for row, (memory, folds) in self._known.held.items()
         }

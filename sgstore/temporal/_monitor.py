@@ -287,7 +287,7 @@ class Monitor:
         return f"<Monitor of {', '.join(self.names)} after {seen} frames>"
 
     def _of_scope(self, ego: str | None, *, world: bool) -> tuple[int, QueryCache]:
-        """Return the index and the queries of a graph scope: an ego, with or without the world around."""
+        """Return number and queries of a graph scope: an ego, with or without the world around."""
         if (ego or "") not in self._egos:
             self._egos.append(ego or "")
         scope = self._egos.index(ego or ""), world

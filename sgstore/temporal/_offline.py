@@ -94,7 +94,7 @@ class TimedRelation:
         return cls(keys[first], starts, frames, tuple(value[order] for value in values))
 
     def between(self, first: int, last: int) -> TimedRelation:
-        """Return the part in a range of frames (ends included), numbered from 0."""
+        """Return the rows in a range of frames, ends included. Frame numbers restart at 0."""
         rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
         owners = np.searchsorted(self.starts, rows, "right") - 1
         new = np.flatnonzero(np.diff(owners, prepend=-1))
@@ -116,7 +116,7 @@ class TimedRelation:
         return place[codes[len(self.keys) :]]
 
     def rows_of(self, places: Ints) -> tuple[Ints, Ints]:
-        """Return the rows of some keys: for each row, the position of its key in ``places``, and its index."""
+        """Return all rows of some keys: the index of each row's key in ``places``, and the row index."""
         known = np.flatnonzero(places >= 0)
         first, end = self.starts[places[known]], self.starts[places[known] + 1]
         counts = end - first
@@ -447,7 +447,7 @@ def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
 def _window_left(
     ask: Ask, catalog: Catalog, window: Window | None, traces: Mapping[int, TraceReader]
 ) -> Window | None:
-    """Return the window of the traces in which all earlier steps hold."""
+    """Limit a window to the traces in which all earlier steps have matches."""
     left = {
         trace_id
         for trace_id, trace in traces.items()
@@ -484,7 +484,7 @@ def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
 
 
 def buckets_of(file: StoreFile, window: Window | None) -> dict[str, Ints]:
-    """Return the buckets of a window with masks: their frames, and the frames without a gap before."""
+    """Return the buckets of a window, with masks of all frames and of frames without a gap before."""
     low, high = (window.low, window.high) if window else (0, _LAST)
     return _ordered(file, BUCKETS, low, high)
 

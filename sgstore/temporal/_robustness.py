@@ -237,7 +237,7 @@ class MarginTable:
                 return until(sides, self.value(right)[:, ::-1], first, end)[:, ::-1]
 
     def _asked(self, formula: Until | Since) -> tuple[Places, Places]:
-        """Return the first frame of a bound and the frame after the last one, for each frame, shape (F,)."""
+        """Return the range of frames in a bound, for each frame: first frame, and frame after the last."""
         forward = isinstance(formula, Until)
         bound = formula.bound.widened(self._tolerance)
         near, far = self._clock.window(bound, forward=forward)
@@ -303,7 +303,7 @@ class MarginTable:
 
 
 def until(left: Floats | None, right: Floats, first: Places, end: Places) -> Floats:
-    """Return the margin (B, F) of an *until*: its best frame for ``right`` and all earlier ``left``.
+    """Return the margin (B, F) of an *until* at each frame.
 
     Parameters
     ----------
@@ -339,7 +339,7 @@ def _behind(values: Floats) -> Floats:
 
 
 def _unbounded(left: Floats, right: Floats) -> Floats:
-    """Return for each frame the larger of ``right`` and the smaller of ``left`` and the next result; (B, F).
+    """Return the margin of an unbounded *until* at each frame, shape (B, F).
 
     Each step is a clamp, and a sequence of clamps is a clamp. So blocks of frames are processed in parallel,
     then combined.

@@ -183,7 +183,7 @@ class _Part:
 
     @property
     def nothing(self) -> float:
-        """Margin of the constant false, or of the constant true in the dual formula."""
+        """Margin of a condition that is always false. In the dual formula, it is always true."""
         return -np.inf if self.positive else np.inf
 
 
@@ -347,7 +347,7 @@ class MarginStream:
         return found
 
     def _told(self, part: _Part) -> Iterator[Margins]:
-        """Yield the newly known margins of a part, frame by frame."""
+        """Yield the margins of a subformula that have become known, frame by frame."""
         match part.formula:
             case TruthConstant(value=value):
                 if not self._ended:

@@ -322,7 +322,7 @@ class RunFinder:
         self._window_nodes = frozenset(ask.variables) if bare else None
 
     def fits(self, places: Sequence[b.Bound]) -> bool:
-        """True if the pattern's rows alone determine its frames and the requested values."""
+        """True if the rows of the pattern are enough to compute its frames and the requested values."""
         step = self._query.steps[0]
         if self._query.spans or step.absent or self._query.gaps != "break" or self._ask.everywhere:
             return False

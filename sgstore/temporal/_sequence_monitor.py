@@ -619,7 +619,7 @@ class SequenceMonitor:
                     one.places.pop(0)
 
     def _oldest(self, number: int) -> tuple[dict[Key, int], list[int]]:
-        """Return the first possible frames of a match by the nodes shared by the first and another step.
+        """Return the first possible frames of matches, by the nodes that two steps share.
 
         Also return the columns of the other step with these nodes.
         """

@@ -322,7 +322,7 @@ class SignalValues:
                 return self._age(seen) if word == "age" else Column(seen)
 
     def _back(self, column: Column, by: int | Ints) -> Column:
-        """Return the values some frames earlier. They are unknown before the trace or across a gap."""
+        """Return the values some frames earlier. Values before the trace start or across a gap are unknown."""
         frames = len(self.clock.times)
         here = np.arange(frames)
         there = here - by if isinstance(by, int) else by
@@ -334,7 +334,7 @@ class SignalValues:
         return Column(values[:, inside], known[:, inside] & told)
 
     def window_starts(self, course: b.SignalCall) -> Ints:
-        """Return the first frame of the time window at each frame, shape (F,). Windows end at gaps."""
+        """Return the first frame of the time window at each frame, shape (F,). A window never crosses a gap."""
         times, here = self.clock.times, np.arange(len(self.clock.times))
         begun = np.maximum.accumulate(np.where(self.clock.gap_before, here, 0))
         if course.frames:
@@ -356,7 +356,7 @@ class SignalValues:
         return Column(self._turned(now, by, change), known)
 
     def _turned(self, now: Column, by: int | Ints, change: Array) -> Array:
-        """Return the change of an angle with full turns. Where values are missing, use the short way."""
+        """Return the change of an angle with full turns. If values are missing, assume the shortest turn."""
         frames = len(self.clock.times)
         there = np.arange(frames) - by if isinstance(by, int) else by
         there = np.clip(there, 0, None)

@@ -90,7 +90,7 @@ class Lattice:
                 yield tuple(n if place in pattern else None for place, n in enumerate(binding))
 
     def closed(self, bindings: Iterable[Partial], known: Iterable[Partial] = ()) -> set[Partial]:
-        """Return the bindings with the empty binding and all unions of compatible bindings.
+        """Return a set of bindings closed under union, including the empty binding.
 
         ``known`` bindings are closed already.
         """
@@ -850,7 +850,7 @@ class Valuation:
         return letters, self._measure(list(rows), letters, memory)
 
     def _told(self) -> dict[Partial, int]:
-        """Return the true atoms of each binding that an atom directly binds."""
+        """Return the true atoms as bits, for each partial binding."""
         answers, placed = self._questions.answers, self.lattice.placed
         told: dict[Partial, int] = {}
         for bit, number, places in self._atoms:

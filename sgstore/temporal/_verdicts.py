@@ -123,7 +123,7 @@ def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # n
 
 
 def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
-    """Return, for each end, True if the right side of an *until* has held by then."""
+    """Return, for each end of the trace, True if an *until* is fulfilled at one frame."""
     near, far = table.window(formula.bound, forward=True)
     frames = len(table.times)
     first = at if near is None else int(near[at])
@@ -306,7 +306,7 @@ def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) 
 
 
 def met(right: Places, left: Places | None, bound: Bound, table: PropositionTable) -> Places:
-    """Return, for each frame, the first frame that makes an *until* certainly true, for monotonic operands.
+    """Return, for each frame, the frame from which on an *until* is true. Its sides must stay true.
 
     Parameters
     ----------
@@ -323,7 +323,7 @@ def met(right: Places, left: Places | None, bound: Bound, table: PropositionTabl
 
 
 def _asked(bound: Bound, table: PropositionTable) -> tuple[Places, Places | None]:
-    """Return the first frame of the bound of an *until*, and the frame after the last one, if any."""
+    """Return the range of frames of an *until* bound: first frame, and frame after the last, or ``None``."""
     here, frames = table.frames, len(table.times)
     near, far = table.window(bound, forward=True)
     start = here if near is None else np.minimum(near, frames)
@@ -339,7 +339,7 @@ def _chained(
     *,
     least: bool,
 ) -> Places:
-    """Return max(right, min(left, …)) over frames from ``start`` to before ``end``, then ``last``.
+    """Combine the two sides of an *until* over a range of frames, by minima and maxima.
 
     Parameters
     ----------
@@ -449,7 +449,7 @@ class Settled:
 
     @cached_property
     def _missed(self) -> Places:
-        """Frames (F,) at which the formula becomes false if the trace ends, except for open bounds."""
+        """Frames (F,) at which the formula is certainly false if no frame follows."""
         return known(self.formula, self._table, ended=self._tolerance)[1]
 
     def due(self, start: int, end: str) -> bool:
@@ -544,7 +544,7 @@ class Settled:
 def within_bounds(
     formula: Formula, columns: Mapping[str, Bools], times: Ints, gaps: Bools, rows: int
 ) -> tuple[Bools, Bools]:
-    """Return the lower and upper value of a formula at the first frame, with any content of the gaps.
+    """Return the lowest and highest value of a formula at the first frame, over all contents of gaps.
 
     Each gap is treated as one additional frame with arbitrary propositions. For the lower value, they are the
     least favourable ones; for the upper value, the most favourable.
