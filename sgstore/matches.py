@@ -446,7 +446,7 @@ class Matches(Tabular):
         Raises
         ------
         ExportError
-            The file cannot be written.
+            The file is not writable.
         """
         with closing(self._record_batches()) as found:
             columns = next(found, None)

@@ -726,7 +726,7 @@ class MapRecords:
     Attributes
     ----------
     about, reach
-        As above.
+        Same objects as the parameters.
     src, relation, dst
         Edges, ordered by source, relation and destination. Ids of map elements descend.
     """

@@ -154,7 +154,7 @@ def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
     Returns
     -------
     values : (n, 16) float64
-        The same array if nothing is implausible.
+        Cleaned values, or the input array without faults.
     faults : list of (int, str)
         Row and fault: ``"length is -4.5 m"``, ``"speed is 900 m/s"``.
     """
@@ -322,9 +322,9 @@ class Lives(Generic[AnyEntity]):
         Parameters
         ----------
         kind : int
-            Its kind.
+            Kind of the observed entity.
         here : Sight
-            Where it is.
+            Place and time of the observation.
         enter : callable
             Creates a new entity if no earlier one fits.
         sure_kind : bool

@@ -91,7 +91,7 @@ class DerivedSet:
     Attributes
     ----------
     name : str
-        Of the set.
+        Name of the set.
     trace_id : int
     trace : str
         Name of the trace.

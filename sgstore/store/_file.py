@@ -302,7 +302,7 @@ class StoreFile:
         Raises
         ------
         SqlError
-            As :meth:`user_sql`.
+            See :meth:`user_sql`.
         """
         first = self.user_sql(
             sql,
@@ -332,9 +332,9 @@ class StoreFile:
         Raises
         ------
         SqlError
-            As :meth:`user_sql`.
+            See :meth:`user_sql`.
         ExportError
-            The file cannot be written.
+            The file is not writable.
         """
 
         def step(connection: DuckDBPyConnection) -> int | None:
@@ -627,9 +627,9 @@ class StoreFile:
         Raises
         ------
         StoreError
-            As :meth:`payload`.
+            See :meth:`payload`.
         TraceError
-            As :meth:`payload`; or the recording lacks the data to decode the video frame.
+            See :meth:`payload`; or the recording lacks the data to decode the video frame.
         """
         from sgstore.readers import read_carried
 

@@ -129,7 +129,7 @@ class Tabular:
         Raises
         ------
         ExportError
-            The file cannot be written.
+            The file is not writable.
         """
         names, types = self._described()
         return write_parquet(names, self, Path(path), types)
@@ -140,7 +140,7 @@ class Tabular:
         Raises
         ------
         ExportError
-            The file cannot be written.
+            The file is not writable.
         """
         return write_csv(self._described()[0], self, Path(path))
 
@@ -270,7 +270,7 @@ class LaterRows(Rows):
         Raises
         ------
         ExportError
-            The file cannot be written.
+            The file is not writable.
         """
         return super().parquet(path) if self._whole else self._ask_parquet(Path(path))
 
@@ -534,7 +534,7 @@ def write_csv(columns: Sequence[str], rows: Iterable[Sequence[Any]], to: Path) -
     Raises
     ------
     ExportError
-        The file cannot be written.
+        The file is not writable.
     """
     number = 0
     with written_text(to) as stream:
@@ -552,7 +552,7 @@ def arrow_file(source: Path, to: Path) -> None:
     Raises
     ------
     ExportError
-        The file cannot be written.
+        The file is not writable.
     MissingExtraError
         pyarrow is not installed.
     """
@@ -620,7 +620,7 @@ class ParquetTable:
     Raises
     ------
     ExportError
-        The file cannot be written.
+        The file is not writable.
     """
 
     def __init__(
@@ -738,7 +738,7 @@ def write_parquet(
     Raises
     ------
     ExportError
-        The file cannot be written, or a later row does not fit the type of its column.
+        The file is not writable, or a later row does not fit the type of its column.
     """
     rows = iter(rows)
     if types is None:
@@ -807,7 +807,7 @@ def write_batches(stream: ArrowStream, to: Path) -> int:
     Raises
     ------
     ExportError
-        The file cannot be written.
+        The file is not writable.
     """
     columns, batches = stream
     arrow = _package("pyarrow")

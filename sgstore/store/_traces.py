@@ -133,7 +133,7 @@ class StoredTrace:
     size, mtime_ns : int
         Size and modification time of the recording at ingest.
     digest, flavour, ego : str
-        As in :class:`sgstore.model.world.TraceInfo`.
+        See :class:`sgstore.model.world.TraceInfo`.
     since, until : float or None
         Part of the recording, if not all; seconds since its first frame.
     map : str

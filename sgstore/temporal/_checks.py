@@ -259,7 +259,7 @@ class Witness:
     nodes : dict of str to int
         Node ids by variable.
     names : dict of str to str
-        Their names.
+        Entity names by variable.
     holds : bool
     violations : tuple of Interval
         Violations of the check by these entities.
@@ -307,7 +307,7 @@ class Verdict:
     Attributes
     ----------
     check, trace : str
-        Their names.
+        Names of check and trace.
     verdict : str
         ``true`` or ``false``, if independent of unknown values; ``pending``, if an obligation is open at the
         end of the recording; else ``unknown``.

@@ -1,6 +1,6 @@
 """Online monitor, and its sources of frames.
 
-Frames come from a recording, as if it were live, or from a running CARLA.
+The frames are from a recording, replayed as if live, or from a running CARLA.
 """
 
 from __future__ import annotations

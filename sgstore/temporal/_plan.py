@@ -2,15 +2,15 @@
 
 A :class:`Plan` contains all single-frame data that the expressions of a statement need, without duplicates:
 
-* an **atom** is a condition on one frame. It has free variables (keys of nodes) and is a query of its own:
-  its matches say in which frames, and for which entities, it is true. A store answers it by SQL; in memory
-  :class:`sgstore.lang.memory._search.ScopeSearch` does, with its scope.
-* a **signal** is a value of one frame, of the same kind: a query, and the value that is asked of its matches.
-  An edge variable stands for the edges of its relations from its source to its destination in that frame: a
-  condition is true if it is of one of these, a value is that of the one whose relation comes first in the
-  alphabet. So bindings speak of nodes only, and the ends of an edge are among them.
-* a **test** is an expression over values of several frames, in which ``prev``, ``delta``, ``run_length``,
-  ``since_true`` and ``age`` stand over signals and formulas.
+* an **atom** is a condition on one frame. It has free variables (keys of nodes) and is a separate query: its
+  matches are the frames and entities for which it is true. A store answers it by SQL, and
+  :class:`sgstore.lang.memory._search.ScopeSearch` answers it in memory.
+* a **signal** is a value of one frame: a query, and a value of its matches. An edge variable represents the
+  edges of its relations from its source to its destination in that frame. A condition is true if it is true
+  for one of these edges. A value is that of the alphabetically first relation. So bindings contain only
+  nodes, including the ends of edges.
+* a **test** is an expression over values of several frames. In it, ``prev``, ``delta``, ``run_length``,
+  ``since_true`` and ``age`` apply to signals and formulas.
 
 In a :class:`~sgstore.temporal._formula.Formula` of the plan, a proposition is the name of an atom or of a test.
 

@@ -69,7 +69,7 @@ class Robustness:
     nodes : mapping of str to int
         Deciding entities: variable → node id.
     names : mapping of str to str
-        Their names.
+        Entity names by variable.
     upper : float or None
         Margin with unknown values in favour of the check, if different; in ``value`` they count against it.
     """

@@ -75,7 +75,7 @@ class FrameLine:
     Attributes
     ----------
     ids : (F,) int64
-        In ascending order.
+        Frame ids in ascending order.
     owners : (F,) int64
         Index of each frame's trace.
     traces, starts : (T,) int64

@@ -70,7 +70,7 @@ class MonitorEvent:
     nodes : mapping of str to int
         Node ids by variable.
     names : mapping of str to str
-        Their names.
+        Entity names by variable.
     steps : tuple of FrameTime
         For a sequence: frame of each occurring step.
     at_end : bool

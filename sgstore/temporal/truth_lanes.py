@@ -51,7 +51,7 @@ class TruthLanes:
     binding : mapping of str to int
         Node ids of the bound variables. For the other variables, any node may match.
     lanes : tuple of TruthLane
-        In reading order, step by step.
+        Lanes in reading order, step by step.
     """
 
     trace: str
