@@ -9,37 +9,66 @@ nodes begin with ``#``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, Literal, TypeGuard
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeGuard
 
-from sgstore.lang._durations import (
-    BoundHold,  # noqa: TC001  they are of this module
-    Length,  # noqa: F401  # pyright: ignore[reportUnusedImport]
-)
-from sgstore.lang._ir_leaves import (
-    Choices,
-    EdgeAttribute,
-    EdgeRelation,
-    FrameAttribute,
-    Happened,
-    LabelTest,
-    NodeAttribute,
-    NodeValue,
-    PairNumber,
-    TraceAttribute,
-    Value,
-)
-from sgstore.lang._kind_sets import Kinds as Kinds  # noqa: PLC0414, TC001
-from sgstore.lang._kind_sets import any_kinds as any_kinds  # noqa: PLC0414
-from sgstore.lang._kind_sets import any_relation as any_relation  # noqa: PLC0414
-from sgstore.lang._kind_sets import ego_kinds as ego_kinds  # noqa: PLC0414
-from sgstore.lang._step_links import StepLink, StepWay
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, RelationScope, Type
+from sgstore.model.vocabulary import KINDS, RELATIONS, entity_kinds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from sgstore.errors import TextSpan
+
+
+@dataclass(frozen=True, slots=True)
+class Kinds:
+    """Kinds that a node may have: one set for the ego, one set for other nodes."""
+
+    ego: frozenset[str]
+    other: frozenset[str]
+
+    def __and__(self, more: Kinds) -> Kinds:
+        return Kinds(self.ego & more.ego, self.other & more.other)
+
+    def __or__(self, more: Kinds) -> Kinds:
+        return Kinds(self.ego | more.ego, self.other | more.other)
+
+    def __invert__(self) -> Kinds:
+        every = any_kinds()
+        return Kinds(every.ego - self.ego, every.other - self.other)
+
+    def __bool__(self) -> bool:
+        return bool(self.ego or self.other)
+
+    def only(self, kinds: frozenset[str]) -> Kinds:
+        """Return a copy limited to the given kinds."""
+        return Kinds(self.ego & kinds, self.other & kinds)
+
+    @property
+    def every(self) -> frozenset[str]:
+        """All kinds, of the ego or of other nodes."""
+        return self.ego | self.other
+
+    @property
+    def one_a_frame(self) -> bool:
+        """True if the node must be the ego, so that a frame has at most one such node."""
+        return not self.other
+
+
+def any_kinds() -> Kinds:
+    """Return all known kinds. Readers, settings and stores may add kinds."""
+    return Kinds(entity_kinds(), frozenset(KINDS))
+
+
+def ego_kinds() -> Kinds:
+    """Return all known kinds for the ego, and no kinds for other nodes."""
+    return Kinds(entity_kinds(), frozenset())
+
+
+def any_relation() -> frozenset[str]:
+    """Return all known relations. Stores and settings may add relations."""
+    return frozenset(RELATIONS)
 
 
 Scopes = tuple[tuple[RelationScope | None, tuple[int, ...]], ...]
@@ -104,7 +133,132 @@ class Edge:
     beyond: Scopes = ()
 
 
-# Expressions --------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class Value:
+    """Bound constant.
+
+    Attributes
+    ----------
+    value, type
+    closed : bool
+        True for a canonical word of the vocabulary, false for a text of the user.
+    unit : str
+        ``s`` or ``frames`` if it was written as a duration, such as ``2s``. Ignored in comparisons.
+    span : TextSpan or None
+        Place of the duration in the query.
+    written : float or None
+        The original number, if it was rounded for a comparison.
+    """
+
+    value: int | float | str | bool | None
+    type: Type
+    closed: bool = False
+    unit: str = field(default="", compare=False)
+    span: TextSpan | None = field(default=None, compare=False)
+    written: float | None = field(default=None, compare=False)
+
+    @property
+    def shown(self) -> float | str | bool | None:
+        """Constant as written in the query, before rounding."""
+        return self.value if self.written is None else self.written
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """List of constants after ``IN``."""
+
+    items: tuple[Value, ...]
+    type: Type = Type.list
+
+
+@dataclass(frozen=True, slots=True)
+class NodeValue:
+    """Reference to a node."""
+
+    node: str
+    type: Type = Type.node
+
+
+@dataclass(frozen=True, slots=True)
+class NodeAttribute:
+    """Attribute of a node."""
+
+    node: str
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class LabelTest:
+    """Test that a node, bound outside, has a label."""
+
+    node: str
+    kinds: Kinds
+    type: Type = Type.boolean
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeRelation:
+    """Relation that an edge variable is bound to."""
+
+    edge: str
+    type: Type = Type.text
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeAttribute:
+    """Attribute of an edge from an entity to a lane."""
+
+    edge: str
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class FrameAttribute:
+    """Attribute of the frame: ``frame.name``."""
+
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class TraceAttribute:
+    """Attribute of the trace: ``trace.name``."""
+
+    attribute: Attribute
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class PairNumber:
+    """Number computed for an ordered pair of entities, such as ``gap(a, b)``."""
+
+    function: str
+    a: str
+    b: str
+    type: Type = Type.number
+
+
+@dataclass(frozen=True, slots=True)
+class Happened:
+    """Test that the recording has an event of a kind in this frame.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of the event, one of :data:`sgstore.model.vocabulary.EVENT_KINDS`; or the name of a user table.
+    nodes : tuple of str
+        Nodes that the event involves: none, one or two.
+    table : tuple of str
+        For a user table: the columns with the entities, one for each node; one empty name if there are no
+        nodes. Empty for an event of the recording, where the order of two entities does not matter.
+    """
+
+    kind: str
+    nodes: tuple[str, ...]
+    table: tuple[str, ...] = ()
+    type: Type = Type.boolean
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,8 +459,6 @@ class Scope:
         """Return the kinds of a node of this scope, or of an outer node that it uses."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
-
-# Queries ------------------------------------------------------------------------------------------
 
 FRAME_COLUMNS: Final = ("frame_id", "trace", "seq", "time_ns", "t")
 """Columns that identify the frame of a row. ``t`` is in seconds since the start of the trace."""
@@ -819,7 +971,92 @@ def blocks_of(expression: Bound) -> tuple[BlockValue, ...]:
     return tuple(part for part in walk(expression) if isinstance(part, BlockValue))
 
 
-# Bound steps of sequences, and bound checks -----------
+@dataclass(frozen=True, slots=True)
+class Length:
+    """Duration of ``amount`` nanoseconds or frames."""
+
+    amount: int
+    frames: bool
+
+
+_COMPARE: Final[Mapping[str, Callable[[Any, int, int], Any]]] = {
+    ">=": lambda length, amount, by: length >= amount - by,
+    ">": lambda length, amount, by: length > amount + by,
+    "<=": lambda length, amount, by: length <= amount + by,
+    "<": lambda length, amount, by: length < amount - by,
+    "=": lambda length, amount, by: abs(length - amount) <= by,
+}
+"""Comparisons that treat lengths within a tolerance as equal."""
+
+
+@dataclass(frozen=True, slots=True)
+class BoundHold:
+    """Duration that a step must have, from the first to the last frame of its run.
+
+    Attributes
+    ----------
+    comparison : str
+    length : Length
+        Duration to compare with; if in frames, the number of frames.
+    inclusive : bool
+        True if one median frame period is added to the duration of the run.
+    """
+
+    comparison: str
+    length: Length
+    inclusive: bool
+
+    def fits(self, length: Any, tolerance: int) -> Any:
+        """Return true for runs whose length meets the comparison.
+
+        Parameters
+        ----------
+        length : int or (R,) int
+            Length of the run; ns or frames.
+        tolerance : int
+            Tolerance for times; ns.
+
+        Returns
+        -------
+        bool or (R,) bool
+        """
+        by = 0 if self.length.frames else tolerance
+        return _COMPARE[self.comparison](length, self.length.amount, by)
+
+
+@dataclass(frozen=True, slots=True)
+class StepLink:
+    """Relation in time between a step and the previous step.
+
+    Attributes
+    ----------
+    kind : str
+        ``then``: in a later frame, at least ``after`` and at most ``within`` later; ``immediately``: in the
+        next frame; ``until``: in the frame after a run of the previous step; ``while``: in the same frame.
+    after, within : Length or None
+    """
+
+    kind: Literal["then", "immediately", "until", "while"]
+    after: Length | None
+    within: Length | None
+
+
+@dataclass(frozen=True, slots=True)
+class StepWay:
+    """Sequence of steps that an expression of steps allows.
+
+    Attributes
+    ----------
+    steps : tuple of int
+        Numbers of the steps. A repeated step occurs several times.
+    happen : tuple of int
+        Numbers of the steps that must occur, without absent steps.
+    links : tuple of StepLink
+    """
+
+    steps: tuple[int, ...]
+    happen: tuple[int, ...]
+    links: tuple[StepLink, ...]
 
 
 @dataclass(frozen=True, slots=True)
