@@ -93,8 +93,6 @@ class Operator:
     strict: bool = False
 
 
-# SQL: operands are put in brackets where needed, except in calls ----------------------------------
-
 _WHOLE: Final = re.compile(r"""\$\d+|\w+|"[^"]*"(\."[^"]*")*|'[^']*'""")
 """Text without need of brackets: a placeholder, a word, a number, a column or a string."""
 
@@ -175,9 +173,6 @@ def _if_all_known(name: str) -> SqlOf:
 def _member(parts: Sequence[str]) -> str:
     value, *items = parts
     return f"{operand_text(value)} IN ({', '.join(items)})" if items else "FALSE"
-
-
-# Strict operators -------------------------------------------------------------------------------
 
 
 def _edges_between(nodes: Sequence[int]) -> int:
@@ -359,9 +354,6 @@ def _matches_columns(texts: Any, pattern: Any) -> Any:
     words, places = np.unique(texts, return_inverse=True)
     flags = np.array([wanted.fullmatch(word) is not None for word in words], np.bool_)
     return flags[places].reshape(texts.shape)
-
-
-# Operators with a rule of their own -------------------------------------------------------------
 
 
 def _ruled(

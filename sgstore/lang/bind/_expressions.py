@@ -58,9 +58,6 @@ MAX_NUMBER: Final = 1e300
 _ORDERED: Final = frozenset({"<", "<=", ">", ">="})
 
 
-# Values and names ---------------------------------------------------------------------------------
-
-
 def _constant(e: s.Constant, _: SymbolTable) -> b.Value:
     return b.Value(e.value, _type_of(e.value))
 
@@ -296,9 +293,6 @@ def _list(e: s.ListOf, names: SymbolTable) -> b.Choices:
     return b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
 
 
-# Logic --------------------------------------------------------------------------------------------
-
-
 def _logic(e: s.Logic, names: SymbolTable) -> b.Operation:
     if e.word == "IMPLIES" and "=>" in _between(e.operands, names):
         first = names.bind(e.operands[0])
@@ -517,9 +511,6 @@ def _case(e: s.Case, names: SymbolTable) -> b.Operation:
 
 def _constants(values: Sequence[b.Bound]) -> list[object]:
     return [value.value for value in values if isinstance(value, b.Value)]
-
-
-# Numbers ------------------------------------------------------------------------------------------
 
 
 def _arithmetic(e: s.Arithmetic, names: SymbolTable) -> b.Bound:

@@ -169,8 +169,6 @@ class _Looking:
     known: dict[str, float]
     speed: float
 
-    # Which entities matter: those of blocks ------------------------------------------------------
-
     def blocks(  # noqa: C901, PLR0912 - a case each
         self, formula: Bound, *, up: bool = True
     ) -> Iterable[_Missed]:
@@ -217,8 +215,6 @@ class _Looking:
         )
         for part in block.inside:
             yield from inner.blocks(part, up=up)
-
-    # Where an entity can be ----------------------------------------------------------------------
 
     def in_scope(self, scope: Scope, key: str) -> _Place:
         """Return the position bounds of a node of a pattern or block, if there is a match."""
@@ -349,9 +345,6 @@ _SMALL: Final[Mapping[str, Callable[[float, float], float]]] = {
 
 _BRAKING: Final = {"a_long_req": -1.0, "drac": 1.0, "btn": 11.5}
 """Numbers that are large only for near entities: the deceleration for a value of 1; m/s²."""
-
-
-# Ranges of values ------------------------------------------------------------------------------
 
 
 def bounds(value: Bound, speed: float) -> Interval:

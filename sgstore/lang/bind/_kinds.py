@@ -145,9 +145,6 @@ def alias_of(edge: Edge) -> str:
     )
 
 
-# Kinds implied by comparisons of pair numbers -----------------------------------------------------
-
-
 def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
     """Restrict nodes to entities if a condition compares a number of their pair.
 

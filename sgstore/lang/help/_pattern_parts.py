@@ -163,9 +163,6 @@ def _label(edge: b.Edge) -> str:
     return label if edge.high == 1 else f"{label}*{edge.low}..{edge.high}"
 
 
-# Grouping ---------------------------------------------------------------------------------------------------
-
-
 def _groups(
     scope: b.Scope, when: tuple[b.Bound, ...], pins: Mapping[str, int]
 ) -> Iterator[list[_Atom]]:

@@ -55,9 +55,6 @@ class StageSearch:
         return _value(of, injective=self._injective)
 
 
-# Patterns -----------------------------------------------------------------------------------------
-
-
 class _Joining:
     """Stage that joins the matches of a pattern to the previous rows."""
 
@@ -119,9 +116,6 @@ class _Joining:
 
 def _row(view: FrameView, nodes: Any, edges: Any, passed: Any) -> Binding:
     return Binding(view, dict(nodes), dict(edges), dict(passed))
-
-
-# WITH ---------------------------------------------------------------------------------------------
 
 
 class _Passing:
@@ -243,8 +237,6 @@ AGGREGATE: Final[Mapping[str, Callable[[list[Any], b.Aggregate], Any]]] = {
 }
 """Functions that compute aggregates from the known values."""
 
-
-# Values -------------------------------------------------------------------------------------------
 
 _OF_NOTHING: Final = {"EXISTS": False, "COUNT": 0, "SUM": 0.0}
 """Values of blocks that use an absent node. Other blocks are unknown."""

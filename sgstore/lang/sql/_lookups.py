@@ -187,8 +187,6 @@ def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
     return kind_conditions(kinds, f'"{alias}"."kind"', f'"{alias}"."is_ego"', held)
 
 
-# Measures from later frames ------------------------------------------------------------------------
-
 LOOKED_UP: Final = WAYS | RECORDED.keys()
 """Pair numbers that are looked up, not computed from values of both nodes."""
 

@@ -203,9 +203,6 @@ def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
     return replace(query, scope=deep(query.scope), result=query.result.changed(inside))
 
 
-# Conditions ----------------------------------------------------------------------------------------
-
-
 def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
     """Replace ``in_graph`` by true unless the store has data beyond the graphs in scope ``world``."""
 
@@ -318,9 +315,6 @@ def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
 def complement(sign: str) -> str:
     """Return the opposite comparison, such as ``>=`` for ``<``."""
     return _OPPOSITE[sign]
-
-
-# Patterns ------------------------------------------------------------------------------------------
 
 
 def unfold_paths(scope: Scope, _: Catalog, *, injective: bool) -> Scope:
@@ -449,9 +443,6 @@ def _merged(scope: Scope, block: BlockValue) -> Scope:
     )
 
 
-# Contents of the store ------------------------------------------------------------------------------
-
-
 def narrowed(scope: Scope, catalog: Catalog) -> Scope:
     """Limit nodes to the kinds that occur at the ends of such edges in the store.
 
@@ -547,9 +538,6 @@ def _words(kinds: frozenset[str]) -> Choices:
     return Choices(tuple(Value(kind, Type.text, closed=True) for kind in KINDS if kind in kinds))
 
 
-# Results -------------------------------------------------------------------------------------------
-
-
 INVARIANT: Final = FrameAttribute(
     Attribute("held", Type.number, {}, "how many frames a row stands for"), Type.number
 )
@@ -606,8 +594,6 @@ def _weighed(value: Bound) -> Bound:
         case _:
             return with_operands(value, _weighed)
 
-
-# Conditions that follow from others ------------------------------------------------------------------------
 
 _LESS: Final = {"<", "<=", "="}
 _MORE: Final = {">", ">=", "="}

@@ -70,9 +70,6 @@ def staged_matches(query: Query, catalog: Catalog, window: Window | None) -> Sql
     return sql
 
 
-# Patterns -----------------------------------------------------------------------------------------
-
-
 def _first(sql: SqlBuilder, query: Query, stage: MatchStage) -> SharedRelation:
     nodes, edges = _bound(stage.scope)
     late, wanted = _late(stage)
@@ -176,9 +173,6 @@ def _given(sql: SqlBuilder, rows: SharedRelation, outer: frozenset[str]) -> Shar
 
 def _speaks_of_passed(condition: Bound) -> bool:
     return any(is_passed_on(part) for part in walk(condition))
-
-
-# WITH ---------------------------------------------------------------------------------------------
 
 
 def _passed(

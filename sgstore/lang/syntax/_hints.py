@@ -56,9 +56,6 @@ def said_of(of: str, word: str) -> str | None:
     return _words("said", of).get(normalize_name(word))
 
 
-# Mistakes of syntax -------------------------------------------------------------------------------
-
-
 def places(names: Container[str]) -> frozenset[str]:
     """Return the kinds of a place in a query, derived from the terminals allowed there.
 
@@ -191,9 +188,6 @@ def _joined(found: str, before: str, at: frozenset[str]) -> str | None:
     if "comma" in at:
         return "values are separated by commas"
     return "conditions are joined by AND, and texts stand in quotes"
-
-
-# Unknown names ------------------------------------------------------------------------------------
 
 
 _WORDS: Final = frozenset(

@@ -38,9 +38,6 @@ class BuildError(Exception):
         super().__init__(reason)
 
 
-# Values -------------------------------------------------------------------------------------------
-
-
 def _number(span: TextSpan, children: Children) -> s.Constant:
     text: str = children[0].text
     value = int(text) if text.isdigit() else float(text)
@@ -163,9 +160,6 @@ def _over_steps(span: TextSpan, children: Children) -> s.OverExpression:
     return s.OverExpression(value, start, end, span)
 
 
-# Conditions ---------------------------------------------------------------------------------------
-
-
 def _logic(
     word: Literal["NOT", "AND", "OR", "XOR", "IMPLIES"], span: TextSpan, children: Children
 ) -> s.Logic:
@@ -249,9 +243,6 @@ def _block_expression(word: str, span: TextSpan, children: Children) -> s.BlockE
 def _aggregate_block(span: TextSpan, children: Children) -> s.BlockExpression:
     word, block, value = children
     return s.BlockExpression(word.text.upper(), block, value, span)
-
-
-# Patterns -----------------------------------------------------------------------------------------
 
 
 def _label(span: TextSpan, children: Children) -> s.Label:
@@ -353,9 +344,6 @@ def _named_path(_: TextSpan, children: Children) -> s.Path:
 def _block_body(span: TextSpan, children: Children) -> s.Block:
     paths, where = children
     return s.Block(paths, where, span)
-
-
-# Statements ---------------------------------------------------------------------------------------
 
 
 def _match_step(span: TextSpan, children: Children) -> s.StepClause:
@@ -543,9 +531,6 @@ def _param(span: TextSpan, children: Children) -> s.Formal:
 
 def _statements(_: TextSpan, children: Children) -> tuple[Any, ...]:
     return tuple(child for child in children if child is not None)
-
-
-# Results ------------------------------------------------------------------------------------------
 
 
 def _item(span: TextSpan, children: Children) -> s.Item:

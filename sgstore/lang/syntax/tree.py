@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from sgstore.errors import TextSpan
 
 
-# Expressions --------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class Constant:
     """Number, text, truth value or ``NULL`` in a query."""
@@ -241,9 +238,6 @@ Given = Constant | Duration | Parameter | Variable
 """Expressions that can be arguments of a scenario."""
 
 
-# Patterns -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class Label:
     """Label in a pattern. The name ``%`` means any label."""
@@ -316,9 +310,6 @@ class Block:
     paths: tuple[Path, ...]
     where: Expression | None
     span: TextSpan
-
-
-# Statements ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
