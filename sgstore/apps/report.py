@@ -214,7 +214,6 @@ def _notes(store: Store) -> list[Any]:
 
 
 def _key(*values: Any) -> str:
-    """Return the key of a data item, as written by ``JSON.stringify``."""
     return json.dumps(values, separators=(",", ":"), ensure_ascii=False)
 
 

@@ -287,7 +287,6 @@ def _session(sql: Any, master: str) -> Any:
 
 
 def _lines_done(name: str, lines: Iterable[str]) -> Iterator[str]:
-    """Run tasks from JSON lines; yield the result of each."""
     for line in lines:
         yield json.dumps(_done(name, json.loads(line)))
 

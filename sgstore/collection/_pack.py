@@ -445,7 +445,6 @@ def gc(
 
 
 def _segment_of(name: str) -> str:
-    """Return the segment of a file below ``segments/``."""
     return name.split("/")[1] if name.count("/") > 1 else ""
 
 

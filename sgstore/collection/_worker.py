@@ -238,7 +238,6 @@ def _check(
 
 
 def _plain(value: Any) -> Any:
-    """Convert numpy values for JSON."""
     return value.tolist()
 
 
@@ -316,7 +315,6 @@ def _sql(
 def _coded(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the class of each frame in an abstraction."""
     part = write_coded(file, task["abstraction"], to / f"{secrets.token_hex(8)}.parquet")
     return {"parts": [part.as_dict()], "reasons": {}}
 
@@ -358,7 +356,6 @@ def _margins(
 def _rows(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the rows of an internal statement."""
     statement = task["sql"], task["values"]
     columns = [row[0] for row in file.rows(f"DESCRIBE {task['sql']}", task["values"]).values]
     part = write_part(file, statement, columns, (), to / f"{secrets.token_hex(8)}.parquet")
@@ -368,7 +365,6 @@ def _rows(
 def _step(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
 ) -> dict[str, Any]:
-    """Return the result of a module-level function for a bundle."""
     module, _, name = task["step"].partition(":")
     step = attrgetter(name)(import_module(module))
     return {"value": step(Store.of(file), **task["values"])}

@@ -447,7 +447,6 @@ def _ruler(dpi: float) -> RendererAgg:
 
 @lru_cache(maxsize=4096)
 def _text_size(text: str, size: float, weight: str, dpi: float) -> tuple[float, float]:
-    """Return width and height; pixels."""
     font = FontProperties(size=size, weight=weight)
     ismath = False
     width, height, _ = _ruler(dpi).get_text_width_height_descent(text, font, ismath)

@@ -202,7 +202,6 @@ def _write_frames(export: Export, frames: ClipFrames, tables: _Tables) -> None:
 
 
 def _by_trace(of: dict[tuple[str, str], _Count]) -> list[tuple[tuple[str, str], _Count]]:
-    """Sort by trace name and topic."""
     return sorted(of.items(), key=lambda one: (natural(one[0][0]), one[0][1]))
 
 

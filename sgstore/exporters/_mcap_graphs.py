@@ -218,7 +218,6 @@ def _graph(graph: SceneGraph) -> dict[str, Any]:
 
 
 def _as_json(value: Any) -> bytes:
-    """Return a value as JSON; NaN and infinity become null."""
     return json_text(value).encode("utf-8", "backslashreplace")
 
 

@@ -149,7 +149,6 @@ def _drawable(about: dict[str, Any]) -> dict[str, Any]:
 
 
 def _readable(text: str) -> str:
-    """Replace characters that XML cannot hold."""
     return "".join(
         c if c.isprintable() or c in "\t\n" else "\N{REPLACEMENT CHARACTER}" for c in text
     )

@@ -497,5 +497,4 @@ def _mode(state: str, bulb: str) -> str:
 
 
 def _number_of(message: Any, field: str, name: str) -> int:
-    """Return the number of an enumeration's value by name."""
     return message.DESCRIPTOR.fields_by_name[field].enum_type.values_by_name[name].number

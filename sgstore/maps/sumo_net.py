@@ -243,7 +243,6 @@ def _with_opposites(net: _SumoNet, lines: dict[str, LaneLine]) -> dict[str, Lane
 
 
 def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
-    """True if lanes of opposite directions touch at both ends."""
     if one.sections is None or other.sections is None:
         return False
     gaps = one.sections.left[[0, -1]] - other.sections.left[[-1, 0]]

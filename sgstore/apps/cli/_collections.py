@@ -37,7 +37,6 @@ def _say(url: Path, told: str) -> None:
 
 
 def _statuses(done: Commit) -> list[tuple[str, str]]:
-    """Return the status of each trace after a commit."""
     from sgstore.model.vocabulary import natural
 
     present = sorted(done.present, key=natural)
@@ -45,7 +44,6 @@ def _statuses(done: Commit) -> list[tuple[str, str]]:
 
 
 def _new_in(done: Commit) -> str:
-    """Return a summary of a commit."""
     if not done.added:
         return f"nothing new; the last snapshot is {done.number}"
     told = f"{number_of(len(done.added), 'trace')} in {number_of(len(done.bundles), 'bundle')}"

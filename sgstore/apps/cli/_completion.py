@@ -156,7 +156,6 @@ def _about(trace: StoredTrace) -> str:
 
 
 def _traces(ctx: typer.Context) -> list[StoredTrace]:
-    """Return the traces of the store on the command line; empty if it cannot be read."""
     with suppress(SgstoreError, OSError):
         file = _store(ctx)
         return [] if file is None else [*file.traces()]

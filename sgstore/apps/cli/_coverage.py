@@ -499,7 +499,6 @@ def _one_specification(slots: Path) -> Specification:
 
 
 def _short(text: str) -> str:
-    """Shorten the text of a selection for a title."""
     path, colon, query = text.partition(":")
     name = f"{Path(path).name}{colon}{query}"
     return name if len(name) <= 60 else f"{name[:59]}…"

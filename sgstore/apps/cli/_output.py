@@ -312,7 +312,6 @@ def _csv_cell(value: Any) -> Any:
 
 
 def _flat(value: Any) -> Any:
-    """Convert lists and objects to JSON, for formats without nesting."""
     return json.dumps(_json_value(value), ensure_ascii=False) if _is_nested(value) else value
 
 
@@ -407,7 +406,6 @@ def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: 
 
 
 def _room(stream: TextIO) -> int | None:
-    """Return the width of the terminal, or ``None`` for other outputs."""
     return shutil.get_terminal_size().columns if stream.isatty() else None
 
 

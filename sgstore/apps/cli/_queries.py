@@ -402,7 +402,6 @@ def _sandbox(store: Path, bounds: QueryLimits, max_rows: int, tables: list[str] 
 
 
 def _say_all(answer: Answer) -> None:
-    """Report omissions of a result."""
     say_left_out(answer)
     if answer.truncated:
         say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")

@@ -165,7 +165,6 @@ def _landed(
 
 
 def _names(traces: list[str]) -> list[str]:
-    """Return the given names, with names from stdin in place of ``-``."""
     return [name for one in traces for name in (lines_of(Path("-")) if one == "-" else [one])]
 
 

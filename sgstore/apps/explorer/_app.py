@@ -62,7 +62,6 @@ _SCRIPT: Final = "js/main.js"
 
 
 async def _lines(replies: Replies) -> AsyncGenerator[bytes]:
-    """Yield replies as lines of JSON on arrival."""
     async for reply in replies:
         yield as_json(reply) + b"\n"
 
@@ -223,7 +222,6 @@ class Explorer:
         return self._pools[side]
 
     def _side(self, fields: Mapping[str, Any]) -> str:
-        """Return the requested store: ``a`` or ``b``."""
         return one_of(*self.stores)(fields.get("side"), "side")
 
     # What somebody typed -------------------------------------------------------------------------
@@ -421,7 +419,6 @@ def application_of(
 
 
 async def _refusal(_: Request, error: Any) -> Response:
-    """Return an error of sgstore as a response with its status."""
     is_query = isinstance(error, QueryError | SqlError)
     usual = 404 if isinstance(error, StoreError) and not is_query else 422
     return JSONResponse(error.as_dict(), getattr(error, "status", usual))

@@ -102,7 +102,6 @@ class Reads:
         return self._store.file.frame(f"{trace}#{seq}").frame_id
 
     def _trace(self, name: str) -> StoredTrace:
-        """Return a trace by its full name."""
         return _among(self._traces()[0], name)
 
     # Columns -------------------------------------------------------------------------------------

@@ -62,7 +62,6 @@ def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Re
 
 
 def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Yield truth lanes."""
     text, values, binding = question["text"], question["parameters"], question["binding"]
     yield store.parts(text, question["frame"], binding, **values).as_dict()
 

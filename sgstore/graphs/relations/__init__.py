@@ -3,7 +3,8 @@
 A relation has one file in this package and one line in :mod:`sgstore.base.plugins`, or one file in
 another package and one entry point. The registration adds it to the vocabulary, the generator, the
 table of ``docs/relations.md``, pictures, and the law tests: no self edges; symmetric relations are
-symmetric; the result does not change when the world is moved or turned, or frame by frame.
+symmetric; moving or turning the world does not change the result, nor does computing it frame by
+frame.
 """
 
 from sgstore.graphs.relations._contact import contacts, contacts_of

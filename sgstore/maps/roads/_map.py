@@ -772,7 +772,6 @@ def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
 
 
 def _cells(places: Floats) -> Ints:
-    """Return the grid cell numbers of places (N, 2)."""
     return _numbered(_floor(places / _CELL))
 
 

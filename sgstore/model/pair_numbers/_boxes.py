@@ -39,7 +39,6 @@ _PARTS: Final = "parts1, parts2, parts3, parts4"
 
 
 def _turned(angle: str) -> str:
-    """Return the SQL of an angle in degrees, wrapped to (-180, 180]."""
     return f"{angle} - 360 * ceil(({angle} - 180) / 360)"
 
 

@@ -408,7 +408,6 @@ def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tupl
 
 
 def _impurity(positive: Floats | float, total: Floats | float) -> Floats:
-    """Return Gini's impurity times the weight."""
     share = positive / np.maximum(total, 1e-12)
     return 2 * share * (1 - share) * total
 

@@ -444,7 +444,6 @@ def _together(*orders: Ints) -> Ints:
 
 
 def _classes(units: Units, abstraction: str) -> Ints:
-    """Return the classes of the frames of units, (N,); −1 for unknown ones."""
     of = classed(units.chosen, abstraction)
     code = np.full(len(units.frame_id), UNKNOWN, np.int64)
     code[np.searchsorted(units.frame_id, of.frame_id)] = of.code
@@ -569,7 +568,6 @@ def _times(units: Units) -> Floats:
 
 
 def _or_none(values: Floats) -> list[float | None]:
-    """Convert an array to a list, with None for NaN."""
     found: list[float | None] = values.tolist()
     for place in np.flatnonzero(np.isnan(values)).tolist():
         found[place] = None

@@ -307,7 +307,6 @@ def units_of(
 
 
 def _ranges(fresh: Bools) -> tuple[Ints, Ints]:
-    """Return begin and end of ranges from a mask of their first rows."""
     begin = np.flatnonzero(fresh)
     return begin, np.append(begin[1:], len(fresh))
 
