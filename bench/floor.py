@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sgstore.base.compiled import compiled, use_loops
+from sgstore.base.numba_loops import compiled, use_loops
 from sgstore.maps.roads._footprints import _Shapes
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ import numpy as np
 import sgstore
 from bench.floor import floor
 from bench.measure import Measure
-from sgstore.base import compiled
+from sgstore.base import numba_loops
 from sgstore.graphs.relations._bearing import BESIDE
 from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config, LaneSettings
@@ -249,7 +249,7 @@ def run(quick: bool = False) -> list[Measure]:
         blocks = list(traffic(entities, 300, radius))
         name, frames = f"sgg, {entities} entities{where}", sum(map(len, blocks))
         table += with_loops(name, blocks, road_map, seconds)
-        compiled.use_loops(math.inf)
+        numba_loops.use_loops(math.inf)
         with_map = frames / timed(partial(generated, blocks, road_map), seconds)
         columns = frames / timed(partial(generated, blocks, None, sees=False), seconds)
         few = blocks[:1]
@@ -266,14 +266,14 @@ def run(quick: bool = False) -> list[Measure]:
         ]
     alone = list(traffic(60, 60 if quick else 300, 45))
     for after, how in ((math.inf, ""), (0, ", with numba")):
-        if compiled.use_loops(after) or not how:
+        if numba_loops.use_loops(after) or not how:
             generated(alone[:1], road_map)
             online = latency(alone, road_map)
             label = f"sgg, 60 entities, one frame alone{how}"
             table.append(Measure(label, online, "ms", "99th percentile"))
-    compiled.use_loops(math.inf)
+    numba_loops.use_loops(math.inf)
     table += [*of_sample(seconds), *in_one_pass(road_map, seconds), *over_time(road_map, quick)]
-    compiled.use_loops()
+    numba_loops.use_loops()
     return table
 
 
@@ -281,7 +281,7 @@ def with_loops(
     name: str, blocks: list[FrameBlock], road_map: RoadMap, seconds: float
 ) -> list[Measure]:
     """The same with loops that numba compiles, and their share of what a bare loop reaches."""
-    if not compiled.use_loops(0):
+    if not numba_loops.use_loops(0):
         return [Measure(f"{name}, with numba", math.nan, "frames/s", "numba is not installed")]
     generated(blocks[:1], road_map)
     frames = sum(map(len, blocks))

@@ -25,9 +25,9 @@ from sgstore.errors import SgstoreError, StoreError, TraceError, failure, url_na
 from sgstore.maps.map_files import Maps
 from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of, remote_names
 from sgstore.model.config import Config
-from sgstore.model.trace_parts import TracePart
+from sgstore.model.trace_sampling import TracePart
 from sgstore.model.world import BUCKET_FRAMES
-from sgstore.pipeline.segments import Job, Progress, SegmentReader, TraceOutcome
+from sgstore.pipeline.recording_ingest import Job, Progress, SegmentReader, TraceOutcome
 from sgstore.readers import ENDINGS, is_recording
 from sgstore.store import Folder, PresentError, Sealed, StoreFile, refuse_name
 
@@ -248,7 +248,7 @@ class Workers:
         while len(self._workers) < count:
             separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
             process = subprocess.Popen(  # noqa: S603  a module of ours
-                command("sgstore.pipeline.segments"),
+                command("sgstore.pipeline.recording_ingest"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 encoding="utf-8",

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from sgstore.lang.syntax import Pattern
     from sgstore.matches import Interval, Matches
     from sgstore.model.world import Clip
-    from sgstore.pipeline.segments import TraceOutcome
+    from sgstore.pipeline.recording_ingest import TraceOutcome
     from sgstore.store import Rows, SimilarFrames, StoredTrace
     from sgstore.temporal import CheckRun, ShortestClip
     from sgstore.temporal.truth_lanes import TruthLanes

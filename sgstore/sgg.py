@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base import compiled
-from sgstore.base.columns import chained, taken
+from sgstore.base import numba_loops
+from sgstore.base.tables import chained, taken
 from sgstore.errors import ConfigError
 from sgstore.graphs.abstractions import (
     Classes,
@@ -284,7 +284,7 @@ class SceneGraphGenerator:
         part = whole.of(keys)
         bodies = part.bodies
         if len(frames) > 1:  # Online steps must not wait for the compiler.
-            compiled.count(int((np.bincount(bodies.frame) ** 2).sum()))
+            numba_loops.count(int((np.bincount(bodies.frame) ** 2).sum()))
         if self._survey is not None and part.standing is not None and standing is not None:
             self._parking.stand(bodies, part.standing, self._survey.driving)
             self._parking.stand(whole.bodies, standing, self._survey.driving, beyond=True)

@@ -17,7 +17,7 @@ import pytest
 import typer.main
 from slow import seconds
 
-from sgstore.base import compiled
+from sgstore.base import numba_loops
 
 try:
     from hypothesis import HealthCheck, settings
@@ -57,7 +57,7 @@ typer.main.get_command = _command
 
 # Loops that numba compiles are for processes that make many graphs; here the tests that came before would
 # decide who uses them, and who waits until they are compiled. test_compiled.py goes both ways and compares.
-compiled._seen["enough"] = math.inf
+numba_loops._seen["enough"] = math.inf
 
 REPOSITORY = Path(__file__).parents[1]
 

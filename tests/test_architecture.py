@@ -61,7 +61,7 @@ OWNERS = {
     "zstandard": {"mcap", "readers", "exporters"},
     "lz4": {"mcap", "exporters"},
     "isal": {"mcap"},
-    "numba": {"base/compiled"},
+    "numba": {"base/numba_loops"},
     "typer": {"apps/cli"},
     "rich": {"apps/cli"},
     "networkx": {"model/graph", "exporters"},

@@ -15,7 +15,7 @@ from builders import Thing, frames, thing
 from test_relations import TOWN, busy, crowd
 
 from sgstore.apps.demo import RECORDING
-from sgstore.base import compiled
+from sgstore.base import numba_loops
 from sgstore.graphs.relations import _loops
 from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config, configured
@@ -41,7 +41,7 @@ CONFIGS = [
 @pytest.fixture
 def _ends_without_loops() -> Iterator[None]:
     yield
-    compiled.use_loops()
+    numba_loops.use_loops()
 
 
 def columns(graph: GraphBlock) -> list[np.ndarray[Any, Any]]:
@@ -56,7 +56,7 @@ def assert_same_both_ways(
 ) -> None:
     found: list[list[np.ndarray[Any, Any]]] = []
     for after in (math.inf, 0):
-        if not compiled.use_loops(after):
+        if not numba_loops.use_loops(after):
             pytest.skip("numba is not installed")
         generator = SceneGraphGenerator(road_map, config)
         found.append([column for block in blocks for column in columns(generator.block(block))])
@@ -101,24 +101,24 @@ def test_loops_and_numpy_give_the_same_graphs_of_the_sample(config: Config) -> N
 
 @pytest.mark.usefixtures("_ends_without_loops")
 def test_loops_are_used_when_they_are_worth_it() -> None:
-    if not compiled.use_loops():
+    if not numba_loops.use_loops():
         pytest.skip("numba is not installed")
 
-    compiled.count(compiled.WORTH - 1)
-    assert not compiled.worth()
-    compiled.count(1)
-    assert compiled.worth()
+    numba_loops.count(numba_loops.WORTH - 1)
+    assert not numba_loops.worth()
+    numba_loops.count(1)
+    assert numba_loops.worth()
 
 
 @pytest.mark.usefixtures("_ends_without_loops")
 def test_frames_that_come_alone_do_not_start_the_compiler() -> None:
-    if not compiled.use_loops(after=2):
+    if not numba_loops.use_loops(after=2):
         pytest.skip("numba is not installed")
 
     SceneGraphGenerator(None, Config()).block(frames([thing("ego"), thing("a", 5), thing("b", 9)]))
-    assert not compiled.worth()
+    assert not numba_loops.worth()
     SceneGraphGenerator(None, Config()).block(frames([thing("ego")], [thing("ego")]))
-    assert compiled.worth()
+    assert numba_loops.worth()
 
 
 @pytest.mark.parametrize(("room", "told"), [(9, (1, 3)), (3, (1, 3)), (2, (0, 0))])
@@ -137,8 +137,8 @@ def test_without_numba_nothing_is_compiled() -> None:
     program = """if True:
         import sys
         sys.modules["numba"] = None
-        from sgstore.base import compiled
-        assert not compiled.use_loops(0) and not compiled.worth()
+        from sgstore.base import numba_loops
+        assert not numba_loops.use_loops(0) and not numba_loops.worth()
         from sgstore.graphs.relations import _loops
         import numpy as np
         order, end = np.arange(3), np.full(3, 3)

@@ -22,8 +22,8 @@ from sgstore.graphs.online import Frame, Replay
 from sgstore.ingest import ingest
 from sgstore.model.config import Config
 from sgstore.model.vocabulary import KINDS
-from sgstore.pipeline import doctor, segments
-from sgstore.pipeline.segments import TraceOutcome
+from sgstore.pipeline import doctor, recording_ingest
+from sgstore.pipeline.recording_ingest import TraceOutcome
 from sgstore.query import Store
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
@@ -557,14 +557,14 @@ def test_any_exception_of_one_recording_fails_it_and_no_other(
 ) -> None:
     places = {"a": 20.0, "b": 21.0, "c": 22.0}
     paths = [write_osi(tmp_path / name, stand(3, Body(7, x))) for name, x in places.items()]
-    opened = segments.open_trace
+    opened = recording_ingest.open_trace
 
     def broken(path: Path, **how: Any) -> Any:
         if path.stem == "b":
             raise ZeroDivisionError("by nothing")
         return opened(path, **how)
 
-    monkeypatch.setattr(segments, "open_trace", broken)
+    monkeypatch.setattr(recording_ingest, "open_trace", broken)
     monkeypatch.setattr(doctor, "open_trace", broken)
     outcomes = ingest(tmp_path / "s.sgstore", paths)
 

@@ -27,7 +27,7 @@ from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
-    from sgstore.pipeline.segments import Progress
+    from sgstore.pipeline.recording_ingest import Progress
 
 STREET = a_map(a_road("1", line(200.0, x=-20.0, y=2.0)))
 """A lane 200 m long under the drive."""

@@ -19,7 +19,7 @@ from sgstore.store import StoreFile
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.pipeline.segments import TraceOutcome
+    from sgstore.pipeline.recording_ingest import TraceOutcome
 
 pytestmark = pytest.mark.data
 

@@ -20,14 +20,14 @@ from sgstore import readers
 from sgstore.errors import MapError, StoreError, TraceError
 from sgstore.ingest import ingest, recordings
 from sgstore.model.config import Config, RangeSettings
-from sgstore.pipeline import segments
+from sgstore.pipeline import recording_ingest
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.pipeline.segments import Progress, TraceOutcome
+    from sgstore.pipeline.recording_ingest import Progress, TraceOutcome
 
 
 def rows(store: Path, sql: str) -> list[tuple[Any, ...]]:
@@ -315,7 +315,7 @@ def test_each_of_several_egos_has_the_trace_that_it_would_have_alone(
     crowd: Any, alone: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int
 ) -> None:
     """In one reading, or in several that share the rows of the map and the classes of their frames."""
-    monkeypatch.setattr(segments, "EGOS_AT_ONCE", at_once)
+    monkeypatch.setattr(recording_ingest, "EGOS_AT_ONCE", at_once)
 
     outcomes = ingest(tmp_path / "s.db", [crowd], config=SMALL, egos=["5", "1", "6"])
 
@@ -339,7 +339,7 @@ def test_names_of_egos_are_looked_up_in_a_recording_that_is_open(
         opened.append(path)
         return readers.open_trace(path, **options)
 
-    monkeypatch.setattr(segments, "open_trace", open_trace)
+    monkeypatch.setattr(recording_ingest, "open_trace", open_trace)
     config = Config(egos=("5", "1", "nobody"), exclude_ids=("2", "somebody"))
 
     outcomes = ingest(tmp_path / "s.db", [crowd], config=config)

@@ -28,7 +28,7 @@ from opendrive_maps import (
     width,
 )
 
-from sgstore.base.columns import chained
+from sgstore.base.tables import chained
 from sgstore.maps.opendrive import read_map
 from sgstore.maps.roads import OFF_ROAD, LaneHits, MapNodes, Ribbons, RoadMap, edges_of
 from sgstore.model.vocabulary import KINDS

@@ -12,7 +12,7 @@ import pytest
 from scenes import Scene, actor, along, ego, path, store_of, street
 
 from sgstore.apps.cli import run
-from sgstore.base.columns import taken
+from sgstore.base.tables import taken
 from sgstore.errors import QueryError, StoreError
 from sgstore.ingest import ingest
 from sgstore.query import Store

@@ -23,7 +23,7 @@ import numpy as np
 from sgstore.apps.explorer import PAGE, Reads, answer, as_json, packed
 from sgstore.base.files import write_bytes
 from sgstore.errors import SgstoreError
-from sgstore.model.notes import NotesFile
+from sgstore.model.user_notes import NotesFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

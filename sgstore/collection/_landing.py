@@ -24,9 +24,9 @@ from sgstore.ingest import BLOCK_FRAMES, Workers
 from sgstore.maps.map_files import Maps
 from sgstore.mcap import digest_of, mark_of
 from sgstore.model.config import Config
-from sgstore.model.trace_parts import TracePart
+from sgstore.model.trace_sampling import TracePart
 from sgstore.model.vocabulary import natural
-from sgstore.pipeline.segments import Job, SegmentReader, TraceOutcome
+from sgstore.pipeline.recording_ingest import Job, SegmentReader, TraceOutcome
 from sgstore.store import (
     Sealed,
     StoreFile,

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from sgstore.base.columns import chained
 from sgstore.base.geometry import wrapped
+from sgstore.base.tables import chained
 from sgstore.model.graph import (
     Edges,
     LaneDistances,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 
-from sgstore.base.columns import taken
+from sgstore.base.tables import taken
 from sgstore.model.pair_numbers import UNEVEN
 from sgstore.model.vocabulary import MOST_RELATIONS, RELATION_CODE, RELATIONS, SIGNALS
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from sgstore.base.columns import taken
 from sgstore.base.geometry import wrapped
+from sgstore.base.tables import taken
 from sgstore.mcap import Findings, Loss
 
 if TYPE_CHECKING:

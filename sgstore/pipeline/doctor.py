@@ -15,7 +15,7 @@ from sgstore.maps.map_files import Maps, lost_lanes
 from sgstore.mcap import Loss, near
 from sgstore.model.config import Config
 from sgstore.model.world import BUCKET_FRAMES, TraceReport
-from sgstore.pipeline.segments import TraceTally
+from sgstore.pipeline.recording_ingest import TraceTally
 from sgstore.readers import on_map, open_recording, open_trace
 
 
@@ -49,7 +49,7 @@ class Examination:
     clock_jumps, gaps : int
         Number of backward steps of the clock, and of steps longer than 2.5 periods.
     clock_jumps_at, gaps_at : list of dict
-        The first of them, as in :meth:`sgstore.pipeline.segments.TraceTally.as_dict`.
+        The first of them, as in :meth:`sgstore.pipeline.recording_ingest.TraceTally.as_dict`.
     warnings : list of str
         Oddities without loss of data.
     losses : list of Loss

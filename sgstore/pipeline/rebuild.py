@@ -27,7 +27,7 @@ from sgstore.store import StoreFile, named_as, remains_of, take_place
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
 
-    from sgstore.pipeline.segments import Progress
+    from sgstore.pipeline.recording_ingest import Progress
     from sgstore.store import OldMap, OldTrace, Remains
 
 

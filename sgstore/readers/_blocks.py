@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, Generic, NamedTuple, TypeAlia
 
 import numpy as np
 
-from sgstore.base.columns import chained, taken
+from sgstore.base.tables import chained, taken
 from sgstore.mcap import IDS, Loss
 from sgstore.model.vocabulary import KIND_CODE, KINDS
 from sgstore.model.world import (

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.columns import ascending
 from sgstore.base.quoting import quoted
+from sgstore.base.tables import ascending
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import NAMES
 from sgstore.store._packing import FRAME_BITS, MISSING, packed

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from sgstore.base.columns import ascending, taken
+from sgstore.base.tables import ascending, taken
 from sgstore.model.world import (
     BUCKET_FRAMES,
     GAP,

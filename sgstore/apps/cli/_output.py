@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import TextIO
 
-    from sgstore.pipeline.segments import Progress
+    from sgstore.pipeline.recording_ingest import Progress
 
 
 @contextmanager

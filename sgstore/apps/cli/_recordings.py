@@ -35,7 +35,7 @@ from sgstore.errors import StoreError, place_named
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 
-    from sgstore.pipeline.segments import TraceOutcome
+    from sgstore.pipeline.recording_ingest import TraceOutcome
     from sgstore.store import StoreFile
 
 PANEL: Final = "Recordings"

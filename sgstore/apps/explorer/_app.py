@@ -27,7 +27,7 @@ from sgstore.apps.explorer._wire import PAGE, as_json
 from sgstore.apps.sandbox import Errand, SandboxPool
 from sgstore.base.quoting import is_statement
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
-from sgstore.model.notes import Note, NotesFile, write_table
+from sgstore.model.user_notes import Note, NotesFile, write_table
 from sgstore.query import Store
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sgstore.base.columns import ascending
+from sgstore.base.tables import ascending
 from sgstore.graphs.abstractions._columns import ego_lanes, found
 from sgstore.graphs.abstractions._subsets import OF_JUNCTION
 from sgstore.model.vocabulary import MOST_RELATIONS, RELATION_CODE

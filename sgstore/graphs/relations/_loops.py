@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sgstore.base.compiled import compiled
+from sgstore.base.numba_loops import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

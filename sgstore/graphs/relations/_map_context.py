@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sgstore.base.columns import chained, taken
+from sgstore.base.tables import chained, taken
 from sgstore.errors import ConfigError
 from sgstore.graphs.relations._following import (
     Centrelines,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base.compiled import worth
+from sgstore.base.numba_loops import worth
 from sgstore.graphs.relations._scene import (
     CHUNK,
     IS_SIGNAL,

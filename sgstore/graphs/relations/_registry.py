@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from sgstore.base import plugins
-from sgstore.base.columns import taken
+from sgstore.base.tables import taken
 from sgstore.errors import ConfigError
 from sgstore.graphs.relations._bearing import sector
 from sgstore.graphs.relations._proximity import rung

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.columns import taken
-from sgstore.base.compiled import worth
 from sgstore.base.geometry import bearings
+from sgstore.base.numba_loops import worth
+from sgstore.base.tables import taken
 from sgstore.model.graph import Edges
 from sgstore.model.pair_numbers import STOREY, TOUCH, UPRIGHT, all_level, climb, gap, low_and_high
 from sgstore.model.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES

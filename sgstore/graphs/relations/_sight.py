@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base.compiled import worth
 from sgstore.base.geometry import corners, wrapped
+from sgstore.base.numba_loops import worth
 from sgstore.graphs.relations._scene import (
     IS_SIGNAL,
     Relation,

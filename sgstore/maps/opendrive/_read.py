@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import shapely
 
-from sgstore.base.columns import chained
+from sgstore.base.tables import chained
 from sgstore.errors import MapError
 from sgstore.maps.opendrive._document import Document, Record, Spoiled, read_document
 from sgstore.maps.opendrive._lanes import heights, odd_sections, read_lanes, read_plan_view, surface

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.columns import chained
+from sgstore.base.tables import chained
 from sgstore.maps.opendrive._document import coefficients_of, cubic, last_before
 from sgstore.maps.opendrive._lanes import PlanView, poses
 from sgstore.maps.opendrive._network import END, FIRST_LANE, START, junction_of, speed

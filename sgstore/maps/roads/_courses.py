@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base.columns import taken
+from sgstore.base.tables import taken
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base.columns import chained
-from sgstore.base.compiled import worth
+from sgstore.base.numba_loops import worth
+from sgstore.base.tables import chained
 from sgstore.maps.roads._ribbons import Ribbons, wrapped
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import shapely
 
-from sgstore.base.columns import chained
+from sgstore.base.tables import chained
 from sgstore.maps.roads._courses import lane_courses
 from sgstore.maps.roads._map import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap, turn_words
 from sgstore.maps.roads._places import broad_lines

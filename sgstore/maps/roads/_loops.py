@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sgstore.base.compiled import compiled
+from sgstore.base.numba_loops import compiled
 
 if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, Ints

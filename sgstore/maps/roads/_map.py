@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sgstore.base.columns import taken
+from sgstore.base.tables import taken
 from sgstore.maps.roads._courses import LaneCourses
 from sgstore.maps.roads._footprints import LaneIndex
 from sgstore.maps.roads._places import (

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import shapely
 
-from sgstore.base.columns import chained
+from sgstore.base.tables import chained
 from sgstore.maps.roads._ribbons import centre_lines
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import shapely
 
-from sgstore.base.columns import chained
+from sgstore.base.tables import chained
 from sgstore.errors import MapError
 
 if TYPE_CHECKING:

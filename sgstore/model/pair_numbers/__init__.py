@@ -14,7 +14,15 @@ with the usual symbols of the literature (``v1``, ``a2``).
 """
 
 from sgstore.model.pair_numbers._arrays import COLUMNS, PairNumbers, gap
-from sgstore.model.pair_numbers._declared import PairFunction
+from sgstore.model.pair_numbers._lane_numbers import (
+    COURSES,
+    LANE_DIST,
+    NEXT_PARTS,
+    OF_ONE,
+    PART_DIST,
+    WAYS,
+    as_written,
+)
 from sgstore.model.pair_numbers._levels import (
     HUNG,
     OPTIONAL,
@@ -27,6 +35,7 @@ from sgstore.model.pair_numbers._levels import (
     low_and_high,
     low_and_high_sql,
 )
+from sgstore.model.pair_numbers._pair_function import PairFunction
 from sgstore.model.pair_numbers._table import (
     MARKS,
     PAIR_FUNCTIONS,
@@ -37,15 +46,6 @@ from sgstore.model.pair_numbers._table import (
     pairs_view,
     parts_of,
     stage_of,
-)
-from sgstore.model.pair_numbers._ways import (
-    COURSES,
-    LANE_DIST,
-    NEXT_PARTS,
-    OF_ONE,
-    PART_DIST,
-    WAYS,
-    as_written,
 )
 
 __all__ = [

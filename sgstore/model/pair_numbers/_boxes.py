@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from sgstore.model.pair_numbers._declared import PairFunction
+from sgstore.model.pair_numbers._lane_numbers import LANE_DIST
 from sgstore.model.pair_numbers._levels import GRADE, STEEPEST, STOREY, TOUCH
-from sgstore.model.pair_numbers._ways import LANE_DIST
+from sgstore.model.pair_numbers._pair_function import PairFunction
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from sgstore.model.pair_numbers._declared import PairFunction
+from sgstore.model.pair_numbers._pair_function import PairFunction
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

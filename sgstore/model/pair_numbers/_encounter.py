@@ -6,12 +6,12 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from sgstore.model.pair_numbers._boxes import BEYOND, GAP
-from sgstore.model.pair_numbers._declared import measure
+from sgstore.model.pair_numbers._pair_function import measure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from sgstore.model.pair_numbers._declared import PairFunction
+    from sgstore.model.pair_numbers._pair_function import PairFunction
 
 _EGGERT: Final = "Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014"
 _MOVED: Final = re.compile(r"\b(lon|lat|back|side|(?:out|past|square)[1-4])\b")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from sgstore.model.pair_numbers._declared import measure
+from sgstore.model.pair_numbers._pair_function import measure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from sgstore.model.pair_numbers._declared import PairFunction
+    from sgstore.model.pair_numbers._pair_function import PairFunction
 
 NUMBERS: Final[Mapping[str, PairFunction]] = {
     "ttk": measure(

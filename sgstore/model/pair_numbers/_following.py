@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from sgstore.model.pair_numbers._declared import measure
 from sgstore.model.pair_numbers._levels import TOUCH
+from sgstore.model.pair_numbers._pair_function import measure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from sgstore.model.pair_numbers._declared import PairFunction
+    from sgstore.model.pair_numbers._pair_function import PairFunction
 
 _AHEAD: Final = "NULL where b is not ahead in a's way"
 _JANSSON: Final = "Jansson, Collision Avoidance Theory, 2005"

@@ -12,15 +12,15 @@ import sgstore.model.pair_numbers._crossing as crossing
 import sgstore.model.pair_numbers._encounter as encounter
 import sgstore.model.pair_numbers._evading as evading
 import sgstore.model.pair_numbers._following as following
-import sgstore.model.pair_numbers._mild as mild
 import sgstore.model.pair_numbers._rss as rss
+import sgstore.model.pair_numbers._ttc_mild as mild
+from sgstore.model.pair_numbers._lane_numbers import WAYS
 from sgstore.model.pair_numbers._levels import OPTIONAL, UNEVEN, low_and_high_sql
-from sgstore.model.pair_numbers._ways import WAYS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from sgstore.model.pair_numbers._declared import PairFunction
+    from sgstore.model.pair_numbers._pair_function import PairFunction
 
 # New columns are appended.
 _FAMILIES: Final = (boxes, encounter, following, crossing, rss, evading, mild, contact)

@@ -2,9 +2,9 @@
 
 Types for the progress and the outcome of an ingest.
 
-``python -m sgstore.pipeline.segments`` is a worker process that reads recordings for its parent process. Input
-(stdin) and output (stdout) have one JSON value per line. The first input is the job; each further input is a
-recording. The outputs are progress and outcomes. The process ends at once when stdin ends.
+``python -m sgstore.pipeline.recording_ingest`` is a worker process. It reads recordings for its parent process.
+Input (stdin) and output (stdout) have one JSON value per line. The first input is the job, each further one
+a recording. The outputs are progress and outcomes. The process ends at once when stdin ends.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sgstore.graphs.relations import Crowds, renamed
 from sgstore.maps.map_files import Maps, lost_lanes
 from sgstore.mcap import Loss, check_name, near
 from sgstore.model.config import ALL_EGOS, Config, from_dict
-from sgstore.model.trace_parts import TracePart
+from sgstore.model.trace_sampling import TracePart
 from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled
 from sgstore.model.world import longest_step_ns
 from sgstore.readers import on_map, open_trace

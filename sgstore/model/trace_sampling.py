@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base.columns import chained, taken
+from sgstore.base.tables import chained, taken
 from sgstore.errors import TraceError
 from sgstore.model.world import TOLERANCE_NS, FrameBlock
 
