@@ -85,7 +85,7 @@ REMEMBERED: Final = 100_000
 """Largest number of cached transitions before a reset."""
 
 Duties = tuple["frozenset[Term] | Term | None", ...]
-"""Open obligations of each part of a formula: a list for an ``ALWAYS``, else one term."""
+"""Open obligations of each part of a formula: a set for an ``ALWAYS``, else one term."""
 
 
 class ObligationState:
