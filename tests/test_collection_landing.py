@@ -23,7 +23,7 @@ from sgstore.apps.cli import run as run_verb
 from sgstore.collection import Collection, commit, gc, land, pack, rebuild, verify
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _landing as landing
-from sgstore.collection import _place as places
+from sgstore.collection import _storage as places
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.query import Store

@@ -31,7 +31,7 @@ from sgstore.collection import (
     unpack,
     verify,
 )
-from sgstore.collection import _place as places
+from sgstore.collection import _storage as places
 from sgstore.errors import StoreError, TraceError, place_named
 from sgstore.ingest import ingest, recordings
 from sgstore.query import Store

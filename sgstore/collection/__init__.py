@@ -1,7 +1,7 @@
 """Collections of stores: the same queries over several stores and machines.
 
 A collection is a folder, or a prefix in an object store. It has *bundles*, which are immutable
-stores of some hundreds of traces, and a *catalogue* of their contents. ``_place`` reads and writes
+stores of some hundreds of traces, and a *catalogue* of their contents. ``_storage`` reads and writes
 such places, ``_catalogue`` the snapshots of the catalogue. ``_pack`` makes bundles of stores and of
 landed segments, and maintains them.
 
@@ -14,7 +14,6 @@ from sgstore.collection._frames import CollectionFrames
 from sgstore.collection._landing import commit, land
 from sgstore.collection._open import open
 from sgstore.collection._pack import CollectionFaults, Commit, Garbage, gc, pack, unpack, verify
-from sgstore.collection._place import ABOUT
 from sgstore.collection._questions import (
     Collection,
     PartedChecks,
@@ -24,6 +23,7 @@ from sgstore.collection._questions import (
     PartialAnswerError,
 )
 from sgstore.collection._remake import rebuild
+from sgstore.collection._storage import ABOUT
 
 __all__ = [
     "ABOUT",

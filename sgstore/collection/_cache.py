@@ -14,11 +14,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sgstore.collection._place import digest_of_file
+from sgstore.collection._storage import digest_of_file
 from sgstore.errors import StoreError
 
 if TYPE_CHECKING:
-    from sgstore.collection._place import Place
+    from sgstore.collection._storage import Place
 
 CACHE: Final = "SGSTORE_CACHE"
 """Environment variable: the folder for fetched bundles."""

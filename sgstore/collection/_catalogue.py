@@ -16,7 +16,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.files import working_folder
-from sgstore.collection._place import ABOUT, MissingObjectError, digest_of_file
+from sgstore.collection._storage import ABOUT, MissingObjectError, digest_of_file
 from sgstore.errors import ExportError, StoreError
 from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts, Type, own_type
 from sgstore.model.vocabulary import NAMES, natural
@@ -34,7 +34,7 @@ from sgstore.store import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from sgstore.collection._place import Place
+    from sgstore.collection._storage import Place
     from sgstore.lang.catalog import Triple
     from sgstore.store import Facts
 

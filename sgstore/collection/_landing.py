@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.base.files import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._pack import ATTEMPTS, Commit, groups, map_names, put_bundle
-from sgstore.collection._place import digest_of_file, place_at
+from sgstore.collection._storage import digest_of_file, place_at
 from sgstore.errors import SgstoreError, StoreError, TraceError, url_named
 from sgstore.ingest import BLOCK_FRAMES, Workers
 from sgstore.maps.map_files import Maps
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from sgstore.collection._catalogue import Snapshot
-    from sgstore.collection._place import Place
+    from sgstore.collection._storage import Place
     from sgstore.store import Facts
 
 FILES: Final = ("sealed.json", "tables")

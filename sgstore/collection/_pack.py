@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.base.files import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._cache import bundle_path
-from sgstore.collection._place import digest_of_file, place_at
+from sgstore.collection._storage import digest_of_file, place_at
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.vocabulary import natural
 from sgstore.store import (
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from sgstore.collection._catalogue import About, Snapshot
-    from sgstore.collection._place import Place
+    from sgstore.collection._storage import Place
     from sgstore.store import Facts
 
 ATTEMPTS: Final = 100

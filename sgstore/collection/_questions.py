@@ -26,7 +26,7 @@ from sgstore.collection import _worker as worker
 from sgstore.collection._engines import engine_named, fault_of_question
 from sgstore.collection._frames import CollectionFrames
 from sgstore.collection._pack import refuse_others
-from sgstore.collection._place import place_at
+from sgstore.collection._storage import place_at
 from sgstore.errors import QueryError, SqlError, StoreError
 from sgstore.lang.bind import CLASSES_GIVEN
 from sgstore.lang.catalog import TableFacts, Type

@@ -9,7 +9,7 @@ from sgstore.base.files import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._cache import bundle_path
 from sgstore.collection._pack import ATTEMPTS, put_bundle
-from sgstore.collection._place import place_at
+from sgstore.collection._storage import place_at
 from sgstore.errors import StoreError
 from sgstore.pipeline.rebuild import rebuild as rebuild_store
 from sgstore.store import maps_of_traces, names_of_traces
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from sgstore.collection._place import Place
+    from sgstore.collection._storage import Place
     from sgstore.store import Facts
 
 

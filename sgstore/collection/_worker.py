@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.base.files import working_folder
 from sgstore.collection._cache import bundle_path
-from sgstore.collection._place import place_at
+from sgstore.collection._storage import place_at
 from sgstore.errors import StoreError
 from sgstore.lang.catalog import Type
 from sgstore.lang.sql import Compiled

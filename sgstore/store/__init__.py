@@ -2,10 +2,10 @@
 
 Reading: ``_file`` has the main class, :class:`StoreFile`. ``_locking`` shares the file between readers and
 writers, and ``_schema`` checks it against ``schema.sql`` before the first read. ``_rows`` runs SQL statements
-and converts their rows; ``_given`` creates their temporary tables, and ``_steps`` makes them interruptible.
-``_traces`` finds traces and frames by name, ``_graphs`` reads graphs, ``_catalog`` describes the store for the
-query compiler, ``_joins`` joins user tables, ``_encounters`` computes measures of later encounters, and
-``_contents`` computes digests of frames.
+and converts their rows; ``_temporary_tables`` creates their temporary tables, and ``_interrupts`` makes them
+interruptible. ``_traces`` finds traces and frames by name, and ``_graphs`` reads graphs. ``_catalog`` describes
+the store for the query compiler. ``_joins`` joins user tables, ``_encounters`` computes measures of later
+encounters, and ``_contents`` computes digests of frames.
 
 Writing: ``_packing`` converts the graphs of a block to columns and masks. ``_write`` builds a trace outside the
 store, as arrays in a file of ``_staging``; ``_columns`` sorts them and computes checksums. ``_payloads`` joins
@@ -13,8 +13,8 @@ messages to frames, and ``_publish`` adds the trace to the store. ``_classes`` a
 adds derived sets of relations; ``_similarity`` compares frames. ``_verify`` verifies a store; ``_rebuild``
 creates and rewrites stores.
 
-Collections: ``_bundles`` copies traces into new stores and describes their content, ``_landed`` keeps segments
-before that, and ``_merge`` merges the results of several bundles.
+Collections: ``_bundles`` copies traces into new stores and describes their content, ``_inbox_segments`` keeps
+segments before that, and ``_merge`` merges the results of several bundles.
 """
 
 from sgstore.store._bundles import (
@@ -43,9 +43,8 @@ from sgstore.store._contents import (
 )
 from sgstore.store._encounters import measured
 from sgstore.store._file import StoreFile
-from sgstore.store._given import Given, GivenTable
+from sgstore.store._inbox_segments import split_segment, whole_segment
 from sgstore.store._joins import UserTables
-from sgstore.store._landed import split_segment, whole_segment
 from sgstore.store._locking import Folder, refuse_name
 from sgstore.store._merge import (
     PartFile,
@@ -78,6 +77,7 @@ from sgstore.store._rows import (
 from sgstore.store._schema import SCHEMA_VERSION
 from sgstore.store._similarity import Example, SimilarFrames, example_of, frames_like, most_like
 from sgstore.store._staging import Sealed
+from sgstore.store._temporary_tables import Given, GivenTable
 from sgstore.store._traces import (
     FrameRef,
     Identity,

@@ -21,9 +21,9 @@ from duckdb.func import FunctionNullHandling
 
 from sgstore.errors import ConfigError
 from sgstore.model.criticality import FIXED_KINDS, KNOWN, RECORDED, TRACKS, tracks_of
+from sgstore.store._interrupts import interrupted
 from sgstore.store._lease import stamp_of
 from sgstore.store._schema import INSIDE
-from sgstore.store._steps import interrupted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable

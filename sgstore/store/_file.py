@@ -18,7 +18,6 @@ import sgstore.store._rows as rows
 from sgstore.errors import SgstoreError, StoreError, TraceError
 from sgstore.model.world import Channel, MessageRefs
 from sgstore.store._encounters import recorded_measures
-from sgstore.store._given import Given, give
 from sgstore.store._locking import (
     WAIT_S,
     Access,
@@ -29,6 +28,7 @@ from sgstore.store._locking import (
     translated,
 )
 from sgstore.store._rows import BATCH, Batches, Rows
+from sgstore.store._temporary_tables import Given, give
 from sgstore.store._traces import (
     FrameRef,
     Identity,
@@ -478,14 +478,14 @@ class StoreFile:
         Returns
         -------
         frames, states : dict of str to array
-            See :mod:`sgstore.store._states`.
+            See :mod:`sgstore.store._state_columns`.
 
         Raises
         ------
         StoreError
             The trace does not exist, or these are too many frames at once.
         """
-        from sgstore.store._states import frame_times, states_between
+        from sgstore.store._state_columns import frame_times, states_between
 
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
@@ -494,14 +494,14 @@ class StoreFile:
 
     def states_at(self, frames: Sequence[tuple[int, int]]) -> Columns:
         """Return states in frames given as (trace id, number). Column ``at`` is the index of the frame."""
-        from sgstore.store._states import states_at
+        from sgstore.store._state_columns import states_at
 
         with self.access.reading() as connection:
             return states_at(connection, frames)
 
     def scenery(self, trace: int | str) -> Columns:
         """Return the static entities of a trace, without its road map, as plain columns."""
-        from sgstore.store._states import scenery
+        from sgstore.store._state_columns import scenery
 
         with self.access.reading() as connection:
             return scenery(connection, trace_named(connection, str(trace))[0])
@@ -516,7 +516,7 @@ class StoreFile:
         StoreError
             The trace or value does not exist.
         """
-        from sgstore.store._states import series
+        from sgstore.store._state_columns import series
 
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
@@ -525,14 +525,14 @@ class StoreFile:
 
     def entity_names(self, trace: int | str) -> dict[int, tuple[str, ...]]:
         """Return kind, simulator id and type name of each entity of a trace, by node id."""
-        from sgstore.store._states import names_of_nodes
+        from sgstore.store._state_columns import names_of_nodes
 
         with self.access.reading() as connection:
             return names_of_nodes(connection, trace_named(connection, str(trace))[0])
 
     def places(self) -> dict[str, tuple[float, float, str, list[str]]]:
-        """Return origin, map digest and cameras of each trace; see ``_states``."""
-        from sgstore.store._states import places
+        """Return origin, map digest and cameras of each trace; see ``_state_columns``."""
+        from sgstore.store._state_columns import places
 
         with self.access.reading() as connection:
             return places(connection)
@@ -547,7 +547,7 @@ class StoreFile:
 
     def codes(self) -> dict[str, list[str]]:
         """Return the names of kinds and light states, indexed by their code in plain columns."""
-        from sgstore.store._states import kinds_of
+        from sgstore.store._state_columns import kinds_of
 
         with self.access.reading() as connection:
             return kinds_of(connection)

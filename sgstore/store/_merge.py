@@ -18,13 +18,13 @@ import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import NAMES
+from sgstore.store._interrupts import interruptible
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import shared_instance
 from sgstore.store._locking import default_memory, spill_folder, translated
 from sgstore.store._packing import SEQ_BITS
 from sgstore.store._rows import Batches, arrays, write_parquet
 from sgstore.store._staging import scratch
-from sgstore.store._steps import interruptible
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Mapping, Sequence

@@ -20,10 +20,10 @@ from sgstore.base.files import without_controls, working_folder, written_at, wri
 from sgstore.base.json_text import shortest
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import ExportError, MissingExtraError, SqlError
-from sgstore.store._given import Given, give
+from sgstore.store._interrupts import interrupt, interruptible
 from sgstore.store._locking import EngineError, engine_fault, spill_fault
 from sgstore.store._schema import INSIDE, expected
-from sgstore.store._steps import interrupt, interruptible
+from sgstore.store._temporary_tables import Given, give
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterator, Sequence

@@ -11,7 +11,7 @@ continues. :func:`_lost` catches the report and raises the interruption again a 
 
 Python handles a signal only between its own steps. One step of the database can take very long;
 therefore the main thread only waits for a worker thread: see ``interruptible`` of
-:mod:`sgstore.store._steps`.
+:mod:`sgstore.store._interrupts`.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ process reads states, pictures and graphs by trace and frame.
 
 from sgstore.apps.explorer._app import Explorer, application
 from sgstore.apps.explorer._live import LiveRun, live_application
-from sgstore.apps.explorer._reads import Reads
 from sgstore.apps.explorer._serve import serve, serve_live
+from sgstore.apps.explorer._store_reader import Reads
 from sgstore.apps.explorer._wire import PAGE, as_json, packed
 from sgstore.apps.explorer._worker import answer
 

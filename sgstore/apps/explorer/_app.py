@@ -21,8 +21,8 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from sgstore.apps.explorer._guard import Guard
-from sgstore.apps.explorer._reads import READS, Reads
 from sgstore.apps.explorer._requests import RequestError, fields_of, one_of, taken
+from sgstore.apps.explorer._store_reader import READS, Reads
 from sgstore.apps.explorer._wire import PAGE, as_json
 from sgstore.apps.sandbox import Errand, SandboxPool
 from sgstore.base.quoting import is_statement

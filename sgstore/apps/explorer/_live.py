@@ -21,8 +21,8 @@ from starlette.responses import Response, StreamingResponse
 
 from sgstore.apps.explorer._app import answered, application_of, page_of
 from sgstore.apps.explorer._guard import Guard
-from sgstore.apps.explorer._reads import drawn_map, shown_picture, told_graph
 from sgstore.apps.explorer._requests import fields_of, taken
+from sgstore.apps.explorer._store_reader import drawn_map, shown_picture, told_graph
 from sgstore.apps.explorer._wire import as_json, packed
 from sgstore.base.json_text import finite
 from sgstore.errors import QueryNameError, StoreError

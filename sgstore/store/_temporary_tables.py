@@ -14,7 +14,7 @@ import numpy as np
 
 from sgstore.base.quoting import quoted
 from sgstore.store._encounters import show_recorded
-from sgstore.store._steps import interruptible
+from sgstore.store._interrupts import interruptible
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
