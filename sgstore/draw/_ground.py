@@ -89,7 +89,7 @@ class GroundView:
         return dict(zip(rows, levels.tolist(), strict=True))
 
     def cover(self, places: Floats, z: Floats) -> Floats:
-        """Return the height of the highest lane above places (N, 2) at heights z; m. -inf without a lane.
+        """Return how far the highest lane is above places (N, 2) at heights z; m. -inf without a lane.
 
         The height of a lane is that of its nearest cross section.
         """

@@ -67,7 +67,7 @@ def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Repl
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Yield the first part that fails in a frame, and parameter values that would match."""
+    """Yield the first part that fails in a frame, and changed numbers with which it would hold."""
     text, values, frame = question["text"], question["parameters"], question["frame"]
     answer = store.why_not(frame, text, **values)
     steps = answer.steps if isinstance(answer, WhyNotSteps) else (answer,)

@@ -521,7 +521,7 @@ class Parking:
 
     @property
     def parked(self) -> Codes:
-        """Return the parked state of each entity within graphs: 1 parked, 0 not parked, -1 unknown."""
+        """Return the parked state of each entity in graphs: 1 parked, 0 not, -1 unknown or no vehicle."""
         return self._parked(0)
 
     @property

@@ -302,7 +302,7 @@ def novel_clips(a: Classed, than: Classed) -> ReportTable:
 
 
 def venn(a: Classed, b: Classed) -> ReportTable:
-    """Return the intersection of two selections, by class and by frame.
+    """Return the sizes of intersection, differences and union of two selections.
 
     Returns
     -------

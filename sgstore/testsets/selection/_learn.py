@@ -182,7 +182,7 @@ def fitted(x: Singles, failed: Bools, asked: Singles, seed: int) -> Floats:
 
 
 def _logistic(x: Singles, failed: Bools, asked: Singles) -> Floats:
-    """Return a logistic regression on ranks by Newton's method, with an L2 penalty."""
+    """Predict failures by a logistic regression on ranks (Newton's method, L2 penalty)."""
     columns = [np.sort(column[~np.isnan(column)]) for column in x.T]
     known = _ranked(x, columns)
     weights, penalty = np.zeros(known.shape[1]), np.ones(known.shape[1])
