@@ -32,7 +32,7 @@ print(0 < store.find("MATCH (e:Ego)-[:besides]-(v:Vehicle)").count() < edges)
 """
 
 
-@pytest.mark.parametrize(("verb", "title"), [("ingest", "goes in"), ("find", "is answered")])
+@pytest.mark.parametrize(("verb", "title"), [("ingest", "Ingest"), ("find", "Query")])
 def test_a_walk_through_the_house_is_the_way_that_it_takes(
     verb: str, title: str, town_store: Path, tmp_path: Path
 ) -> None:
