@@ -156,7 +156,7 @@ class SceneGraphGenerator:
 
     @property
     def world_parked(self) -> Codes:
-        """Parking state as in :attr:`parked`, but including the surroundings of the graphs."""
+        """Parking state of each entity as in :attr:`parked`, including entities near but outside the graphs."""
         return self._parking.world_parked
 
     def pieces(self, frames: FrameBlock, egos: int = 1) -> Iterator[FrameBlock]:
@@ -298,7 +298,7 @@ class SceneGraphGenerator:
 
     @staticmethod
     def _uneven(known: Bodies) -> int:
-        """Return the ``UNEVEN`` bits of the bodies: flat bodies, different storeys, carried bodies."""
+        """Return the bits of ``UNEVEN`` for the bodies: flat bodies, different storeys, carried bodies."""
         flat = ~IS_UPRIGHT[known.kind] & (known.height == 0)
         low, high = known.low_and_high
         near = known.moves | IS_USER[known.kind]
@@ -377,7 +377,7 @@ class SceneGraphGenerator:
     def _world_of(
         self, view: _View, whole: _World | None, ground: MapContext | None, edges: Edges
     ) -> WorldBlock | None:
-        """Return the surroundings of one ego's graphs. ``ground`` and ``edges`` belong to the graphs."""
+        """Return the surroundings of one ego's graphs: known entities outside the graphs, but near the ego."""
         beyond = view.beyond
         if beyond is None or whole is None:
             return None
@@ -537,7 +537,7 @@ class SceneGraphGenerator:
         return dict(zip(lanes.tolist(), roles, strict=True))
 
     def _seen(self, number: int) -> GraphColumns:
-        """Return a graph of the last step in the form for abstractions."""
+        """Return a graph of the last step in the column form that abstractions need."""
         if self._online is None or self._online.last is None:
             raise ValueError("there was no step yet")
         graphs, kinds = self._online.last
@@ -601,7 +601,7 @@ class SceneGraphGenerator:
         return held & self._wanted(states.node, kind)
 
     def _bodies(self, frames: FrameBlock, keys: Ints) -> Bodies:
-        """Return the states of a block and its scenery as rows of one table."""
+        """Return the moving entities of a block and the static scenery as rows of one table."""
         states, scenery = frames.states, self._scenery
         count = int(np.searchsorted(keys, len(states)))
         rows = keys[:count]
@@ -666,7 +666,7 @@ class _View:
 
 @dataclass(frozen=True, slots=True)
 class _Beyond:
-    """Surroundings of the graphs of one ego: ``frames`` with their states, their areas and row keys."""
+    """Surroundings of one ego's graphs: known entities outside the graphs, but near the ego."""
 
     frames: FrameBlock
     areas: Areas
@@ -743,7 +743,7 @@ def _of_codes(edges: Edges, codes: tuple[int, ...]) -> Edges:
 
 
 def _rows_apart(one: Edges, other: Edges) -> tuple[Rows, Rows]:
-    """Return the rows of the first edges that the second lack, and the other way round."""
+    """Return the rows of the edges that only the first table has, and of those that only the second has."""
     a, b = _keys(*((of.frame, of.relation, of.src, of.dst) for of in (one, other)))
     return (
         np.flatnonzero(~_in_ascending(np.sort(b), a)),

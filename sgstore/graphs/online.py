@@ -1,6 +1,6 @@
 """Online generation of scene graphs, frame by frame.
 
-Also the frame type, built from plain values by a client or from a recording.
+Frames are built from plain values by a client, or from a recording.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Entity(NamedTuple):
         return self.kind, self.special, self.subkind
 
     def meant(self, told: TypeMeaning | None) -> Entity:
-        """Return the entity with the kind of its configured type meaning; unchanged for ``None``."""
+        """Return the entity with the kind in the type mapping; unchanged for ``None``."""
         if told is None:
             return self
         kind = KIND_CODE[told.kind]
@@ -147,7 +147,7 @@ class Frame:
         return len(self.entities)
 
     def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
-        """Return the frame with the configured kinds of its type names (lower case)."""
+        """Return the frame after applying the configured type mapping to its entities."""
         if not types:
             return self
         frame = Frame(self.time_ns, self.ego)
@@ -481,7 +481,7 @@ class Records:
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:
-        """Store the attributes of a static entity, whose pose comes only once."""
+        """Store the attributes of a static entity, because its pose is given only once."""
         numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
         numbers["heading"] = _degrees(states.heading[row : row + 1])[0]
         about = known.attributes(is_ego=False, is_static=True)
@@ -521,7 +521,7 @@ class Records:
         outer: Ints,
         known: dict[int, EntityConstants],
     ) -> SceneGraph:
-        """Return the scene graph for several parts: the graph, and optionally its surroundings."""
+        """Return the scene graph of one or more parts, for example with its surroundings."""
         frames = graph.frames
         states = chained([part.frames.states for part in parts])
         presence = chained([part.presence for part in parts])

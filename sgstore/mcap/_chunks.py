@@ -75,7 +75,7 @@ class Recording(Protocol):
 
     @property
     def window(self) -> tuple[int, int]:
-        """First and last log time of messages that can become frames; both included; ns."""
+        """First and last log time of the messages that can become frames, both included; ns."""
         ...
 
     def walk(

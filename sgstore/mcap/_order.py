@@ -132,7 +132,7 @@ class ChannelRanks:
         return self._numbers[channel]
 
     def is_loose(self, channel: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return a mask of the channels whose order at equal times does not matter."""
+        """Return a mask of the channels whose order does not matter for messages of equal time."""
         self._learn()
         return self._loose[channel]
 
@@ -152,7 +152,7 @@ class ChannelRanks:
 
 
 def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Times:
-    """Return the publish times, raised to be ascending within each channel and log time."""
+    """Return the publish times, raised where necessary to ascend within each channel and log time."""
     order = np.lexsort((channel, log_time))  # stable: equal messages keep their place
     log, number, times = log_time[order], channel[order], publish_time[order]
     same = (log[1:] == log[:-1]) & (number[1:] == number[:-1])
@@ -231,9 +231,8 @@ class _IndexBlock:
         ``None`` means all. The entries must be sorted by the key.
         """
         at = len(self.entries) if edge is None else np.searchsorted(self.entries[key], *edge)
-        part = _IndexBlock(
-            self.first, self.entries[:at].copy()
-        )  # A copy, because the block must become smaller.
+        # A copy, because the block must become smaller.
+        part = _IndexBlock(self.first, self.entries[:at].copy())
         if at:
             self.entries = self.entries[at:].copy()
         return part
@@ -307,7 +306,7 @@ class TimeOrder:
             yield _block_of(waiting, first)
 
     def _note(self, run: Messages, keeps: Callable[[int], bool]) -> None:
-        """Record the position of a run, its channels, and the backward steps of log times."""
+        """Record the position and channels of a run, and how far its log times run backwards."""
         for number in np.unique(run.channel).tolist():
             self._kept[number] = keeps(number)
             times = run.log_time_ns[run.channel == number]
@@ -480,7 +479,7 @@ def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> 
 
 
 def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
-    """Return the edges of parts, each with at most about half of the messages that can be sorted at once.
+    """Return key values that divide the messages into parts small enough to sort.
 
     A value with many messages becomes a separate part. The last part begins at the greatest value.
     """

@@ -69,9 +69,8 @@ class Buffers:
             if len(buffer) >= size and _is_free(buffer):
                 return memoryview(buffer)[:size]
         self._kept = [one for one in self._kept if len(one) >= size or not _is_free(one)]
-        grain = max(
-            1 << max(size.bit_length() - 3, 0), 4096
-        )  # Chunks of a file differ slightly in size.
+        # Chunks of a file differ slightly in size.
+        grain = max(1 << max(size.bit_length() - 3, 0), 4096)
         buffer = bytearray(-(-size // grain) * grain)
         if len(self._kept) < MOST_BUFFERS and self.kept + len(buffer) <= MOST_BUFFERED:
             self._kept.append(buffer)
@@ -296,7 +295,7 @@ class Spool:
 
 
 def _reader(starts: dict[int, int], data: memoryview, anew: Callable[[], Read]) -> Read:
-    """Return a reader of message data by position. ``starts`` maps record offsets to offsets in ``data``."""
+    """Return a function that reads message data by position. ``starts``: record offset → offset in ``data``."""
     whole: list[Read] = []
 
     def read(position: int, length: int) -> memoryview:

@@ -222,7 +222,7 @@ class McapFile:
 
     @property
     def window(self) -> tuple[int, int]:
-        """First and last log time of a clip, both included; for other files, the full range; ns.
+        """First and last log time of a clip, both included; ns. For other files: the full range.
 
         A clip also contains earlier or later messages that its own messages depend on.
         """
@@ -446,7 +446,7 @@ class McapFile:
             walk.position = resume
 
     def _chunk(self, walk: _FileWalk, place: RecordPlace, astray: int | None) -> Iterator[Messages]:
-        """Yield the messages of a chunk. ``astray`` is the offset of another listed chunk inside it."""
+        """Yield the messages of a chunk. ``astray``: offset of another listed chunk that starts inside it."""
         if walk.wanted is not None and not walk.wanted(place.offset):
             return
         walk.chunks += 1
@@ -508,7 +508,7 @@ class McapFile:
             yield messages
 
     def _chunk_behind(self, start: int, stop: int) -> int | None:
-        """Return the offset of the first listed chunk after ``start`` and before ``stop``, or ``None``.
+        """Return the offset of the first chunk in the summary between ``start`` and ``stop``, or ``None``.
 
         An offset of the summary counts only if a valid chunk head is at this place.
         """
@@ -521,7 +521,7 @@ class McapFile:
         return None
 
     def _broken(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
-        """Handle a record with an impossible length: continue at the next listed chunk, or end."""
+        """Handle a record with an impossible length. Continue at the next chunk in the summary, or end."""
         resume = self._chunk_behind(walk.position, self.size)
         start = walk.position
         stop = self.size if resume is None else resume
@@ -866,7 +866,7 @@ class McapBag(McapFile):
         return free
 
     def _meant(self, keep: Callable[[int], bool], file: McapFile) -> Callable[[int], bool]:
-        """Return ``keep`` as a function of the channel ids of one file."""
+        """Convert the filter ``keep`` from channel ids of the bag to channel ids of one file."""
         return lambda number: keep(self._own[file.path, number])
 
     def _placed(self, file: McapFile, run: Messages, base: int) -> Messages:

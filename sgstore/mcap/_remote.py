@@ -75,7 +75,7 @@ def _options(url: str) -> dict[str, Any]:
 
 
 def reason_of_object_store(error: BaseException) -> tuple[str, bool]:
-    """Return a one-line reason for an error of an object store, and True if the object is missing."""
+    """Return a one-line reason for an object store error. The second value is True for a missing object."""
     wrong = object_stores().exceptions
     if isinstance(error, FileNotFoundError | wrong.NotFoundError):
         return "no such object, or no such bucket", True

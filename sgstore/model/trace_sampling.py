@@ -93,7 +93,7 @@ class _Clock:
         self.over = False
 
     def within(self, time_ns: int) -> bool:
-        """True if a time is in the part. Frames up to this time must have been processed before."""
+        """True if a time is in the part. Earlier frames must have been processed before."""
         since = (time_ns - (self._zero or 0)) / 1e9
         part = self._part
         return (

@@ -282,7 +282,7 @@ def _covers(old: RangeSettings, new: RangeSettings) -> bool:
 
 
 def _reaches(old: RangeSettings, new: RangeSettings) -> bool:
-    """True if the area of the old range contains that of the new range, without heights."""
+    """True if the area of the old range contains the area of the new range. Heights are ignored."""
     if old.shape == new.shape == "corridor":
         return new.length <= old.length and new.width <= old.width
     if old.shape == "polygon":

@@ -295,7 +295,7 @@ def _steps(
 
 
 def _as_egos(path: Path, views: Sequence[OldTrace]) -> Config:
-    """Return the settings that give the same egos for a recording as before."""
+    """Return settings that give the recording the same egos as before."""
     config = _settings(views[0])
     if len(views) > 1:
         return replace(config, egos=tuple(one.ego for one in views))

@@ -446,7 +446,7 @@ class SegmentReader:
         return found
 
     def _is_new(self, store: StoreFile, view: _EgoView, road_map: RoadMap | None) -> bool:
-        """True if the store lacks the trace of this ego. Otherwise set the outcome."""
+        """True if the store lacks the trace of this ego. Otherwise, set the status of the outcome."""
         job, outcome = self._job, view.outcome
         try:
             shown = map_of_graphs(road_map, job.config)

@@ -119,7 +119,7 @@ BEGINNING: Final = 1_000_000_000
 
 
 def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int = 1) -> int:
-    """Add to a count, and remember its first message. Return the count before."""
+    """Increase a counter, and remember its first message. Return the previous count."""
     before, first = told.get(key, (0, ref))
     told[key] = before + times, first
     return before
@@ -194,7 +194,7 @@ class Survey(Generic[AnyLead]):
         self._window = recording.window
 
     def meet(self, channel: int) -> bool:
-        """True if a channel contains frames or lasting facts. Its messages are then not treated as context.
+        """True if a channel contains frames or facts that stay valid for later frames.
 
         It is called once per channel, before its first message is examined.
         """
@@ -217,7 +217,7 @@ class Survey(Generic[AnyLead]):
         raise NotImplementedError
 
     def rank(self, lead: AnyLead) -> tuple[int, ...]:
-        """Return the sort key of a candidate. The greatest key wins."""
+        """Return the sort key of a possible leading channel. The greatest key wins."""
         return lead.weight, lead.frames
 
     def read(self) -> Self:
@@ -261,13 +261,13 @@ class Survey(Generic[AnyLead]):
                 watched[channel] = self.watches(channel, met=met)
 
     def see_stamp(self, run: Messages, row: int, stamp_ns: int | None) -> None:
-        """Record the time in a message of a candidate channel, if its log time is in the window."""
+        """Record the time in a message of a possible leading channel, if its log time is in the window."""
         log_time, (start, end) = int(run.log_time_ns[row]), self._window
         if start <= log_time <= end:
             self.leads[int(run.channel[row])].stamps.see(log_time, stamp_ns)
 
     def count(self, run: Messages, row: int, weight: int) -> None:
-        """Count a frame of a candidate channel, if its log time is in the window."""
+        """Count a frame of a possible leading channel, if its log time is in the window."""
         log_time, (start, end) = int(run.log_time_ns[row]), self._window
         if start <= log_time <= end:
             lead = self.leads[int(run.channel[row])]
@@ -276,7 +276,7 @@ class Survey(Generic[AnyLead]):
             lead.first_ns = min(lead.first_ns, log_time)
 
     def first_lead(self) -> int:
-        """Return the best candidate channel; -1 if all lack frames. Equal candidates are sorted by topic."""
+        """Return the leading channel, which contains the frames; -1 if all channels lack frames."""
         ranked = [
             ([-number for number in self.rank(lead)], self.topic(channel), channel)
             for channel, lead in self.leads.items()
@@ -296,7 +296,7 @@ class Survey(Generic[AnyLead]):
         return record.topic, record.message_encoding, *named
 
     def shared_stamps(self, channel: int, stamps: Stamps) -> Stamps:
-        """Return the stamps of a candidate channel with the same topic and definition, else ``stamps``."""
+        """Return the stamps of a channel with the same topic and definition, else ``stamps``."""
         leads = self.leads
         return next((leads[one].stamps for one in self.alike(channel) if one in leads), stamps)
 
@@ -341,7 +341,7 @@ class Survey(Generic[AnyLead]):
         report.losses += self.lost.losses()
 
     def once(self, first_ns: int) -> list[Ref]:
-        """Return the messages of channels that have only one message, near the first frame.
+        """Return the messages near the first frame whose channels have no other message.
 
         Such a message, for example a camera calibration, is valid for the whole recording.
         """
@@ -476,7 +476,7 @@ AnySurvey = TypeVar("AnySurvey", bound=Survey[Any])
 
 
 class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
-    """Open recording with a finished first reading.
+    """Open recording whose first reading is complete.
 
     Parameters
     ----------

@@ -251,7 +251,7 @@ class EntityTable:
         return before + len(self._returned) - 1
 
     def turn(self, number: int, lifetime: int, seq: int) -> None:
-        """Record the lifetime of an id that is valid from a frame on."""
+        """Record that an id has a certain lifetime number from a frame on."""
         self._turns.setdefault(self._rows[number].ident, []).append((seq, lifetime))
 
     @property
@@ -260,7 +260,7 @@ class EntityTable:
         return len(self._returned)
 
     def nodes_of(self, numbers: Ints) -> Ints:
-        """Return the node ids of the first entities with some numbers. Negative numbers stay."""
+        """Return the node ids for entity numbers. Negative numbers stay unchanged."""
         if not self._returned:
             return numbers
         places = np.array([place for place, _ in self._returned], np.int64)
@@ -288,7 +288,7 @@ class EntityTable:
         return tuple(events)
 
     def _lifetime(self, ident: str, seq: int) -> int:
-        """Return the lifetime of an id in a frame."""
+        """Return the lifetime number of an id in a frame."""
         turns = self._turns.get(ident, ())
         at = bisect_right(turns, seq, key=itemgetter(0))
         return turns[at - 1][1] if at else 1
@@ -603,7 +603,7 @@ def _block(
     roster: EntityTable,
     known: int,
 ) -> FrameBlock:
-    """Return the block of ``size`` frames in a window that also contains the frames before and after it.
+    """Return the block of ``size`` frames in a window. The window also contains the neighbouring frames.
 
     ``known``: number of entities before the first frame of the next block.
     """
@@ -651,7 +651,7 @@ FIRST_STEPS: Final = 64
 
 
 class LifetimeTracker:
-    """Assignment of node ids and time steps to frames, for ids that are reused by other entities.
+    """Tracker that assigns node ids to frames, also for ids that another entity uses later.
 
     Node ids depend on lifetimes, by the rule of :class:`~sgstore.model.world.Lives`. Most ids have the same
     entity in all frames. They are compared as arrays; only the rows of possibly different entities are
@@ -679,9 +679,8 @@ class LifetimeTracker:
         self._time: int | None = None
         self._seq = self._run = 0
         self._gaps: list[int] = []
-        self._seen = np.zeros(
-            (0, 2), np.int64
-        )  # For each id: time, and run of the clock; -1 if never seen.
+        # For each id: time, and run of the clock; -1 if never seen.
+        self._seen = np.zeros((0, 2), np.int64)
         self._places = np.zeros((0, 3))
         # Node id and lifetime of the entities of each id with a changed kind or a jump.
         self._lives: dict[int, Lives[tuple[int, int]]] = {}
@@ -733,7 +732,7 @@ class LifetimeTracker:
         return step / 1e9 if joined else NAN
 
     def _earlier(self, frames: list[FrameRows], runs: list[int]) -> list[dict[int, Sight | None]]:
-        """Return, for each frame, the rows that may be another entity, with the last place of their id.
+        """Return, for each frame, the rows whose id may have a new entity, with the id's last position.
 
         These are ids with a jump, and ids with a different kind in some frame.
         """
@@ -929,9 +928,8 @@ def derive(
         slopes = slopes_of()
         found = lacking[:, bit] & np.isfinite(slopes).all(axis=1)
         if column == _ACCELERATION:
-            bent = np.isnan(
-                values[rows, _VELOCITY]
-            )  # From positions, where noise grows with the square.
+            # From positions, where noise grows with the square.
+            bent = np.isnan(values[rows, _VELOCITY])
             hard = found & bent & (np.hypot(slopes[:, 0], slopes[:, 1]) > HARDEST)
             impossible[1] = int(hard.sum())
             found &= ~hard
@@ -959,7 +957,7 @@ def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
 
 
 def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
-    """Return the steps without implausibly fast ones, and a mask of the affected rows."""
+    """Return the time steps without those of implausible speed, and a mask of the changed rows."""
     before, behind, since, until = steps
     position = values[:, _X : _X + 3]
     lost = np.zeros(len(since), np.bool_)
@@ -990,7 +988,7 @@ def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floa
 
 
 def _accelerations(values: Floats, rows: slice, steps: Steps, moving: Steps) -> Floats:
-    """Return the accelerations. ``moving`` contains the steps with plausible changes of position."""
+    """Return the accelerations. ``moving`` contains the time steps with plausible speeds."""
     velocity = values[:, _VELOCITY : _VELOCITY + 3]
     position = values[:, _X : _X + 3]
     before, behind, since, until = moving

@@ -202,9 +202,8 @@ def _of_json(message: bytes) -> Mapping[str, Any] | None:
 def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[bytes, str]]:
     """Return a function that extracts the data and format of a message; both empty without a picture."""
     if channel not in recording.channels:
-        for _ in recording.walk(
-            Findings()
-        ):  # Without a summary, channels are known only after a walk.
+        # Without a summary, channels are known only after a walk.
+        for _ in recording.walk(Findings()):
             if channel in recording.channels:
                 break
     about = recording.channels.get(channel)
@@ -366,9 +365,8 @@ def _decodable(
         kinds = sorted(missing - sets.keys())
         reason = f"no parameter sets ({codec.name}, NAL units of type {kinds}) before its key frame"
         raise TraceError(f"{reason}: it cannot be decoded")
-    return run[::-1], [
-        sets[kind] for kind in sorted(sets)
-    ]  # The order is VPS, SPS, PPS in both codecs.
+    # The order is VPS, SPS, PPS in both codecs.
+    return run[::-1], [sets[kind] for kind in sorted(sets)]
 
 
 def _is_key(codec: _Codec, data: bytes) -> bool:

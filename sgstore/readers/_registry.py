@@ -129,9 +129,8 @@ def open_trace(
     recording = open_recording(path)
     try:
         if not recording.channels:
-            for _ in recording.walk(
-                TraceReport()
-            ):  # Without a summary, channels are known only after a walk.
+            # Without a summary, channels are known only after a walk.
+            for _ in recording.walk(TraceReport()):
                 pass
         for reader in readers():
             if reader.recognises(recording):

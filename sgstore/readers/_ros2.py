@@ -457,7 +457,7 @@ class _MessageReader:
         return {name: self.value(inner) for name, inner in kind.fields}
 
     def count(self, kind: Sequence) -> int:
-        """Return the number of the following elements."""
+        """Read the number of elements of a sequence."""
         smallest = least(kind.element)
         if kind.count < 0:
             return self.length(smallest, kind.bound, "sequence")
@@ -487,7 +487,7 @@ def _dtype(order: str, kind: Number) -> np.dtype[Any]:
 
 @dataclass(slots=True)
 class _StructLayout:
-    """Positions of the numbers in an element, for one alignment of its start.
+    """Byte positions of the numbers in an element, for one alignment of its start.
 
     ``size``: bytes from its start to the next element; ``prefixes``: position and value of each length in it;
     ``runs``: first column, position, number and type of adjacent numbers.
@@ -628,7 +628,7 @@ class _ElementWalk:
         self._columns = columns
 
     def step(self, kind: Type, path: str) -> None:
-        """Walk over a value."""
+        """Walk over a value, and record the positions of its numbers."""
         reader = self._reader
         match kind:
             case Number(_, size):
@@ -673,7 +673,7 @@ class _ElementWalk:
 def _side_by_side(
     found: dict[int, tuple[int, np.dtype[Any]]],
 ) -> list[tuple[int, int, int, np.dtype[Any]]]:
-    """Return numbers as runs that are adjacent both in columns and in bytes."""
+    """Group numbers into runs that are adjacent both in columns and in bytes."""
     runs: list[tuple[int, int, int, np.dtype[Any]]] = []
     for column, (place, dtype) in sorted(found.items()):
         if runs:

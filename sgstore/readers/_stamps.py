@@ -107,7 +107,7 @@ class Stamps:
         return self.first or (self._zero if self.explicit or alone else None)
 
     def reading(self) -> StampReader:
-        """Return a reader of the message times for the second reading."""
+        """Return a reader of the message times, for the second reading of the recording."""
         return StampReader(self, self._runs)
 
 

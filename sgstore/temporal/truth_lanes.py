@@ -1,4 +1,4 @@
-"""Truth lanes: the frames in which each part of a pattern holds, for the nodes of one match."""
+"""Truth lanes: for each part of a pattern, the frames in which it holds for the nodes of one match."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class TruthLanes:
         return found
 
     def as_dict(self) -> dict[str, Any]:
-        """Return JSON values: ``trace``, ``binding``, ``lanes``, and ``together`` (the runs by step)."""
+        """Return plain values: ``trace``, ``binding``, ``lanes``, and ``together`` (the runs by step)."""
         lanes = [
             {name: getattr(lane.part, name) for name in ("text", "step", "nodes", "conditions")}
             | {"edges": [*map(asdict, lane.part.edges)]}

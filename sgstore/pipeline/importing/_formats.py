@@ -377,7 +377,7 @@ def _documents(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, Any]]:
-    """Yield the documents of a file in which a document spans several lines."""
+    """Parse a file as one JSON text, and yield its graph or graphs."""
     parts = StringIO()
     values = 0
     for part in lines:

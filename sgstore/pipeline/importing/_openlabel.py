@@ -383,7 +383,7 @@ class _Axes:
         self._systems = {name: of if isinstance(of, dict) else {} for name, of in systems.items()}
 
     def at(self, transforms: Mapping[str, Any]) -> _FrameAxes:
-        """Return the coordinate systems for one frame, with its transforms."""
+        """Return the coordinate systems in one frame, with the transforms of this frame."""
         moved: dict[tuple[str, str], NDArray[np.float64]] = {}
         for told in transforms.values():
             if isinstance(told, dict):

@@ -205,7 +205,7 @@ OWN: Final = "own"
 
 @dataclass(frozen=True, slots=True)
 class LabelMeaning:
-    """Resolved label of a node.
+    """Resolved label of a node: its kind in the vocabulary, with details.
 
     Attributes
     ----------
@@ -306,7 +306,7 @@ class Words:
         return _simulators(text)
 
     def relation(self, name: str) -> str | None:
-        """Return the relation of the vocabulary for a name. ``None`` means unknown."""
+        """Return the relation in the vocabulary for a relation name of a file. ``None`` means unknown."""
         given = {normalize_name(own): relation for own, relation in self.relations.items()}
         known = relation_named(given.get(normalize_name(name), name))
         return _own_relation(name) if known is None and self.unknown_as == OWN else known
@@ -372,7 +372,7 @@ def _own_relation(text: str) -> str | None:
 
 
 def _kind(text: str) -> str:
-    """Return the kind for a word; empty if the word is unknown or ambiguous."""
+    """Return the kind that a word names; empty if the word is unknown or ambiguous."""
     return kind_named(_SHORT.get(normalize_name(text), text)) or ""
 
 
@@ -634,7 +634,7 @@ class Meant:
 
 
 class Understanding:
-    """Resolver of the graphs of one file, one after another."""
+    """Resolver that maps the labels and relations of a file's graphs to the vocabulary."""
 
     def __init__(self, path: Path, words: Words) -> None:
         self._path = path

@@ -317,7 +317,7 @@ _LONGEST_VALUE: Final = 10_000
 
 
 def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) -> RoadMap:
-    """Return a road map of named parts, without geometry. Edges between parts are in the frames.
+    """Return a road map of named lanes and roads, without geometry and without edges.
 
     Parameters
     ----------

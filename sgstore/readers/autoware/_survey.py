@@ -1,4 +1,4 @@
-"""First reading of an Autoware recording: leading objects, their classes, and the ego's pose.
+"""First reading of an Autoware recording: leading channel, classes of objects, and the ego's pose.
 
 Topics are arbitrary, so only the schemas count. The class of an object may change between messages; the most
 frequent one is used.
@@ -167,7 +167,7 @@ class AutowareSurvey(Survey[ObjectLead]):
         self._looks = 0
 
     def rank(self, lead: ObjectLead) -> tuple[int, ...]:
-        """Return the sort key of a candidate: non-empty, then the list type, then the number of frames."""
+        """Return the sort key of a possible leading channel: non-empty, list type, number of frames."""
         return lead.objects > 0, lead.order, lead.frames
 
     def label_of(self, ident: str, first: str) -> str:

@@ -446,7 +446,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
             table[row, _BOX_BEGINS : _BOX_BEGINS + 3] += np.nan_to_num(turn @ middle)
 
     def _settle_open(self) -> None:
-        """Compute the poses of the open frame from the messages so far."""
+        """Compute the poses of the last frame from all messages so far."""
         frame, self._open = self._open, None
         if frame is None:
             return
@@ -478,7 +478,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return place + rotated(turn, motion[:3]) * (late / 1e9), product(turn, further)
 
     def _base_at(self, frame: AutowareRawFrame) -> Pose | None:
-        """Return the pose of the objects' axes in fixed axes, or ``None`` if it is unknown."""
+        """Return the pose, in fixed axes, of the axes that the objects are given in, or ``None``."""
         survey = self._survey
         if frame.axes == survey.world:
             return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])

@@ -208,7 +208,7 @@ class LiveWorld:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings so far: traffic lights that are assigned to wrong signals."""
+        """Warnings so far, about traffic lights with a wrong signal of the map."""
         if self._at_once is None:
             return []
         return [*shared_signals(self._heads, self.road_map), *self._at_once.warnings]

@@ -6,7 +6,7 @@ A light has at most one signal, and a signal at most one light. The steps are:
    If all lights of a world have another common offset, it is learned: the median over lights and signals
    without other candidates. The offset with the most matches is used first;
 2. *by remaining signals*: a light within :data:`SAME_PLACE` of a free signal;
-3. *by sideways offset*: CARLA moves lights on the road sideways until they are beside it;
+3. *by sideways offset*: CARLA moves lights on the road sideways until they are off the road;
 4. *by lanes*: the signal of the lanes in the light's trigger boxes, or of their successors.
 
 The sum of squared distances over all lights is minimised. A common shift adds the same amount to every
@@ -127,7 +127,7 @@ def signals_of(
 
 
 class _Rule(NamedTuple):
-    """Usual pose of lights relative to their signals: rotation, and offset ahead and left in signal axes."""
+    """Usual pose of a light relative to its signal: rotation, and offset in the axes of the signal."""
 
     turn: float
     ahead: float
@@ -135,7 +135,7 @@ class _Rule(NamedTuple):
 
 
 class _Near(NamedTuple):
-    """Candidate pairs of lights and signals: the rows of both, and their distances.
+    """Pairs of a light and a signal that may belong together, with their distances.
 
     ``ahead``, ``left``: in the signal's axes, minus the offset of the rule; ``up``: minus the usual height; m.
     """
@@ -182,7 +182,7 @@ def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
 def _near(
     lights: Floats, signals: Floats, rule: _Rule, reach: float, found: Mapping[int, int]
 ) -> _Near:
-    """Return the candidate pairs of free lights and signals with similar heading within a distance."""
+    """Return the pairs of unassigned lights and signals with similar heading and small distance."""
     light = np.setdiff1d(np.arange(len(lights)), list(found))
     signal = np.setdiff1d(np.arange(len(signals)), list(found.values()))
     rows, columns = [light[:0]], [signal[:0]]
@@ -200,15 +200,14 @@ def _near(
     ahead, left = dx * cos + dy * sin - rule.ahead, dy * cos - dx * sin - rule.left
     away = np.abs(np.arctan2(np.sin(turn - rule.turn), np.cos(turn - rule.turn))) > SAME_WAY
     near = _Near(one, other, ahead, left, np.nan_to_num(dz))
-    near = near.take(
-        (np.hypot(ahead, left) <= reach) & ~away
-    )  # A light without a heading matches any heading.
+    # A light without a heading matches any heading.
+    near = near.take((np.hypot(ahead, left) <= reach) & ~away)
     usual = float(np.median(near.up)) if len(near.up) else 0.0
     return near._replace(up=near.up - usual)
 
 
 def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, int]) -> _Rule | None:
-    """Return the common offset of lights with a single candidate. ``None`` if they disagree."""
+    """Return the usual offset between lights and signals. ``None`` means that the lights disagree."""
     near = _near(lights, signals, _Rule(turn, 0.0, 0.0), LEARNT_WITHIN, found)
     sure = near.take(_only(near.light) & _only(near.signal))
     if len(sure.light) < LEARNT_FROM:
@@ -219,7 +218,7 @@ def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, in
 
 
 def _alone(near: _Near) -> dict[int, int]:
-    """Return the pairs in which both light and signal have no other candidate."""
+    """Return the pairs of a light and a signal that have only each other as possible partner."""
     sure = near.take(_only(near.light) & _only(near.signal))
     return dict(zip(sure.light.tolist(), sure.signal.tolist(), strict=True))
 
@@ -230,7 +229,7 @@ def _only(rows: Rows) -> Bools:
 
 
 def _assigned(near: _Near) -> dict[int, int]:
-    """Assign signals to the largest possible number of lights, with the smallest sum of squared distances."""
+    """Assign the most lights possible to signals, with the smallest sum of squared distances."""
     cost = near.ahead**2 + near.left**2 + (_OF_HEIGHT * near.up) ** 2
     found: dict[int, int] = {}
     for rows in _heaps(near):
@@ -336,7 +335,7 @@ def least_sum(cost: Floats) -> Rows:
 def _by_boxes(
     lights: Mapping[int, Light], road_map: RoadMap, columns: Iterable[int]
 ) -> dict[int, str]:
-    """Assign free signals to lights by the lanes in their trigger boxes, or by the successors of these lanes.
+    """Assign the remaining signals to lights by the lanes that run through the lights' trigger boxes.
 
     Of several signals, the one with the most of these lanes is used, then the nearest. Without a free signal,
     the lanes of the boxes are returned by name.
@@ -417,7 +416,7 @@ def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
 
 
 class AtOnce:
-    """Detector of lanes with red and green at the same time, a sign of wrong assignments.
+    """Detector of lanes that are red and green at the same time, which reveals wrong assignments.
 
     Parameters
     ----------

@@ -94,7 +94,7 @@ def meaning_of(type_name: str) -> TypeMeaning:
 
 
 def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning:
-    """Return the meaning of an object by its blueprint, else by the class from the bridge.
+    """Return the meaning of an object from its blueprint, else from the class in the ROS bridge.
 
     The class ``car`` is the bridge's default, so it is ignored for an unmapped blueprint.
     """
@@ -393,7 +393,7 @@ class CarlaSurvey(Survey[Lead]):
         self._lasting: list[Ref] = []
 
     def rank(self, lead: Lead) -> tuple[int, ...]:
-        """Return the sort key of a candidate: the number of frames, then their bytes."""
+        """Return the sort key of a possible leading channel: the number of frames, then their bytes."""
         return lead.frames, lead.weight
 
     @property
@@ -411,7 +411,7 @@ class CarlaSurvey(Survey[Lead]):
         return lost[0].reason if lost else "no list of objects can be read"
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego for a name. ``None`` means that objects must be searched for the number."""
+        """Return the id of the ego for a name. ``None`` means that a new reading may find it."""
         egos = self.egos
         if name.isdecimal() and int(name) not in egos.actors.keys() | egos.seen:
             return None
@@ -424,20 +424,20 @@ class CarlaSurvey(Survey[Lead]):
         return "" if self.ego is None else str(self.ego)
 
     def role(self, channel: int) -> str:
-        """Return the role of a channel, ``lasting`` for a channel with lasting facts."""
+        """Return the role of a channel. Channels whose facts stay valid for later frames are ``lasting``."""
         lasts = channel != self.leading and self.contents.get(channel) in LASTING
         return "lasting" if lasts else super().role(channel)
 
     def context(self) -> list[Ref]:
-        """Return the messages that later ones depend on: changes of lasting facts, and calibrations."""
+        """Return the messages that later ones depend on, for example maps, actor lists and calibrations."""
         return [*self._lasting, *super().context()]
 
     def meet(self, channel: int) -> bool:
-        """True if the messages of a channel are frames or lasting facts."""
+        """True if the messages of a channel are frames or facts that stay valid for later frames."""
         return self._content(channel) in LASTING | {OBJECTS}
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """True also for texts, which may contain the map, and for odometry of an unknown vehicle."""
+        """True if the messages of a channel must be examined, for example texts with a map."""
         content = self.contents[channel]
         if content == TEXT:
             return channel not in self._last  # A text other than a map is examined only once.
@@ -507,7 +507,7 @@ class CarlaSurvey(Survey[Lead]):
 
     @property
     def _take(self) -> dict[str, Callable[[dict[str, Any]], bool]]:
-        """Functions that store lasting facts, by content type. They return True for new facts."""
+        """Functions that store the facts of a message, by content type. They return True for new facts."""
         return {
             ACTORS: self._take_actors,
             LIGHT_PLACES: self._take_lights,
@@ -583,7 +583,7 @@ class CarlaSurvey(Survey[Lead]):
             self._find_egos()
 
     def _find_egos(self) -> None:
-        """Find the only object at the position of a role's odometry, at the same instant."""
+        """Find the object of each role by its odometry: the only object at this position and time."""
         stamp, table = self._objects
         self._tries += 1
         for role, (when, place) in self._odometry.items():

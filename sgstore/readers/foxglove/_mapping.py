@@ -1,4 +1,4 @@
-"""Mapping of a Foxglove scene: a TOML file with the places of kind, id, speed and ego.
+"""Mapping of a Foxglove scene: a TOML file that names the fields for kind, id, speed and ego.
 
 A ``foxglove.SceneUpdate`` is made for drawing. Its boxes lack types, speeds and the ego. Every producer stores
 these facts in its own way, so a mapping describes them. ``docs/flavours.md`` explains the file. The included
@@ -69,7 +69,7 @@ class SceneMapping:
 
 @dataclass(frozen=True, slots=True)
 class EntityMapping:
-    """Places of an entity's values: ``id``, or ``metadata.KEY``; empty without a place.
+    """Names of the fields with an entity's values: ``id`` or ``metadata.KEY``; empty for an unused value.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class EntityMapping:
     light_state: str = ""
 
     def ident_of(self, box: Box) -> str:
-        """Return the id of an entity from its mapped place, else its own id."""
+        """Return the id of an entity from its mapped field, else the entity's own id."""
         return _text(self.id, box) or box.id
 
     def type_of(self, box: Box) -> str:
@@ -104,7 +104,7 @@ class EntityMapping:
         return next((lowered[key] for key in _TYPE_KEYS if lowered.get(key)), "")
 
     def number_of(self, place: str, box: Box) -> float:
-        """Return the number at a place of an entity; NaN if it is missing."""
+        """Return the number in a mapped field of an entity; NaN if it is missing."""
         try:
             return float(_text(place, box) or math.nan)
         except ValueError:
@@ -192,7 +192,7 @@ _SECTIONS: Final[dict[str, type[Any]]] = {
 
 
 def _text(place: str, box: Box) -> str:
-    """Return the text at a place of an entity; empty if it is missing."""
+    """Return the text in a mapped field of an entity; empty if it is missing."""
     if place.startswith(METADATA):
         return box.metadata.get(place.removeprefix(METADATA), "")
     return box.id if place == "id" else ""
@@ -268,7 +268,7 @@ def _section(name: str, values: Any) -> Any:
 
 
 def _value(name: str, kind: str, value: Any) -> Any:
-    """Convert a value to the type of a field, given as a text."""
+    """Check a value of a mapping file, and convert it to the type of its field."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     match kind:
         case "str" if isinstance(value, str):

@@ -269,9 +269,8 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
             return None
         last, before = self._open, self._told_by
         leads = channel in self._leading
-        same = (
-            last is not None and last.log_time_ns == log_time
-        )  # The message belongs to the same instant.
+        # The message belongs to the same instant.
+        same = last is not None and last.log_time_ns == log_time
         goes_on = same and leads and before not in {-1, channel}
         self._take_scene(self._sources[channel], scene, time_ns, log_time, goes_on=goes_on)
         if leads:

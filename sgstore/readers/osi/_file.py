@@ -381,7 +381,7 @@ class _Stream:
         ] = []  # Start of each frame in the stream, and its file offset.
 
     def append(self, place: int, piece: bytes) -> None:
-        """Add the next bytes, from the zstd frame at ``place``."""
+        """Add the next bytes of the zstd frame at ``place``."""
         if not self._frames or self._frames[-1][1] != place:
             self._frames.append((self._start + len(self._buffer), place))
         self._buffer += piece

@@ -275,7 +275,7 @@ class OsiLanes:
         return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
 
     def _rows(self, lines: Sequence[LaneLine], plain: Sequence[PlainLane]) -> dict[int, list[int]]:
-        """Return the row numbers of the plain lanes for each lane id."""
+        """Return, for each lane id, the row numbers of its lanes in the road map."""
         row_of = {lane.name: row for row, lane in enumerate(plain)}
         rows: dict[int, list[int]] = {}
         for line in lines:
@@ -422,7 +422,7 @@ def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
 
 
 def _only_way(lane: Any, borders: _LaneBoundaries) -> LaneLine | None:
-    """Return an intersection as a single lane, or ``None`` if its boundaries do not define one."""
+    """Return an intersection as a single lane, or ``None`` if its boundaries do not form a lane."""
     about = lane.classification
     if len(about.lane_pairing) > 1 or not about.left_lane_boundary_id:
         return None
@@ -545,7 +545,7 @@ def _connections(connections: Iterable[Any]) -> tuple[Joint, ...]:
 
 
 def _source(lane: Any) -> dict[str, Any]:
-    """Return road, section and number of the OpenDRIVE lane behind a lane. The section is its start s.
+    """Return road, section and number of the OpenDRIVE lane that an OSI lane was made from.
 
     The identifiers are the road, the section's s and the lane, in this order; esmini writes ``road_id:1``.
     """

@@ -205,7 +205,7 @@ class MovingObjects:
         return [*odd, *rows.tolist()]
 
     def _trees(self, found: Any) -> tuple[dict[str, Any], Tree]:
-        """Return the descriptors of the sub-messages of the base, and the fields to read."""
+        """Return the message descriptors of the parts of an object, and the fields to read."""
         base = found.fields_by_name["base"]
         parts: dict[str, Any] = {}
         inner: Tree = {}
@@ -358,7 +358,7 @@ def _numbers(layout: _ObjectLayout, content: Bytes) -> tuple[Floats, Bools]:
 
 
 def _runs(doubles: dict[int, int]) -> list[tuple[int, int, int]]:
-    """Return the positions of doubles as runs of adjacent columns, with one tag byte between two doubles."""
+    """Group adjacent doubles into runs. Return first column, byte position and length of each run."""
     runs: list[tuple[int, int, int]] = []
     for column, place in sorted(doubles.items()):
         if runs and (column, place) == (sum(runs[-1][::2]), runs[-1][1] + _DOUBLE * runs[-1][2]):

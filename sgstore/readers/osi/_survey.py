@@ -75,14 +75,14 @@ def _names_or_none(moving_object: Any) -> list[str]:
 
 
 def hosts_of(message: Any) -> list[int]:
-    """Return the host vehicle ids in a message, most reliable first. 0 is a valid id."""
+    """Return the ids of the host vehicle in a message, most reliable first. 0 is a valid id."""
     told = [getattr(message, part) if part else message for part in _telling(type(message))]
     return [part.host_vehicle_id.value for part in told if part.HasField("host_vehicle_id")]
 
 
 @lru_cache(maxsize=64)
 def _telling(message: type[Any]) -> tuple[str, ...]:
-    """Return the parts of a message class that can contain the host vehicle id; empty means the message."""
+    """Return the message parts that can contain the id of the host vehicle; empty means the message itself."""
     inner = [
         (part, found.message_type)
         for part in ("global_ground_truth", "host_vehicle_data")
@@ -308,7 +308,7 @@ class _Latch:
 
 @dataclass(slots=True, kw_only=True)
 class OsiLead(Lead):
-    """Candidate channel with its message class and the messages that later ones depend on.
+    """Possible leading channel, with its message class and the messages that later ones depend on.
 
     ``objects``: class of its moving objects. ``latch``: its messages that others depend on. ``lanes``: its
     lanes; ``None`` if they are unreadable. The weight of a frame is 1 if it has moving objects.
@@ -360,7 +360,7 @@ class OsiSurvey(Survey[OsiLead]):
         self._lights: dict[int, TrafficLights] = {}  # By channel.
 
     def rank(self, lead: OsiLead) -> tuple[int, ...]:
-        """Return the sort key of a candidate: first the number of frames with moving objects."""
+        """Return the sort key of a possible leading channel: first the number of frames with moving objects."""
         return lead.weight, lead.frames, lead.schema == GROUND_TRUTH
 
     def read(self) -> Self:

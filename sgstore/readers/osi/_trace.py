@@ -358,7 +358,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     def _join(
         self, frame: OsiRawFrame, message: Any, nodes: list[int], objects: list[bytes]
     ) -> None:
-        """Add the missing objects and facts of a message to a frame."""
+        """Add the objects and controls of a message to a frame, unless the frame already has them."""
         if not frame.nodes:
             frame.nodes, frame.objects = nodes, objects
         else:
@@ -403,7 +403,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             self._leave_aside(contents)
 
     def _leave_aside(self, contents: list[bytes]) -> None:
-        """Count objects at a time without a frame."""
+        """Count the objects of a time that has no frame."""
         for content in contents:
             with suppress(*DECODE_ERRORS):
                 ident = int(self._class.FromString(content).id.value)
