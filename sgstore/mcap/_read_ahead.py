@@ -482,5 +482,4 @@ def _is_apt(head: ChunkHead) -> bool:
 
 
 def _processors() -> int:
-    """Return the number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

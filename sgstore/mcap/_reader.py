@@ -859,7 +859,7 @@ class McapBag(McapFile):
         return number
 
     def _free(self, number: int, taken: dict[int, Any]) -> int:
-        """Return the id, or the next free one."""
+        """Return the given id if it is free, else the next free one."""
         free = number if number not in taken else max(taken) + 1
         if free >= IDS:  # The limit applies to all files together.
             raise TraceError(f"more than {IDS} channels or schemas", path=self.path)

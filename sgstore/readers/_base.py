@@ -830,7 +830,6 @@ def _driven(moving: dict[int, Entity]) -> dict[int, tuple[float, ...]]:
 def _channels(
     flavour: FramesTrace | type[FramesTrace], recording: Recording
 ) -> tuple[Channel, ...]:
-    """Return the channels of a recording, with the roles of a flavour."""
     found = channels_of(recording, lambda _: "payload")
     return tuple(replace(channel, role=flavour.role(channel)) for channel in found)
 
@@ -847,7 +846,6 @@ def _lose(
     row: int,
     error: Exception,
 ) -> None:
-    """Count an unreadable message."""
     topic = channels[int(run.channel[row])].topic
     reason = f"{topic!r}: {error!r}"[:_LONGEST_REASON]
     losses.add(reason, int(run.log_time_ns[row]), int(run.length[row]))

@@ -92,7 +92,6 @@ class CommonRoadTrace(FramesTrace):
 
 
 def _add(frame: Frame, one: dict[str, Any], **more: Any) -> None:
-    """Add an obstacle to a frame."""
     kind: dict[str, Any] = _KINDS.get(one["type"], {"kind": "unknown"})
     numbers = {name: one[name] for name in _POSE if name in one}
     numbers |= {name: math.degrees(one[name]) for name in ("heading", "yaw_rate") if name in one}

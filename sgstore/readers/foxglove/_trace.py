@@ -333,7 +333,6 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
                 self._odd_axes += 1
 
     def _time(self, channel: int, scene: SceneUpdate, log_time: int) -> int | None:
-        """Return the time of a message; ns."""
         if channel not in self._leading or not self.is_inside(log_time):
             return self._stamps.beside(log_time, time_of(scene))
         return self._stamps.time(log_time, time_of(scene))

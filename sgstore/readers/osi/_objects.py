@@ -391,7 +391,7 @@ def _codes(layout: _ObjectLayout, content: Bytes) -> Ints:
 
 
 def _whole(content: Bytes, start: int, stop: int) -> NDArray[np.uint64]:
-    """Return the varint in each row."""
+    """Return the protobuf varint in each row."""
     found = np.zeros(len(content), np.uint64)
     for place in range(stop - 1, start - 1, -1):
         found = found << np.uint64(7) | (content[:, place] & 0x7F).astype(np.uint64)

@@ -497,7 +497,7 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             self._unusable.add(words, log_time)
 
     def _number(self, node: int) -> int:
-        """Return the recording's own id of a moving object."""
+        """Return the id of a moving object in the recording."""
         return next(ident for ident, known in self._nodes.items() if known == node)
 
     def _usable(self, frame: FrameRows, usable: Bools, ego: int) -> FrameRows:
