@@ -9,7 +9,7 @@ import pytest
 from scenes import Scene, actor, along, cone, ego, light, store_of, street
 
 from sgstore.graphs.online import Replay
-from sgstore.lang.bind._needed_values import in_range
+from sgstore.lang.bind._in_range import in_range
 from sgstore.lang.catalog import RelationScope, TraceFacts
 from sgstore.lang.ir import Value
 from sgstore.model.config import Config, PairSettings, Proximity

@@ -2,7 +2,9 @@
 
 from sgstore.lang.bind._aggregates import PLACE, sql_of
 from sgstore.lang.bind._beyond import is_limited, within
-from sgstore.lang.bind._bind import CheckInCatalog, bind_checks, bind_query
+from sgstore.lang.bind._bind import bind_query
+from sgstore.lang.bind._checks import CheckInCatalog, bind_checks
+from sgstore.lang.bind._datasets import CLASSES_GIVEN, traces_in
 from sgstore.lang.bind._functions import FUNCTIONS
 from sgstore.lang.bind._horizon import Horizon, horizon, spoken_kinds
 from sgstore.lang.bind._kinds import (
@@ -14,8 +16,8 @@ from sgstore.lang.bind._kinds import (
     kind_conditions,
 )
 from sgstore.lang.bind._needed_values import MOTION, Need, not_computed, of_check, of_query
-from sgstore.lang.bind._symbols import CLASSES_GIVEN, regex, traces_in
 from sgstore.lang.bind._temporal import FUTURE
+from sgstore.lang.bind._text_tests import regex
 from sgstore.lang.bind._unknowns import (
     CONNECTIVES,
     certain,

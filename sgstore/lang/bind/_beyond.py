@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
 from sgstore.lang.bind._horizon import LINKS
-from sgstore.lang.bind._needed_values import bounded, in_traces
+from sgstore.lang.bind._in_range import bounded, in_traces
 from sgstore.lang.catalog import IN_GRAPH, NODE_ATTRIBUTES, RelationScope, Type
 from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY, entity_kinds
 

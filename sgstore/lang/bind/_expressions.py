@@ -6,17 +6,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import QueryNameError, TextSpan
 from sgstore.lang import ir as b
+from sgstore.lang.bind._datasets import CLASSES, abstraction_named, seen_in
 from sgstore.lang.bind._precision import chosen, compared
-from sgstore.lang.bind._symbols import (
-    CLASSES,
-    RESERVED,
-    Binders,
-    SymbolTable,
-    abstraction_named,
-    call_hint,
-    seen_in,
-    text_test,
-)
+from sgstore.lang.bind._symbols import RESERVED, Binders, SymbolTable, call_hint
+from sgstore.lang.bind._text_tests import text_test
 from sgstore.lang.catalog import (
     EDGE_ALIASES,
     EDGE_ATTRIBUTES,

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Final, NoReturn
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang.bind._aggregates import AGGREGATES, aggregate, is_aggregate
+from sgstore.lang.bind._datasets import CLASSES, abstraction_named, class_count
+from sgstore.lang.bind._in_range import in_range
 from sgstore.lang.bind._kinds import on_lanes
-from sgstore.lang.bind._needed_values import in_range
-from sgstore.lang.bind._symbols import CLASSES, Symbol, SymbolTable, abstraction_named, class_count
+from sgstore.lang.bind._symbols import Symbol, SymbolTable
 from sgstore.lang.bind._temporal import course
 from sgstore.lang.catalog import NODE_ATTRIBUTES, PAIR_NAMES, Type
 from sgstore.lang.library import pattern_named, patterns, predicates
@@ -25,12 +26,10 @@ from sgstore.model.pair_numbers import (
     PAIR_FUNCTIONS,
     PART_DIST,
 )
-from sgstore.model.vocabulary import EVENT_KINDS, entity_kinds, normalize_name, relation_named
+from sgstore.model.vocabulary import entity_kinds, normalize_name, relation_named
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from sgstore.lang.catalog import TableFacts
 
 
 _OTHERS: Final = frozenset(
@@ -346,97 +345,6 @@ def _class_count(e: s.Call, names: SymbolTable) -> b.FrameAttribute:
 def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:
     names.session.refuse(
         f"{e.name}() may stand after IN only", e.span, f"write frame.class IN {e.name}('train')"
-    )
-
-
-# Recorded events --------------------------------------------------------------------------------------
-
-
-def happens(e: s.HappensExpression, names: SymbolTable) -> b.Happened:
-    """Bind ``HAPPENS``: a test for an event in the recording or in a user table.
-
-    Raises
-    ------
-    QueryNameError
-        Unknown event kind and unknown table.
-    QueryError
-        Wrong number or kind of nodes.
-    """
-    session, wanted = names.session, normalize_name(e.kind)
-    kind = next((one for one in EVENT_KINDS if normalize_name(one) == wanted), None)
-    table = session.tables.get(e.kind)
-    if table is None and kind is None:
-        session.unknown("event", e.kind, e.kind_span, (*EVENT_KINDS, *session.tables), _no_event(e))
-    nodes = tuple(_to_whom(e, argument, names) for argument in e.arguments)
-    if len(set(nodes)) < len(nodes):
-        session.refuse("what happens between two happens to two nodes", e.span)
-    if table is not None:
-        return b.Happened(table.name, nodes, _columns_of(table, e, names))
-    assert kind is not None  # noqa: S101 - it was refused above
-    if len(nodes) > EVENT_KINDS[kind]:
-        most = {0: "to nobody: it is of the frame", 1: "to one node", 2: "to two nodes at most"}
-        session.refuse(
-            f"{kind} happens {most[EVENT_KINDS[kind]]}, found {len(nodes)}",
-            e.span,
-            f"write HAPPENS {kind}({', '.join('ev'[: EVENT_KINDS[kind]])})",
-        )
-    return b.Happened(kind, nodes)
-
-
-def _no_event(e: s.HappensExpression) -> str | None:
-    """Suggest a condition for an unknown event name, or None."""
-    word = normalize_name(e.kind)
-    if word in predicates() or relation_named(e.kind) or word in map(normalize_name, FUNCTIONS):
-        called = ", ".join(a.name if isinstance(a, s.Variable) else "a" for a in e.arguments)
-        how = (
-            f"EXISTS {{(a)-[:{e.kind}]->(b)}}" if relation_named(e.kind) else f"{e.kind}({called})"
-        )
-        return f"it is no event that is recorded, but a condition: {how}"
-    return None
-
-
-def _to_whom(e: s.HappensExpression, argument: s.Expression, names: SymbolTable) -> str:
-    """Return the key of an entity that an event involves."""
-    found = names.bind(argument)
-    if not isinstance(found, b.NodeValue):
-        names.session.refuse(
-            f"{e.kind} happens to nodes, and this is a {found.type.value}",
-            argument.span,
-            f"write HAPPENS {e.kind}(v)",
-        )
-    kinds = names.scope.kinds(found.node).every
-    if not kinds & entity_kinds():
-        names.session.refuse(
-            f"{e.kind} happens to entities, and this is a {' or '.join(sorted(kinds))}",
-            argument.span,
-        )
-    return found.node
-
-
-_WHOM: Final = (("node_id", "other"), ("ident", "other_ident"), ("src", "dst"))
-"""Columns of a user table with the entities of an event: node ids, or simulator ids."""
-
-
-def _columns_of(table: TableFacts, e: s.HappensExpression, names: SymbolTable) -> tuple[str, ...]:
-    """Return the columns of a user table with the entities of an event. Without entities: one empty name."""
-    if not table.joins:
-        names.session.refuse(
-            f"the rows of {table.name} belong to no frames",
-            e.kind_span,
-            "it needs frame_id, or trace and one of seq, time_ns, t",
-        )
-    if len(e.arguments) > len(_WHOM[0]):
-        names.session.refuse(f"{table.name} happens to two nodes at most", e.span)
-    there = {name.lower(): name for name in table.columns}
-    for known in _WHOM:
-        chosen = known[: len(e.arguments)]
-        if all(name in there for name in chosen):
-            return tuple(there[name] for name in chosen) or ("",)
-    return names.session.refuse(
-        f"{table.name} does not say to whom: it has no column"
-        f" {' or '.join(' and '.join(known[: len(e.arguments)]) for known in _WHOM)}",
-        e.span,
-        f"of the frame it says: HAPPENS {e.kind}()",
     )
 
 

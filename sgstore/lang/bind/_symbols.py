@@ -1,4 +1,4 @@
-"""Symbol table, datasets, and text tests of the binder.
+"""Symbol table of the binder: names and their meanings, and scopes.
 
 There are two chains from the inside out. *Names*: a block can use the names around it, the body of a
 predicate can use only its parameters. *Scopes* hold nodes: a node used in an inner scope becomes an outer
@@ -7,18 +7,14 @@ node of every scope between.
 
 from __future__ import annotations
 
-import re
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sgstore.errors import QueryError, QueryNameError
-from sgstore.lang import ir as b
-from sgstore.lang.bind._needed_values import scopes_of
-from sgstore.lang.catalog import PAIR_NAMES, Attribute, DisplayUnit, Home, Type
+from sgstore.lang.bind._in_range import scopes_of
+from sgstore.lang.catalog import PAIR_NAMES, Type
 from sgstore.lang.ir import Bound, Edge, Kinds, Node, Scope, ego_kinds
 from sgstore.lang.library import predicates
 from sgstore.lang.syntax import condition_hint, hint_at, variable_hint
@@ -29,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from sgstore.errors import TextSpan
+    from sgstore.lang import ir as b
     from sgstore.lang.catalog import Catalog, TableFacts, TraceFacts
     from sgstore.lang.syntax.tree import Define
 
@@ -373,181 +370,3 @@ def call_hint(name: str) -> str | None:
         formals = ", ".join(formal.name for formal in found.parameters)
         return f"it is a predicate: {found.name}({formals})"
     return f"it is a function: {PAIR_NAMES[word]}(a, b)" if word in PAIR_NAMES else None
-
-
-# Datasets in queries: traces selected by a name pattern or by a user table -----
-
-CLASSES_GIVEN: Final = "sgstore_classes"
-"""Table with the frame classes of all parts of a collection: ``dataset`` (empty: all frames),
-``abstraction``, ``class``, ``frames``."""
-
-CLASSES: Final = "datasetclasses"
-"""Folded name of the function after ``IN``: ``frame.class IN dataset_classes('train')``."""
-
-
-def traces_in(
-    name: str,
-    traces: Iterable[TraceFacts],
-    tables: Mapping[str, TableFacts],
-    *,
-    part: bool = False,
-) -> frozenset[int] | None:
-    """Return the ids of the traces of a dataset. ``None`` means an unknown dataset.
-
-    Parameters
-    ----------
-    name : str
-        A user table with one row for each trace, or a pattern of trace names with the wildcards ``*`` and
-        ``?``.
-    traces : iterable of TraceFacts
-    tables : mapping of str to TableFacts
-    part : bool
-        True if other stores may contain the dataset.
-    """
-    if name in tables:
-        return tables[name].traces
-    found = frozenset(t.trace_id for t in traces if fnmatchcase(t.name, name))
-    return found if found or part else None
-
-
-def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
-    """Return the ids of the traces that ``USING DATASET`` selects.
-
-    Raises
-    ------
-    QueryError
-        Unknown dataset, or a table of single frames.
-    """
-    found = traces_in(name, session.traces, session.tables, part=session.part)
-    if found is None and name in session.tables:
-        session.refuse(
-            f"'{name}' is a table of single frames, and USING DATASET chooses traces",
-            span,
-            f"ask for its columns: WHERE {name}.… IS NOT NULL",
-        )
-    return _known(found, name, span, session)
-
-
-def seen_in(
-    classes: b.FrameAttribute, name: str, span: TextSpan, session: Session
-) -> b.FrameAttribute:
-    """Return the condition that the class of a frame occurs in a dataset of traces or frames.
-
-    Raises
-    ------
-    QueryError
-        Unknown dataset.
-    """
-    found = traces_in(name, session.traces, session.tables, part=session.part)
-    table = session.tables.get(name)
-    if found is None and table is not None and not table.joins:
-        session.refuse(f"the rows of '{name}' belong to no frames", span)
-    if table is None:
-        found = _known(found, name, span, session)
-    (abstraction,) = classes.attribute.columns.values()
-    attribute = Attribute(
-        f"class_{abstraction} in {name}",
-        Type.boolean,
-        {Home.state: abstraction},
-        "whether its class is in a dataset",
-        DisplayUnit.seen,
-        table=name if found is None else "",
-        traces=tuple(sorted(found or ())),
-        given=CLASSES_GIVEN if session.part else "",
-    )
-    return b.FrameAttribute(attribute, Type.boolean)
-
-
-def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
-    """Return the number of frames with the class of this frame, in the store or in all parts."""
-    attribute = Attribute(
-        f"class_count({abstraction})",
-        Type.number,
-        {Home.state: abstraction},
-        "frames of its class",
-        DisplayUnit.counted,
-        given=CLASSES_GIVEN if part else "",
-    )
-    return b.FrameAttribute(attribute, Type.number)
-
-
-def abstraction_named(name: str, span: TextSpan, session: Session) -> str:
-    """Return the exact name of an abstraction whose frame classes are in the store.
-
-    Raises
-    ------
-    QueryNameError
-        Unknown abstraction.
-    """
-    found = next(
-        (one for one in session.classed if normalize_name(one) == normalize_name(name)), None
-    )
-    if found is None:
-        session.unknown("abstraction", name, span, session.classed)
-    return found
-
-
-def _known(
-    found: frozenset[int] | None, name: str, span: TextSpan, session: Session
-) -> frozenset[int]:
-    if found is None:
-        known = [*session.tables, *(trace.name for trace in session.traces)]
-        session.unknown("dataset", name, span, known)
-    return found
-
-
-# Text tests: ``CONTAINS`` and similar, and regular expressions -----------------------------
-
-_NOT_RE2: Final = re.compile(r"\(\?(?!:|P<\w+>|[ims]+[:)])|\\[1-9NuUZ]|[*+?}]\+")
-
-
-def text_test(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> b.Operation:
-    """Bind a test of one text by another, such as ``CONTAINS`` or ``=~``.
-
-    Raises
-    ------
-    QueryError
-        A side is not a text, or the text after ``=~`` is not a valid regular expression.
-    """
-    for side, written in ((left, e.left), (right, e.right)):
-        if side.type is not Type.text:
-            names.session.refuse(
-                f"{e.word} compares texts, but this is a {side.type.value}", written.span
-            )
-    if e.word == "=~":
-        _check_regex(right, e.right.span, names)
-    return b.Operation(e.word, (left, right), Type.boolean)
-
-
-def regex(text: str) -> re.Pattern[str]:
-    """Compile a regular expression that Python and the database interpret in the same way.
-
-    Raises
-    ------
-    re.error
-        Invalid, or with a nested set, which they interpret differently: ``[[:alpha:]]``, ``[a&&b]``.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", FutureWarning)
-        try:
-            return re.compile(text)
-        except FutureWarning:
-            raise re.error(
-                "a set in a set; write a backslash before [, -, &, | or ~ in a set"
-            ) from None
-
-
-def _check_regex(pattern: b.Bound, span: TextSpan, names: SymbolTable) -> None:
-    if not isinstance(pattern, b.Value):
-        names.session.refuse("the pattern after =~ must be a constant", span)
-    text = str(pattern.value)
-    try:
-        regex(text)
-    except re.error as error:
-        names.session.refuse(f"not a regular expression: {error}", span)
-    if _NOT_RE2.search(text):
-        names.session.refuse(
-            "not a regular expression that can be searched for",
-            span,
-            "no look-around, no back-references",
-        )

@@ -1,0 +1,171 @@
+"""Binding of ``CHECK``: rules for whole traces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from sgstore.errors import TextSpan
+from sgstore.lang import ir as b
+from sgstore.lang.bind._beyond import looks_less
+from sgstore.lang.bind._bind import chosen, refuse_strange, refuse_unused
+from sgstore.lang.bind._patterns import ALL_BINDERS, kinds_of
+from sgstore.lang.bind._results import bind_column
+from sgstore.lang.bind._sequences import StepScope
+from sgstore.lang.bind._symbols import RESERVED, Session, Symbol, SymbolTable
+from sgstore.lang.bind._temporal import settled
+from sgstore.lang.catalog import Catalog, Type
+from sgstore.lang.syntax import tree as s
+from sgstore.lang.syntax.tree import CheckClause as WrittenCheck
+from sgstore.lang.syntax.tree import Define, MatchClause
+from sgstore.model.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from sgstore.lang.catalog import TraceFacts
+    from sgstore.lang.syntax.tree import QuantifierClause, Statement
+
+
+@dataclass(frozen=True, slots=True)
+class CheckInCatalog:
+    """Check with the catalog to which it was bound: of the store, or of an abstraction."""
+
+    check: b.BoundCheck
+    catalog: Catalog
+
+
+def bind_checks(
+    text: str,
+    statements: Sequence[Statement],
+    seen: Callable[[Statement], Catalog],
+    parameters: Mapping[str, Any],
+) -> tuple[CheckInCatalog, ...]:
+    """Bind every ``CHECK`` of a text, with the predicates defined before it.
+
+    Parameters
+    ----------
+    text : str
+        Text for messages.
+    statements : sequence of Statement
+    seen : function
+        Function that returns the catalog for a statement.
+    parameters : mapping of str to value
+        Values of ``$name``.
+
+    Raises
+    ------
+    QueryError
+        No check, or an invalid check. The error has the place.
+    """
+    found: list[CheckInCatalog] = []
+    defined: dict[str, Define] = {}
+    used: set[str] = set()
+    for statement in statements:
+        session = Session(text, parameters, ALL_BINDERS, dict(defined), used=used)
+        if isinstance(statement, Define):
+            defined[normalize_name(statement.name)] = statement
+        elif isinstance(statement, MatchClause | s.UnionClause):
+            session.refuse("a MATCH has matches, and no verdict", statement.span, "ask it by find")
+        else:
+            catalog = seen(statement)
+            session.ask(catalog)
+            name = statement.name or f"check {len(found) + 1}"
+            if name in {one.check.name for one in found}:
+                session.refuse(f"two checks are called '{name}'", statement.span)
+            found.append(CheckInCatalog(_check(statement, name, session, catalog), catalog))
+    session = Session(text, parameters, ALL_BINDERS, used=used)
+    if not found:
+        session.refuse("nothing is checked", TextSpan(0, len(text)), "add CHECK ALWAYS …")
+    refuse_unused(session)
+    return tuple(found)
+
+
+def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog) -> b.BoundCheck:
+    settings = chosen(written.settings, session, catalog)
+    session.look_beyond(catalog, world=settings.scope != "graph")
+    if settings.policy is not None:
+        session.refuse("USING MATCHES belongs to sequences", written.settings[0].span)
+    scope = StepScope(session)
+    names = SymbolTable(session, scope)
+    quantifiers = tuple(_quantifier(one, names, scope) for one in written.quantifiers)
+    formula = settled(names.condition(written.formula), session)
+    reset = None
+    if written.reset is not None:
+        reset = settled(names.condition(written.reset), session)
+    if written.robustness and settings.end == "weak":
+        session.refuse(
+            "USING END weak forgives what is due at the end of a trace, and robustness counts it",
+            written.span,
+            "leave out USING END weak, or ROBUSTNESS; bound the formula: EVENTUALLY[0s, 5s] …",
+        )
+    returns = _returned(written, names)
+    refuse_strange(session, catalog)
+    found = b.BoundCheck(
+        name,
+        replace(scope.finished(), distinct=scope.distinct()),
+        quantifiers,
+        formula,
+        reset,
+        frozenset(session.relations),
+        session.injective,
+        settings.ego,
+        settings.unknown_is_false,
+        settings.end or "bounded",
+        settings.gaps or "break",
+        written.robustness,
+        returns,
+        world=settings.scope != "graph",
+        range=settings.range,
+    )
+    if settings.range is None or _knows_no_more(session.traces, settings.range):
+        return found
+    ego = b.Node(session.key(None), b.ego_kinds(), "unnamed", written.span)
+    return looks_less(replace(found, limit=settings.range), ego)
+
+
+def _knows_no_more(traces: Iterable[TraceFacts], limit: float) -> bool:
+    """True if no trace has data on entities beyond the limit around the ego."""
+    return all(one.reach is not None and one.reach.farthest <= limit for one in traces)
+
+
+def _returned(written: WrittenCheck, names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
+    """Bind the values that are returned for each violation."""
+    inner = replace(names, over=True)
+    found = tuple(bind_column(item, inner) for item in written.returns)
+    taken = [node.name for one in written.quantifiers for node in one.nodes]
+    called = [column.name for column in found]
+    for item, column in zip(written.returns, found, strict=True):
+        if [*taken, *called].count(column.name) > 1:
+            reason = f"two results are called '{column.name}'"
+            names.session.refuse(reason, item.span, "name them with AS")
+        if column.value.type is Type.node:
+            hint = "its name, v.name, or a number: v.speed"
+            names.session.refuse("a violation has values, not nodes", item.span, hint)
+    return found
+
+
+def _quantifier(
+    written: QuantifierClause, names: SymbolTable, scope: StepScope
+) -> b.BoundQuantifier:
+    session = names.session
+    keys: list[str] = []
+    for node in written.nodes:
+        if node.name in RESERVED or names.meaning(node.name) is not None:
+            session.refuse(f"'{node.name}' is bound already", node.span)
+        kinds = kinds_of(node.label, session)
+        if not kinds:
+            session.refuse("no node can have this label", node.span)
+        key = scope.add(node.name, kinds, node.span, named=True)
+        names.meanings[node.name] = Symbol(node=key)
+        keys.append(key)
+    where = None
+    if written.where is not None:
+        where = settled(names.condition(written.where), session)
+        if b.is_temporal(where):
+            session.refuse(
+                "what restricts a quantifier looks at one frame",
+                written.where.span,
+                "put it into the formula: … IMPLIES …",
+            )
+    return b.BoundQuantifier(written.word, tuple(keys), where, written.absent)

@@ -1,0 +1,135 @@
+"""Datasets in queries: traces selected by a name pattern or by a user table."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang.catalog import Attribute, DisplayUnit, Home, Type
+from sgstore.model.vocabulary import normalize_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from sgstore.errors import TextSpan
+    from sgstore.lang.bind._symbols import Session
+    from sgstore.lang.catalog import TableFacts, TraceFacts
+
+CLASSES_GIVEN: Final = "sgstore_classes"
+"""Table with the frame classes of all parts of a collection: ``dataset`` (empty: all frames),
+``abstraction``, ``class``, ``frames``."""
+
+CLASSES: Final = "datasetclasses"
+"""Folded name of the function after ``IN``: ``frame.class IN dataset_classes('train')``."""
+
+
+def traces_in(
+    name: str,
+    traces: Iterable[TraceFacts],
+    tables: Mapping[str, TableFacts],
+    *,
+    part: bool = False,
+) -> frozenset[int] | None:
+    """Return the ids of the traces of a dataset. ``None`` means an unknown dataset.
+
+    Parameters
+    ----------
+    name : str
+        A user table with one row for each trace, or a pattern of trace names with the wildcards ``*`` and
+        ``?``.
+    traces : iterable of TraceFacts
+    tables : mapping of str to TableFacts
+    part : bool
+        True if other stores may contain the dataset.
+    """
+    if name in tables:
+        return tables[name].traces
+    found = frozenset(t.trace_id for t in traces if fnmatchcase(t.name, name))
+    return found if found or part else None
+
+
+def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
+    """Return the ids of the traces that ``USING DATASET`` selects.
+
+    Raises
+    ------
+    QueryError
+        Unknown dataset, or a table of single frames.
+    """
+    found = traces_in(name, session.traces, session.tables, part=session.part)
+    if found is None and name in session.tables:
+        session.refuse(
+            f"'{name}' is a table of single frames, and USING DATASET chooses traces",
+            span,
+            f"ask for its columns: WHERE {name}.… IS NOT NULL",
+        )
+    return _known(found, name, span, session)
+
+
+def seen_in(
+    classes: b.FrameAttribute, name: str, span: TextSpan, session: Session
+) -> b.FrameAttribute:
+    """Return the condition that the class of a frame occurs in a dataset of traces or frames.
+
+    Raises
+    ------
+    QueryError
+        Unknown dataset.
+    """
+    found = traces_in(name, session.traces, session.tables, part=session.part)
+    table = session.tables.get(name)
+    if found is None and table is not None and not table.joins:
+        session.refuse(f"the rows of '{name}' belong to no frames", span)
+    if table is None:
+        found = _known(found, name, span, session)
+    (abstraction,) = classes.attribute.columns.values()
+    attribute = Attribute(
+        f"class_{abstraction} in {name}",
+        Type.boolean,
+        {Home.state: abstraction},
+        "whether its class is in a dataset",
+        DisplayUnit.seen,
+        table=name if found is None else "",
+        traces=tuple(sorted(found or ())),
+        given=CLASSES_GIVEN if session.part else "",
+    )
+    return b.FrameAttribute(attribute, Type.boolean)
+
+
+def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
+    """Return the number of frames with the class of this frame, in the store or in all parts."""
+    attribute = Attribute(
+        f"class_count({abstraction})",
+        Type.number,
+        {Home.state: abstraction},
+        "frames of its class",
+        DisplayUnit.counted,
+        given=CLASSES_GIVEN if part else "",
+    )
+    return b.FrameAttribute(attribute, Type.number)
+
+
+def abstraction_named(name: str, span: TextSpan, session: Session) -> str:
+    """Return the exact name of an abstraction whose frame classes are in the store.
+
+    Raises
+    ------
+    QueryNameError
+        Unknown abstraction.
+    """
+    found = next(
+        (one for one in session.classed if normalize_name(one) == normalize_name(name)), None
+    )
+    if found is None:
+        session.unknown("abstraction", name, span, session.classed)
+    return found
+
+
+def _known(
+    found: frozenset[int] | None, name: str, span: TextSpan, session: Session
+) -> frozenset[int]:
+    if found is None:
+        known = [*session.tables, *(trace.name for trace in session.traces)]
+        session.unknown("dataset", name, span, known)
+    return found

@@ -1,0 +1,255 @@
+"""Binding of patterns: nodes, edges, labels and blocks."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from sgstore.errors import TextSpan
+from sgstore.lang import ir as b
+from sgstore.lang.bind._beyond import whole_block
+from sgstore.lang.bind._expressions import BINDERS, edge_attribute, node_attribute
+from sgstore.lang.bind._functions import call
+from sgstore.lang.bind._match_values import over_match
+from sgstore.lang.bind._recorded_events import happens
+from sgstore.lang.bind._stages import name_path
+from sgstore.lang.bind._symbols import RESERVED, THE_EGO, Binders, Session, Symbol, SymbolTable
+from sgstore.lang.bind._temporal import tense, timespan
+from sgstore.lang.catalog import Type
+from sgstore.lang.syntax import tree as s
+from sgstore.model.vocabulary import (
+    RELATION_ALIASES,
+    entity_kinds,
+    kinds_labelled,
+    known_names,
+    labels,
+    normalize_name,
+    relation_named,
+)
+
+
+def bind_block(block: s.Block, names: SymbolTable) -> None:
+    """Bind the paths and the condition of a block into the scope of ``names``.
+
+    All nodes and edges are bound before any condition. So a condition inside a node can use later nodes.
+    """
+    pending: list[tuple[s.NodePattern | s.EdgePattern, str]] = []
+    for path in block.paths:
+        keys = [_node(node, names) for node in path.nodes]
+        pending += zip(path.nodes, keys, strict=True)
+        edges = [
+            (edge, _edge(edge, left, right, names))
+            for edge, left, right in zip(path.edges, keys, keys[1:], strict=False)
+        ]
+        pending += edges
+        if path.name is not None:
+            name_path(path, keys, [key for _, key in edges], names)
+    for pattern, key in pending:
+        _inline(pattern, key, names)
+    if block.where is not None:
+        names.scope.where += b.conjuncts(names.condition(block.where))
+
+
+def _block(e: s.BlockExpression, names: SymbolTable) -> b.Bound:
+    session, inner = names.session, names.block()
+    bind_block(e.block, inner)
+    value = inner.number(e.value) if e.value is not None else None
+    kind = Type.boolean if e.word == "EXISTS" else Type.number
+    session.blocks += 1
+    block = b.BlockValue(e.word, inner.scope.finished(), value, kind, session.blocks)
+    found = whole_block(block, session.blocks + 1)
+    session.blocks += sum(isinstance(part, b.BlockValue) for part in b.walk(found)) - 1
+    return found
+
+
+ALL_BINDERS: Final[Binders] = {
+    **BINDERS,
+    s.BlockExpression: _block,
+    s.Call: call,
+    s.Duration: timespan,
+    s.HappensExpression: happens,
+    s.OverExpression: over_match,
+    s.Temporal: tense,
+}
+"""Binder of each kind of expression."""
+
+
+def _node(node: s.NodePattern, names: SymbolTable) -> str:
+    kinds = kinds_of(node.label, names.session) if node.label else b.any_kinds()
+    if not kinds:
+        names.session.refuse("no node can have this label", node.span)
+    key = _known_node(node, names)
+    if key is None:
+        _refuse_bare_label(node, names)
+        key = names.scope.add(node.name, kinds, node.span, named=node.name is not None)
+        if node.name is not None:
+            names.meanings[node.name] = Symbol(node=key)
+        return key
+    if node.label:
+        names.scope.narrow(key, kinds)
+        if not names.scope.kinds(key):
+            names.session.refuse(f"'{node.name}' has two labels that no node has both", node.span)
+        if key in names.scope.outer:
+            names.scope.where.append(b.LabelTest(key, kinds))
+    return key
+
+
+def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
+    """Reject ``(Car)``, which is a node named Car. The user probably means ``(:Car)``."""
+    if node.name and node.name[0].isupper() and not node.label and node.name in labels():
+        names.session.refuse(
+            f"({node.name}) would be any node, called {node.name}",
+            node.name_span,
+            f"a label stands behind a colon: (:{node.name})",
+        )
+
+
+def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
+    """Return the key of a node that is already bound. ``None`` means a new node."""
+    if node.name is None:
+        return None
+    if node.name in RESERVED:
+        names.session.refuse(f"'{node.name}' cannot name a node", node.name_span)
+    meaning = names.meaning(node.name)
+    if meaning is None:
+        return _the_ego(node, names)
+    if meaning.node is None:
+        names.session.refuse(f"'{node.name}' is not a node", node.name_span)
+    names.scope.mention(meaning.node)
+    return meaning.node
+
+
+def _the_ego(node: s.NodePattern, names: SymbolTable) -> str | None:
+    """Return the key of the ego if the node has the reserved name ``ego``, or None."""
+    if node.name != THE_EGO:
+        return None
+    if names.scope.parent is None:
+        key = names.scope.add(THE_EGO, b.ego_kinds(), node.span, named=True)
+        names.session.the_ego = key
+        names.meanings[THE_EGO] = Symbol(node=key)
+        return key
+    return names.node(THE_EGO, node.name_span)
+
+
+def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str:
+    session = names.session
+    if edge.name is not None and names.meaning(edge.name) is not None:
+        session.refuse(f"'{edge.name}' is bound already", edge.span)
+    if edge.name is not None and edge.low is not None:
+        session.refuse(
+            "a repeated edge cannot have a name", edge.span, "-[:near*1..3]->, or edge by edge"
+        )
+    if edge.name is not None and not edge.label and relation_named(edge.name):
+        session.refuse(
+            f"-[{edge.name}]-> would be an edge of any relation, called {edge.name}",
+            edge.span,
+            f"a relation stands behind a colon: -[:{edge.name}]->",
+        )
+    relations = _relations(edge.label, session) if edge.label else b.any_relation()
+    if not relations:
+        session.refuse(
+            "no edge can have this label: an edge has one relation",
+            edge.span,
+            "two edges: (a)-[:near]->(b), (a)-[:visible]->(b)",
+        )
+    key = session.key(edge.name)
+    src, dst = (right, left) if edge.direction == "left" else (left, right)
+    low, high = edge.low or 1, edge.high or 1
+    if edge.name is not None:
+        names.meanings[edge.name] = Symbol(edge=key)
+    names.scope.edges.append(
+        b.Edge(
+            key,
+            src,
+            dst,
+            relations,
+            edge.direction == "any",
+            low,
+            high,
+            edge.name is not None,
+            edge.span,
+            known=names.scope.parent is not None,
+            beyond=session.beyond if names.scope.parent is not None else (),
+        )
+    )
+    return key
+
+
+def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable) -> None:
+    """Bind the properties and the condition inside a node or an edge."""
+    for prop in pattern.properties:
+        attribute_of = node_attribute if isinstance(pattern, s.NodePattern) else edge_attribute
+        attribute = attribute_of(key, prop.name, prop.name_span, names)
+        names.scope.where.append(_equality(attribute, prop, names))
+    if pattern.where is not None:
+        names.scope.where += b.conjuncts(names.condition(pattern.where))
+
+
+def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bound:
+    """Bind the property ``name: value`` as a comparison. The attribute gets a name unavailable to queries."""
+    inner = names.body({"": Symbol(value=attribute)})
+    inner.parent = names
+    span = TextSpan(prop.name_span.start, prop.value.span.end)
+    return inner.condition(s.Comparison("=", s.Variable("", prop.name_span), prop.value, span))
+
+
+def kinds_of(label: s.LabelExpression, session: Session) -> b.Kinds:
+    """Return the kinds that a label allows.
+
+    Raises
+    ------
+    QueryNameError
+        Unknown label.
+    """
+    if isinstance(label, s.Label):
+        return _labelled(label, session)
+    operands = [kinds_of(operand, session) for operand in label.operands]
+    result = operands[0]
+    for operand in operands[1:]:
+        result = result & operand if label.word == "&" else result | operand
+    return ~result if label.word == "!" else result
+
+
+def _labelled(label: s.Label, session: Session) -> b.Kinds:
+    if label.name == "%":
+        return b.any_kinds()
+    if normalize_name(label.name) == "ego":
+        return b.ego_kinds()
+    kinds = kinds_labelled(label.name)
+    if kinds is None:
+        if relation_named(label.name):
+            session.refuse(
+                f"'{label.name}' is a relation, not a label",
+                label.span,
+                f"write -[:{label.name}]->",
+            )
+        session.unknown("label", label.name, label.span, labels())
+    every = frozenset(kinds)
+    return b.Kinds(every & entity_kinds(), every)
+
+
+def _relations(label: s.LabelExpression, session: Session) -> frozenset[str]:
+    if isinstance(label, s.Label):
+        return _related(label, session)
+    operands = [_relations(operand, session) for operand in label.operands]
+    result = operands[0]
+    for operand in operands[1:]:
+        result = result & operand if label.word == "&" else result | operand
+    return b.any_relation() - result if label.word == "!" else result
+
+
+def _related(label: s.Label, session: Session) -> frozenset[str]:
+    if label.name == "%":
+        return b.any_relation()
+    relation = relation_named(label.name)
+    if relation is None:
+        if kinds_labelled(label.name):
+            session.refuse(
+                f"'{label.name}' is a label of nodes, not a relation",
+                label.span,
+                f"write (x:{label.name})",
+            )
+        session.unknown(
+            "relation", label.name, label.span, (*known_names("relation"), *RELATION_ALIASES)
+        )
+    session.relations.add(relation)
+    return frozenset({relation})

@@ -1,0 +1,224 @@
+"""Binding of results: ``RETURN``, ``ORDER BY``, ``SAMPLE`` and ``TOP``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from sgstore.lang import ir as b
+from sgstore.lang.bind._precision import is_stored
+from sgstore.lang.bind._temporal import settled
+from sgstore.lang.catalog import TRACE_ATTRIBUTES, Type
+from sgstore.lang.syntax import tree as s
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from sgstore.errors import TextSpan
+    from sgstore.lang.bind._symbols import Session, SymbolTable
+
+_FORMS: Final[dict[str, b.Form]] = {
+    "intervals": "intervals",
+    "clips": "clips",
+    "subgraphs": "subgraphs",
+}
+
+
+def bind_result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
+    if returns is None:
+        return b.Result()
+    inner = replace(names, aggregates=True, over=True)
+    item = _special(returns, names.session)
+    form = item.form if item is not None else "value"
+    result = b.Result(
+        form=_FORMS.get(form, "rows"),
+        columns=bind_columns(returns.items, inner),
+        whole=any(item.form == "all" for item in returns.items),
+        framed=form == "frames",
+        distinct=returns.distinct,
+        skip=returns.skip,
+        limit=returns.limit,
+        before=item.before if item else 0,
+        after=item.after if item else 0,
+    )
+    result = replace(result, having=_having(returns.having, result, inner))
+    _check_result(result, returns, names.session)
+    if result.aggregated or result.form in {"intervals", "clips"}:
+        # Each row is unique already, and DISTINCT must not remove rows that are counted.
+        result = replace(result, distinct=False)
+    order = tuple(b.SortKey(_key(k.value, result, inner), k.descending) for k in returns.order)
+    sample, top = _sampling(returns.sample, result, inner), _top(returns.top, result, inner)
+    return replace(result, order=order, sample=sample, top=top)
+
+
+def _special(returns: s.Returns, session: Session) -> s.Item | None:
+    """Return the item ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``, or None."""
+    special = [item for item in returns.items if item.form not in {"value", "all"}]
+    if len(special) > 1:
+        session.refuse("one of FRAMES, INTERVALS, SUBGRAPHS and CLIPS at a time", special[1].span)
+    return special[0] if special else None
+
+
+def bind_columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
+    """Bind the values to return. An aggregating value may use the grouping values of the same ``RETURN``."""
+    items = [item for item in items if item.form == "value"]
+    found = [bind_column(item, names) for item in items]
+    keys = _group_keys(found)
+    columns: list[b.ReturnColumn] = []
+    for item, column in zip(items, found, strict=True):
+        assert item.value is not None  # noqa: S101 - the form of the item guarantees it
+        value = _of_groups(column.value, keys) if b.is_counted(column.value) else column.value
+        _refuse_mixed(value, item.value.span, names.session)
+        columns.append(replace(column, value=value))
+    return tuple(columns)
+
+
+def _group_keys(columns: Iterable[b.ReturnColumn]) -> dict[b.Bound, str]:
+    plain = (one for one in columns if not b.is_counted(one.value))
+    return {one.value: one.name for one in plain if not isinstance(one.value, b.Value)}
+
+
+def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
+    """Replace grouping values in an expression by references to their columns."""
+    if value in keys:
+        return b.GroupKey(keys[value], value.type)
+    if isinstance(value, b.Operation):
+        return b.with_operands(value, lambda part: _of_groups(part, keys))
+    return value
+
+
+def bind_column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
+    assert item.value is not None  # noqa: S101 - the form of the item guarantees it
+    value = settled(names.bind(item.value), names.session)
+    if value.type is Type.list and not (isinstance(value, b.Aggregate) or b.is_passed_on(value)):
+        names.session.refuse("a list cannot be returned", item.span)
+    text = names.session.text[item.value.span.start : item.value.span.end]
+    return b.ReturnColumn(item.name or " ".join(text.split()), value, is_stored(value))
+
+
+def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
+    """Reject a value that mixes single matches with an aggregate over all matches."""
+    if b.is_counted(value) and _of_each(value):
+        session.refuse(
+            "a value of each match cannot stand beside one of all matches",
+            span,
+            "return both by themselves: x.speed, AVG(x.speed)",
+        )
+
+
+def _of_each(value: b.Bound) -> bool:
+    """True if a value depends on single matches outside its aggregates."""
+    if isinstance(value, b.Operation):
+        return any(_of_each(operand) for operand in value.operands)
+    return not isinstance(value, b.Aggregate | b.GroupKey | b.Value | b.Choices)
+
+
+def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) -> b.Bound | None:
+    """Return the condition on groups of matches or on intervals, or None."""
+    if written is None:
+        return None
+    session = names.session
+    if result.form in {"intervals", "clips"}:
+        own: dict[str, b.Bound] = {
+            name: b.GroupKey(name, Type.text if name == "trace" else Type.number)
+            for name in result.names
+        }
+        found = settled(replace(names, aliases=own).condition(written), session)
+        if b.is_counted(found) or _of_each(found):
+            session.refuse(
+                f"behind HAVING, {result.form} have their ends and no other values",
+                written.span,
+                f"name one of: {', '.join(own)}; what a match must be stands behind WHERE",
+            )
+        return found
+    own = {column.name: column.value for column in result.columns}
+    found = settled(replace(names, aliases=own).condition(written), session)
+    found = _of_groups(found, _group_keys(result.columns))
+    if not b.is_counted(found) and not result.aggregated:
+        session.refuse(
+            "HAVING chooses among groups of matches, and nothing is counted here",
+            written.span,
+            "what a match must be stands behind WHERE, before RETURN",
+        )
+    if _of_each(found):
+        session.refuse(
+            "behind HAVING stand values of groups: what is counted, and what is returned beside it",
+            written.span,
+            "what a match must be stands behind WHERE, before RETURN",
+        )
+    return found
+
+
+def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound | str:
+    """Return a sort or sampling key: the name of a result, or a value of each match."""
+    own = {column.name: column.value for column in result.columns}
+    known = (*result.names, *own)
+    taken = isinstance(value, s.Variable) and names.meaning(value.name) is not None
+    if isinstance(value, s.Variable) and (value.name in own or (value.name in known and not taken)):
+        return value.name
+    if isinstance(value, s.Variable) and value.name not in {*names.visible(), *known}:
+        names.session.unknown("variable", value.name, value.span, {*names.visible(), *known})
+    found = settled(replace(names, aliases=own).bind(value), names.session)
+    if result.aggregated and b.is_counted(found):
+        found = _of_groups(found, _group_keys(result.columns))
+    _refuse_mixed(found, value.span, names.session)
+    if found.type is Type.list:
+        names.session.refuse("a list puts nothing in an order", value.span)
+    if isinstance(found, b.Value):
+        hint = f"name a value, or one of: {', '.join(known)}"
+        names.session.refuse("a constant puts nothing in an order", value.span, hint)
+    same = next((column.name for column in result.columns if column.value == found), None)
+    if result.form in {"intervals", "clips"} and found == _TRACE_NAME:
+        same = "trace"
+    if same is not None:
+        return same
+    counted = b.is_counted(found)
+    one_each = not (result.distinct or result.framed or result.aggregated)
+    listed = result.form in {"rows", "subgraphs"}
+    if not listed or not (result.aggregated if counted else one_each):
+        names.session.refuse(
+            "only by what is returned can these results be ordered or sampled",
+            value.span,
+            f"name one of: {', '.join(known)}",
+        )
+    return found
+
+
+def _sampling(sample: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampling | None:
+    if sample is None:
+        return None
+    if result.aggregated or (result.distinct and not (result.whole or result.framed)):
+        reason = "SAMPLE chooses among matches, and these are not listed"
+        names.session.refuse(reason, sample.span, "LIMIT n gives the first ones, by ORDER BY")
+    return b.Sampling(sample.number, sample.per and _key(sample.per, result, names))
+
+
+_TRACE_NAME: Final = b.TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
+
+
+def _top(top: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampling | None:
+    """Bind ``LIMIT n PER value``: the first rows for each value."""
+    if top is None or top.per is None:
+        return None
+    per = _key(top.per, result, names)
+    rows = result.form == "rows" and not (result.whole or result.framed)
+    if not isinstance(per, str) and rows and (result.aggregated or result.distinct):
+        names.session.refuse(
+            "LIMIT n PER takes what is returned, where it is counted or DISTINCT",
+            top.per.span,
+            f"name one of: {', '.join(column.name for column in result.columns)}",
+        )
+    return b.Sampling(top.number, per)
+
+
+def _check_result(result: b.Result, returns: s.Returns, session: Session) -> None:
+    names = [*result.names, *(column.name for column in result.columns)]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        session.refuse(f"two results are called '{twice}'", returns.span, "name them with AS")
+    listed = result.form != "rows" or result.whole or result.framed
+    if result.aggregated and listed:
+        hint = "a number for each row is COUNT {(a)-[:near]->(b)} AS n"
+        if result.form in {"intervals", "clips"}:
+            hint = "frames says how many each has; a value over each is MIN(…) OVER match"
+        session.refuse("matches are either counted or listed, not both", returns.span, hint)
