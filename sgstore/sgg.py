@@ -258,7 +258,7 @@ class SceneGraphGenerator:
         )
 
     def _wanted(self, node: Ints, kind: Codes) -> Bools:
-        """Return a mask of the states whose entity the settings include, in or out of range."""
+        """Return a mask of the states whose entities the settings do not exclude."""
         return self._keeping.entities(kind) & ~self._left_out[node]
 
     def _beyond(self, frames: FrameBlock, poses: EgoPoses, outer: Extent, keys: Ints) -> _Beyond:
@@ -274,7 +274,10 @@ class SceneGraphGenerator:
         return _Beyond(_reduced(frames, kept), areas, others)
 
     def _world(self, frames: FrameBlock, keys: Ints, every: Ints) -> _World:
-        """Return the world for all egos: the rows in graphs (``keys``) and with surroundings (``every``)."""
+        """Compute the results that all egos share: bodies, pairs, contacts and lanes.
+
+        ``keys`` are the rows in the graphs, ``every`` also those of the surroundings.
+        """
         bodies = self._bodies(frames, every)
         rows = every, len(frames.states), len(self._scenery)
         standing = None if self._survey is None else self._survey.standing(bodies)
@@ -312,7 +315,10 @@ class SceneGraphGenerator:
         return sum(UNEVEN[name] for name, holds in found.items() if holds)
 
     def _near(self, bodies: Bodies, rows: tuple[Ints, int, int], frames: int) -> Gathered:
-        """Return the pairs of nearby bodies. ``rows`` are as in :meth:`StillPairs.among`."""
+        """Return the pairs of nearby bodies.
+
+        ``rows`` are as in :meth:`StillPairs.among`.
+        """
 
         def chunks(unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
             yield from near_pairs(bodies, self._config, unwanted)
@@ -321,7 +327,7 @@ class SceneGraphGenerator:
         return gathered(chunks, bodies.frame, frames)
 
     def _of_view(self, view: _View, world: _World) -> _World:
-        """Return the world in the range of one ego.
+        """Return the shared results for the range of one ego.
 
         A frame may be too crowded for all egos together, but not for this one. Its pairs are then
         computed again.
@@ -400,7 +406,7 @@ class SceneGraphGenerator:
     def _beyond_edges(
         self, bodies: Bodies, around: MapContext | None, edges: Edges
     ) -> tuple[Edges, LaneGaps]:
-        """Return the edges that differ between graph and surroundings, and the gaps of the additional edges."""
+        """Return the edges that change if the surroundings are added, and the gaps of the additional edges."""
         if around is None:
             return Edges.chained([]), gaps(bodies, None)
         none = np.zeros(0, np.intp)
@@ -675,7 +681,7 @@ class _Beyond:
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """Part of the world in the range of any ego, with all results that do not depend on the ego.
+    """Results for the range of all egos that do not depend on a single ego.
 
     ``whole`` is the same with the surroundings of the graphs, but without pairs.
     """
@@ -690,7 +696,7 @@ class _World:
     uneven: int = 0
 
     def of(self, keys: Ints) -> _World:
-        """Return the part in the range of one ego."""
+        """Return the results for the range of one ego."""
         if len(keys) == len(self.keys):
             return self
         rows = np.searchsorted(self.keys, keys)
@@ -762,7 +768,7 @@ def _keys(one: tuple[Whole | Codes, ...], other: tuple[Whole | Codes, ...]) -> t
 
 
 def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:
-    """Return the new row numbers of the pairs whose two rows are both kept."""
+    """Drop the pairs with a removed row, and return the other pairs with new row numbers."""
     a, b = place[pairs[0]], place[pairs[1]]
     both = (a >= 0) & (b >= 0)
     return a[both], b[both]

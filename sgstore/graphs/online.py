@@ -381,7 +381,7 @@ class Replay:
         self._trailers: list[str] = []
 
     def frames(self, block: FrameBlock) -> Iterator[Frame]:
-        """Yield the frames of the next block of a trace, with exactly the same numbers."""
+        """Yield the frames of the next block of a recording, with unchanged numbers."""
         new = block.entities
         columns = (new.ident, new.kind.tolist(), new.special, new.subkind, new.type_name)
         columns = (*columns, new.static.tolist(), new.map_ref)

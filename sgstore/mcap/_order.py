@@ -360,7 +360,7 @@ class TimeOrder:
         self._cache.clear()
 
     def _batch(self, rows: Ints, of: Ints, reads: Numbers) -> SortedMessages:
-        """Return messages by their rows in runs. ``of`` is the run number of each message."""
+        """Read messages as one batch, given by run number (``of``) and row."""
         columns = np.zeros((7, len(rows)), np.int64)
         held = np.full(len(rows), None, np.object_)
         for run in np.unique(of).tolist():
@@ -433,7 +433,7 @@ def _no_place(_position: int, _length: int) -> memoryview:
 
 
 def _entries_of(run: Messages) -> bytes:
-    """Return the index entries of at most ``_BLOCK`` messages, without their rows."""
+    """Return the index entries of a run of messages."""
     entries = np.zeros(len(run), _ENTRY)
     entries["log"], entries["publish"] = run.log_time_ns, run.publish_time_ns
     entries["channel"] = run.channel

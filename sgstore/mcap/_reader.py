@@ -839,7 +839,10 @@ class McapBag(McapFile):
         self.attachments += [place for place in moved if place not in known]
 
     def _take(self, number: int, file: McapFile, key: tuple[Any, ...], alike: list[int]) -> int:
-        """Return the id in the bag for a channel of a file. ``alike``: the file's channels with this key."""
+        """Return the id in the bag for a channel of a file.
+
+        ``alike``: the file's channels with this key.
+        """
         known = self._channel_ids.setdefault(key, [])
         if {*alike} <= {*known}:
             return number

@@ -201,9 +201,10 @@ class Survey(Generic[AnyLead]):
         raise NotImplementedError
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """True if the messages of a channel must be examined. ``met`` is the result of :meth:`meet`.
+        """True if the messages of a channel must be examined.
 
-        It is called for each run of messages. A result of ``False`` is final.
+        ``met`` is the result of :meth:`meet`. The method is called for each run of messages. A result of
+        ``False`` is final.
         """
         del channel
         return met

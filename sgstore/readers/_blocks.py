@@ -235,7 +235,7 @@ class EntityTable:
         return node
 
     def entered(self, number: int) -> EntityRow:
-        """Return the entity with a number."""
+        """Return the entity with the given number."""
         return self._rows[number]
 
     def enter_again(self, row: EntityRow, before: int) -> int:
@@ -251,7 +251,7 @@ class EntityTable:
         return before + len(self._returned) - 1
 
     def turn(self, number: int, lifetime: int, seq: int) -> None:
-        """Record that an id has a certain lifetime number from a frame on."""
+        """Record which entity an id refers to from a frame on, by its lifetime number."""
         self._turns.setdefault(self._rows[number].ident, []).append((seq, lifetime))
 
     @property
@@ -288,7 +288,7 @@ class EntityTable:
         return tuple(events)
 
     def _lifetime(self, ident: str, seq: int) -> int:
-        """Return the lifetime number of an id in a frame."""
+        """Return the lifetime number of the entity that an id refers to in a frame."""
         turns = self._turns.get(ident, ())
         at = bisect_right(turns, seq, key=itemgetter(0))
         return turns[at - 1][1] if at else 1
@@ -806,7 +806,7 @@ class LifetimeTracker:
         )
 
     def _follow(self, number: int, kind: int, here: Sight, called: Called | None, size: int) -> int:
-        """Return the node id of an id in a frame."""
+        """Return the node id of the entity that an id refers to in a frame."""
         lives = self._lives[number]
         before = lives.last
 
@@ -821,7 +821,7 @@ class LifetimeTracker:
         return node
 
     def _enter(self, number: int, called: Called | None, size: int, why: str) -> tuple[int, int]:
-        """Add another entity of an id, and return its node id and lifetime number."""
+        """Add another entity with the same id, and return its node id and lifetime number."""
         row = self._roster.entered(number)
         if called is not None:
             meaning, type_name = called

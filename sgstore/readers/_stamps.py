@@ -1,4 +1,4 @@
-"""Times of frames: the stamps of messages, and replacements for missing stamps.
+"""Times of frames: the time stamps of messages, and replacements for missing ones.
 
 All readers use the same rules, so that a trace never mixes two clocks:
 
@@ -46,7 +46,7 @@ class _Unstamped:
 
 @dataclass(slots=True)
 class Stamps:
-    """Stamps of a channel, collected by the first reading.
+    """Time stamps of a channel, collected by the first reading.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Stamps:
         self._number += 1
 
     def see(self, log_time_ns: int, stamp_ns: int | None) -> None:
-        """Record the stamp of the last counted message."""
+        """Record the time stamp of the last counted message."""
         if stamp_ns == 0:
             self._zero = self._zero or (log_time_ns, 0)
         if stamp_ns:
@@ -95,14 +95,14 @@ class Stamps:
             self._runs.append(self._open)
 
     def is_near(self, known: Known | None) -> bool:
-        """True if a stamp is near 0."""
+        """True if a time stamp is near 0."""
         steps = sorted(self.steps)
         period = steps[len(steps) // 2] if steps else 0
         return known is not None and abs(known[1]) <= max(NEAR, 3 * period)
 
     @property
     def clock(self) -> Known | None:
-        """Log time and stamp of one message. ``None`` means that the log time is the clock."""
+        """Log time and time stamp of one message. ``None`` means that the log time is the clock."""
         alone = self._number == 0
         return self.first or (self._zero if self.explicit or alone else None)
 
@@ -183,7 +183,7 @@ class StampReader:
         return before[1] + (behind[1] - before[1]) * share[0] // share[1]
 
     def _is_time(self, before: Known | None, behind: Known | None) -> bool:
-        """True if stamps of 0 between two others are real times."""
+        """True if time stamps of 0 are real times. False if they mean a missing time."""
         stamps = self._stamps
         if before is None and behind is None:
             return True  # Without another clock, 0 is a time.
@@ -195,7 +195,7 @@ class StampReader:
 
 
 def _between(log_time_ns: int, before: Known | None, behind: Known | None) -> int:
-    """Return the time at a log time, from the offsets of the neighbouring messages; ns."""
+    """Return the simulation time for a log time, from the times of the neighbouring messages; ns."""
     log, stamp = before or behind or (log_time_ns, log_time_ns)
     time_ns = log_time_ns - (log - stamp)
     if before is None or behind is None or before[1] <= time_ns <= behind[1]:

@@ -412,7 +412,10 @@ class _FrameAxes:
         self.missing: set[str] = set()
 
     def _outward(self, system: str) -> NDArray[np.float64] | None:
-        """Return the matrix from a system into the root system. ``None`` means the root system itself."""
+        """Return the matrix from a coordinate system into the root system.
+
+        ``None`` means the root system itself.
+        """
         if system not in self._known:
             self._known[system] = self._found(system)
         return self._known[system]

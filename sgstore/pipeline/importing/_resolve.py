@@ -230,7 +230,7 @@ class LabelMeaning:
 
 @dataclass(frozen=True)
 class Words:
-    """Mapping of labels and relations to the vocabulary.
+    """Mapping from the labels and relations of a file to the vocabulary.
 
     Parameters
     ----------

@@ -431,7 +431,7 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         return idents
 
     def _measure(self, table: Floats, data: memoryview) -> None:
-        """Set length, width and centre of polygon objects from their corners."""
+        """Set length, width and centre of objects with a polygon shape, from the polygon's corners."""
         told = records(self._decoded(self._survey.leading, data), "objects")
         for row, one in enumerate(told[: len(table)]):
             corners = records(one, "shape.footprint.points")

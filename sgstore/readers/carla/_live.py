@@ -343,7 +343,7 @@ class LiveWorld:
         return nodes.name[rows[nearest]] if apart[nearest] <= SAME_PLACE else ""
 
     def _add_scenery(self, frame: Frame) -> None:
-        """Add the objects of the level: static ones once, vehicles and people in every frame."""
+        """Add the objects of the CARLA level: static ones once, vehicles and people in every frame."""
         for ident, kind, place, more in self._level:
             moves = kind in MOVING
             if moves or not self._told:
@@ -352,7 +352,7 @@ class LiveWorld:
 
     @cached_property
     def _level(self) -> list[tuple[str, str, tuple[float, float, float], dict[str, Any]]]:
-        """Return id, kind, position and other properties of the level's objects. Boxes are in world axes."""
+        """Return id, kind, position and other properties of the objects in the CARLA level."""
         found: list[tuple[str, str, tuple[float, float, float], dict[str, Any]]] = []
         for thing in self.world.get_environment_objects():
             label = str(thing.type)
@@ -787,7 +787,7 @@ def _values(data: Any) -> dict[str, Any]:
 
 
 def _vector(name: str, value: Any) -> dict[str, float]:
-    """Convert a vector into the axes of sgstore. Rotations change sign in x and z, translations in y."""
+    """Convert a vector from CARLA's left-handed axes into right-handed axes."""
     if "gyroscope" in name:
         return {"x": 0.0 - value.x, "y": value.y, "z": 0.0 - value.z}
     return {"x": value.x, "y": 0.0 - value.y, "z": value.z}

@@ -527,7 +527,7 @@ def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:
 
 @lru_cache(maxsize=4096)  # Vehicles keep the same lights for a long time.
 def _our_lights(bits: int) -> int:
-    """Return the mask of ``VEHICLE_LIGHTS`` for a ``carla.VehicleLightState``."""
+    """Convert CARLA's bits of vehicle lights into the light mask of sgstore."""
     return sum((bits >> theirs & 1) << ours for ours, theirs in enumerate(_CARLA_LIGHTS))
 
 
@@ -590,7 +590,7 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
 
 
 def _inputs(told: Sequence[float], *, applied: bool) -> Controls:
-    """Convert columns :data:`CONTROLS` into :data:`sgstore.model.world.INPUTS`.
+    """Convert CARLA's controls into the control inputs of sgstore.
 
     An applied control contains the actual gear. A requested control contains a gear only for manual shifting.
     Otherwise, the simulator chooses the gear, and only the reverse direction is known.

@@ -344,7 +344,7 @@ def _point(node: _Node) -> Place:
 
 
 def _position(node: _Node | None) -> Place | None:
-    """Return a position, or the centre of an area; ``None`` if it is missing."""
+    """Return a position, or the centre of an area. ``None`` means that it is missing."""
     if node is None or not node.children:
         return None
     point = node.get("point")

@@ -269,7 +269,7 @@ class SceneUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Pose of the axes ``child`` in the axes ``parent``."""
+    """Pose of child axes in their parent axes."""
 
     parent: str
     child: str

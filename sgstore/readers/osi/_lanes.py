@@ -358,7 +358,7 @@ class _LaneBoundaries:
         return None if kind in _UNKNOWN else kind in _CROSSED
 
     def logical(self, idents: Iterable[Any]) -> tuple[Floats, Floats, tuple[Border, ...]]:
-        """Return the points (n, 3) of consecutive logical boundaries, their s (n,), and the borders."""
+        """Return the points, s positions and borders of consecutive logical boundaries."""
         lines: list[Floats] = [np.zeros((0, 3))]
         places: list[Floats] = [np.zeros(0)]
         borders: list[Border] = []

@@ -125,7 +125,7 @@ class _ObjectLayout:
 
 @dataclass(slots=True)
 class _Learned:
-    """Intermediate results of a walk through an object; see :class:`_ObjectLayout`."""
+    """Intermediate results during the learning of an object's byte layout."""
 
     mask: Bytes
     doubles: dict[int, int] = field(default_factory=dict[int, int])
@@ -584,7 +584,7 @@ def lit(mode: int, colour: int) -> int:
 
 
 def shown(bulbs: Iterable[int]) -> int:
-    """Return the code of the light state that lit bulbs show together.
+    """Return the state that the lit bulbs of a traffic light show together, as a code.
 
     The codes are those of :data:`sgstore.model.vocabulary.LIGHT_STATES`. Flashing has priority. Red with yellow
     is ``red_yellow``. For other combinations, the most restrictive colour counts (a red light with a green
@@ -611,7 +611,7 @@ class _Head:
     top: float = -math.inf
 
     def join(self, pose: tuple[float, ...]) -> None:
-        """Extend the head by another bulb."""
+        """Extend a traffic light head by another bulb."""
         _x, _y, z, *rest = pose
         if math.isnan(z):
             return
@@ -664,7 +664,7 @@ class TrafficLights:
 
     @property
     def unplaced(self) -> int:
-        """Number of heads without a position and without a map reference."""
+        """Number of traffic light heads without a position and without a map reference."""
         return len(self._heads) - len(self._rows[0])
 
     def update(self, words: list[bytes]) -> None:
@@ -690,7 +690,7 @@ class TrafficLights:
         head.bulbs[bulb.id.value] = 0 if out else lit(classification.mode, classification.color)
 
     def signals(self) -> dict[int, LaneSignal]:
-        """Return the signal of each head with assigned lanes, by the id of its first bulb."""
+        """Return the signal of each traffic light head with assigned lanes, by the id of its first bulb."""
         return {
             head.first: LaneSignal(
                 head.map_ref or f"{OWN}{head.first}",
@@ -703,7 +703,7 @@ class TrafficLights:
         }
 
     def rows(self) -> tuple[Ints, Floats, Ints]:
-        """Return the rows of all heads with a position: node ids, columns :data:`POSE`, states."""
+        """Return the rows of all traffic light heads with a position: node ids, pose columns, states."""
         return self._rows
 
     def _fill(self) -> None:
@@ -715,7 +715,7 @@ class TrafficLights:
         )
 
     def _enter(self, bulb: Any) -> _Head:
-        """Return the head of a bulb; it may be new."""
+        """Return the traffic light head of a bulb; it may be new."""
         ident = bulb.id.value
         pose = static_pose(bulb.base) or (NAN,) * 16
         ref, lanes = map_ref(bulb), assigned_lanes(bulb.classification)
@@ -736,7 +736,7 @@ class TrafficLights:
         return head
 
     def _beside(self, pose: tuple[float, ...]) -> _Head | None:
-        """Return the head at the position of a pose, or ``None``."""
+        """Return the traffic light head at a position, or ``None``."""
         if math.isnan(pose[0]):
             return None
         column, line = _cell(pose)

@@ -163,7 +163,7 @@ class Cast:
                 self._keys.add(key)
 
     def idents(self) -> dict[int, str]:
-        """Return the ident of each id: the proper name if it is unique, else the number."""
+        """Return the name of each moving object if it is unique, else its number."""
         numbers = {str(number) for number in self.names}
         bearers: dict[str, int] = {}
         for names in self.names.values():
