@@ -226,7 +226,9 @@ class _IndexBlock:
         self.entries = self.entries[np.argsort(self.entries[key], kind="stable")]
 
     def split(self, key: str, edge: Edge) -> _IndexBlock:
-        """Remove and return the entries before an edge.
+        """Remove and return the entries before a key value.
+
+        ``None`` means all. The entries must be sorted by the key.
 
         ``None`` means all. The entries must be sorted by the key.
         """

@@ -131,7 +131,7 @@ class FrameRows:
 
 
 class EntityRow(NamedTuple):
-    """Row of :class:`sgstore.model.world.Entities`."""
+    """Entity as one row of the entity table."""
 
     ident: str
     kind: int
@@ -308,7 +308,7 @@ class EntityTable:
             warn(f"of {self.happened} events the report lists the first {MOST_EVENTS}")
 
     def plausible(self, values: Floats, nodes: Sequence[int] | Ints) -> Floats:
-        """Return the numbers of entities without implausible ones, which are counted.
+        """Replace implausible sizes and speeds of entities by NaN, and count them.
 
         Parameters
         ----------

@@ -377,7 +377,7 @@ def _kind(text: str) -> str:
 
 
 def _simulators(text: str) -> LabelMeaning | None:
-    """Return the meaning of a simulator's type name, or of the longest known prefix before a dot."""
+    """Return the meaning of a simulator's type name, or of its longest known prefix before a dot."""
     meanings = type_meanings()
     name = text.lower()
     while name:
@@ -443,7 +443,7 @@ Own = dict[str, Any]
 def state_of(
     path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int], *, any_state: bool
 ) -> tuple[dict[str, float], Own]:
-    """Return the state of an entity in a frame (columns of ``States``), and its other attributes.
+    """Return the state of an entity in a frame, and its attributes without a column.
 
     The columns are those of :class:`sgstore.model.world.States`. With ``any_state``, traffic lights may have
     states outside the vocabulary.
@@ -503,7 +503,7 @@ def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[st
 
 
 def part_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[dict[str, Any], Own]:
-    """Return the attributes of a map part (columns of ``MapNodes``), and its other attributes.
+    """Return the attributes of a map part with a column, and those without.
 
     The columns are those of :class:`sgstore.maps.roads.MapNodes`.
 
@@ -643,7 +643,7 @@ class Understanding:
         self._relations = lru_cache(_REMEMBERED)(words.relation)
 
     def of(self, graph: GivenGraph) -> Meant:
-        """Resolve a graph. Unknown parts are dropped and counted in ``graph.lost``, or raise an error.
+        """Resolve a graph. Unknown parts are dropped and counted, or raise an error.
 
         Raises
         ------

@@ -80,7 +80,7 @@ _ANSWERED: Final = {"s3c": ("isIn", *PROXIMITY[1:], *DIRECTIONS, "toLeftOf", "to
 
 _BLOCK: Final = 2 * BUCKET_FRAMES
 _BLOCK_SIZE: Final = 200_000
-"""Maximum number of nodes and edges in a block, except for a single larger graph."""
+"""Maximum number of graphs, and of nodes and edges, in a block. A larger graph is a block of its own."""
 
 
 @dataclass(slots=True)

@@ -302,7 +302,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         return done
 
     def _rows(self, frame: CarlaRawFrame, values: Floats, usable: Bools) -> FrameRows:
-        """Return a frame with its numbers, without unusable rows."""
+        """Convert a frame into its final columns, without unusable rows."""
         node = frame.nodes
         if not usable.all():
             for row in np.flatnonzero(~usable).tolist():

@@ -89,7 +89,7 @@ class SumoTrace(FramesTrace):
             self.info = replace(self.info, mapping=digest_of(beside))
 
     def start(self) -> None:
-        """Reset the assignment of ids to elements."""
+        """Reset the state before the messages are read again."""
         self._owners: dict[str, str] = {}
 
     def on_map(self, road_map: RoadMap | None) -> None:
