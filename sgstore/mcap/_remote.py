@@ -63,7 +63,7 @@ def object_store_at(url: str) -> Any:
 
 
 def _options(url: str) -> dict[str, Any]:
-    """Return the settings of the client. An own S3 server (AWS_ENDPOINT_URL) may use plain HTTP."""
+    """Return the settings of the client. A private S3 server (AWS_ENDPOINT_URL) may use plain HTTP."""
     retry = {
         "max_retries": TRIES,
         "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5)},

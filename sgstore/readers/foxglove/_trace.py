@@ -145,7 +145,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return "", axes
 
     def context(self) -> list[Ref]:
-        """Return the messages that later ones depend on: single messages, and lasting entities."""
+        """Return the messages that later ones depend on: single messages, and entities that stay valid."""
         lasting = self._transforms
         if not self.mapping.scene.snapshot:
             lasting = self._entities | self._transforms
