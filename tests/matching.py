@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 from sgstore.lang.ir import Node
 from sgstore.lang.memory import Binding, ScopeSearch
 from sgstore.lang.sql import Layout
-from sgstore.lang.sql._compile import graph_of
+from sgstore.lang.sql._subgraphs import graph_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.lang.ir import Edge, Query
     from sgstore.lang.memory import FrameView
-    from sgstore.lang.sql._compile import Record
+    from sgstore.lang.sql._subgraphs import Record
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from thorough import LONG
 
 import sgstore.lang.sql._rewrite as rewrite
 from sgstore.lang.sql import compile_query
-from sgstore.lang.sql._masks import MOST, CountRange, frames_with
+from sgstore.lang.sql._mask_counts import MOST, CountRange, frames_with
 
 if TYPE_CHECKING:
     from collections.abc import Callable

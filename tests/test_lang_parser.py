@@ -11,7 +11,7 @@ from lark import Lark, UnexpectedInput
 
 import sgstore.lang.syntax._parse as tables
 from sgstore.errors import QuerySyntaxError
-from sgstore.lang.sql._compile import statements_text, tree_text
+from sgstore.lang.sql._explain import statements_text, tree_text
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax import tree as s
 from sgstore.lang.syntax._parse import MAX_DEPTH, MAX_LENGTH

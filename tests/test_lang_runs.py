@@ -8,7 +8,7 @@ from itertools import groupby
 import duckdb
 import pytest
 
-from sgstore.lang.sql._results import runs
+from sgstore.lang.sql._runs import runs
 
 Rows = dict[tuple[int, int | None], int]
 """Bucket and key → mask."""

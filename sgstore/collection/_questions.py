@@ -39,7 +39,8 @@ from sgstore.lang.sql import (
     traces_of,
     union_parts,
 )
-from sgstore.lang.sql.collection_parts import PARTS, Pruning, class_questions, parted
+from sgstore.lang.sql.collection_parts import PARTS, parted
+from sgstore.lang.sql.collection_pruning import Pruning, class_questions
 from sgstore.lang.syntax import pattern_tables
 from sgstore.matches import Interval, UnionMatches, merged, row_type
 from sgstore.model.vocabulary import natural
@@ -72,7 +73,7 @@ if TYPE_CHECKING:
     from sgstore.lang.bind import CheckInCatalog
     from sgstore.lang.catalog import Catalog, Triple
     from sgstore.lang.sql import Compiled
-    from sgstore.lang.sql.collection_parts import ClassQuestion
+    from sgstore.lang.sql.collection_pruning import ClassQuestion
     from sgstore.lang.syntax import Pattern
     from sgstore.model.world import Floats, Ints
     from sgstore.temporal import Verdict

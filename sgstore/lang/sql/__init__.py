@@ -1,22 +1,9 @@
 """SQL compiler: rewrites bound queries, plans them, and writes the statements of each phase."""
 
-from sgstore.lang.sql._compile import (
-    Compiled,
-    Layout,
-    compile_checks,
-    compile_query,
-    for_people,
-    unnumbered_text,
-    value_text,
-)
-from sgstore.lang.sql._formulas import (
-    Select,
-    happened_in_frame,
-    leaves,
-    nested,
-    recorded_events,
-    told_events,
-)
+from sgstore.lang.sql._compile import Compiled, compile_checks, compile_query
+from sgstore.lang.sql._display import for_people
+from sgstore.lang.sql._explain import unnumbered_text, value_text
+from sgstore.lang.sql._expressions import leaves
 from sgstore.lang.sql._frame_relations import (
     BUCKETS,
     CLOCK,
@@ -24,17 +11,20 @@ from sgstore.lang.sql._frame_relations import (
     TIMES,
     TOLD_WEATHER,
     TRACES,
-    ExternalRelation,
     entities,
     relation,
     traces_with,
-    with_places,
 )
+from sgstore.lang.sql._known_matches import ExternalRelation, with_places
 from sgstore.lang.sql._lookups import told_lanes
-from sgstore.lang.sql._plan import TRACE_OF_FRAME, Gathered, Window, extents, traces_of
+from sgstore.lang.sql._plan import Gathered, traces_of
+from sgstore.lang.sql._recorded_events import happened_in_frame, recorded_events, told_events
 from sgstore.lang.sql._results import CONSTANTS, SqlStatement, about_frame
 from sgstore.lang.sql._rewrite import path_ways, rewritten
+from sgstore.lang.sql._select import Select, nested
+from sgstore.lang.sql._subgraphs import Layout
 from sgstore.lang.sql._union import UnionParts, each_match, joined_rows, union_parts
+from sgstore.lang.sql._windows import TRACE_OF_FRAME, Window, extents
 
 __all__ = [
     "BUCKETS",

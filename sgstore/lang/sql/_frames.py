@@ -1,15 +1,11 @@
 """SQL of the second phase: conditions and values of single frames.
 
-Statements around the join of the frame values compute pair numbers and test conditions.
-
-Pair numbers are computed in layers of nested statements, so that each part has a name and is computed once. A
-condition is tested in the first layer that has all its parts. For the expensive ``gap``, ``ttc`` and
-``closing_time``, a cheap lower bound is tested first.
+The frames from the first phase are joined with ``state`` (and the tables of constants) for each node whose
+values are needed. Statements around that join compute pair numbers and test conditions.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeGuard
 
 from sgstore.base.quoting import quoted
@@ -33,38 +29,34 @@ from sgstore.lang.ir import (
     nodes_of,
 )
 from sgstore.lang.operators import COMPARISONS, Column
-from sgstore.lang.sql._formulas import (
+from sgstore.lang.sql._attributes import (
     Aliases,
-    Leaf,
-    Select,
     attribute_text,
+    frame_text,
+    own_text,
+    owner_text,
+    role_text,
+)
+from sgstore.lang.sql._expressions import (
+    Leaf,
     column_of,
     columns_of,
     edge_table,
     expression_text,
-    frame_text,
-    happened_text,
     is_position,
     lane_text,
     leaves,
-    nested,
-    own_text,
-    owner_text,
-    pair_column,
-    pair_text,
-    raw_text,
-    role_text,
 )
-from sgstore.lang.sql._lookups import LOOKED_UP, WayEnd, of_later, recorded_text, way_text
+from sgstore.lang.sql._layers import Join, Layers, named, pairs_of
+from sgstore.lang.sql._lookups import LOOKED_UP, WayEnd, way_text
+from sgstore.lang.sql._mask_counts import CountRange, frames_with
 from sgstore.lang.sql._masks import (
     BUCKET,
-    CountRange,
     SqlBuilder,
     base_rows,
     expanded,
     folded,
     found_masks,
-    frames_with,
     held,
     if_bound,
     in_mask,
@@ -75,219 +67,17 @@ from sgstore.lang.sql._masks import (
     with_blocks,
 )
 from sgstore.lang.sql._plan import Phases, SharedRelation, apart, phases_of
-from sgstore.lang.sql._rewrite import (
-    INVARIANT,
-    bounds,
-    complement,
-    counted_block,
-    is_dear,
-    is_lasting,
-)
-from sgstore.model.pair_numbers import MARKS, STOREYS, UNEVEN, WAYS, needed_for, parts_of, stage_of
+from sgstore.lang.sql._recorded_events import happened_text
+from sgstore.lang.sql._rewrite import INVARIANT, bounds, complement, counted_block, is_lasting
+from sgstore.lang.sql._select import Select, nested
+from sgstore.model.pair_numbers import MARKS, STOREYS, UNEVEN, WAYS
 from sgstore.model.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from sgstore.lang.catalog import Attribute, Catalog
-    from sgstore.lang.sql._formulas import BoundValues
 
-
-Part = tuple[str, str, str]
-"""Pair number: its name and the two nodes."""
-
-
-def _pairs(found: Iterable[Leaf]) -> list[PairNumber]:
-    """Return the pair numbers that are computed in layers."""
-    return [
-        leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function not in LOOKED_UP
-    ]
-
-
-@dataclass(slots=True)
-class Join:
-    """Join of the second phase during its construction.
-
-    Attributes
-    ----------
-    select : Select
-    frame : str
-        Column of the frame id; empty until a table has it.
-    trace : str
-        SQL of the trace id; empty means derived from the frame id.
-    nodes, edges : dict of str to str
-        Column of the id by node, column of the relation by edge.
-    at : dict of str to Aliases
-        Joined tables of each node.
-    texts : dict of Leaf to str
-        SQL of the available values.
-    lanes : set of str
-        Aliases of the tables joined for edge attributes.
-    world : bool
-        True if recorded measures cover all data of scope ``world``.
-    """
-
-    select: Select = field(default_factory=Select)
-    frame: str = ""
-    trace: str = ""
-    nodes: dict[str, str] = field(default_factory=dict[str, str])
-    edges: dict[str, str] = field(default_factory=dict[str, str])
-    at: dict[str, Aliases] = field(default_factory=dict[str, Aliases])
-    texts: dict[Leaf, str] = field(default_factory=dict[Leaf, str])
-    lanes: set[str] = field(default_factory=set[str])
-    world: bool = False
-
-
-@dataclass(slots=True)
-class Layers:
-    """Nested statements around a join that compute pair numbers and test conditions.
-
-    Numbers that no cheap condition needs are computed after the tests of the cheap conditions.
-
-    Attributes
-    ----------
-    join : Join
-    needed : list of Leaf
-        Values needed by conditions or results.
-    conditions : list of Bound
-    without : frozenset of str
-        Marks that no pair of these traces needs (:data:`sgstore.model.pair_numbers.MARKS`).
-    users : frozenset of str
-        Nodes that are road users.
-    early : set of Part
-        Parts of the conditions without expensive numbers.
-    tested : int
-        Layer after which these conditions are tested.
-    """
-
-    join: Join
-    needed: list[Leaf]
-    conditions: list[Bound]
-    without: frozenset[str] = frozenset()
-    users: frozenset[str] = frozenset()
-    early: set[Part] = field(default_factory=set["Part"])
-    tested: int = 0
-    _stages: dict[Part, int] = field(default_factory=dict["Part", int])
-
-    def __post_init__(self) -> None:
-        cheap = [c for c in self.conditions if not any(is_dear(leaf) for leaf in leaves(c))]
-        pairs = [pair for c in cheap for pair in _pairs(leaves(c))]
-        self.early = {
-            (name, p.a, p.b)
-            for p in pairs
-            for name in needed_for(p.function, self.without)
-            if stage_of(name)
-        }
-        self.tested = max((stage_of(name, self.without) for name, _, _ in self.early), default=0)
-
-    def stage(self, name: str, a: str, b: str) -> int:
-        """Return the layer in which a pair number is computed, or 0 for a raw column."""
-        if not stage_of(name):
-            return 0
-        part = name, a, b
-        if part not in self._stages:
-            found = 1 + max(self.stage(one, a, b) for one in parts_of(name, self.without))
-            self._stages[part] = found if part in self.early else max(found, self.tested + 1)
-        return self._stages[part]
-
-    def stage_of_test(self, condition: Bound) -> int:
-        """Return the layer after which a condition can be tested."""
-        pairs = _pairs(leaves(condition))
-        return max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
-
-    def text(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
-        """Return the complete SQL, with frame, keys and wanted values."""
-        later = list(dict.fromkeys(of_later(self.needed)))
-        if not later:
-            return self._without_later(values, keys, wanted)
-        last = [c for c in self.conditions if of_later(leaves(c))]
-        self.conditions = [c for c in self.conditions if c not in last]
-        kept = dict.fromkeys([*wanted, *(leaf for c in last for leaf in leaves(c))])
-        ends = dict.fromkeys(quoted(f"{key}.id") for one in later for key in (one.a, one.b))
-        known = [leaf for leaf in kept if leaf not in later]
-        text = self._without_later(values, list(dict.fromkeys([*keys, *ends])), known)
-        told = Select(["*"], [nested(text, ":tested")])
-        told.columns += [
-            named(recorded_text(one, world=self.join.world), quoted(column_of(one)))
-            for one in later
-        ]
-        names = ['"frame_id"', *keys, *(quoted(column_of(leaf)) for leaf in wanted)]
-        final = Select(list(dict.fromkeys(names)), [nested(told.text(), ":recorded")])
-        final.where = [
-            expression_text(c, lambda leaf: quoted(column_of(leaf)), values) for c in last
-        ]
-        return final.text()
-
-    def _without_later(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
-        """Return the SQL without conditions on measures from later frames."""
-        pairs = _pairs(self.needed)
-        last = max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
-        innermost = self.join.select
-        innermost.where += [
-            expression_text(c, self.join.texts.__getitem__, values)
-            for c in self.conditions
-            if self.stage_of_test(c) == 0
-        ]
-        ids = {quoted(f"{k}.id"): v for k, v in self.join.nodes.items()}
-        ids |= {quoted(f"{k}.type"): v for k, v in self.join.edges.items()}
-        names = ['"frame_id"', *keys, *(quoted(column_of(leaf)) for leaf in wanted)]
-        texts = {quoted(column_of(leaf)): text for leaf, text in self.join.texts.items()}
-        known = {'"frame_id"': self.join.frame, **ids, **texts}
-        if last == 0:
-            innermost.columns = [named(known[n], n) for n in dict.fromkeys(names)]
-            return innermost.text()
-        carried = dict.fromkeys([*names, *texts])
-        innermost.columns = [named(known[n], n) for n in carried if n in known]
-        innermost.columns += [named(text, n) for n, text in self._raw(pairs).items()]
-        text = innermost.text()
-        for stage in range(1, last + 1):
-            text = self._layer(values, text, stage, pairs)
-        final = Select(list(dict.fromkeys(names)), [nested(text, f":layer {last}")])
-        final.where = self._tests(values, last)
-        return final.text()
-
-    def _layer(self, values: BoundValues, text: str, stage: int, pairs: list[PairNumber]) -> str:
-        select = Select(["*"], [nested(text, f":layer {stage - 1}")])
-        parts = dict.fromkeys(
-            (name, pair.a, pair.b)
-            for pair in pairs
-            for name in sorted(needed_for(pair.function, self.without))
-            if self.stage(name, pair.a, pair.b) == stage
-        )
-        select.columns += [
-            named(pair_text(*part, self.without), pair_column(*part)) for part in parts
-        ]
-        select.where = self._tests(values, stage - 1) if stage > 1 else []
-        return select.text()
-
-    def _tests(self, values: BoundValues, stage: int) -> list[str]:
-        return [
-            expression_text(c, lambda leaf: quoted(column_of(leaf)), values)
-            for c in self.conditions
-            if self.stage_of_test(c) == stage
-        ]
-
-    def _raw(self, pairs: list[PairNumber]) -> dict[str, str]:
-        """Return the raw columns that pair numbers need."""
-        columns: dict[str, str] = {}
-        for pair in pairs:
-            for name in sorted(needed_for(pair.function, self.without)):
-                if stage_of(name) == 0:
-                    key = pair.a if name[0] == "a" else pair.b
-                    columns[pair_column(name, pair.a, pair.b)] = raw_text(
-                        name[2:], self.join.at[key], upright=key in self.users
-                    )
-        return columns
-
-
-def named(text: str, name: str) -> str:
-    """Return a column with its name. ``AS`` is omitted if the column already has that name."""
-    return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"
-
-
-# SQL of the second phase: conditions and results that need values of single frames ----
-# The frames from the first phase are joined with ``state`` (and the tables of constants) for each node whose
-# values are needed. Pair numbers are computed around that join.
 
 PATTERN: Final = '":pattern"'
 FRAME: Final = '":frame"'
@@ -425,7 +215,7 @@ def frames(
     users = frozenset(
         key for key in {*scope.nodes, *scope.outer} if scope.kinds(key).other <= _USERS
     )
-    without = _needless(sql.catalog, _pairs(needed), users)
+    without = _needless(sql.catalog, pairs_of(needed), users)
     layers = Layers(join, needed, conditions, without, users)
     text = layers.text(sql.values, columns_of(nodes, edges), wanted)
     told = {leaf.node for leaf in wanted if isinstance(leaf, NodeValue)}
@@ -903,10 +693,6 @@ def _of_kind(leaf: Leaf) -> bool:
     return _is(leaf, "kind") or _is(leaf, "name")
 
 
-# Values that are constant in a bucket: constants of entities, of parts of the map, and of traces ----
-# Results with only such values need no single frames. Their count is the number of frames in a mask.
-
-
 def _join_lasting(
     select: Select,
     bucket: str,
@@ -915,7 +701,10 @@ def _join_lasting(
     catalog: Catalog,
     needed: Iterable[Leaf],
 ) -> dict[Leaf, str]:
-    """Join tables of constant values to a relation of buckets. Return the SQL of each value."""
+    """Join tables of constant values to a relation of buckets. Return the SQL of each value.
+
+    Results with only such values need no single frames. Their count is the number of frames in a mask.
+    """
     needed = list(needed)
     trace = f"{bucket} >> 18"
     of_traces = [leaf for leaf in needed if isinstance(leaf, TraceAttribute)]

@@ -13,7 +13,7 @@ from sgstore.base.quoting import literal, quoted
 from sgstore.lang.bind import kind_conditions
 from sgstore.lang.ir import PairNumber
 from sgstore.lang.sql._masks import in_mask
-from sgstore.lang.sql._plan import TRACE_OF_FRAME
+from sgstore.lang.sql._windows import TRACE_OF_FRAME
 from sgstore.model.criticality import KNOWN, RECORDED
 from sgstore.model.pair_numbers import COURSES, LANE_DIST, NEXT_PARTS, PART_DIST, WAYS
 from sgstore.model.vocabulary import SIGNALS, entity_kinds
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import Kinds
-    from sgstore.lang.sql._formulas import Leaf
+    from sgstore.lang.sql._expressions import Leaf
 
 _SIGNALS: Final = frozenset(SIGNALS)
 

@@ -1,11 +1,17 @@
 """SQL of the first phase: presence of nodes and relations as bit masks.
 
-Presence and single-node conditions become masks, with one relation for each table that stores such nodes.
+The mask of a row of ``edge`` or ``node`` marks the frames of a bucket in which the row holds. So edges join
+on bucket and node ids, and the frames of a match are the common bits of all masks. Conditions on attributes
+of one node also become masks, and so do blocks (``EXISTS``, ``COUNT``), which are evaluated once for all
+bindings of their outer nodes. Conditions that need values of single frames are evaluated in the second phase
+(:mod:`sgstore.lang.sql._frames`).
+
+A relation of this phase has the columns ``bucket``, ``mask``, ``"x.id"`` for each node x and ``"d.type"``
+for each edge d. A relation of the second phase has ``frame_id`` instead of the first two.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Final
@@ -13,49 +19,25 @@ from typing import TYPE_CHECKING, Final
 from sgstore.base.quoting import quoted
 from sgstore.lang.bind import Profile, alias_of, edge_conditions, homes_of, kind_conditions
 from sgstore.lang.catalog import Home
-from sgstore.lang.ir import (
-    Bound,
-    Edge,
-    Happened,
-    Node,
-    NodeAttribute,
-    Scope,
-    ego_kinds,
-)
-from sgstore.lang.sql._formulas import (
-    Aliases,
-    BoundValues,
-    Select,
-    among,
+from sgstore.lang.ir import Bound, Edge, Happened, Node, NodeAttribute, Scope, ego_kinds
+from sgstore.lang.sql._attributes import Aliases, among
+from sgstore.lang.sql._expressions import (
     bound_text,
     columns_of,
     edge_table,
     expression_text,
-    happened_rows,
     is_constant,
     is_position,
     lane_text,
     leaves,
-    nested,
     node_text,
     trace_text,
 )
-from sgstore.lang.sql._plan import (
-    TRACE_OF_BUCKET,
-    TRACE_OF_FRAME,
-    Phases,
-    SharedRelation,
-    apart,
-    phases_of,
-    traces_of,
-)
-from sgstore.lang.sql._rewrite import (
-    FALSE,
-    chain,
-    narrowed,
-    ordered,
-    possible,
-)
+from sgstore.lang.sql._plan import Phases, SharedRelation, apart, phases_of, traces_of
+from sgstore.lang.sql._recorded_events import happened_rows
+from sgstore.lang.sql._rewrite import FALSE, chain, narrowed, ordered, possible
+from sgstore.lang.sql._select import BoundValues, Select, nested
+from sgstore.lang.sql._windows import TRACE_OF_BUCKET, TRACE_OF_FRAME
 from sgstore.model.vocabulary import entity_kinds
 
 if TYPE_CHECKING:
@@ -63,7 +45,8 @@ if TYPE_CHECKING:
 
     from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import BlockValue, Kinds, Query
-    from sgstore.lang.sql._plan import Gathered, Window
+    from sgstore.lang.sql._plan import Gathered
+    from sgstore.lang.sql._windows import Window
 
 
 _BIT: Final = '"bit"'
@@ -73,133 +56,6 @@ def bit_of(frame: str) -> str:
     """Return the SQL of the mask of a single frame, from its id or its number in the bucket."""
     number = frame if frame.endswith(_BIT) else f"{frame} & 63"
     return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
-
-
-# Counting rows per frame by adding masks, without reading single frames
-# ------------------------------------------------------------------------------------------------
-# A mask is spread over twelve numbers, each with every twelfth bit, so that each frame has a field of twelve
-# bits. The sums of these numbers over many rows are the counts of all frames of a bucket, five counts in each
-# number. To compare counts with a bound, the top bit of each field is set and the bound is subtracted. If the
-# top bit stays set, the count reaches the bound.
-#
-# A count must stay below the top bit, so this is valid for up to :data:`MOST` rows. In a bucket with more
-# rows, the frames are counted one by one.
-
-WIDTH: Final = 12
-"""Bits of each count; 60 frames are five counts in each of twelve numbers."""
-
-MOST: Final = (1 << (WIDTH - 1)) - 1
-"""Largest number of rows that can be added."""
-
-_ONES: Final = sum(1 << place for place in range(0, 60, WIDTH))
-_TOPS: Final = _ONES << (WIDTH - 1)
-
-
-@dataclass(frozen=True, slots=True)
-class CountRange:
-    """Range of positive counts that a comparison accepts: at least ``least`` and less than ``end``."""
-
-    least: int
-    end: int | None
-
-    @classmethod
-    def of(cls, sign: str, number: float) -> CountRange:
-        """Return the counts from 1 for which ``count sign number`` is true; it must be false for 0."""
-        up, past = math.ceil(number), math.floor(number) + 1
-        match sign:
-            case "=":
-                found = (up, past)
-            case "<":
-                found = (1, up)
-            case "<=":
-                found = (1, past)
-            case ">":
-                found = (past, None)
-            case ">=":
-                found = (up, None)
-            case _:  # <>: as it is false for 0, the number is 0
-                found = (1, None)
-        least, end = found
-        return cls(max(least, 1), end if end is None else max(end, 1))
-
-    @property
-    def empty(self) -> bool:
-        """True if the range contains no count."""
-        return self.end is not None and self.least >= self.end
-
-    def condition(self, count: str) -> str:
-        """Return the SQL condition that a count is in the range."""
-        least = f"{count} >= {self.least}"
-        return least if self.end is None else f"{least} AND {count} < {self.end}"
-
-
-def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL for the frames whose number of rows is in a range, as masks.
-
-    Parameters
-    ----------
-    rows : str
-        Name of a relation with the columns ``bucket``, ``mask`` and the key columns. A frame counts once for
-        each row whose mask contains it.
-    keys : list of str
-        Quoted key columns.
-    wanted : CountRange
-    """
-    if wanted.empty:
-        return Select(['"bucket"', *keys, '"mask"'], [quoted(rows)], ["FALSE"]).text()
-    many = _one_by_one(rows, keys, wanted)
-    return f"{_summed(rows, keys, wanted)}\nUNION ALL\n{many}" if wanted.least <= MOST else many
-
-
-def _summed(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL for buckets with few rows, which adds masks."""
-    sums = [
-        f'CAST(sum(("mask" >> {shift}) & {_ONES}) AS BIGINT) AS {_sum(shift)}'
-        for shift in range(WIDTH)
-    ]
-    inner = Select(
-        ['"bucket"', *keys, *sums],
-        [quoted(rows)],
-        group=['"bucket"', *keys],
-        having=[f"count(*) <= {MOST}"],
-    )
-    mask = _reached(wanted.least)
-    if wanted.end is not None and wanted.end <= MOST:
-        mask = f"({mask})\n    & ~({_reached(wanted.end)})"
-    outer = Select(['"bucket"', *keys, f'{mask} AS "mask"'])
-    outer.join(nested(inner.text(), ":sums"), [])
-    return outer.text()
-
-
-def _sum(shift: int) -> str:
-    return quoted(f"sum {shift}")
-
-
-def _reached(bound: int) -> str:
-    """Return SQL for the mask of the frames whose counts reach a bound."""
-    less = bound * _ONES
-    parts = [
-        f"((({_sum(shift)} | {_TOPS}) - {less}) & {_TOPS}) >> {WIDTH - 1 - shift}"
-        for shift in range(WIDTH)
-    ]
-    return "\n    | ".join(f"({part})" for part in parts)
-
-
-def _one_by_one(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL for buckets with many rows or for large bounds, which counts frame by frame."""
-    group = ['"bucket"', *keys]
-    crowded = Select(group, [quoted(rows)], group=group)
-    if wanted.least <= MOST:
-        crowded.having.append(f"count(*) > {MOST}")
-    frame = '":row"."bucket" * 64 + ":bit"."bit"'
-    counted = Select([f'{frame} AS "frame_id"', *(f'":row".{key}' for key in keys)])
-    counted.join(f'{quoted(rows)} AS ":row"', [])
-    on = [f'":crowded".{column} = ":row".{column}' for column in group]
-    counted.join(nested(crowded.text(), ":crowded"), on)
-    counted.join('"bits" AS ":bit"', ['(":row"."mask" & ":bit"."m") <> 0'])
-    counted.group = [frame, *(f'":row".{key}' for key in keys)]
-    counted.having = [wanted.condition("count(*)")]
-    return folded(counted.text(), keys)
 
 
 def folded(text: str, keys: list[str]) -> str:
@@ -226,18 +82,6 @@ def merged(text: str, values: Mapping[str, str]) -> str:
     select.group = ['"bucket"', *values.values()]
     return select.text()
 
-
-# SQL of the first phase: conditions that can be evaluated on masks, 60 frames at a time ----------
-# The mask of a row of ``edge`` or ``node`` marks the frames of a bucket in which the row holds. So edges join
-# on bucket and node ids, and the frames of a match are the common bits of all masks. Conditions on attributes
-# of one node also become masks, and so do blocks (``EXISTS``, ``COUNT``), which are evaluated once for all
-# bindings of their outer nodes.
-#
-# Conditions that need values of single frames are evaluated in the second phase
-# (:mod:`sgstore.lang.sql._frames`). Only this module and the store use masks.
-#
-# A relation of this phase has the columns ``bucket``, ``mask``, ``"x.id"`` for each node x and ``"d.type"``
-# for each edge d. A relation of the second phase has ``frame_id`` instead of the first two.
 
 OUTSIDE: Final = '":outside"'
 BUCKET: Final = '":bucket"'

@@ -1,7 +1,7 @@
 """SQL of results: rows, frames, intervals, clips and counts.
 
-A node id is unique within a trace, or, if negative, within a map. So an entity is identified by trace and id,
-a part of a map by map and id. Traces may share a map.
+Rows are sorted by trace, frame and binding, unless the query has an order. An *interval* is a longest run
+of consecutive frames of one trace with the same binding. A gap of more than 2.5 median periods ends it.
 """
 
 from __future__ import annotations
@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.quoting import quoted
 from sgstore.lang.bind import Profile
-from sgstore.lang.catalog import (
-    FRAME_ATTRIBUTES,
-    NODE_ATTRIBUTES,
-    TRACE_ATTRIBUTES,
-    Attribute,
-    Catalog,
-    DisplayUnit,
-    Type,
-)
+from sgstore.lang.catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Catalog, DisplayUnit, Type
 from sgstore.lang.ir import (
     CLIP_COLUMNS,
     FRAME_COLUMNS,
@@ -45,174 +37,31 @@ from sgstore.lang.ir import (
     walk,
     with_operands,
 )
-from sgstore.lang.sql._formulas import (
-    Leaf,
-    Select,
-    column_of,
-    columns_of,
-    expression_text,
-    frame_text,
-    leaves,
-    nested,
-    owner_text,
-    seconds_text,
-)
+from sgstore.lang.sql._attributes import frame_text, owner_text, seconds_text
+from sgstore.lang.sql._expressions import Leaf, column_of, columns_of, expression_text, leaves
 from sgstore.lang.sql._frames import frames as frames_of
 from sgstore.lang.sql._frames import in_masks, masks, phases
 from sgstore.lang.sql._masks import SqlBuilder, number_of_frames
-from sgstore.lang.sql._plan import TRACE_OF_BUCKET, frame_key, name_key, traces_of
+from sgstore.lang.sql._node_owners import counted_apart, owners_of
+from sgstore.lang.sql._runs import runs
+from sgstore.lang.sql._select import Select, nested
+from sgstore.lang.sql._windows import frame_key, name_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from sgstore.lang.sql._plan import Gathered, Window
+    from sgstore.lang.sql._plan import Gathered
+    from sgstore.lang.sql._windows import Window
 
-
-_TRACE_KEYS: Final = (TRACE_ATTRIBUTES["id"], TRACE_ATTRIBUTES["name"], FRAME_ATTRIBUTES["id"])
-"""Attributes that identify the trace, and therefore the owner of node ids."""
-
-
-OWNER: Final = Attribute("owner", Type.number, {}, "whose number the node id is", DisplayUnit.owner)
-"""Owner of a node id, which distinguishes nodes of several traces: the trace of an entity, or the map of a
-map part. Traces may share a map. Queries cannot use this attribute."""
-
-
-def owner_of(node: str) -> NodeAttribute:
-    """Return the owner attribute of a node: a trace or a map."""
-    return NodeAttribute(node, OWNER, Type.number)
-
-
-def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[NodeAttribute]:
-    """Return the owners needed to distinguish the nodes in some values.
-
-    Empty if only one trace is searched, or if a value identifies the trace.
-    """
-    values = list(values)
-    if _tells_trace(values) or not _several(query, catalog):
-        return []
-    return list(dict.fromkeys(owner_of(v.node) for v in values if isinstance(v, NodeValue)))
-
-
-def with_owners(result: Result) -> Result:
-    """Return a result with extra columns: the owner of each returned node, if rows have no frame."""
-    if result.names:
-        return result
-    owners = (
-        ReturnColumn(f":owner {place}", owner_of(column.value.node))
-        for place, column in enumerate(result.columns)
-        if isinstance(column.value, NodeValue)
-    )
-    return replace(result, columns=(*result.columns, *owners))
-
-
-def counted_apart(query: Query, catalog: Catalog) -> Query:
-    """Return a query in which ``COUNT(DISTINCT v)`` counts nodes separately for each trace or map."""
-    keys = [column.value for column in query.result.columns]
-    if _tells_trace(keys) or not _several(query, catalog):
-        return query
-    return replace(query, result=query.result.changed(_apart))
-
-
-def _apart(value: Bound) -> Bound:
-    match value:
-        case Aggregate(distinct=True, operand=NodeValue(node=node) as operand):
-            whose = Operation("whose", (operand, owner_of(node)), Type.node)
-            return replace(value, operand=whose)
-        case _:
-            return with_operands(value, _apart)
-
-
-def _tells_trace(keys: Iterable[Bound]) -> bool:
-    return any(
-        isinstance(k, FrameAttribute | TraceAttribute) and k.attribute in _TRACE_KEYS for k in keys
-    )
-
-
-def _several(query: Query, catalog: Catalog) -> bool:
-    if catalog.part:  # other parts have traces, too
-        return True
-    chosen, _ = traces_of(query, catalog)
-    return len(catalog.traces if chosen is None else chosen) != 1
-
-
-# Runs of frames from masks ----------------------------------------------------------------------
-# A frame *continues* a run if the same keys hold in the frame before it, without a gap in the recording
-# between the two (``bucket.joined``). A frame of a mask that continues no run is the first of a run. A frame
-# that no frame continues is the last. So runs are found bucket by bucket, and only their ends are read as
-# frames.
-
-FIRST, OWNER_KEY, TOP_OWNER = ":first frame", ":owner", ":top owner"
-"""Extra columns of intervals with ``keyed``: the id of the first frame, and the owners of the nodes used as
-sampling keys."""
-
-_LAST: Final = 59
-"""Bit of the last frame of a bucket."""
-
-
-def runs(masks: str, keys: list[str], apart: list[str]) -> str:
-    """Return SQL for the longest runs of consecutive frames of a trace with the same keys.
-
-    Parameters
-    ----------
-    masks : str
-        Relation with the columns ``bucket``, ``mask`` and the key columns. Each bucket and combination of
-        keys occurs once.
-    keys : list of str
-        Quoted key columns.
-    apart : list of str
-        Key columns that can differ within a trace.
-
-    Returns
-    -------
-    str
-        Relation with the key columns, ``":from"`` and ``":to"``: ids of the first and the last frame.
-    """
-    trace = f'"bucket" >> {TRACE_OF_BUCKET}'
-    same = f'PARTITION BY {", ".join([trace, *apart])} ORDER BY "bucket"'
-    joined = Select(['":masks".*', '":bucket"."joined"'])
-    joined.join(nested(masks, ":masks"), [])
-    joined.join('"bucket" AS ":bucket"', ['":bucket"."bucket" = ":masks"."bucket"'])
-
-    beside = Select(["*"], [nested(joined.text(), ":joined")])
-    beside.columns += [
-        f'CASE WHEN lag("bucket") OVER ({same}) = "bucket" - 1'
-        f' THEN lag("mask") OVER ({same}) >> {_LAST} ELSE 0 END AS "before"',
-        f'CASE WHEN lead("bucket") OVER ({same}) = "bucket" + 1'
-        f' THEN lead("mask" & "joined") OVER ({same}) & 1 ELSE 0 END AS "after"',
-    ]
-    going = Select(["*"], [nested(beside.text(), ":beside")])
-    going.columns.append('"mask" & "joined" & (("mask" << 1) | "before") AS "going"')
-
-    ends = Select(['"bucket"', *keys], [nested(going.text(), ":going")])
-    ends.columns.append('"mask" & ~"going" AS "firsts"')
-    ends.columns.append(f'"mask" & ~(("going" >> 1) | ("after" << {_LAST})) AS "lasts"')
-
-    last = f'CASE WHEN "lasts" <> 0 THEN {_first_of("lasts")} END'
-    following = f"OVER ({same} ROWS BETWEEN 1 FOLLOWING AND UNBOUNDED FOLLOWING)"
-    later = Select(["*", f'min({last}) {following} AS "later"'], [nested(ends.text(), ":ends")])
-
-    from_here = Select([*keys, '"later"', '"bucket" * 64 + ":bit"."bit" AS ":from"'])
-    from_here.columns += ['"bucket"', '"lasts" & ~(":bit"."m" - 1) AS "lasts"']
-    from_here.join(nested(later.text(), ":later"), [])
-    from_here.join('"bits" AS ":bit"', ['("firsts" & ":bit"."m") <> 0'])
-
-    to = f'CASE WHEN "lasts" <> 0 THEN {_first_of("lasts")} ELSE "later" END AS ":to"'
-    return Select([*keys, '":from"', to], [nested(from_here.text(), ":from here")]).text()
-
-
-def _first_of(mask: str) -> str:
-    """Return the SQL of the first frame of a mask: its lowest bit."""
-    return f'"bucket" * 64 + bit_count(("{mask}" & -"{mask}") - 1)'
-
-
-# Statements for the results of a query -------------------------------------------------------------
-# Rows are sorted by trace, frame and binding, unless the query has an order. An *interval* is a longest run
-# of consecutive frames of one trace with the same binding. A gap of more than 2.5 median periods ends it.
 
 CONSTANTS: Final = """
 SELECT node_id, ident, type_name, lifetime, {parked} AS parked FROM inside.entity WHERE trace_id = ?
 """
 """Constants of the entities of a trace that are not stored with frames."""
+
+FIRST, OWNER_KEY, TOP_OWNER = ":first frame", ":owner", ":top owner"
+"""Extra columns of intervals with ``keyed``: the id of the first frame, and the owners of the nodes used as
+sampling keys."""
 
 LOG_TIME: Final = "log_time_ns"
 

@@ -55,14 +55,14 @@ from sgstore.lang.ir import (
     walk,
     with_operands,
 )
-from sgstore.lang.sql._formulas import is_constant, leaves
+from sgstore.lang.sql._expressions import is_constant, leaves
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
-    from sgstore.lang.sql._formulas import Leaf
+    from sgstore.lang.sql._expressions import Leaf
 
 
 FALSE: Final = Value(value=False, type=Type.boolean)

@@ -26,26 +26,19 @@ from sgstore.lang.ir import (
     is_passed_on,
     walk,
 )
-from sgstore.lang.sql._formulas import (
-    Leaf,
-    Select,
-    column_of,
-    columns_of,
-    expression_text,
-    leaves,
-    nested,
-)
+from sgstore.lang.sql._expressions import Leaf, column_of, columns_of, expression_text, leaves
 from sgstore.lang.sql._frames import frames
 from sgstore.lang.sql._masks import SqlBuilder, folded
 from sgstore.lang.sql._plan import SharedRelation
 from sgstore.lang.sql._results import directed, in_order
 from sgstore.lang.sql._rewrite import FALSE
+from sgstore.lang.sql._select import Select, nested
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from sgstore.lang.catalog import Catalog
-    from sgstore.lang.sql._plan import Window
+    from sgstore.lang.sql._windows import Window
 
 
 def staged_matches(query: Query, catalog: Catalog, window: Window | None) -> SqlBuilder:

@@ -14,7 +14,7 @@ from sgstore.base.quoting import quoted
 from sgstore.errors import QueryError, TextSpan
 from sgstore.lang.catalog import TRACE_ATTRIBUTES, Type
 from sgstore.lang.ir import TraceAttribute
-from sgstore.lang.sql._formulas import Select, nested
+from sgstore.lang.sql._select import Select, nested
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import normalize_name

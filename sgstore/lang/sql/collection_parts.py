@@ -17,12 +17,10 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.base.quoting import quoted
 from sgstore.errors import QueryError
 from sgstore.lang.bind import PLACE, sql_of
-from sgstore.lang.catalog import FRAME_ATTRIBUTES, TRACE_ATTRIBUTES, Catalog, DisplayUnit, Type
+from sgstore.lang.catalog import FRAME_ATTRIBUTES, TRACE_ATTRIBUTES, Catalog, Type
 from sgstore.lang.ir import (
     Aggregate,
-    BlockValue,
     Bound,
-    BoundCheck,
     EdgeRelation,
     FrameAttribute,
     GroupKey,
@@ -33,15 +31,11 @@ from sgstore.lang.ir import (
     Sampling,
     SortKey,
     TraceAttribute,
-    WithStage,
     is_counted,
-    is_passed_on,
-    walk,
     with_operands,
 )
-from sgstore.lang.sql._compile import Compiled, Layout
-from sgstore.lang.sql._formulas import BoundValues, Select, expression_text, nested
-from sgstore.lang.sql._plan import frame_key, name_key
+from sgstore.lang.sql._expressions import expression_text
+from sgstore.lang.sql._node_owners import owner_of, with_owners
 from sgstore.lang.sql._results import (
     FIRST,
     OWNER_KEY,
@@ -50,18 +44,19 @@ from sgstore.lang.sql._results import (
     directed,
     keyed,
     names_of,
-    owner_of,
     sampled,
     told_apart_by,
     with_bindings,
-    with_owners,
 )
-from sgstore.lang.sql._rewrite import FALSE, kinds_left, possible, rewritten
+from sgstore.lang.sql._rewrite import rewritten
+from sgstore.lang.sql._select import BoundValues, Select, nested
+from sgstore.lang.sql._subgraphs import Layout
+from sgstore.lang.sql._windows import frame_key, name_key
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
-    from sgstore.lang.catalog import Triple
+    from sgstore.lang.sql._compile import Compiled
 
 PARTS: Final = "parts"
 """Table with the answers to the first query. The other tables have a number after this name."""
@@ -71,9 +66,6 @@ LOG_TIME_COLUMN: Final = ":log_time_ns"
 _FRAME_ID: Final = FrameAttribute(FRAME_ATTRIBUTES["id"], Type.number)
 _LOG_TIME: Final = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
 _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
-
-_WITNESSES: Final = 32
-"""Largest number of remembered sets of triples and kinds that are sufficient for a match."""
 
 Terms = list[str]
 """Expressions of an ``ORDER BY``."""
@@ -203,136 +195,6 @@ def _intervals(query: Query, *, graphs: bool) -> Query:
     return replace(query, result=Result(form="intervals", columns=result.columns, whole=False))
 
 
-# Which parts may answer -----------------------------------------------------------------------------
-
-
-class Pruning:
-    """Filter of the parts of a collection that may answer a query, by their triples and kinds.
-
-    The filter uses the narrowing of the compiler: a pattern that becomes false for the content of a part has
-    no match there.
-
-    Parameters
-    ----------
-    compiled : Compiled
-        Query compiled against the collection.
-
-    Notes
-    -----
-    Triples that no edge of the pattern can have are ignored. Then most parts look alike, and one decision is
-    valid for all of them. Extra content never removes a match. So one comparison accepts a part that has all
-    the content that was sufficient in another part.
-    """
-
-    def __init__(self, compiled: Compiled) -> None:
-        query = compiled.query
-        steps, ways = query.steps, query.ways if query.steps else ()
-        self._ways = [tuple(steps[n].scope for n in way.happen) for way in ways]
-        self._ways = self._ways or [tuple(query.required)]
-        self._known: dict[frozenset[Any], bool] = {}
-        self._enough: list[frozenset[Any]] = []
-        self._edges = [
-            (edge, scope.kinds(edge.src), scope.kinds(edge.dst))
-            for scopes in self._ways
-            for scope in scopes
-            for edge in scope.edges
-            if edge.high == 1
-        ]
-
-    def matters(self, triple: Triple) -> bool:
-        """True if an edge of the pattern can have this triple."""
-        return any(True for of in self._edges for _ in possible(*of, (triple,)))
-
-    def may_answer(self, held: frozenset[Triple], kinds: Sequence[frozenset[str]]) -> bool:
-        """True if a part may have a match.
-
-        Parameters
-        ----------
-        held : frozenset of Triple
-            The relevant triples that occur in the part.
-        kinds : sequence of frozenset
-            Moving kinds, fixed kinds and map kinds of the part.
-        """
-        every = held.union(*kinds)
-        known = self._known.get(every)
-        if known is None:
-            known = any(enough <= every for enough in self._enough)
-            if not known and self._possible(every):
-                known = True
-                if len(self._enough) < _WITNESSES:
-                    self._enough.append(self._least(every))
-            self._known[every] = known
-        return known
-
-    def _possible(self, every: frozenset[Any]) -> bool:
-        """True if a match is possible with these triples and kinds."""
-        triples = [one for one in every if isinstance(one, tuple)]
-        return any(
-            all(s.where != (FALSE,) and kinds_left(s, triples, every) is not None for s in scopes)
-            for scopes in self._ways
-        )
-
-    def _least(self, every: frozenset[Any]) -> frozenset[Any]:
-        """Return a minimal set of triples and kinds with which a match is still possible."""
-        for one in every:
-            if self._possible(every - {one}):
-                every -= {one}
-        return every
-
-
-@dataclass(frozen=True, slots=True)
-class ClassQuestion:
-    """Frame classes used by a query, which must be collected from all parts.
-
-    Attributes
-    ----------
-    abstraction : str
-    dataset : str
-        Dataset with the required classes. Empty means the number of frames of each class in all traces.
-    traces : tuple of int
-        Traces of the dataset.
-    table : str
-        Table of single frames of the dataset; empty for a dataset of traces.
-    """
-
-    abstraction: str
-    dataset: str = ""
-    traces: tuple[int, ...] = ()
-    table: str = ""
-
-
-def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
-    """Return the frame classes that a query or a check uses, without duplicates."""
-    if isinstance(asked, BoundCheck):
-        values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
-        values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]
-        values += [column.value for column in asked.returns]
-    else:
-        values = [*asked.scope.where, *asked.result.values]
-        for stage in asked.stages:
-            values += stage.expressions if isinstance(stage, WithStage) else stage.scope.where
-        values += [v for step in asked.steps for v in (*step.scope.where, *step.when)]
-    return tuple(dict.fromkeys(_class_questions(values)))
-
-
-def _class_questions(values: Iterable[Bound]) -> Iterator[ClassQuestion]:
-    for part in (part for value in values for part in walk(value)):
-        if isinstance(part, BlockValue):
-            yield from _class_questions(part.inside)
-        if not isinstance(part, FrameAttribute) or is_passed_on(part):
-            continue
-        attribute = part.attribute
-        (column,) = attribute.columns.values()
-        if attribute.unit is DisplayUnit.counted:
-            yield ClassQuestion(column)
-        elif attribute.unit is DisplayUnit.seen:
-            dataset = attribute.name.removeprefix(f"class_{column} in ")
-            yield ClassQuestion(column, dataset, attribute.traces, attribute.table)
-
-
-# Rows: in the order of the query, otherwise ordered by trace, frame and binding --------------------------
-
-
 def _parted_rows(query: Query) -> Parted:
     result, hidden = query.result, _Hidden()
     own = [directed(hidden.key(k.value), k.descending) for k in result.order]
@@ -447,9 +309,6 @@ class _Hidden:
         return quoted(value) if isinstance(value, str) else self.add(value)
 
 
-# Intervals and clips ---------------------------------------------------------------------------------
-
-
 def _parted_intervals(query: Query) -> Parted:
     result = query.result
     asked = _of_part(replace(result, keyed=True))
@@ -483,9 +342,6 @@ def _per_of_intervals(result: Result, chosen: Sampling | None, owner: str) -> Te
 def _name(key: SortKey) -> str:
     assert isinstance(key.value, str)  # noqa: S101 - the binder knows the names of intervals only
     return quoted(key.value)
-
-
-# Sets and groups -----------------------------------------------------------------------------------------
 
 
 def _parted_sets(query: Query) -> Parted:

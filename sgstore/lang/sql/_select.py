@@ -1,0 +1,80 @@
+"""Builder of ``SELECT`` statements, with bound values.
+
+The text is portable SQL. It runs on DuckDB and can be adapted to other engines. Every identifier is quoted
+and every value of the user is bound. Words of the vocabulary are literals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from sgstore.base.quoting import quoted
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+@dataclass(slots=True)
+class BoundValues:
+    """User values bound by a statement, in order."""
+
+    items: list[Any] = field(default_factory=list[Any])
+
+    def add(self, value: object) -> str:
+        """Add a value and return its placeholder."""
+        self.items.append(value)
+        return f"${len(self.items)}"
+
+
+@dataclass(slots=True)
+class Select:
+    """Builder of a ``SELECT`` statement: one line for each column, table and condition.
+
+    If ``lenient``, tables are joined by ``LEFT JOIN``, so rows without a partner are kept.
+    """
+
+    columns: list[str] = field(default_factory=list[str])
+    tables: list[str] = field(default_factory=list[str])
+    where: list[str] = field(default_factory=list[str])
+    group: list[str] = field(default_factory=list[str])
+    having: list[str] = field(default_factory=list[str])
+    order: list[str] = field(default_factory=list[str])
+    limit: int | None = None
+    offset: int = 0
+    distinct: bool = False
+    lenient: bool = False
+
+    def text(self) -> str:
+        """Return the SQL text."""
+        head = "SELECT DISTINCT " if self.distinct else "SELECT "
+        lines = [head + ",\n  ".join(self.columns)]
+        lines += ["FROM " + "\n  ".join(self.tables)] if self.tables else []
+        lines += ["WHERE " + "\n  AND ".join(self.where)] if self.where else []
+        lines += ["GROUP BY " + ", ".join(self.group)] if self.group else []
+        lines += ["HAVING " + "\n  AND ".join(self.having)] if self.having else []
+        lines += ["ORDER BY " + ", ".join(self.order)] if self.order else []
+        lines += [f"LIMIT {self.limit}"] if self.limit is not None else []
+        lines += [f"OFFSET {self.offset}"] if self.offset else []
+        return "\n".join(lines)
+
+    def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
+        """Join a table. Without conditions, it is a cross join."""
+        if not self.tables:
+            self.tables.append(table)
+            self.where += conditions
+        elif conditions:
+            how = "LEFT JOIN" if self.lenient else how
+            self.tables.append(f"{how} {table} ON " + " AND ".join(conditions))
+        else:
+            self.tables.append(f"CROSS JOIN {table}")
+
+
+def indented(text: str) -> str:
+    """Indent a statement for use in another statement."""
+    return "\n".join(f"    {line}" for line in text.splitlines())
+
+
+def nested(text: str, name: str) -> str:
+    """Return a statement as a derived table."""
+    return f"(\n{indented(text)}\n  ) AS {quoted(name)}"
