@@ -17,6 +17,7 @@ Collections: ``_bundles`` copies traces into new stores and describes their cont
 segments before that, and ``_merge`` merges the results of several bundles.
 """
 
+from sgstore.store._arrow import arrow_file, as_told, as_told_batches
 from sgstore.store._bundles import (
     CATALOGUE,
     Facts,
@@ -60,23 +61,11 @@ from sgstore.store._merge import (
 from sgstore.store._packing import BUCKET_BITS, SEQ_BITS, begins, frame_ids, seq_of, trace_of
 from sgstore.store._publish import PresentError
 from sgstore.store._rebuild import OldMap, OldTrace, Remains, named_as, remains_of, take_place
-from sgstore.store._rows import (
-    IN_NOTEBOOK,
-    Batches,
-    ParquetTable,
-    Rows,
-    Tabular,
-    arrow_file,
-    as_told,
-    as_told_batches,
-    count_parquet,
-    write_batches,
-    write_csv,
-    write_parquet,
-)
+from sgstore.store._rows import IN_NOTEBOOK, Batches, Rows, Tabular, count_parquet
 from sgstore.store._schema import SCHEMA_VERSION
 from sgstore.store._similarity import Example, SimilarFrames, example_of, frames_like, most_like
 from sgstore.store._staging import Sealed
+from sgstore.store._table_files import ParquetTable, write_batches, write_csv, write_parquet
 from sgstore.store._temporary_tables import Given, GivenTable
 from sgstore.store._traces import (
     FrameRef,

@@ -17,6 +17,7 @@ import numpy as np
 import sgstore.store._rows as rows
 from sgstore.errors import SgstoreError, StoreError, TraceError
 from sgstore.model.world import Channel, MessageRefs
+from sgstore.store._arrow import record_batches, table_of
 from sgstore.store._encounters import recorded_measures
 from sgstore.store._locking import (
     WAIT_S,
@@ -28,6 +29,7 @@ from sgstore.store._locking import (
     translated,
 )
 from sgstore.store._rows import BATCH, Batches, Rows
+from sgstore.store._table_files import write_batches, write_parquet
 from sgstore.store._temporary_tables import Given, give
 from sgstore.store._traces import (
     FrameRef,
@@ -58,13 +60,14 @@ if TYPE_CHECKING:
     from sgstore.model.graph import SceneGraph
     from sgstore.model.world import TraceInfo
     from sgstore.readers import Media
+    from sgstore.store._arrow import ArrowStream
     from sgstore.store._classes import Abstracted
     from sgstore.store._derive import Deriving
     from sgstore.store._graphs import Graphs
     from sgstore.store._joins import JoinedTable, UserTables
     from sgstore.store._locking import Stamp
     from sgstore.store._packing import Columns
-    from sgstore.store._rows import ArrowStream, Parameters, UserTablesGiven
+    from sgstore.store._rows import Parameters, UserTablesGiven
     from sgstore.store._staging import Sealed
     from sgstore.store._verify import Verification
     from sgstore.store._write import Segment
@@ -219,8 +222,8 @@ class StoreFile:
     def table(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Any:
-        """Run a trusted SQL statement, and return an Arrow table; see :func:`sgstore.store._rows.table_of`."""
-        with self._answered(lambda at, _: rows.table_of(at, sql, parameters), sql, given) as found:
+        """Run a trusted SQL statement, and return an Arrow table; see :func:`sgstore.store._arrow.table_of`."""
+        with self._answered(lambda at, _: table_of(at, sql, parameters), sql, given) as found:
             return found
 
     @contextmanager
@@ -249,7 +252,7 @@ class StoreFile:
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Generator[ArrowStream | None]:
         """Stream the rows of a trusted SQL statement as Arrow batches."""
-        with self._answered(lambda x, _: rows.record_batches(x, sql, parameters), sql, given) as y:
+        with self._answered(lambda x, _: record_batches(x, sql, parameters), sql, given) as y:
             yield y
 
     def user_sql(
@@ -315,7 +318,7 @@ class StoreFile:
         return rows.LaterRows(
             first,
             partial(self.user_sql, sql, timeout_s=timeout_s, given=given),
-            lambda: self._user_step(sql, timeout_s, lambda at: rows.table_of(at, sql), given),
+            lambda: self._user_step(sql, timeout_s, lambda at: table_of(at, sql), given),
             partial(self.user_parquet, sql, timeout_s=timeout_s, given=given),
         )
 
@@ -338,15 +341,15 @@ class StoreFile:
         """
 
         def step(connection: DuckDBPyConnection) -> int | None:
-            stream = rows.record_batches(connection, sql)
-            return None if stream is None else rows.write_batches(stream, to)
+            stream = record_batches(connection, sql)
+            return None if stream is None else write_batches(stream, to)
 
         number = self._user_step(sql, timeout_s, step, given)
         if number is not None:
             return number
         with self.user_batches(sql, timeout_s=timeout_s, given=given) as batches:
             values = chain.from_iterable(batch.values for batch in batches)
-            return rows.write_parquet(batches.columns, values, to, batches.types)
+            return write_parquet(batches.columns, values, to, batches.types)
 
     def _user_step(
         self,

@@ -23,8 +23,9 @@ from sgstore.store._joins import tables_folder
 from sgstore.store._lease import shared_instance
 from sgstore.store._locking import default_memory, spill_folder, translated
 from sgstore.store._packing import SEQ_BITS
-from sgstore.store._rows import Batches, arrays, write_parquet
+from sgstore.store._rows import Batches, arrays
 from sgstore.store._staging import scratch
+from sgstore.store._table_files import write_parquet
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Mapping, Sequence
