@@ -14,7 +14,7 @@ from recordings import Recorder, car
 import sgstore
 from sgstore.errors import QueryError, StoreError
 from sgstore.ingest import ingest
-from sgstore.store import _locking
+from sgstore.store import _gate
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -95,8 +95,8 @@ def test_without_locks_one_reads_and_does_not_write(
     def flock(*_: Any) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr(_locking.fcntl, "flock", flock)
-    gate = _locking.gate_of(path)
+    monkeypatch.setattr(_gate.fcntl, "flock", flock)
+    gate = _gate.gate_of(path)
     gate.touch()
     with sgstore.open(path) as store:
         assert store.find("MATCH (e:Ego)").count() == 3

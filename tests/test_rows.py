@@ -12,7 +12,6 @@ import pyarrow as pa
 import pytest
 
 import sgstore.matches
-import sgstore.store._rows as rows_of_store
 from sgstore.apps.cli import run
 from sgstore.errors import MissingExtraError, SqlError
 from sgstore.query import Store
@@ -146,14 +145,15 @@ def test_files_of_matches_are_those_of_their_rows(
 ) -> None:
     for name in ("FIRST_WINDOW", "LAST_WINDOW"):
         monkeypatch.setattr(sgstore.matches, name, 2)
-    monkeypatch.setattr(rows_of_store, "_TOGETHER", 100)  # rows whose values tell the types
+    for module in ("_arrow", "_table_files"):  # rows whose values tell the types
+        monkeypatch.setattr(f"sgstore.store.{module}.ROWS_AT_ONCE", 100)
 
     def written(name: str) -> bytes:
         assert run(["find", str(town_store), query, "-o", str(tmp_path / name)]) == 0
         return (tmp_path / name).read_bytes()
 
     ours = written(f"a.{form}")
-    monkeypatch.setattr(rows_of_store, "record_batches", nothing)
+    monkeypatch.setattr("sgstore.store._file.record_batches", nothing)
 
     assert ours == written(f"b.{form}")
 
@@ -204,7 +204,7 @@ def test_files_of_the_verb_hold_the_same_rows(
         return (tmp_path / name).read_bytes()
 
     ours = written(f"a.{form}")
-    monkeypatch.setattr(rows_of_store, "record_batches", nothing)
+    monkeypatch.setattr("sgstore.store._file.record_batches", nothing)
 
     assert ours == written(f"b.{form}")
     assert np.array_equal([row[0] for row in store.sql(sql.format(300))], np.arange(300))

@@ -16,6 +16,7 @@ import pytest
 from graph_blocks import RandomTrace, map_stub, publish, trace_info
 
 import sgstore.store._staging as staging
+import sgstore.store._table_stream as table_stream
 from sgstore.errors import StoreError
 from sgstore.model.config import Config, RangeSettings
 from sgstore.model.world import TraceReport
@@ -209,7 +210,7 @@ def test_traces_that_cannot_come_in_cost_no_other_of_those_that_come_with_them(
             for graph in trace.blocks:
                 segment.append(graph)
             sealed.append(segment.seal(TraceReport(frames=70)))
-        (sealed[2].folder / staging.FILE).unlink()
+        (sealed[2].folder / table_stream.FILE).unlink()
 
         told = store.publish_each(sealed)
 

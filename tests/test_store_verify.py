@@ -15,7 +15,8 @@ import sgstore.store._publish as publishing
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
-from sgstore.store._columns import REPEATED, Checksum
+from sgstore.store._checksums import Checksum
+from sgstore.store._columns import REPEATED
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -25,7 +25,7 @@ from sgstore.pipeline.rebuild import rebuild
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
-from sgstore.store._schema import BEYOND
+from sgstore.store._schema_text import BEYOND
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

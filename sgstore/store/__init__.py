@@ -1,37 +1,38 @@
 """The store: one DuckDB file. Only this package uses DuckDB.
 
 Reading: ``_file`` has the main class, :class:`StoreFile`. ``_locking`` shares the file between readers and
-writers, and ``_schema`` checks it against ``schema.sql`` before the first read. ``_rows`` runs SQL statements
-and converts their rows; ``_temporary_tables`` creates their temporary tables, and ``_interrupts`` makes them
-interruptible. ``_traces`` finds traces and frames by name, and ``_graphs`` reads graphs. ``_catalog`` describes
-the store for the query compiler. ``_joins`` joins user tables, ``_encounters`` computes measures of later
-encounters, and ``_contents`` computes digests of frames.
+writers, with ``_gate`` and ``_lease``. ``_schema`` checks it against ``schema.sql`` before the first read.
+``_rows`` runs SQL statements; ``_arrow`` and ``_table_files`` convert their rows. ``_temporary_tables`` creates
+the temporary tables of a statement, and ``_interrupts`` interrupts statements. ``_traces`` finds traces
+and frames by name, and ``_graphs`` reads graphs. ``_catalog`` describes the store for the query compiler.
+``_joins`` joins user tables, ``_encounters`` computes measures of later encounters, and ``_contents`` computes
+digests of frames.
 
 Writing: ``_packing`` converts the graphs of a block to columns and masks. ``_write`` builds a trace outside the
-store, as arrays in a file of ``_staging``; ``_columns`` sorts them and computes checksums. ``_payloads`` joins
-messages to frames, and ``_publish`` adds the trace to the store. ``_classes`` adds frame classes, ``_derive``
-adds derived sets of relations; ``_similarity`` compares frames. ``_verify`` verifies a store; ``_rebuild``
-creates and rewrites stores.
+store, in ``_staging``, as arrays in a file of ``_table_stream``. ``_columns`` sorts them, and ``_checksums``
+computes their checksums. ``_payloads`` joins messages to frames, and ``_publish`` adds the trace to the store.
+``_classes`` adds frame classes, ``_derive`` adds derived sets of relations; ``_similarity`` compares frames.
+``_verify`` verifies a store; ``_creation`` creates stores, and ``_rebuild`` rewrites them.
 
-Collections: ``_bundles`` copies traces into new stores and describes their content, ``_inbox_segments`` keeps
-segments before that, and ``_merge`` merges the results of several bundles.
+Collections: ``_bundles`` copies traces into new stores, and ``_bundle_catalogue`` describes their content.
+``_inbox_segments`` keeps segments before that, and ``_merge`` merges the results of several bundles.
 """
 
 from sgstore.store._arrow import arrow_file, as_told, as_told_batches
-from sgstore.store._bundles import (
+from sgstore.store._bundle_catalogue import (
     CATALOGUE,
     Facts,
     answers_of,
     facts_of,
-    join_bundles,
     maps_of_traces,
     names_of_traces,
     parquet_rows,
-    write_bundle,
 )
+from sgstore.store._bundles import join_bundles, write_bundle
 from sgstore.store._catalog import relations_of_set, subset_catalogs
-from sgstore.store._classes import Abstracted, CodedClasses, Triples
+from sgstore.store._classes import Abstracted
 from sgstore.store._clients import duckdb
+from sgstore.store._coded_classes import CodedClasses, Triples
 from sgstore.store._contents import (
     DIGEST_BYTES,
     WINDOW,
@@ -46,7 +47,6 @@ from sgstore.store._encounters import measured
 from sgstore.store._file import StoreFile
 from sgstore.store._inbox_segments import split_segment, whole_segment
 from sgstore.store._joins import UserTables
-from sgstore.store._locking import Folder, refuse_name
 from sgstore.store._merge import (
     PartFile,
     merged_arrays,
@@ -65,6 +65,7 @@ from sgstore.store._rows import IN_NOTEBOOK, Batches, Rows, Tabular, count_parqu
 from sgstore.store._schema import SCHEMA_VERSION
 from sgstore.store._similarity import Example, SimilarFrames, example_of, frames_like, most_like
 from sgstore.store._staging import Sealed
+from sgstore.store._store_paths import Folder, refuse_name
 from sgstore.store._table_files import ParquetTable, write_batches, write_csv, write_parquet
 from sgstore.store._temporary_tables import Given, GivenTable
 from sgstore.store._traces import (

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import duckdb as engine
 
-from sgstore.store._locking import refuse_special, translated, without_faults
+from sgstore.store._engine_errors import translated
+from sgstore.store._locking import without_faults
+from sgstore.store._store_paths import refuse_special
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection

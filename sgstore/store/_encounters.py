@@ -23,7 +23,7 @@ from sgstore.errors import ConfigError
 from sgstore.model.criticality import FIXED_KINDS, KNOWN, RECORDED, TRACKS, tracks_of
 from sgstore.store._interrupts import interrupted
 from sgstore.store._lease import stamp_of
-from sgstore.store._schema import INSIDE
+from sgstore.store._schema_text import INSIDE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable

@@ -19,15 +19,8 @@ from sgstore.errors import SgstoreError, StoreError, TraceError
 from sgstore.model.world import Channel, MessageRefs
 from sgstore.store._arrow import record_batches, table_of
 from sgstore.store._encounters import recorded_measures
-from sgstore.store._locking import (
-    WAIT_S,
-    Access,
-    EngineError,
-    default_memory,
-    spill_folder,
-    stamp_of,
-    translated,
-)
+from sgstore.store._engine_errors import EngineError, translated
+from sgstore.store._locking import WAIT_S, Access, default_memory, spill_folder, stamp_of
 from sgstore.store._rows import BATCH, Batches, Rows
 from sgstore.store._table_files import write_batches, write_parquet
 from sgstore.store._temporary_tables import Given, give
@@ -168,7 +161,7 @@ class StoreFile:
         path = Path(path)
         made = not path.exists()
         if made:
-            from sgstore.store._rebuild import create
+            from sgstore.store._creation import create
 
             create(path)
         return cls(path, memory=memory, wait_s=wait_s, made=made)

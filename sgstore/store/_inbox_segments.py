@@ -6,7 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.store._publish import SHARED
-from sgstore.store._staging import FILE, Sealed, TableFile
+from sgstore.store._staging import Sealed
+from sgstore.store._table_stream import FILE, TableFile
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -241,9 +241,6 @@ class OpenFile:
                 self.changed.release()
 
 
-# Thread that closes idle files ------------------------------------------------------------------
-
-
 class _Watch:
     """Idle open files, and the thread that closes them."""
 

@@ -1,16 +1,20 @@
-"""Shared access to the DuckDB file: locks, guards, recovery, and errors.
+"""Shared access of readers and writers to the DuckDB file, within and among processes.
 
-This module also defines valid store files, and the files that a writing connection can access.
+DuckDB lets one process write a file, or many read it, and rejects other processes at once. Here, a process
+waits for a limited time instead. The file is open during reading and publication, and for a short time after
+a reading, unless a writer waits (see :mod:`sgstore.store._lease`).
+
+* *Among processes* DuckDB's own lock decides. A writer that waits for readers holds a second lock, the
+  *gate* (``STORE.gate``), that new readers pass first, so that a stream of them cannot keep it out for ever.
+* *Within a process* that lock is not enough, because POSIX forgets all locks of a process on a file when any
+  descriptor of it is closed. All readers of a file share one instance of the database, a writer has it
+  alone, and **nothing in this process may open a store's file by other means while it is written**.
 """
 
 from __future__ import annotations
 
-import atexit
-import gc
 import os
-import stat
 import threading
-import time
 from contextlib import contextmanager, suppress
 from functools import partial
 from glob import escape
@@ -20,12 +24,16 @@ from weakref import finalize
 import duckdb
 
 import sgstore.store._schema as shape
-from sgstore.base.files import HeldFolder, new_place, sweep
+from sgstore.base.files import new_place
 from sgstore.base.logs import logger
 from sgstore.base.quoting import literal
-from sgstore.errors import SqlError, StoreError, one_store_needed, url_named
+from sgstore.errors import StoreError
+from sgstore.store._engine_errors import BusyError, translated
+from sgstore.store._gate import Deadline, closed_gate, pass_gate
 from sgstore.store._joins import tables_folder
-from sgstore.store._lease import AttachedFile, OpenFile, files, gate_of, stamp_of
+from sgstore.store._lease import AttachedFile, OpenFile, files, stamp_of
+from sgstore.store._schema_text import INSIDE
+from sgstore.store._store_paths import refuse_odd_name, refuse_special, remove_left_behind
 
 _log = logger("store")
 
@@ -37,63 +45,6 @@ if TYPE_CHECKING:
 
     from sgstore.store._joins import UserTables
     from sgstore.store._lease import Stamp
-
-
-_KINDS: Final = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
-
-
-_NO_NAME: Final = frozenset("?\\")
-"""Characters that DuckDB treats as the end of a path, or as a slash."""
-
-
-def refuse_name(path: Path) -> None:
-    """Reject a path with characters that DuckDB misinterprets.
-
-    Raises
-    ------
-    StoreError
-    """
-    found = sorted(_NO_NAME & set(str(path.absolute())))
-    if found and os.name == "posix" and url_named(path) is None:
-        raise StoreError(
-            f"{path}: DuckDB cannot open a path with {found[0]!r}; rename the store, or its folder"
-        )
-
-
-def refuse_special(path: Path) -> None:
-    """Reject pipes and devices, which would block on open.
-
-    Raises
-    ------
-    StoreError
-    """
-    if url_named(path) is not None:
-        raise one_store_needed(path)
-    refuse_name(path)
-    for file in (path.with_name(f"{path.name}.wal"), path):
-        try:
-            mode = file.stat().st_mode
-        except FileNotFoundError:
-            continue
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "not a name of a file"
-            raise StoreError(f"{path}: cannot be read: {reason}") from error
-        if (path / "COLLECTION.json").is_file():
-            raise one_store_needed(path)
-        if not stat.S_ISREG(mode):
-            what = _KINDS.get(stat.S_IFMT(mode), "no file")
-            whose = "" if file == path else f"{file.name} beside it is "
-            raise StoreError(
-                f"{path}: {whose}{what}: not a store; expected a file that 'sgstore ingest' made"
-            )
-    if not path.exists():
-        raise StoreError(f"{path}: no such store; 'sgstore ingest' makes one")
 
 
 def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...]) -> None:
@@ -114,127 +65,20 @@ def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...
     connection.execute("SET lock_configuration = true")
 
 
-# Folder of unpublished segments next to a store, named ``STORE.segment-…`` ----------------------
-
-_NAME: Final = ".segment-"
-
-
-class Folder(HeldFolder):
-    """Folder next to a store, locked while its process lives.
-
-    Parameters
-    ----------
-    store : Path
-
-    Attributes
-    ----------
-    path : Path
-
-    Raises
-    ------
-    StoreError
-        The folder is not writable, or the store name is invalid.
-    """
-
-    def __init__(self, store: Path) -> None:
-        refuse_odd_name(store)
-        try:
-            super().__init__(store.parent, f"{store.name}{_NAME}")
-        except OSError as error:
-            raise StoreError(f"{store.parent}: cannot be written: {error.strerror}") from error
-
-
-def remove_left_behind(store: Path) -> None:
-    """Remove the folders that killed writer processes left next to a store."""
-    sweep(store.parent, f"{store.name}{_NAME}")
-
-
-def refuse_odd_name(store: Path) -> None:
-    """Reject a path that is not valid UTF-8 or contains a null character.
-
-    Raises
-    ------
-    StoreError
-        The path is not UTF-8, or contains a null character.
-    """
-    try:
-        if b"\0" not in str(store).encode():
-            return
-    except UnicodeEncodeError:
-        pass
-    shown = str(store).encode(errors="backslashreplace").decode().replace("\0", "\\x00")
-    raise StoreError(
-        f"{shown}: the name of a store and of its folders is UTF-8; rename what is not"
-    )
-
-
-# Messages for database errors that the query did not cause --------------------------------------
-
-
-def engine_fault(error: duckdb.Error) -> str | None:
-    """Return one line about an internal DuckDB error, or ``None`` for another error."""
-    if not isinstance(error, duckdb.InternalException | duckdb.FatalException):
-        return None
-    reason = str(error).strip().partition("\n")[0].removeprefix("INTERNAL Error: ")
-    return f"a fault of DuckDB {duckdb.__version__} itself, not of the question: {reason}"
-
-
-def spill_fault(message: str) -> str | None:
-    """Return the message for a query beyond its memory and disk limits, or ``None`` for another error."""
-    if not message.startswith("Out of Memory Error"):
-        return None
-    return (
-        "stopped: it needs more memory, and disk beside it, than it may take; allow it more (--max-spill 50GB;"
-        " memory and max_spill of Store), or ask for less: fewer variables, a narrower WHERE, no ORDER BY"
-    )
-
-
-# Shared access of readers and writers to a DuckDB file, within and among processes --------------
-# DuckDB lets one process write a file, or many read it, and rejects other processes at once. Here, a process
-# waits for a limited time instead. The file is open during reading and publication, and for a short time after
-# a reading, unless a writer waits (see :mod:`sgstore.store._lease`).
-#
-# * *Among processes* DuckDB's own lock decides. A writer that waits for readers holds a second lock, the
-#   *gate* (``STORE.gate``), that new readers pass first, so that a stream of them cannot keep it out for ever.
-# * *Within a process* that lock is not enough, because POSIX forgets all locks of a process on a file when any
-#   descriptor of it is closed. All readers of a file share one instance of the database, a writer has it
-#   alone, and **nothing in this process may open a store's file by other means while it is written**.
-
-try:
-    import fcntl
-except ImportError:  # not on Windows: without a gate, access is first come, first served
-    fcntl = None
-
-
 STORAGE_VERSION: Final = "v1.5.0"
 """File format version: the newest one that every supported DuckDB can read."""
 
 BLOCK_SIZE: Final = 1 << 16
 """Block size of a new file; bytes. Each of about thirty tables uses whole blocks, even for few rows."""
 
-_BUSY: Final = ("Could not set lock on file", "Conflicting lock is held")
-"""Words in the DuckDB error if another process uses the file."""
-
-_HELD_HERE: Final = (
-    "Unique file handle conflict",
-    "different configuration than existing connections",
-)
-"""Words in the DuckDB error if another connection of this process uses the file."""
-
 WAIT_S: Final = 60.0
 """Longest wait for other readers or writers; s."""
-
-_HELD_HERE_S: Final = 0.25
-"""Longest wait for another connection of this process, which may be closing; s."""
 
 _SURPRISES: Final = (
     *(ArithmeticError, AssertionError, AttributeError, LookupError, StopIteration),
     *(TypeError, ValueError),
 )
 """Exceptions that invalid store rows can cause."""
-
-_PAUSE: Final = 0.005, 0.1
-"""First and longest pause between two attempts; s."""
 
 
 def without_faults(connection: DuckDBPyConnection) -> None:
@@ -382,7 +226,7 @@ class Access:
         StoreError
             The file does not exist, is not a database, or a writer process used it for too long.
         """
-        deadline = _Deadline(self._wait_s)
+        deadline = Deadline(self._wait_s)
         connection = self._enter(deadline, public=public, idle=idle)
         failed = True
         try:
@@ -424,8 +268,8 @@ class Access:
             return ""  # an error of the caller
         instance = self._file.instance
         if isinstance(instance, AttachedFile):
-            return self._diagnose(instance.cursor(shape.INSIDE), self.path)
-        connection.execute(f"USE {shape.INSIDE}")  # it may have been opened with public names
+            return self._diagnose(instance.cursor(INSIDE), self.path)
+        connection.execute(f"USE {INSIDE}")  # it may have been opened with public names
         return self._diagnose(connection, self.path)
 
     def restart(self) -> bool:
@@ -449,12 +293,12 @@ class Access:
             again, file.careful = not file.careful, True
         return again
 
-    def _enter(self, deadline: _Deadline, *, public: bool, idle: bool) -> DuckDBPyConnection:
+    def _enter(self, deadline: Deadline, *, public: bool, idle: bool) -> DuckDBPyConnection:
         file = self._file
         if (
             not file.mine
         ):  # a nested reading must not wait for a writer that waits for the outer one
-            _pass_gate(self.path, deadline)
+            pass_gate(self.path, deadline)
         with file.changed:
             free = file.changed.wait_for(
                 lambda: not file.writing and (file.mine or not file.waiting) and self._is_fit(file),
@@ -479,11 +323,9 @@ class Access:
                 if idle or not isinstance(instance, AttachedFile):
                     connection = instance.cursor()
                     if inside and not idle:
-                        connection.execute(
-                            f"USE {shape.INSIDE}"
-                        )  # a cursor does not inherit the setting
+                        connection.execute(f"USE {INSIDE}")  # a cursor does not inherit the setting
                 else:
-                    connection = instance.cursor(shape.INSIDE if inside else "main")
+                    connection = instance.cursor(INSIDE if inside else "main")
             except BaseException:
                 file.close()
                 raise
@@ -513,7 +355,7 @@ class Access:
             shape.check(connection, database or shape.database_of(connection), self.path)
         self._file.good = stamp
 
-    def _open(self, deadline: _Deadline) -> DuckDBPyConnection | AttachedFile:
+    def _open(self, deadline: Deadline) -> DuckDBPyConnection | AttachedFile:
         """Open the file for all readers of this process."""
         file = self._file
         while True:
@@ -526,7 +368,7 @@ class Access:
         _log.debug("%s: opened to read", self.path)
         return instance
 
-    def _opened(self, deadline: _Deadline) -> DuckDBPyConnection | AttachedFile:
+    def _opened(self, deadline: Deadline) -> DuckDBPyConnection | AttachedFile:
         # All readers have one configuration, because they share the instance, also for user statements.
         config: dict[str, str | bool | int | float | list[str]] = {
             "memory_limit": memory_setting(self._memory),
@@ -582,7 +424,7 @@ class Access:
         From then on, the connection can access only the store and the named folders, and its settings are
         locked.
         """
-        with self._alone() as deadline, _closed_gate(self.path, deadline):
+        with self._alone() as deadline, closed_gate(self.path, deadline):
             with translated(self.path):
                 shut_in(connection, self.path, folders)
             self._attach(connection, deadline)
@@ -601,9 +443,9 @@ class Access:
                         self._file.good = stamp_of(self.path)
 
     @contextmanager
-    def _alone(self) -> Generator[_Deadline]:
+    def _alone(self) -> Generator[Deadline]:
         """Exclude all other threads of this process from the file."""
-        file, deadline = self._file, _Deadline(self._wait_s)
+        file, deadline = self._file, Deadline(self._wait_s)
         if file.mine:
             raise StoreError(f"{self.path}: cannot be written while the same thread reads it")
         with file.changed:
@@ -625,7 +467,7 @@ class Access:
                 file.writing = False
                 file.changed.notify_all()
 
-    def _attach(self, connection: DuckDBPyConnection, deadline: _Deadline) -> None:
+    def _attach(self, connection: DuckDBPyConnection, deadline: Deadline) -> None:
         while True:
             refuse_special(self.path)  # ATTACH would create a missing file
             try:
@@ -653,181 +495,6 @@ def transaction(connection: DuckDBPyConnection) -> Generator[None]:
     # The checkpoint removes the write-ahead log. If it fails, the log stays, and its data are safe.
     with suppress(duckdb.Error):
         connection.execute("CHECKPOINT store")
-
-
-class BusyError(StoreError):
-    """Another process or connection uses the file."""
-
-
-class EngineError(StoreError):
-    """DuckDB failed with an internal error."""
-
-
-class HeldHereError(BusyError):
-    """Another connection of this process, not made by sgstore, uses the file."""
-
-
-@contextmanager
-def translated(path: Path) -> Generator[None]:
-    """Convert DuckDB errors to errors of the store at ``path``, and interruptions to ``KeyboardInterrupt``.
-
-    DuckDB converts Ctrl-C: to a RuntimeError while a statement runs, and to an error that quotes
-    KeyboardInterrupt while it scans Python arrays.
-    """
-    try:
-        yield
-    except RuntimeError as error:
-        if "Query interrupted" in str(error):
-            raise KeyboardInterrupt from error
-        raise
-    except duckdb.Error as error:
-        message = str(error).strip()
-        if isinstance(error, duckdb.InterruptException) or "KeyboardInterrupt" in message:
-            raise KeyboardInterrupt from error
-        if (fault := engine_fault(error)) is not None:
-            raise EngineError(f"{path}: {fault}") from error
-        if any(phrase in message for phrase in _HELD_HERE):
-            raise HeldHereError(
-                f"{path}: open in this process already, by a connection of duckdb's own (duckdb.connect);"
-                " close that first, or ask by sgstore.open(…).sql"
-            ) from error
-        if any(phrase in message for phrase in _BUSY):
-            raise BusyError(f"{path}: in use by another process for too long") from error
-        if (spilled := spill_fault(message)) is not None:
-            raise SqlError(spilled) from error
-        raise StoreError(f"{path}: {_reason(message)}") from error
-
-
-def _reason(message: str) -> str:
-    # DuckDB may treat a name that ends in .csv as a table file.
-    phrases = (
-        "not a valid DuckDB database file",
-        "Is a directory",
-        "in-memory database in read-only",
-    )
-    if any(phrase in message for phrase in phrases):
-        return "not a store; expected a file that 'sgstore ingest' made"
-    if "database does not exist" in message:
-        return "no such store; 'sgstore ingest' makes one"
-    if "database file with version number" in message:
-        return "made by a newer DuckDB than is installed here; upgrade the package duckdb"
-    return message
-
-
-class _Deadline:
-    """Retry timer with growing pauses and an overall limit."""
-
-    def __init__(self, wait_s: float) -> None:
-        self._start = time.monotonic()
-        self._end = self._start + wait_s
-        self._next, self._longest = _PAUSE
-
-    def left(self) -> float:
-        return max(self._end - time.monotonic(), 0)
-
-    def pause(self, error: StoreError) -> None:
-        """Sleep briefly, or raise the error after the time limit."""
-        if isinstance(error, HeldHereError):
-            if time.monotonic() - self._start > _HELD_HERE_S:
-                raise error
-            gc.collect()  # the connection may be unreferenced garbage
-        if not self.left():
-            raise error
-        time.sleep(min(self._next, self.left()))
-        self._next = min(self._next * 1.5, self._longest)
-
-
-def _pass_gate(path: Path, deadline: _Deadline) -> None:
-    """Wait while a writer process holds the gate. This is a courtesy: the DuckDB lock decides."""
-    if fcntl is None:
-        return
-    try:
-        gate = os.open(gate_of(path), os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    except OSError:
-        return
-    try:
-        _lock(gate, fcntl.LOCK_SH, path, deadline)
-    finally:
-        os.close(gate)
-
-
-@contextmanager
-def _closed_gate(path: Path, deadline: _Deadline) -> Generator[None]:
-    """Keep new readers of other processes out."""
-    if fcntl is None:
-        yield
-        return
-    gate = _Gate(path)
-    atexit.register(gate.remove)  # in case of an interrupt before the finally block
-    try:
-        gate.close(deadline)
-        yield
-    finally:
-        gate.remove()
-        atexit.unregister(gate.remove)
-
-
-class _Gate:
-    """Gate of a store, closed by this process."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._lock = -1
-        self._begun = False
-
-    def close(self, deadline: _Deadline) -> None:
-        """Wait until the gate is free, and close it."""
-        self._begun = True
-        while True:
-            try:
-                self._lock = os.open(gate_of(self._path), os.O_RDWR | os.O_CREAT, 0o666)
-            except OSError as error:
-                raise StoreError(f"{self._path}: cannot be written: {error.strerror}") from error
-            if fcntl is not None:
-                _lock(self._lock, fcntl.LOCK_EX, self._path, deadline)
-            if self._is_there():
-                return
-            # The previous owner has deleted the file, so other processes would not see this lock.
-            os.close(self._lock)
-            self._lock = -1
-
-    def _is_there(self) -> bool:
-        try:
-            return os.path.samestat(os.fstat(self._lock), gate_of(self._path).stat())
-        except FileNotFoundError:
-            return False
-
-    def remove(self) -> None:
-        """Open the gate, unless another process holds it now."""
-        if fcntl is None or not self._begun:
-            return
-        with suppress(OSError):
-            if self._lock < 0:  # an interrupt came before the assignment
-                self._lock = os.open(gate_of(self._path), os.O_RDWR)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if self._is_there():
-                gate_of(self._path).unlink()
-        with suppress(OSError):
-            os.close(self._lock)
-        self._lock, self._begun = -1, False
-
-
-def _lock(gate: int, how: int, path: Path, deadline: _Deadline) -> None:
-    if fcntl is None:
-        return
-    while True:
-        try:
-            fcntl.flock(gate, how | fcntl.LOCK_NB)
-            return
-        except BlockingIOError:
-            deadline.pause(StoreError(f"{path}: another process has been writing for too long"))
-        except OSError as error:
-            if how == fcntl.LOCK_SH:
-                return  # a file system without locks: DuckDB decides alone
-            raise StoreError(
-                f"{path}: cannot be locked for writing: {error.strerror}; keep the store on a file"
-                " system that has locks"
-            ) from error
 
 
 def spill_folder() -> Path:

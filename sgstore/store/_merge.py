@@ -18,10 +18,11 @@ import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import NAMES
+from sgstore.store._engine_errors import translated
 from sgstore.store._interrupts import interruptible
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import shared_instance
-from sgstore.store._locking import default_memory, spill_folder, translated
+from sgstore.store._locking import default_memory, spill_folder
 from sgstore.store._packing import SEQ_BITS
 from sgstore.store._rows import Batches, arrays
 from sgstore.store._staging import scratch
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
-    from sgstore.store._classes import CodedClasses
+    from sgstore.store._coded_classes import CodedClasses
     from sgstore.store._file import StoreFile
     from sgstore.store._rows import Given, Parameters
 
@@ -273,7 +274,7 @@ def merged_arrays(
 
 def merged_classes(parts: Sequence[PartFile]) -> CodedClasses:
     """Return the frame classes of partial results with columns ``class``, ``bucket``, ``mask``."""
-    from sgstore.store._classes import classes_coded
+    from sgstore.store._coded_classes import classes_coded
 
     with _tables({"parts": [*parts]}, {}) as connection:
         return classes_coded(connection, "SELECT class, bucket, mask FROM parts")

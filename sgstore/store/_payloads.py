@@ -63,7 +63,6 @@ class Periods:
 FRAMES: Final = -1
 """Channel number of the frames themselves in :class:`Periods`."""
 
-
 _AT_ONCE: Final = 250_000
 """Messages of a channel in memory at once."""
 
@@ -243,8 +242,6 @@ def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -
         reason = "it holds the map, which belongs to all frames"
     return StoreError(f"no message of {channel!r} belongs to {frame.trace}#{frame.seq}: {reason}")
 
-
-# Events of a trace → rows, each with the nearest frame in time ----------------------------------
 
 MOST_WAITING: Final = 100_000
 """Largest number of held-back events. Beyond it, they are assigned to the last frame so far."""

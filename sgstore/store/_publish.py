@@ -17,22 +17,22 @@ from sgstore.base.quoting import literal, quoted
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.vocabulary import NAMES
 from sgstore.model.world import BUCKET_FRAMES
+from sgstore.store._checksums import Checksum, columns_of, expressions
 from sgstore.store._columns import (
     MASKS,
     ORDERS,
     REPEATED,
     STATES,
     TEXTS,
-    Checksum,
     blank,
-    columns_of,
-    expressions,
     missing_of,
     types_of,
 )
-from sgstore.store._locking import spill_folder, transaction, translated
+from sgstore.store._engine_errors import translated
+from sgstore.store._locking import spill_folder, transaction
 from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, MISSING, plain
-from sgstore.store._staging import FILE, PIECE_ROWS, Staging, TableFile, scratch
+from sgstore.store._staging import PIECE_ROWS, Staging, scratch
+from sgstore.store._table_stream import FILE, TableFile
 from sgstore.store._traces import already_stored, free_name, id_of, place_below, stored_name
 
 if TYPE_CHECKING:
@@ -342,8 +342,6 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
             f"INSERT INTO fresh.inside.{table} BY NAME SELECT * FROM store.inside.{table}{order}"
         )
 
-
-# Additions to stored traces: built outside, added in one transaction, with checksums -----------------------
 
 STEP: Final = 64
 """Buckets of rows in memory at once: 3,840 frames."""

@@ -16,9 +16,10 @@ from sgstore.base.json_text import shortest
 from sgstore.base.quoting import quoted
 from sgstore.errors import ExportError, MissingExtraError, SqlError
 from sgstore.store._arrow import ARROW_TYPES, as_told, package
+from sgstore.store._engine_errors import EngineError, engine_fault, spill_fault
 from sgstore.store._interrupts import interrupt, interruptible
-from sgstore.store._locking import EngineError, engine_fault, spill_fault
-from sgstore.store._schema import INSIDE, expected
+from sgstore.store._schema import expected
+from sgstore.store._schema_text import INSIDE
 from sgstore.store._table_files import relation_of, write_csv, write_parquet
 from sgstore.store._temporary_tables import Given, give
 
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
-
 
 BATCH: Final = 10_000
 """Rows of a batch."""

@@ -15,7 +15,6 @@ import re
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from importlib import resources
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Final
 
@@ -24,8 +23,15 @@ import numpy as np
 
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
-from sgstore.model.pair_numbers import pairs_view
 from sgstore.model.vocabulary import NAMES, learn
+from sgstore.store._schema_text import (
+    INSIDE,
+    schema_sql,
+    statement,
+    statements,
+    tokens_of,
+    with_types,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -37,66 +43,8 @@ if TYPE_CHECKING:
     Tokens = tuple[str, ...]
     Objects = tuple[tuple[str, str, str, str | Tokens], ...]
 
-
-INSIDE: Final = "inside"
-"""Schema of a store's tables and internal views. Public views and column types are in ``main``."""
-
 _HEAD: Final = re.compile(r"-- sgstore: what is in a store, version (\d+)\.")
-
-_TOKEN: Final = re.compile(
-    r"""(?P<gap>\s+|--[^\n]*)|(?P<text>'(?:[^']|'')*')|(?P<name>"(?:[^"]|"")*")
-    |(?P<number>\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)|(?P<word>\w+)|(?P<sign><>|!=|<=|>=|::|>>|<<|//|\|\||.)""",
-    re.VERBOSE | re.DOTALL,
-)
-_PLAIN: Final = re.compile(r'"[A-Za-z_]\w*"', re.ASCII)
-_TRUTH: Final = {"'t'": "true", "'f'": "false"}
 _SYSTEM: Final = frozenset({"information_schema", "pg_catalog", "system", "temp"})
-
-
-@cache
-def schema_sql() -> str:
-    """Return the text of ``schema.sql``: types, tables and views."""
-    text = resources.files("sgstore").joinpath("schema.sql").read_text(encoding="utf-8")
-    for view in ("pairs", "criticality"):
-        made, numbers = pairs_view(view)
-        text = text.replace(f"{{{{{view}}}}}", made)
-        text = text.replace(f"{{{{numbers of {view}}}}}", numbers.replace("'", "''"))
-    for table in BEYOND:
-        text = text.replace(f"{{{{columns of {table}}}}}", _between(text, f"TABLE {table} (", ");"))
-    for view, tables in _VIEWS_BEYOND.items():
-        made = _between(text, f"VIEW main.{view} AS", ";")
-        for table, other in tables.items():
-            made = re.sub(rf"\b{INSIDE}\.{table}\b", f"{INSIDE}.{other}", made)
-        text = text.replace(f"{{{{world_{view}}}}}", made)
-    return text
-
-
-BEYOND: Final = {
-    name: f"world_{name}"
-    for name in (
-        "state",
-        "node",
-        "edge",
-        "lane_single",
-        "lane_repeated",
-        "gap_single",
-        "gap_repeated",
-    )
-}
-"""Graph tables → tables of the data outside the graphs, with the same columns."""
-
-_VIEWS_BEYOND: Final[Mapping[str, Mapping[str, str]]] = {
-    "nodes": BEYOND,
-    "lane_states": BEYOND,
-    "pairs": {"state": "known_state"},
-    "criticality": {"state": "known_state"},
-    "lane_dists": {"lane_state": "known_lane_state"},
-}
-"""Views of graphs → replaced tables, which give the views with the data outside the graphs."""
-
-
-def _between(text: str, before: str, behind: str) -> str:
-    return text.partition(f"CREATE {before}")[2].partition(behind)[0].strip()
 
 
 def schema_version() -> str:
@@ -128,7 +76,7 @@ def text_digest() -> str:
 
 def statements_digest() -> str:
     """Compute the SHA-256 of the statements of ``schema.sql``, without comments."""
-    made = ["\0".join(words) for words in _statements() if words[0] != "COMMENT"]
+    made = ["\0".join(words) for words in statements() if words[0] != "COMMENT"]
     return hashlib.sha256("\n".join(made).encode()).hexdigest()
 
 
@@ -156,7 +104,7 @@ def expected(*wider: tuple[str, Tokens]) -> Shape:
     tables: dict[str, Tokens] = {}
     types: dict[str, Tokens] = {}
     views: dict[str, dict[str, str]] = {"main": {}, INSIDE: {}}
-    for words in _statements():
+    for words in statements():
         if words[:2] == ("CREATE", "TYPE"):
             types[words[2]] = words[4:]
         elif words[:2] == ("CREATE", "TABLE"):
@@ -164,7 +112,7 @@ def expected(*wider: tuple[str, Tokens]) -> Shape:
         elif words[:2] == ("CREATE", "VIEW"):
             views[words[2]][words[4]] = " ".join(words[6:])
     types |= dict(wider)
-    written = {name: tuple(_with_types(words, types)) for name, words in tables.items()}
+    written = {name: tuple(with_types(words, types)) for name, words in tables.items()}
     return Shape(written, types, views["main"], views[INSIDE])
 
 
@@ -181,7 +129,7 @@ def _expected_views(connection: DuckDBPyConnection) -> dict[str, Tokens]:
             [list(views.values())],
         ).fetchall()
         for name, (sql,) in zip(views, rows, strict=True):
-            _written[name] = tuple(_words(f"CREATE VIEW {name} AS {sql}"))
+            _written[name] = tuple(tokens_of(f"CREATE VIEW {name} AS {sql}"))
     return _written
 
 
@@ -257,7 +205,7 @@ def about_store(
     if told is None:
         return None
     if not _is_known(objects):
-        made = _statement(told)
+        made = statement(told)
         own, added = expected().tables["store_info"], {"NOT", "NULL"}  # later added to its columns
         if [word for word in made if word not in added] != [w for w in own if w not in added]:
             return {}  # an unknown table is not read
@@ -359,9 +307,6 @@ def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
     )
 
 
-# New kinds, relations and light states in an existing store -------------------------------------------------
-
-
 @cache
 def own_labels(enum: str) -> tuple[str, ...]:
     """Return the values of an enumeration in ``schema.sql``."""
@@ -415,7 +360,7 @@ def widen(
 @cache
 def enums_of(table: str) -> Mapping[str, str]:
     """Return the enumeration columns of a table in ``schema.sql``: column → enumeration."""
-    words = next((words for words in _statements() if words[1:3] == ("TABLE", table)), ())
+    words = next((words for words in statements() if words[1:3] == ("TABLE", table)), ())
     return {
         column: what
         for before, column, what in zip(words[3:], words[4:], words[5:], strict=False)
@@ -425,7 +370,7 @@ def enums_of(table: str) -> Mapping[str, str]:
 
 def code_sql(column: str, enum: str) -> str:
     """Return SQL that maps an enumeration value to the same number in every store."""
-    code, words = f"enum_code({column}::{enum})", tuple(_words(enum))
+    code, words = f"enum_code({column}::{enum})", tuple(tokens_of(enum))
     own = next(own for own in expected().types.values() if words[: len(own) - 1] == own[:-1])
     if words == own:
         return code
@@ -459,61 +404,6 @@ def others(objects: Objects) -> list[str]:
     )
 
 
-# Tokens -----------------------------------------------------------------------------------------------------
-
-
-@cache
-def _statements() -> tuple[Tokens, ...]:
-    """Return the statements of ``schema.sql`` as tokens."""
-    found: list[list[str]] = [[]]
-    for word in _words(schema_sql()):
-        if word == ";":
-            found.append([])
-        else:
-            found[-1].append(word)
-    return tuple(map(tuple, found[:-1]))
-
-
-def _words(sql: str) -> list[str]:
-    """Split a statement into tokens, without comments, quotes of plain names, and casts of constants."""
-    found: list[str] = []
-    for match in _TOKEN.finditer(sql):
-        word = match[0]
-        if match["gap"]:
-            continue
-        if match["name"] and _PLAIN.fullmatch(word):
-            word = word[1:-1]
-        elif match["number"] and not word.isdigit():
-            word = repr(float(word))
-        found.append(word)
-        if word == ")" and found[-6:-4] == ["CAST", "("] and found[-3] == "AS":
-            constant, kind = found[-4], found[-2]
-            if kind == "BOOLEAN" and constant in _TRUTH:
-                found[-6:] = [_TRUTH[constant]]
-            elif kind == "DOUBLE" and re.fullmatch(r"[\d.e+-]+", constant):
-                found[-6:] = [repr(float(constant))]
-    return found
-
-
-@lru_cache(maxsize=256)
-def _statement(sql: str) -> Tokens:
-    words = _words(sql)
-    return tuple(words[:2] + words[4:] if words[3:4] == ["."] else words)
-
-
-def _with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
-    """Yield the tokens of a table, with enumerations expanded to their values, as DuckDB prints them."""
-    before = ""
-    for number, word in enumerate(words):
-        # A type follows the name of a column. Both can be equal.
-        named = number > 3 and before not in {"(", ","}
-        yield from types[word] if named and word in types else (word,)
-        before = word
-
-
-# Objects of a store -----------------------------------------------------------------------------------------
-
-
 def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:
     """Return tables, views and types of a database: (kind, schema, name, statement or values)."""
     found: list[tuple[str, str, str, str | Tokens]] = []
@@ -536,9 +426,9 @@ def _made(objects: Objects) -> Mapping[tuple[str, str], dict[str, Tokens]]:
         if schema not in {"main", INSIDE}:
             continue
         if isinstance(told, str):
-            found[what, schema][name.lower()] = _statement(told)
+            found[what, schema][name.lower()] = statement(told)
         else:
-            found[what, schema][name] = tuple(_words(_enum(told)))
+            found[what, schema][name] = tuple(tokens_of(_enum(told)))
     return found
 
 

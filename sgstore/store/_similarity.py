@@ -27,8 +27,8 @@ from sgstore.model.vocabulary import (
     natural,
     suggestion,
 )
+from sgstore.store._engine_errors import translated
 from sgstore.store._graphs import Graphs
-from sgstore.store._locking import translated
 from sgstore.store._traces import FrameRef, frame_named, stored_traces
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ import json
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
@@ -19,13 +18,11 @@ import numpy as np
 
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import NAMES
+from sgstore.store._checksums import Checksum, as_summed
 from sgstore.store._columns import (
     REPEATED,
     STATES,
     TEXTS,
-    Checksum,
-    as_summed,
-    blank,
     chained,
     in_order,
     kept,
@@ -33,238 +30,20 @@ from sgstore.store._columns import (
     parted,
     types_of,
 )
-from sgstore.store._locking import Folder, memory_setting, without_faults
+from sgstore.store._locking import memory_setting, without_faults
 from sgstore.store._schema import enums_of, own_labels
+from sgstore.store._store_paths import Folder
+from sgstore.store._table_stream import FILE, Piece, TableFile
 from sgstore.store._traces import Identity
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
     from sgstore.store._packing import Columns
 
-
-# File of tables: consecutive pieces, each with a header line and its columns ----------------------------------
-
-FILE: Final = "tables"
-
-_ALIGNED: Final = 8
-_HEAD: Final = 8
-"""Size of the length field of a header line; bytes."""
-_PLAIN: Final = frozenset({"|b1", "|i1", "<i2", "<i4", "<i8", "<f4", "<f8"})
-
-
-class Piece(NamedTuple):
-    """Group of rows of a table in a staging file.
-
-    Attributes
-    ----------
-    table : str
-    rows : int
-    columns : dict
-        Column → description: type and offset from ``at``, or a constant value; an offset added to each value;
-        and the lengths, offset and size of its texts.
-    at : int
-        File offset of the columns.
-    """
-
-    table: str
-    rows: int
-    columns: dict[str, dict[str, Any]]
-    at: int
-
-
-class TableFile:
-    """Private file of table rows. Its content is never run as code.
-
-    Parameters
-    ----------
-    path : Path
-    store : Path
-        Target store, named in errors.
-    new : bool
-        True to create the file and write to it.
-    """
-
-    def __init__(self, path: Path, store: Path, *, new: bool = False) -> None:
-        self._store = store
-        self._pieces: list[Piece] = []
-        try:
-            self._file = path.open("w+b" if new else "rb", buffering=0)
-            self._size = 0 if new else path.stat().st_size
-        except OSError as error:
-            raise self._wrong("cannot be opened", error) from error
-        if not new:
-            self._look()
-
-    def _wrong(self, what: str, error: OSError | None = None) -> StoreError:
-        reason = f": {error.strerror}" if error else ""
-        return StoreError(f"{self._store}: what waits beside it {what}{reason}")
-
-    def close(self) -> None:
-        """Close the file. Its content stays."""
-        self._file.close()
-
-    def append(
-        self, table: str, columns: Columns, texts: Mapping[str, list[str]] | None = None
-    ) -> Piece:
-        """Append rows. ``texts`` maps each text column to the texts behind its indices."""
-        rows = len(next(iter(columns.values())))
-        about: dict[str, dict[str, Any]] = {}
-        body: list[NDArray[Any]] = []
-        place = 0
-        for name, values in columns.items():
-            about[name], array = _narrowed(values)
-            if array is not None:
-                about[name]["at"] = place
-                body.append(array)
-                place += -(-array.nbytes // _ALIGNED) * _ALIGNED
-            if texts and name in texts:
-                joined = np.frombuffer("".join(texts[name]).encode(), np.uint8)
-                about[name]["texts"] = [*map(len, texts[name])], place, len(joined)
-                body.append(joined)
-                place += -(-joined.nbytes // _ALIGNED) * _ALIGNED
-        said = {"table": table, "rows": rows, "columns": about, "bytes": place}
-        line = json.dumps(said, ensure_ascii=False).encode()
-        line += b" " * (-len(line) % _ALIGNED)
-        parts = [len(line).to_bytes(_HEAD, "little"), line]
-        for array in body:
-            parts += [array.tobytes(), bytes(-array.nbytes % _ALIGNED)]
-        self._write(b"".join(parts))
-        piece = Piece(table, rows, about, self._size + _HEAD + len(line))
-        self._size = piece.at + place
-        self._pieces.append(piece)
-        return piece
-
-    def _write(self, data: bytes) -> None:
-        view = memoryview(data)
-        try:
-            self._file.seek(self._size)
-            while view:
-                view = view[self._file.write(view) or 0 :]
-        except OSError as error:
-            raise self._wrong("cannot be written", error) from error
-
-    @property
-    def size(self) -> int:
-        """Size of the file in bytes."""
-        return self._size
-
-    def behind(self, at: int) -> bytes:
-        """Return the bytes of the file from an offset to the end."""
-        return self._bytes(at, self._size - at)
-
-    def adopt(self, pieces: bytes) -> None:
-        """Append raw pieces of another file. This object does not list them; a new reader does."""
-        self._write(pieces)
-        self._size += len(pieces)
-
-    def pieces(self, table: str) -> list[Piece]:
-        """Return the pieces of a table in writing order."""
-        return [piece for piece in self._pieces if piece.table == table]
-
-    def all(self) -> list[Piece]:
-        """Return all pieces in writing order."""
-        return list(self._pieces)
-
-    def read(self, piece: Piece, first: int = 0, end: int | None = None) -> Columns:
-        """Return the columns of a range of rows in a piece.
-
-        Raises
-        ------
-        StoreError
-            The columns are missing or not readable.
-        """
-        return {name: self.column(piece, name, first, end) for name in piece.columns}
-
-    def column(
-        self, piece: Piece, name: str, first: int = 0, end: int | None = None
-    ) -> NDArray[Any]:
-        """Return one column of a range of rows in a piece."""
-        about, end = piece.columns[name], piece.rows if end is None else end
-        if about["type"] not in _PLAIN:
-            raise self._wrong("is none of ours")
-        kind = np.dtype(about["type"])
-        if "value" in about:
-            value = np.nan if about["value"] is None else about["value"]
-            values = np.full(end - first, value, kind)
-        else:
-            data = self._bytes(
-                piece.at + about["at"] + first * kind.itemsize, (end - first) * kind.itemsize
-            )
-            values = np.frombuffer(data, kind)
-        return values.astype(np.int64) + about["base"] if "base" in about else values
-
-    def values(self, piece: Piece, name: str, first: int, end: int) -> NDArray[Any]:
-        """Return one column with texts in place of indices. A column that the piece lacks is all missing."""
-        if name not in piece.columns:
-            texts = types_of(piece.table)[name] in TEXTS
-            count = end - first
-            return np.full(count, "", object) if texts else blank(piece.table, name, count)
-        values = self.column(piece, name, first, end)
-        if "texts" not in piece.columns[name]:
-            return values
-        return np.array([*self._texts(piece, name), ""], object)[values]
-
-    def texts(self, piece: Piece) -> dict[str, list[str]]:
-        """Return the texts behind the indices of a piece, by column."""
-        return {
-            name: self._texts(piece, name)
-            for name in piece.columns
-            if "texts" in piece.columns[name]
-        }
-
-    def _texts(self, piece: Piece, name: str) -> list[str]:
-        lengths, at, size = piece.columns[name]["texts"]
-        joined = self._bytes(piece.at + at, size).decode()
-        ends = [*accumulate(lengths)]
-        return [joined[end - length : end] for length, end in zip(lengths, ends, strict=True)]
-
-    def _bytes(self, at: int, count: int) -> bytes:
-        try:
-            self._file.seek(at)
-            data = self._file.read(count)
-        except OSError as error:
-            raise self._wrong("cannot be read", error) from error
-        if data is None or len(data) != count:
-            raise self._wrong("ends before its rows do")
-        return data
-
-    def _look(self) -> None:
-        """Read the headers of an existing file."""
-        at = 0
-        while at < self._size:
-            length = int.from_bytes(self._bytes(at, _HEAD), "little")
-            if length > self._size:
-                raise self._wrong("is none of ours")
-            said = json.loads(self._bytes(at + _HEAD, length))
-            at += _HEAD + length
-            self._pieces.append(Piece(said["table"], said["rows"], said["columns"], at))
-            at += said["bytes"]
-        if at != self._size:
-            raise self._wrong("ends before its rows do")
-
-
-def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None]:
-    """Encode values in few bytes. Return the description and the array to write."""
-    kind = values.dtype.newbyteorder("<").str
-    values = np.ascontiguousarray(values)
-    if values.dtype.kind == "f":
-        bits = values.view(f"i{values.itemsize}")
-        if bits[0] == bits[-1] and (bits == bits[0]).all():
-            return {"type": kind, "value": None if np.isnan(values[0]) else float(values[0])}, None
-        return {"type": kind}, values
-    low, high = values.min(), values.max()
-    if low == high:
-        return {"type": kind, "value": bool(low) if kind == "|b1" else int(low)}, None
-    if values.dtype.itemsize == 8 and int(high) - int(low) < 1 << 31:
-        return {"type": "<i4", "base": int(low)}, (values - low).astype(np.int32)
-    return {"type": kind}, values
-
-
-# Tables in memory, and in the file ----------------------------------------------------------------------------
 
 PART_ROWS: Final = 20_000
 """Rows of all growing tables in memory."""
@@ -505,8 +284,6 @@ class Staging:
         self.checksums = dict(sorted(self.checksums.items()))
 
 
-# Databases in memory ------------------------------------------------------------------------------------------
-
 MEMORY: Final = 48 << 20
 """Memory limit of a publishing database; bytes. Beyond it, the database writes temporary files."""
 
@@ -536,8 +313,6 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
     without_faults(connection)
     return connection
 
-
-# Trace ready for publication: a folder with a file of tables and metadata -------------------------------------
 
 _SAID: Final = "sealed.json"
 

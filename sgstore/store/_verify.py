@@ -15,8 +15,10 @@ import sgstore.store._schema as shape
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.config import from_dict
 from sgstore.model.world import BUCKET_FRAMES
-from sgstore.store._columns import REPEATED, STATES, Checksum, expressions
-from sgstore.store._locking import Access, translated
+from sgstore.store._checksums import Checksum, expressions
+from sgstore.store._columns import REPEATED, STATES
+from sgstore.store._engine_errors import translated
+from sgstore.store._locking import Access
 from sgstore.store._packing import LONGEST_STEP
 from sgstore.store._publish import SHARED, checksum_of, owned
 from sgstore.store._traces import stored_traces

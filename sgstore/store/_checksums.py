@@ -1,0 +1,177 @@
+"""Checksums of table rows, equal for arrays and for the stored table.
+
+They do not depend on the order of rows, nor on the DuckDB version.
+
+A row is mixed to 64 bits, and the checksum is the sum of all rows modulo 2⁶⁴. So rows can come in parts and in
+any order. The mixing is SplitMix64's (Steele, Lea, Flood: Fast splittable pseudorandom number generators,
+2014): it detects accidental changes, not attacks.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.base.quoting import quoted
+from sgstore.model.vocabulary import NAMES
+from sgstore.store._columns import TEXTS, missing_of, types_of
+from sgstore.store._schema import code_sql, enums_of, own_labels
+from sgstore.store._schema_text import INSIDE
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
+
+    from sgstore.store._packing import Columns
+
+    Words = NDArray[np.uint64]
+
+_STEP: Final = 0x9E3779B97F4A7C15
+
+_FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
+
+_SECOND: Final = np.uint64(0x94D049BB133111EB)
+
+_MISSING: Final = np.uint64(0x6E756C6C6E756C6C)
+"""Hash word of NULL."""
+
+_AT_ONCE: Final = 1 << 13
+"""Rows hashed at once: their words fit into the processor cache."""
+
+_ASSIGNED: Final = {
+    ("trace", "name"),
+    ("trace", "ingested_at"),
+    ("map", "name"),
+    ("recording", "place"),
+}
+"""Tables and columns whose values the store assigns."""
+
+
+@dataclass(slots=True)
+class Checksum:
+    """Checksum of table rows.
+
+    Attributes
+    ----------
+    rows : int
+    value : int
+        0 … 2⁶³ - 1.
+    """
+
+    rows: int = 0
+    value: int = 0
+
+    def add(self, columns: Mapping[str, NDArray[Any] | None]) -> None:
+        """Add rows given as masked columns of numbers and truth values.
+
+        ``None`` means an all-missing column.
+        """
+        count = next((len(values) for values in columns.values() if values is not None), 0)
+        hashes, words, shifted = (np.empty(min(count, _AT_ONCE), np.uint64) for _ in range(3))
+        for first in range(0, count, _AT_ONCE):
+            here = slice(first, min(first + _AT_ONCE, count))
+            size = here.stop - first
+            mixed, word, spare = hashes[:size], words[:size], shifted[:size]
+            mixed[:] = 0
+            for number, name in enumerate(sorted(columns)):
+                values = columns[name]
+                if values is None:
+                    word[:] = _MISSING
+                else:
+                    _words(values[here], word)
+                word ^= np.uint64((number + 1) * _STEP & 0xFFFFFFFFFFFFFFFF)
+                mixed += word
+                _mix(mixed, spare)
+            self.value = (self.value + int(mixed.sum(dtype=np.uint64))) & 0x7FFFFFFFFFFFFFFF
+        self.rows += count
+
+
+def _mix(words: Words, spare: Words) -> None:
+    for shift, factor in ((30, _FIRST), (27, _SECOND), (31, None)):
+        np.right_shift(words, np.uint64(shift), out=spare)
+        words ^= spare
+        if factor is not None:
+            words *= factor
+
+
+def _words(values: NDArray[Any], out: Words) -> None:
+    """Convert values to 64-bit words for the checksum."""
+    plain = np.ma.getdata(values)
+    if plain.dtype.kind == "f":
+        plain = plain + plain.dtype.type(0)  # merges -0 and 0: DuckDB 1.5 drops the sign
+        out[:] = plain.view(np.uint32 if plain.dtype.itemsize == 4 else np.uint64)
+    else:
+        out.view(np.int64)[:] = plain
+    if (missing := np.ma.getmask(values)) is not np.ma.nomask:
+        out[missing] = _MISSING
+
+
+def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, NDArray[Any] | None]:
+    """Return staged columns in the form of :meth:`Checksum.add`. Absent columns are ``None``."""
+    enums = enums_of(table)
+    found: dict[str, NDArray[Any] | None] = {}
+    for name, kind in types_of(table).items():
+        values = columns.get(name)
+        if (table, name) in _ASSIGNED:
+            continue
+        if values is not None:
+            missing = missing_of(table, name, values)
+            if kind in TEXTS:
+                used, index = np.unique(values, return_inverse=True)
+                numbers = [_number(kind, str(texts[at])) if at >= 0 else 0 for at in used.tolist()]
+                values = np.array(numbers, np.int64)[index]
+            elif name in enums:
+                values = _coded(enums[name], values)
+            if missing is not None:
+                values = np.ma.MaskedArray(values, missing)
+        found[name] = values
+    return found
+
+
+@lru_cache(maxsize=1 << 14)
+def _number(kind: str, text: str) -> int:
+    if kind == "UUID" and "-" not in text:
+        text = "-".join((text[:8], text[8:12], text[12:16], text[16:20], text[20:]))
+    return int.from_bytes(hashlib.md5(text.encode(), usedforsecurity=False).digest()[:8]) >> 4
+
+
+def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:
+    """Return enumeration codes that are equal in every store. Codes of added names are hashed."""
+    own = len(own_labels(enum))
+    if codes.max(initial=0) < own:
+        return codes
+    names = NAMES[enum]
+    table = [*range(own), *(_number("VARCHAR", name) for name in names[own:])]
+    return np.array(table, np.int64)[np.maximum(codes, 0)]
+
+
+def columns_of(
+    connection: DuckDBPyConnection, table: str, catalog: str = ""
+) -> list[tuple[str, str]]:
+    """Return names and types of a table's columns. ``duckdb_columns()`` is slower: it binds every view."""
+    place = f"{quoted(catalog)}.{INSIDE}" if catalog else INSIDE
+    rows = connection.execute(f"DESCRIBE {place}.{quoted(table)}").fetchall()
+    return [(name, kind) for name, kind, *_ in rows]
+
+
+def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
+    """Return SQL for the columns of a table, in the form of :meth:`Checksum.add`.
+
+    Numbers stay unchanged. Enumerations become codes, and texts become 60 bits of their MD5.
+    """
+    listed: list[str] = []
+    for name, kind in columns_of(connection, table, catalog):
+        value = f'"{name}"'
+        if kind.startswith("ENUM"):
+            value = code_sql(value, kind)
+        elif kind in TEXTS:
+            value = f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
+        if (table, name) not in _ASSIGNED:
+            listed.append(f'{value} AS "{name}"')
+    return ", ".join(listed)

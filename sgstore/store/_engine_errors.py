@@ -1,0 +1,101 @@
+"""Errors of the database that the query did not cause, and their messages."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+import duckdb
+
+from sgstore.errors import SqlError, StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+    from pathlib import Path
+
+
+def engine_fault(error: duckdb.Error) -> str | None:
+    """Return one line about an internal DuckDB error, or ``None`` for another error."""
+    if not isinstance(error, duckdb.InternalException | duckdb.FatalException):
+        return None
+    reason = str(error).strip().partition("\n")[0].removeprefix("INTERNAL Error: ")
+    return f"a fault of DuckDB {duckdb.__version__} itself, not of the question: {reason}"
+
+
+def spill_fault(message: str) -> str | None:
+    """Return the message for a query beyond its memory and disk limits, or ``None`` for another error."""
+    if not message.startswith("Out of Memory Error"):
+        return None
+    return (
+        "stopped: it needs more memory, and disk beside it, than it may take; allow it more (--max-spill 50GB;"
+        " memory and max_spill of Store), or ask for less: fewer variables, a narrower WHERE, no ORDER BY"
+    )
+
+
+_BUSY: Final = ("Could not set lock on file", "Conflicting lock is held")
+"""Words in the DuckDB error if another process uses the file."""
+
+_HELD_HERE: Final = (
+    "Unique file handle conflict",
+    "different configuration than existing connections",
+)
+"""Words in the DuckDB error if another connection of this process uses the file."""
+
+
+class BusyError(StoreError):
+    """Another process or connection uses the file."""
+
+
+class EngineError(StoreError):
+    """DuckDB failed with an internal error."""
+
+
+class HeldHereError(BusyError):
+    """Another connection of this process, not made by sgstore, uses the file."""
+
+
+@contextmanager
+def translated(path: Path) -> Generator[None]:
+    """Convert DuckDB errors to errors of the store at ``path``, and interruptions to ``KeyboardInterrupt``.
+
+    DuckDB converts Ctrl-C: to a RuntimeError while a statement runs, and to an error that quotes
+    KeyboardInterrupt while it scans Python arrays.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if "Query interrupted" in str(error):
+            raise KeyboardInterrupt from error
+        raise
+    except duckdb.Error as error:
+        message = str(error).strip()
+        if isinstance(error, duckdb.InterruptException) or "KeyboardInterrupt" in message:
+            raise KeyboardInterrupt from error
+        if (fault := engine_fault(error)) is not None:
+            raise EngineError(f"{path}: {fault}") from error
+        if any(phrase in message for phrase in _HELD_HERE):
+            raise HeldHereError(
+                f"{path}: open in this process already, by a connection of duckdb's own (duckdb.connect);"
+                " close that first, or ask by sgstore.open(…).sql"
+            ) from error
+        if any(phrase in message for phrase in _BUSY):
+            raise BusyError(f"{path}: in use by another process for too long") from error
+        if (spilled := spill_fault(message)) is not None:
+            raise SqlError(spilled) from error
+        raise StoreError(f"{path}: {_reason(message)}") from error
+
+
+def _reason(message: str) -> str:
+    # DuckDB may treat a name that ends in .csv as a table file.
+    phrases = (
+        "not a valid DuckDB database file",
+        "Is a directory",
+        "in-memory database in read-only",
+    )
+    if any(phrase in message for phrase in phrases):
+        return "not a store; expected a file that 'sgstore ingest' made"
+    if "database does not exist" in message:
+        return "no such store; 'sgstore ingest' makes one"
+    if "database file with version number" in message:
+        return "made by a newer DuckDB than is installed here; upgrade the package duckdb"
+    return message
