@@ -117,7 +117,6 @@ def serve() -> None:
     import sgstore.testsets.selection
     from sgstore.apps import cli
 
-    cli.application()
     sgstore.ingest.BLOCK_FRAMES = 60
     for asked in sys.stdin:
         arguments, said = json.loads(asked)

@@ -22,7 +22,7 @@ from verb_lines import LINES, verbs
 import sgstore
 import sgstore.apps.cli._process as ending
 import sgstore.store._rows as rows
-from sgstore.apps.cli import application, run
+from sgstore.apps.cli import app, run
 from sgstore.apps.demo import RECORDING
 from sgstore.errors import SqlError
 from sgstore.query import Store
@@ -317,7 +317,7 @@ def files(town_store: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 
 
 def test_verbs_that_ask_a_store_say_in_the_same_words_how_they_are_bounded() -> None:
-    known = verbs(typer.main.get_command(application()))
+    known = verbs(typer.main.get_command(app))
     for name in ("timeout", "max_spill"):
         having = {
             verb: (one.opts, one.metavar, one.help, one.show_default, one.multiple)

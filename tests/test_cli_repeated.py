@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import pytest
 import typer
 
-from sgstore.apps.cli import application, run
+from sgstore.apps.cli import app, run
 from sgstore.apps.demo import RECORDING
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def verbs(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str,
 
 
 def options() -> Iterator[Any]:
-    for path, command in verbs(typer.main.get_command(application())):
+    for path, command in verbs(typer.main.get_command(app)):
         for parameter in command.params:
             if parameter.param_type_name == "option" and not parameter.is_flag:
                 yield pytest.param(
@@ -86,7 +86,7 @@ def short_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("path", "command"),
     [
         pytest.param(path, command, id=" ".join(path))
-        for path, command in verbs(typer.main.get_command(application()))
+        for path, command in verbs(typer.main.get_command(app))
         if path[-1] not in AT_WORK and any(map(numbers_of, command.params))
     ],
 )

@@ -16,7 +16,7 @@ import typer
 from thorough import LONG, some
 from verb_lines import LINES, verbs
 
-from sgstore.apps.cli import application, run
+from sgstore.apps.cli import app, run
 
 CONDITIONS = ("", "stdout full", "stdout closed", "reader gone", "stderr full", "stderr closed")
 SLOTS = """
@@ -130,7 +130,7 @@ def ended(files: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> di
 
 
 def test_the_table_has_every_verb() -> None:
-    assert set(LINES) == set(verbs(typer.main.get_command(application())))
+    assert set(LINES) == set(verbs(typer.main.get_command(app)))
 
 
 @pytest.mark.parametrize("verb", LINES)

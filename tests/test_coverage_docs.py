@@ -11,7 +11,7 @@ import typer
 from verb_lines import verbs
 
 import sgstore
-from sgstore.apps.cli import application, run
+from sgstore.apps.cli import app, run
 from sgstore.ingest import ingest
 from sgstore.pipeline.importing import FORMATS
 
@@ -56,7 +56,7 @@ def test_a_command_of_the_page_runs(
 
 
 def test_every_verb_of_coverage_and_every_format_is_on_the_page() -> None:
-    known = verbs(typer.main.get_command(application()))
+    known = verbs(typer.main.get_command(app))
     of_coverage = {verb.split()[1] for verb in known if verb.startswith("coverage ")}
 
     assert {

@@ -18,7 +18,7 @@ from thorough import LONG
 from typer.testing import CliRunner
 
 import sgstore
-from sgstore.apps.cli import application
+from sgstore.apps.cli import app
 from sgstore.base.geometry import corners
 from sgstore.errors import ConfigError, QueryError, SqlError, StoreError
 from sgstore.model.criticality import (
@@ -332,7 +332,7 @@ def test_the_verb_makes_a_table_that_patterns_and_orders_understand(
 ) -> None:
     file = tmp_path / "close.csv"
     line = ["criticality", str(town_store), "-m", "dce_recorded", "--most", "5", "-o", str(file)]
-    assert CliRunner().invoke(application(line), line).exit_code == 0
+    assert CliRunner().invoke(app, line).exit_code == 0
     every = recorded(open_town, ["dce_recorded"]).dicts()
     close = {(row["trace"], row["dst"]) for row in every if row["dce_recorded"] <= 5}
     store = sgstore.open(town_store, tables={"close": file})

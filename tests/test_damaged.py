@@ -152,10 +152,9 @@ def test_a_recording_whose_log_times_run_back_is_read_in_their_order(
 INGEST = """
 import json, os, re, resource, sys
 from pathlib import Path
-from sgstore.apps.cli import application, run
+from sgstore.apps.cli import run
 import sgstore.pipeline.doctor, sgstore.ingest
 from sgstore.readers import READERS
-application(["ingest"])
 seconds, to, *files = sys.argv[1:]
 for file in files:
     child = os.fork()

@@ -8,12 +8,13 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import pytest
 
 import sgstore
 from sgstore.apps.cli import run
+from sgstore.apps.cli._exports import ClipOptions
 from sgstore.apps.demo import RECORDING
 from sgstore.exporters import EXPORTERS, GROUP, Export, write_export
 from sgstore.ingest import ingest
@@ -88,6 +89,15 @@ def test_every_format_and_every_option_is_on_the_page() -> None:
     for option in ("--label", "--with-graph", "--abstraction", "--channel", "--clouds", "--param"):
         assert f"{option} " in PAGE or f"{option}`" in PAGE
     assert f'"{GROUP}"' in PAGE
+
+
+def test_help_names_the_formats_that_support_each_option() -> None:
+    options = get_type_hints(ClipOptions, include_extras=True)
+    supported = {option for exporter in EXPORTERS for option in exporter.options}
+
+    for option in supported:
+        formats = ", ".join(one.name for one in EXPORTERS if option in one.options)
+        assert re.match(f"{formats}[:,] ", options[option].__metadata__[0].help)
 
 
 @pytest.mark.parametrize(("form", "marker"), [("nx", "node_link_graph"), ("pyg", "GraphData(")])

@@ -16,7 +16,7 @@ from test_lang_match import view_of
 from thorough import LONG
 from typer.testing import CliRunner
 
-from sgstore.apps.cli import application
+from sgstore.apps.cli import app
 from sgstore.errors import QueryError
 from sgstore.lang.sql import compile_query
 from sgstore.lang.syntax import parse
@@ -166,8 +166,8 @@ def test_frames_and_clips_are_those_of_the_pattern(store: Store) -> None:
 def test_the_command_line_gives_what_networkx_reads(safe: list[str], store: Store) -> None:
     arguments = ["find", str(store.file.path), f"{LEADS} RETURN SUBGRAPHS LIMIT 2", *safe]
 
-    rows = json.loads(CliRunner().invoke(application(), [*arguments, "--json"]).stdout)
-    people = CliRunner().invoke(application(), arguments).stdout
+    rows = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
+    people = CliRunner().invoke(app, arguments).stdout
 
     expected = list(store.find(f"{LEADS} LIMIT 2").subgraphs())
     for row, graph in zip(rows, expected, strict=True):

@@ -10,7 +10,7 @@ import networkx as nx
 import pytest
 from typer.testing import CliRunner
 
-from sgstore.apps.cli import application
+from sgstore.apps.cli import app
 from sgstore.errors import AbstractionError, QueryError, StoreError
 
 if TYPE_CHECKING:
@@ -200,14 +200,14 @@ def test_of_each_trace_its_best_run_that_is_not_beside_the_example(store: Store)
 def test_the_command_line_gives_runs_and_what_differs(path: Path) -> None:
     arguments = ["like", str(path), "town#300", "--limit", "3", "--all"]
 
-    table = CliRunner().invoke(application(), arguments).stdout
-    rows = json.loads(CliRunner().invoke(application(), [*arguments, "--json"]).stdout)
+    table = CliRunner().invoke(app, arguments).stdout
+    rows = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
 
     assert [row["similarity"] for row in rows] == sorted(
         (r["similarity"] for r in rows), reverse=True
     )
     assert rows[0]["same"] is True
-    (alone,) = json.loads(CliRunner().invoke(application(), [*arguments[:3], "--json"]).stdout)
+    (alone,) = json.loads(CliRunner().invoke(app, [*arguments[:3], "--json"]).stdout)
     assert alone["similarity"] < rows[2]["similarity"]
     assert rows[1]["missing"] != rows[1]["extra"]
     assert table.splitlines()[0].split() == [
@@ -216,8 +216,8 @@ def test_the_command_line_gives_runs_and_what_differs(path: Path) -> None:
 
 
 def test_the_command_line_prints_a_pattern_that_find_takes(path: Path) -> None:
-    text = CliRunner().invoke(application(), ["like", str(path), "town#300", "--pattern"]).stdout
-    found = CliRunner().invoke(application(), ["find", str(path), text, "--count"])
+    text = CliRunner().invoke(app, ["like", str(path), "town#300", "--pattern"]).stdout
+    found = CliRunner().invoke(app, ["find", str(path), text, "--count"])
 
     assert text.startswith("MATCH (ego:Car&Ego)")
     assert int(found.stdout) >= 1

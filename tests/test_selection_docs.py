@@ -11,7 +11,7 @@ import typer
 from verb_lines import verbs
 
 import sgstore
-from sgstore.apps.cli import application, run
+from sgstore.apps.cli import app, run
 from sgstore.ingest import ingest
 
 PAGE = (Path(__file__).parents[1] / "docs" / "selection.md").read_text(encoding="utf-8")
@@ -78,7 +78,7 @@ def test_the_old_names_of_options_are_understood(
 
 
 def test_every_verb_of_locks_is_on_the_page() -> None:
-    known = verbs(typer.main.get_command(application()))
+    known = verbs(typer.main.get_command(app))
     of_locks = {verb.split()[1] for verb in known if verb.startswith("lock ")}
 
     assert of_locks <= {shlex.split(command)[2] for command in COMMANDS if " lock " in command}

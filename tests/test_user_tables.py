@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import sgstore
 import sgstore.store._joins as own
-from sgstore.apps.cli import application
+from sgstore.apps.cli import app
 from sgstore.apps.sandbox import Sandbox
 from sgstore.errors import MissingExtraError, QueryError, StoreError
 
@@ -231,7 +231,7 @@ def test_a_label_that_is_misspelt_is_told(path, frames, table) -> None:
 
 
 def run(*arguments: Any) -> Any:
-    return CliRunner().invoke(application(), [str(argument) for argument in arguments])
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize("safe", [[], ["--safe", "--timeout", "20s"]])

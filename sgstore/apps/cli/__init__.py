@@ -10,17 +10,25 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from importlib import import_module
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 import sgstore.apps.cli._process as ending
-from sgstore.apps.cli._completion import words_before
-from sgstore.apps.cli._help import spare_packages
-from sgstore.apps.cli._options import ERROR, USAGE, Verbs, app
-from sgstore.apps.cli._output import complain, talk_as_usual, write_error
+from sgstore.apps.cli import (
+    _checks,
+    _collections,
+    _coverage,
+    _exports,
+    _prioritize,
+    _queries,
+    _recordings,
+    _serve,
+    _stores,
+)
+from sgstore.apps.cli._options import ERROR, USAGE, Quiet, Verbose, Verbs
+from sgstore.apps.cli._output import complain, talk, talk_as_usual, write_error
 from sgstore.apps.cli._places import forget_asked, with_missing
 from sgstore.apps.cli._process import take_streams
 from sgstore.base.files import ReaderGoneError
@@ -29,51 +37,54 @@ from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError, is_i
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["application", "main"]
+__all__ = ["app", "main"]
 
-VERBS: Final = {
-    "recordings": ("ingest", "info", "doctor", "import", "record"),
-    "stores": ("verify", "remove", "rebuild", "derive", "map", "payload", "config", "demo"),
-    "queries": ("find", "why-not", "like", "translate", "sql", "patterns"),
-    "checks": ("check", "monitor", "timeline"),
-    "coverage": ("coverage", "select", "diff", "lock"),
-    "prioritize": ("criticality", "prioritize"),
-    "exports": ("show", "export", "shrink"),
-    "serve": ("serve", "report", "mcp"),
-    "collections": ("collection",),
-}
-"""Modules of the verbs, with their verbs; help lists the modules in this order.
-
-A verb exists only after its module is imported and its options are built. :func:`application` does
-this for the requested verb only, because all of them take longer than many queries.
-"""
-
-_OF_ALL: Final = ("--help", "-h", "--version", "--show-completion", "--install-completion")
-"""Options of the application itself; they need only the summaries of the verbs."""
+app: Final = Verbs(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 
 
-def application(arguments: Sequence[str] = ()) -> typer.Typer:
-    """Return the application for a command line.
+@app.callback(invoke_without_command=True)
+def sgstore(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Find the driving scenes that matter.
 
-    Returns
-    -------
-    typer.Typer
-        It contains the requested verb, or all verbs if none or an unknown one is requested. For its
-        own help, and for completion of a verb, it contains all verbs without their options.
+    Recordings go in (ingest), frames are found by what happens in them (find, sql), looked at (show), and
+    exported as clips (export). SGSTORE_STORE names the store of verbs that are given none.
     """
-    if (typed := words_before()) is not None:
-        arguments = typed or ("--help",)
-    first = {*_verb_in(arguments)}
-    asked = [module for module, verbs in VERBS.items() if first & {*verbs}]
-    for module in asked or VERBS:
-        import_module(f"{__name__}._{module}")
-    app.build(first if asked else (), options=not first & {*_OF_ALL})
-    for group in app.registered_groups:
-        if isinstance(group.typer_instance, Verbs) and (group.name in first or not first):
-            group.typer_instance.build()
-    order = [f"{__name__}._{module}" for module in VERBS]
-    app.registered_commands.sort(key=lambda verb: order.index(verb.callback.__module__))
-    return app
+    talk(quiet=quiet, verbose=verbose)
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"sgstore {version_of('sgstore')}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+for _verbs in (  # in the order of help
+    _recordings.verbs,
+    _stores.verbs,
+    _queries.verbs,
+    _checks.verbs,
+    _coverage.verbs,
+    _prioritize.verbs,
+    _exports.verbs,
+    _serve.verbs,
+):
+    app.add_typer(_verbs)
+for _group, _panel in (
+    (_queries.library, _queries.PANEL),
+    (_coverage.coverage, _coverage.PANEL),
+    (_coverage.lock, _coverage.PANEL),
+    (_collections.collection, _collections.PANEL),
+):
+    app.add_typer(_group, rich_help_panel=_panel)
 
 
 def _verb_in(arguments: Sequence[str]) -> Sequence[str]:
@@ -85,15 +96,18 @@ _PUBLISHING: Final = ("ingest", "import", "derive")
 """Verbs that work in parts, where each finished part is already in the store."""
 
 
+_MULTIPLYING: Final = {"coverage", "select", "diff", "lock"}
+"""Verbs with large matrix products."""
+
+
 def main() -> None:
     """Run the command line of this process and end it with the right exit code."""
     # Numpy starts a thread for each core on import; only large matrix products need them.
-    if not {*_verb_in(sys.argv[1:])} & {*VERBS["coverage"]}:
+    if not {*_verb_in(sys.argv[1:])} & _MULTIPLYING:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Imported objects are never garbage: a search for garbage during imports takes a tenth of a
     # short run.
     gc.set_threshold(50_000)
-    spare_packages()
     take_streams()
     try:
         ending.heed_signals()
@@ -153,8 +167,7 @@ def run(arguments: list[str]) -> int:
 def _ran(arguments: list[str]) -> int:
     """Run one command line; return the exit code, also after a lost interruption."""
     try:
-        asked = application(arguments)
-        code = int(asked(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
+        code = int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
         code = with_missing(code)
         if code != ending.INTERRUPTED:
             sys.stdout.flush()

@@ -32,7 +32,7 @@ from sgstore.apps.cli._options import (
     Statements,
     StorePath,
     Traces,
-    app,
+    Verbs,
     parameters_of,
     say_notes,
     say_scope,
@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from sgstore.temporal import CheckRun, FrameSource, Monitor, MonitorEvent, Verdict
 
 PANEL: Final = "Rules over time"
+
+verbs = Verbs()
 
 
 _NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -131,7 +133,7 @@ def _plain(text: str) -> str:
 # The verb that checks: verdicts of traces -------------------------------------------------------
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def check(
     store: AskedPath,
     files: Annotated[
@@ -281,7 +283,7 @@ SensorFile = Annotated[
 ]
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def monitor(
     trace: Annotated[
         str, Argument(metavar="TRACE", help="A recording; or carla://HOST:PORT, until Ctrl-C.")
@@ -458,7 +460,7 @@ def _line(text: str) -> None:
 # The verb that shows when: swim lanes of matches and violations ---------------------------------
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def timeline(
     store: StorePath,
     queries: Annotated[

@@ -14,7 +14,6 @@ from sgstore.apps.cli._options import (
     PrintedRows,
     StorePath,
     Verbs,
-    app,
     jobs_of,
     seconds_of,
 )
@@ -50,12 +49,10 @@ def _new_in(done: Commit) -> str:
     return f"{told}, snapshot {done.number}"
 
 
-collection = Verbs(no_args_is_help=True)
-app.add_typer(
-    collection,
+collection = Verbs(
     name="collection",
     help="Collections of stores, in a folder or an object store: make and look after them.",
-    rich_help_panel=PANEL,
+    no_args_is_help=True,
 )
 
 

@@ -7,7 +7,6 @@ must be fast: names of the package need no database; only names of a store open 
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -27,43 +26,6 @@ STORE: Final = "SGSTORE_STORE"
 """Environment variable with the default store."""
 
 STORE_ENDINGS: Final = (".sgstore", ".duckdb", ".db")
-_ASKED: Final = "_SGSTORE_COMPLETE"
-"""Environment variable by which a shell requests completions."""
-
-_KEPT: Final = "_SGSTORE_KEPT"
-"""Environment variable with the part of the typed word that bash keeps."""
-
-
-def words_before() -> list[str] | None:
-    """Return the words before the completed word of a command line, or ``None``.
-
-    Each shell passes them in its own variables, as in typer's scripts.
-    """
-    if not os.environ.get(_ASKED, "").startswith("complete"):
-        return None
-    os.environ[_KEPT] = ""
-    if (bash := os.environ.get("COMP_WORDS")) is not None:
-        return _words_of_bash(bash.split("\n"), int(os.environ.get("COMP_CWORD", "0") or 0))
-    other = os.environ.get("_TYPER_COMPLETE_ARGS", "")
-    words = other.split()[1:]
-    return words if other[-1:].isspace() else words[:-1]
-
-
-def _words_of_bash(words: list[str], at: int) -> list[str]:
-    """Return the words before a position; words that bash split at ``@`` are joined again, also for typer.
-
-    Bash splits ``town@7`` into three words, and replaces the last two by the completion. Therefore
-    the word for typer is ``@7``, and ``town`` is kept.
-    """
-    typed = words[: at + 1]
-    if "@" in typed:
-        broken = "@" in typed[-2:]
-        typed = re.sub(r"\n@(\n|$)", "@", "\n".join(typed)).split("\n")
-        if broken:
-            os.environ[_KEPT], _, rest = typed[-1].rpartition("@")
-            typed[-1] = f"@{rest}"
-        os.environ.update(COMP_WORDS="\n".join(typed), COMP_CWORD=str(len(typed) - 1))
-    return typed[1:-1]
 
 
 def stores(ctx: typer.Context, incomplete: str) -> Offers:
@@ -101,11 +63,9 @@ def traces(ctx: typer.Context) -> Offers:
 
 def frames(ctx: typer.Context, incomplete: str) -> Offers:
     """Yield completions of a frame name: the typed digits plus one more digit."""
-    kept = os.environ.get(_KEPT, "")
-    typed = f"{kept}{incomplete}"
     for one in _traces(ctx):
-        head = next((h for h in (f"{one.name}#", f"{one.name}@") if typed.startswith(h)), "")
-        digits = typed[len(head) :]
+        head = next((h for h in (f"{one.name}#", f"{one.name}@") if incomplete.startswith(h)), "")
+        digits = incomplete[len(head) :]
         if not head:
             for number in sorted({0, one.frames - 1}):
                 yield f"{one.name}#{number}", f"of {_about(one)}; or {one.name}@12.3s"
@@ -114,8 +74,7 @@ def frames(ctx: typer.Context, incomplete: str) -> Offers:
             last = (one.end_ns - one.start_ns) // 10**9 if by_time else one.frames - 1
             for number in filter(None, (digits, *(f"{digits}{digit}" for digit in range(10)))):
                 if number == str(int(number)) and int(number) <= last:
-                    shown = f"{head}{number}{'s' * by_time}"
-                    yield shown.removeprefix(kept), f"of 0 … {last}{' s' * by_time}"
+                    yield f"{head}{number}{'s' * by_time}", f"of 0 … {last}{' s' * by_time}"
 
 
 def presets() -> Offers:

@@ -26,7 +26,6 @@ from sgstore.apps.cli._options import (
     QueryText,
     RowOptions,
     Verbs,
-    app,
     asked_of,
     parameters_of,
     pattern_option,
@@ -48,13 +47,13 @@ if TYPE_CHECKING:
 
 PANEL: Final = "Coverage and test sets"
 
+verbs = Verbs()
 
-coverage = Verbs(no_args_is_help=True)
-app.add_typer(
-    coverage,
+
+coverage = Verbs(
     name="coverage",
     help="Measure what a data set covers: classes, novelty, growth, combinations, failures.",
-    rich_help_panel=PANEL,
+    no_args_is_help=True,
 )
 
 A = Annotated[
@@ -506,12 +505,10 @@ def _short(text: str) -> str:
 
 # Verbs that choose test sets, lock them, and compare stores ---------------------------------------
 
-lock = Verbs(no_args_is_help=True)
-app.add_typer(
-    lock,
+lock = Verbs(
     name="lock",
     help="Locks of test sets: verify, list, unite, intersect, subtract.",
-    rich_help_panel=PANEL,
+    no_args_is_help=True,
 )
 
 
@@ -616,7 +613,7 @@ class ChoiceOptions:
         return asked[0] if asked else Strategy.every
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def select(
     store: AskedPath,
     choice: ChoiceOptions,
@@ -802,7 +799,7 @@ def say_made(made: Lock, output: Path) -> None:
     say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def diff(
     a: Annotated[
         str, Argument(metavar="A", help="Before: a store or collection, STORE:QUERY, or a lock.")

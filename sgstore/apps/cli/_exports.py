@@ -17,7 +17,7 @@ from sgstore.apps.cli._options import (
     QueryLimits,
     Question,
     StorePath,
-    app,
+    Verbs,
     form_of,
     lines_of,
     parameters_of,
@@ -26,7 +26,6 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import Format, count_bar, say, write_rows
-from sgstore.exporters import EXPORTERS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -38,10 +37,7 @@ if TYPE_CHECKING:
 
 PANEL: Final = "Pictures and exports"
 
-
-def _formats(option: str = "") -> str:
-    """Return the built-in formats, or those that support an option, for help."""
-    return ", ".join(one.name for one in EXPORTERS if not option or option in one.options)
+verbs = Verbs()
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ class ClipOptions:
         bool,
         Option(
             "--with-graph",
-            help=f"{_formats('with_graph')}: with the scene graphs, as JSON and to draw.",
+            help="mcap: with the scene graphs, as JSON and to draw.",
         ),
     ] = False
     mounts: Annotated[
@@ -72,7 +68,7 @@ class ClipOptions:
         Option(
             "--mount",
             metavar="AXES=X,Y,Z[,YAW]",
-            help=f"{_formats('mounts')}, with graphs: where a sensor sits on the ego, by the frame_id of its"
+            help="mcap, rrd, with graphs: where a sensor sits on the ego, by the frame_id of its"
             " messages; m, degrees; repeatable.",
         ),
     ] = None
@@ -80,29 +76,28 @@ class ClipOptions:
         bool,
         Option(
             "--rebase-context",
-            help=f"{_formats('rebase_context')}: put the map and the like, which stand before a clip,"
-            " right beside it.",
+            help="mcap: put the map and the like, which stand before a clip, right beside it.",
         ),
     ] = False
     abstraction: Annotated[
         str,
-        Option("--abstraction", help=f"{_formats('abstraction')}: abstraction of the graphs."),
+        Option("--abstraction", help="nx, pyg, s3c: abstraction of the graphs."),
     ] = ""
     graphml: Annotated[
         bool,
-        Option("--graphml", help=f"{_formats('graphml')}: each frame as GraphML, too, for Gephi."),
+        Option("--graphml", help="nx: each frame as GraphML, too, for Gephi."),
     ] = False
     channels: Annotated[
         list[str] | None,
         Option(
             "--channel",
             metavar="TOPIC",
-            help=f"{_formats('channels')}: only of this sensor; repeatable.",
+            help="frames: only of this sensor; repeatable.",
         ),
     ] = None
     clouds: Annotated[
         Literal["pcd", "npy", "bin"],
-        Option("--clouds", help=f"{_formats('clouds')}: format of point clouds."),
+        Option("--clouds", help="frames: format of point clouds."),
     ] = "pcd"
 
     def order(self, store: Store, clips: Sequence[Clip], **about: Any) -> Export:
@@ -123,7 +118,7 @@ class ClipOptions:
         )
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def export(
     store: StorePath,
     question: Question,
@@ -144,7 +139,7 @@ def export(
         str,
         Option(
             "--format",
-            help=f"{_formats()}, or of a package.",
+            help="mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, or of a package.",
             autocompletion=completion.formats,
         ),
     ] = "mcap",
@@ -230,7 +225,7 @@ def _clips(
 # The verb that cuts clips to what matters ---------------------------------------------------------
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def shrink(
     store: StorePath,
     question: Question,
@@ -350,7 +345,7 @@ class DrawOptions:
         }
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def show(
     store: StorePath,
     frame: Annotated[

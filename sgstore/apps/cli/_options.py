@@ -8,9 +8,9 @@ import re
 import sys
 from collections import Counter
 from dataclasses import dataclass, fields, is_dataclass
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
 
 import typer
 from typer import Argument, Option
@@ -23,7 +23,7 @@ from sgstore.apps.cli._process import set_deadline
 from sgstore.errors import ConfigError, url_named
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.apps.sandbox import Answer
     from sgstore.collection import PartedMatches, PartedRows
@@ -51,7 +51,6 @@ class Verb(TyperCommand):
                     raise typer.BadParameter(
                         f"given {times} times, but it takes one value", ctx=ctx, param=parameter
                     )
-            _spare(self.get_params(ctx))
             rest = super().parse_args(ctx, args)
         except Exception as error:
             _advise(error, self)
@@ -148,61 +147,13 @@ def _is_database(place: str | Path) -> bool:
         return False
 
 
-class Application(TyperGroup):
-    """Verbs of an application; see :func:`_spare`."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse a command line up to the verb."""
-        _spare(self.get_params(ctx))
-        return super().parse_args(ctx, args)
+class Group(TyperGroup):
+    """Group of verbs, whose help ends in examples."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write help, followed by examples."""
         super().format_help(ctx, formatter)
         _write_examples(ctx)
-
-
-def _spare(parameters: Iterable[Any]) -> None:
-    """Let parameters accept plain values without validation by pydantic.
-
-    From 0.29 on typer validates every value with pydantic, whose import takes longer than many
-    queries.
-    """
-    for one in parameters:
-        if hasattr(one, "type_descriptor") and "process_value" not in vars(one):
-            one.process_value = partial(_taken, one, one.process_value)
-
-
-def _taken(parameter: Any, ask: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
-    found = _plain(parameter, value)
-    if found is _NOT_PLAIN:
-        return ask(context, value)
-    return found if parameter.callback is None else parameter.callback(context, parameter, found)
-
-
-_NOT_PLAIN: Final = object()
-"""Neither a default nor a plain text: the value needs validation."""
-
-
-def _plain(parameter: Any, value: Any) -> Any:
-    """Return the value of a parameter, or :data:`_NOT_PLAIN` if it needs validation."""
-    about, several = parameter.type_descriptor, parameter.multiple or parameter.nargs == -1
-    kind = about.annotation
-    if value is None:
-        return _NOT_PLAIN if parameter.required else () if several else None
-    if several:
-        kinds = get_args(kind)
-        found = [_plain_text(kinds[0], one) for one in value] if len(kinds) == 1 else [_NOT_PLAIN]
-        return _NOT_PLAIN if _NOT_PLAIN in found else found
-    if about.is_choice:
-        return next((one for one in about.choices if one == value), _NOT_PLAIN)
-    same = value == parameter.default and isinstance(kind, type) and isinstance(value, kind)
-    return value if same else _plain_text(kind, value)
-
-
-def _plain_text(kind: Any, value: Any) -> Any:
-    fits = kind in {str, Path} and isinstance(value, str) and value.isprintable()
-    return kind(value) if fits else _NOT_PLAIN
 
 
 def _says_one_thing(parameter: Any) -> bool:
@@ -213,46 +164,23 @@ def _says_one_thing(parameter: Any) -> bool:
 
 
 class Verbs(typer.Typer):
-    """Application, or a part of one, whose commands are :class:`Verb` objects.
+    """Typer application whose commands are :class:`Verb` objects.
 
-    Verbs are registered first and built later, because the options of all take longer than many
-    queries.
+    A parameter of a verb with a dataclass type represents the options of its fields.
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(cls=Application, **options)
-        self._verbs: dict[str, tuple[dict[str, Any], Callable[..., Any]]] = {}
-        self._built: set[str] = set()
+        super().__init__(cls=Group, **options)
 
     def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
-        """Return a decorator that makes a function a verb; see :meth:`typer.Typer.command`.
+        """Return a decorator that registers a function as a verb; see :meth:`typer.Typer.command`."""
+        register = super().command(name, cls=Verb, **options)
 
-        A parameter with a dataclass type represents the options of its fields.
-        """
-
-        def noted(function: Callable[..., Any]) -> Callable[..., Any]:
-            self._verbs[name or function.__name__] = options, function
+        def registered(function: Callable[..., Any]) -> Callable[..., Any]:
+            register(_unbundled(function))
             return function
 
-        return noted
-
-    def build(self, only: Collection[str] = (), *, options: bool = True) -> None:
-        """Build the verbs of these names (default all), with or without their options."""
-        built = [one for one in self.registered_commands if one.name in self._built]
-        self.registered_commands = built
-        for name, (about, function) in self._verbs.items():
-            if name in self._built or (only and name not in only):
-                continue
-            verb = _unbundled(function) if options else _without_options(function)
-            super().command(name, cls=Verb, **about)(verb)
-            self._built |= {name} if options else set()
-
-
-def _without_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    def verb() -> None: ...
-
-    verb.__module__, verb.__doc__ = function.__module__, function.__doc__
-    return verb
+        return registered
 
 
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -286,14 +214,6 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
     vars(verb)["__signature__"] = inspect.Signature(parameters)
     return verb
 
-
-# The application, the arguments that verbs share, and how their texts become values -------------
-
-app = Verbs(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
 
 ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
 """Exit codes; 0 means success."""
@@ -654,27 +574,6 @@ class ReadingOptions(GraphOptions):
             help="OpenDRIVE or Lanelet2 file, or folder of them, for recordings without a map of their own.",
         ),
     ] = None
-
-
-@app.callback(invoke_without_command=True)
-def sgstore(
-    context: typer.Context,
-    version: Annotated[bool, Option("--version", help="Print the version.")] = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
-    """Find the driving scenes that matter.
-
-    Recordings go in (ingest), frames are found by what happens in them (find, sql), looked at (show), and
-    exported as clips (export). SGSTORE_STORE names the store of verbs that are given none.
-    """
-    talk(quiet=quiet, verbose=verbose)
-    if version:
-        from importlib.metadata import version as version_of
-
-        typer.echo(f"sgstore {version_of('sgstore')}")
-    elif context.invoked_subcommand is None:
-        typer.echo(context.get_help())
 
 
 _ENDINGS: Final = {

@@ -20,7 +20,7 @@ from sgstore.apps.cli._options import (
     QueryText,
     RowOptions,
     StorePath,
-    app,
+    Verbs,
     parameters_of,
     say_scope,
     seconds_of,
@@ -31,7 +31,10 @@ if TYPE_CHECKING:
     from sgstore.testsets.selection import Prioritized, PrioritySpec
 
 
-@app.command(rich_help_panel=PANEL)
+verbs = Verbs()
+
+
+@verbs.command(rich_help_panel=PANEL)
 def criticality(
     store: StorePath,
     measures: Annotated[
@@ -174,7 +177,7 @@ class OutcomeOptions:
             )
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def prioritize(
     store: StorePath,
     order: OrderOptions,

@@ -27,7 +27,6 @@ from sgstore.apps.cli._options import (
     StorePath,
     Verbs,
     With,
-    app,
     on_terminal,
     parameters_of,
     query_of,
@@ -58,6 +57,8 @@ if TYPE_CHECKING:
 
 PANEL: Final = "Questions"
 
+verbs = Verbs()
+
 
 Safe = Annotated[
     bool,
@@ -66,7 +67,7 @@ Safe = Annotated[
 MaxRows = Annotated[int, Option("--max-rows", min=0, help="With --safe: maximum number of rows.")]
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def find(
     store: AskedPath,
     question: Question,
@@ -220,7 +221,7 @@ def _node_link(
     )
 
 
-@app.command("why-not", rich_help_panel=PANEL)
+@verbs.command("why-not", rich_help_panel=PANEL)
 def why_not(
     store: StorePath,
     frame: FrameName,
@@ -238,7 +239,7 @@ def why_not(
     return 0
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def like(
     store: AskedPath,
     frame: FrameName,
@@ -315,7 +316,7 @@ def _differing(features: dict[str, int]) -> str:
     return ", ".join([*shown[:_FEATURES_SHOWN], *([f"… {len(more)} more"] if more else [])])
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def translate(
     file: Annotated[Path, Argument(metavar="FILE", help="What to translate; - is stdin.")],
     language: Annotated[
@@ -330,7 +331,7 @@ def translate(
     return 0
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def sql(
     store: AskedPath,
     statement: Annotated[
@@ -409,12 +410,10 @@ def _say_all(answer: Answer) -> None:
 
 # Verbs about the library of named patterns: list, search, show, run -----------------------------
 
-library = Verbs(no_args_is_help=True)
-app.add_typer(
-    library,
+library = Verbs(
     name="patterns",
     help="The library of named patterns: list, search, show, run them.",
-    rich_help_panel=PANEL,
+    no_args_is_help=True,
 )
 
 LibraryName = Annotated[

@@ -22,7 +22,7 @@ from sgstore.apps.cli._options import (
     PrintedRows,
     ReadingOptions,
     StorePath,
-    app,
+    Verbs,
     jobs_of,
     lines_of,
     say_scope,
@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 PANEL: Final = "Recordings"
 
+verbs = Verbs()
+
 
 Recordings = Annotated[
     list[str],
@@ -53,7 +55,7 @@ Force = Annotated[
 ]
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def ingest(
     store: StorePath,
     traces: Recordings,
@@ -201,7 +203,7 @@ def _outcome_row(outcome: TraceOutcome) -> tuple[Any, ...]:
     )
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def info(
     store: AskedPath,
     traces: Annotated[
@@ -288,7 +290,7 @@ def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:
         out.write(tuple(documents[0]), [tuple(one.values()) for one in documents])
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def doctor(traces: Recordings, reading: ReadingOptions, out: PrintedRows) -> int:
     """Check recordings: report what can be read, and any damage. Needs no store."""
     from sgstore.ingest import recordings
@@ -322,7 +324,7 @@ PORT: Final = 2000
 """Default port of a CARLA server."""
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def record(
     output: Annotated[
         Path, Argument(metavar="FILE", help="The recording: FILE.mcap; nothing is overwritten.")
@@ -432,7 +434,7 @@ class ImportOptions:
     ] = "1s"
 
 
-@app.command("import", rich_help_panel=PANEL)
+@verbs.command("import", rich_help_panel=PANEL)
 def import_(
     store: StorePath,
     files: Annotated[

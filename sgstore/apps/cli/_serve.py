@@ -12,8 +12,8 @@ from sgstore.apps.cli._options import (
     QueryLimits,
     Question,
     StorePath,
+    Verbs,
     With,
-    app,
     seconds_of,
     tables_of,
 )
@@ -22,8 +22,10 @@ from sgstore.errors import MissingExtraError
 
 PANEL: Final = "Pictures and exports"
 
+verbs = Verbs()
 
-@app.command(rich_help_panel=PANEL)
+
+@verbs.command(rich_help_panel=PANEL)
 def serve(
     store: StorePath,
     compare: Annotated[
@@ -66,7 +68,7 @@ def serve(
     return 0
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def report(
     store: StorePath,
     question: Question,
@@ -110,7 +112,7 @@ def report(
     return 0
 
 
-@app.command(rich_help_panel="Questions")
+@verbs.command(rich_help_panel="Questions")
 def mcp(
     store: StorePath,
     write_to: Annotated[

@@ -21,7 +21,7 @@ from sgstore.apps.cli._options import (
     PrintedRows,
     StorePath,
     Traces,
-    app,
+    Verbs,
     jobs_of,
 )
 from sgstore.apps.cli._output import say
@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 
 PANEL: Final = "Stores and maps"
 
+verbs = Verbs()
 
-@app.command(rich_help_panel=PANEL)
+
+@verbs.command(rich_help_panel=PANEL)
 def verify(
     store: StorePath,
     payloads: Annotated[bool, Option("--payloads", help="Also hash the recordings again.")] = False,
@@ -57,7 +59,7 @@ def verify(
     return ERROR if rows else 0
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def remove(
     store: StorePath,
     traces: Annotated[
@@ -90,7 +92,7 @@ def remove(
     return 0
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def rebuild(
     store: StorePath,
     look_in: LookIn = None,
@@ -126,7 +128,7 @@ def rebuild(
 # Verbs about graphs: other relations from the states of a store ---------------------------------
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def derive(
     store: StorePath,
     name: Annotated[
@@ -190,7 +192,7 @@ def _write_derived(done: list[Derivation], out: PrintedRows) -> int:
 # Verbs about road maps --------------------------------------------------------------------------
 
 
-@app.command("map", rich_help_panel=PANEL)
+@verbs.command("map", rich_help_panel=PANEL)
 def map_(
     file: Annotated[
         Path,
@@ -252,7 +254,7 @@ def _road_map(file: Path) -> RoadMap:
 # The verb that fetches sensor messages ----------------------------------------------------------
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def payload(
     store: StorePath,
     frame: FrameName,
@@ -311,7 +313,7 @@ def _list_channels(file: StoreFile, frame: str, out: PrintedRows) -> None:
 # The verb about settings: print them, with what each means --------------------------------------
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def config(
     file: Annotated[
         Path | None, Argument(metavar="FILE", help="A TOML file: check it, and print it whole.")
@@ -352,7 +354,7 @@ def config(
 # The verb for newcomers -------------------------------------------------------------------------
 
 
-@app.command(rich_help_panel=PANEL)
+@verbs.command(rich_help_panel=PANEL)
 def demo(
     folder: Annotated[
         Path, Argument(metavar="DIR", help="Folder for its store, pictures and clips.")
