@@ -8,53 +8,6 @@ Texts from traces are cut and shown literally; markup in them is not interpreted
 are texts, and the groups of nodes have the ids ``node-17``, ``halo-17``, ``label-17``.
 """
 
-from sgstore.draw._charts import draw_curve, draw_growth, draw_matrix, draw_rank_sizes
-from sgstore.draw._picture import check_installed, draw_frame, draw_map
-from sgstore.draw._stored import (
-    Bindings,
-    camera_image,
-    camera_of,
-    draw_clip,
-    draw_stored,
-    frame_image,
-    graph_picture,
-    thumbnail,
-)
-from sgstore.draw._swimlanes import (
-    LETTERS,
-    NAME,
-    Lane,
-    Timeline,
-    draw_timelines,
-    lines_of,
-    parts_timeline,
-    timelines,
-)
-from sgstore.draw._view import Relations
+import lazy_loader
 
-__all__ = [
-    "LETTERS",
-    "NAME",
-    "Bindings",
-    "Lane",
-    "Relations",
-    "Timeline",
-    "camera_image",
-    "camera_of",
-    "check_installed",
-    "draw_clip",
-    "draw_curve",
-    "draw_frame",
-    "draw_growth",
-    "draw_map",
-    "draw_matrix",
-    "draw_rank_sizes",
-    "draw_stored",
-    "draw_timelines",
-    "frame_image",
-    "graph_picture",
-    "lines_of",
-    "parts_timeline",
-    "thumbnail",
-    "timelines",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

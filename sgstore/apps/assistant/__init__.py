@@ -4,11 +4,6 @@
 for prompts, and ``_server`` connects them to the protocol.
 """
 
-from sgstore.apps.assistant._server import serve, server_of
-from sgstore.apps.assistant._tools import StoreTools
+import lazy_loader
 
-__all__ = [
-    "StoreTools",
-    "serve",
-    "server_of",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

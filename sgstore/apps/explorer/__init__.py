@@ -4,23 +4,6 @@ A server in this process serves the page. A pool of sandboxes runs the queries o
 process reads states, pictures and graphs by trace and frame.
 """
 
-from sgstore.apps.explorer._app import Explorer, application
-from sgstore.apps.explorer._live import LiveRun, live_application
-from sgstore.apps.explorer._serve import serve, serve_live
-from sgstore.apps.explorer._store_reader import Reads
-from sgstore.apps.explorer._wire import PAGE, as_json, packed
-from sgstore.apps.explorer._worker import answer
+import lazy_loader
 
-__all__ = [
-    "PAGE",
-    "Explorer",
-    "LiveRun",
-    "Reads",
-    "answer",
-    "application",
-    "as_json",
-    "live_application",
-    "packed",
-    "serve",
-    "serve_live",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
