@@ -4,6 +4,10 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
+# Folders that tests and tools import from.
+FOLDERS := $(subst $() ,:,$(addprefix $(CURDIR)/,. tests/core tests/edges tests/worlds tests/reference tools))
+TOOL   := PYTHONPATH=$(FOLDERS) $(BIN)/python
+
 .PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster
 
 help:
@@ -74,51 +78,40 @@ demo: $(VENV)/.base
 lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/python tests/typed.py
+	$(TOOL) tools/typed.py
 
 format: $(VENV)/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 check: $(VENV)/.dev
-	@$(BIN)/python tests/check.py
+	@$(TOOL) tools/check.py
 
 # Types take one processor a minute or more, unless nothing changed that they are of: the tests run beside them.
 test: $(VENV)/.dev
 	@$(MAKE) --no-print-directory -j2 lint tests
 
-# Files of tests beside the way from a recording to an answer: what is derived, measured and chosen from what is stored,
-# pictures, exports, graphs and simulators of others, plug-ins of other programs, collections, assistants, the explorer,
-# pages of the docs and the patterns that come along, and parts of the long programs below. A file that is not listed is of the core.
-EDGES := commonroad coverage coverage_docs crime criticality_recorded derive derive_using like locks selection selection_docs selection_overlapping prioritize \
-  draw draw_clip draw_diagram draw_parts export_frames export_graphs export_mcap export_scenarios export_rerun export_viewers exports exports_docs timeline \
-  assistant notebook carla_live collection collection_landing collection_select collection_verbs collection_ray collection_remote collection_spark importing junit lang_sgl pytest_plugin record sample \
-  cli_people docs_house docs_queries lang_docs packaging views_page library cookbook textmate tck \
-  lanelet2 autoware sumo lane_courses roundabouts zones fuzz mutants serve live report parts sandbox_pool sequences shrink
-tests-of = $(foreach name,$(1),tests/test_$(name).py)
-
 # A file of tests at a time in each process: what its tests share is made once. The longest come first
-# (tests/slow.py), so that no process is left alone with one of them. One process more than there are
+# (mark `seconds`), so that no process is left alone with one of them. One process more than there are
 # processors: many tests wait for a process or a time that they started.
 WORKERS ?= $(shell expr $$(nproc 2>/dev/null || echo 2) + 1)
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --maxprocesses 5 --dist loadfile --no-loadscope-reorder --durations 25 --durations-min 3
 tests: $(VENV)/.dev
-	$(PYTEST) $(addprefix --ignore=,$(call tests-of,$(EDGES) $(UI)))
+	$(PYTEST) tests/core
 
 test-edges: $(VENV)/.dev
-	$(PYTEST) $(call tests-of,$(EDGES))
+	$(PYTEST) tests/edges
 
-# What needs a browser, and node for the types of the page, which comes with the checker of types of Python.
-UI := explorer
+# The explorer in a browser; node checks the types of its page.
 test-ui: $(VENV)/.browser
-	$(BIN)/python tests/vendor.py --check
-	$(BIN)/python -m pytest -q -rs --durations 10 --durations-min 3 $(call tests-of,$(UI))
+	$(TOOL) tools/vendor.py --check
+	$(BIN)/python -m pytest -q -rs --durations 10 --durations-min 3 tests/ui
 
 test-wheel: $(VENV)/.dev
-	$(BIN)/python tests/packages.py wheel
+	$(TOOL) tools/packages.py wheel
 
 test-versions: $(VENV)/.dev
-	$(BIN)/python tests/packages.py versions
+	$(TOOL) tools/packages.py versions
 
 # Every page is in the list of docs/conf.py, every link and heading that a page speaks of is there.
 docs: $(VENV)/.docs
@@ -129,88 +122,85 @@ bench: $(VENV)/.dev
 	$(BIN)/python -m bench
 
 fuzz: $(VENV)/.dev
-	$(BIN)/python tests/fuzz.py
+	$(TOOL) tools/fuzz.py
 
 fuzz-queries: $(VENV)/.dev
-	$(BIN)/python tests/fuzz_queries.py 5000 $(if $(FUZZ_STORE),--store $(FUZZ_STORE))
+	$(TOOL) tools/fuzz_queries.py 5000 $(if $(FUZZ_STORE),--store $(FUZZ_STORE))
 
 frozen: $(VENV)/.dev
-	$(BIN)/python tests/frozen.py
+	$(TOOL) tools/frozen.py
 
 reproduce: $(VENV)/.dev
-	SGSTORE_LONG=1 PYTHONPATH=. $(BIN)/python tests/reproduce.py
+	SGSTORE_LONG=1 $(TOOL) tools/reproduce.py
 
 house: $(VENV)/.dev
-	@$(BIN)/python tests/house.py --walk
+	@$(TOOL) tools/house.py --walk
 
 kill: $(VENV)/.dev
-	$(BIN)/python tests/killing.py 200
+	$(TOOL) tools/killing.py 200
 
 mutants: $(VENV)/.dev
-	$(BIN)/python tests/mutants.py
+	$(TOOL) tools/mutants.py
 
 soak: $(VENV)/.dev
-	$(BIN)/python tests/soaking.py 600
+	$(TOOL) tools/soaking.py 600
 
 soak-explorer: $(VENV)/.dev
-	$(BIN)/python tests/soaking.py 600 --explorer
+	$(TOOL) tools/soaking.py 600 --explorer
 
 # In an environment of its own, because torch is large.
 pyg: $(VENV)/.base
 	@test -x build/pyg/bin/python || $(BIN)/python -m venv build/pyg || $(BIN)/python -m virtualenv -q build/pyg
 	@build/pyg/bin/python -m pip install -q --disable-pip-version-check -e '.[pyg,viz]' ipython
-	build/pyg/bin/python tests/learning.py
+	PYTHONPATH=$(FOLDERS) build/pyg/bin/python tools/learning.py
 
 # Likewise: Rerun takes 500 MB. Its own reader looks at what is written for it.
 viewers: $(VENV)/.base
 	@test -x build/viewers/bin/python || $(BIN)/python -m venv build/viewers || $(BIN)/python -m virtualenv -q build/viewers
 	@build/viewers/bin/python -m pip install -q --disable-pip-version-check -e '.[rerun,viz,arrow]' pytest hypothesis foxglove-schemas-protobuf
-	build/viewers/bin/python -m pytest tests/test_export_rerun.py tests/test_export_viewers.py
+	build/viewers/bin/python -m pytest tests/edges/test_export_rerun.py tests/edges/test_export_viewers.py
 
 # Likewise: readers of maps and simulators, each the oracle of what we read of it.
 maps: $(VENV)/.base
 	@test -x build/maps/bin/python || $(BIN)/python -m venv build/maps || $(BIN)/python -m virtualenv -q build/maps
 	@build/maps/bin/python -m pip install -q --disable-pip-version-check -e . lanelet2==1.2.3 eclipse-sumo==1.28.0 libsumo==1.28.0
-	build/maps/bin/python tests/oracle_lanelet2.py
-	build/maps/bin/python tests/oracle_sumo.py
+	PYTHONPATH=$(FOLDERS) build/maps/bin/python tests/reference/oracle_lanelet2.py
+	PYTHONPATH=$(FOLDERS) build/maps/bin/python tests/reference/oracle_sumo.py
 
-# Files of tests that try more where SGSTORE_LONG is set (tests/thorough.py).
-LONG := lang_scope lang_empty lane_dist world_rows collection collection_landing collection_select collection_verbs collection_ray collection_remote commonroad collection_spark temporal ttc pair_numbers criticality crowds cli_ending cli_streams fuzz carla carla_cut mcap_file order abstractions \
-  lang_after lang_attributes lang_counting lang_match lang_oracle lang_parts lang_subgraphs doors frozen importing ingest_data ingest_hardship library zones \
-  export_scenarios monitor motion union store_verify notebook assistant online parts serve sgg_traces step_expressions store_transactions tolerance over_time check_verdicts lane_places lane_courses roundabouts criticality_recorded crime
 oracle: $(VENV)/.dev
-	$(BIN)/python tests/oracle_temporal.py 100000
-	$(BIN)/python tests/oracle_monitor.py 100000
-	$(BIN)/python tests/oracle_robustness.py 100000
-	$(BIN)/python tests/oracle.py 100000 0 2
-	$(BIN)/python tests/oracle_constructs.py 5000
-	$(BIN)/python tests/oracle_over_time.py 1000
-	$(BIN)/python tests/oracle_steps.py 10000
-	$(BIN)/python tests/oracle_watched.py $${SGSTORE_DATA:-../shared/data}/traces
-	SGSTORE_LONG=1 $(BIN)/python -m pytest $(foreach name,$(LONG) geometry,tests/test_$(name).py)
-	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/test_classes.py
-	SGSTORE_HURT_GRAPHS=20000 $(BIN)/python -m pytest tests/test_importing.py
-	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/test_coverage.py
+	$(TOOL) tests/reference/oracle_temporal.py 100000
+	$(TOOL) tests/reference/oracle_monitor.py 100000
+	$(TOOL) tests/reference/oracle_robustness.py 100000
+	$(TOOL) tests/reference/oracle.py 100000 0 2
+	$(TOOL) tests/reference/oracle_constructs.py 5000
+	$(TOOL) tests/reference/oracle_over_time.py 1000
+	$(TOOL) tests/reference/oracle_steps.py 10000
+	$(TOOL) tests/reference/oracle_watched.py $${SGSTORE_DATA:-../shared/data}/traces
+	SGSTORE_LONG=1 $(BIN)/python -m pytest -m long tests/core tests/edges
+	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/core/test_geometry.py
+	SGSTORE_CLASS_PAIRS=12000 $(BIN)/python -m pytest tests/core/test_classes.py
+	SGSTORE_HURT_GRAPHS=20000 $(BIN)/python -m pytest tests/edges/test_importing.py
+	SGSTORE_COVERAGE_RATE=2 $(BIN)/python -m pytest tests/edges/test_coverage.py
 
 # In an environment of its own, because Ray and Spark are large, and bring older packages.
 ENGINES := arrow,cluster,ray,spark,viz
 cluster: $(VENV)/.base
 	@test -x build/cluster/bin/python || $(BIN)/python -m venv build/cluster || $(BIN)/python -m virtualenv -q build/cluster
 	@$(call install,--group dev --group cluster -e '.[$(ENGINES)]',build/cluster/bin)
-	cd tests && ../build/cluster/bin/python oracle_collection.py 1000 'local+ray+spark:local[2,4]' 1 3 20
-	SGSTORE_LONG=1 build/cluster/bin/python -m pytest $(wildcard tests/test_collection*.py)
+	PYTHONPATH=$(FOLDERS) build/cluster/bin/python tests/reference/oracle_collection.py 1000 'local+ray+spark:local[2,4]' 1 3 20
+	SGSTORE_LONG=1 build/cluster/bin/python -m pytest $(wildcard tests/edges/test_collection*.py)
 
 duckdb-versions: $(VENV)/.dev
-	$(BIN)/python tests/duckdb_versions.py
+	$(TOOL) tools/duckdb_versions.py
 
 patterns: $(VENV)/.dev
-	$(BIN)/python tests/library_page.py
+	$(TOOL) tools/library_page.py
 
 vendor: $(VENV)/.dev
-	$(BIN)/python tests/vendor.py
+	$(TOOL) tools/vendor.py
 
 api: $(VENV)/.dev
-	$(BIN)/python tests/api_page.py
+	$(TOOL) tools/api_page.py
 
 sample: $(VENV)/.sample
 	$(BIN)/python samples/town/record.py

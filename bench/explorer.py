@@ -37,7 +37,7 @@ from sgstore.apps.report import report
 from sgstore.ingest import ingest
 from sgstore.query import Store
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.extend(str(Path(__file__).parents[1] / "tests" / name) for name in ("worlds", "reference"))
 from recordings import Recorder, car, person
 
 if TYPE_CHECKING:

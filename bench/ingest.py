@@ -29,7 +29,7 @@ from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.extend(str(Path(__file__).parents[1] / "tests" / name) for name in ("worlds", "reference"))
 from recordings import Recorder, car
 
 if TYPE_CHECKING:

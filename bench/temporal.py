@@ -24,7 +24,7 @@ from sgstore.temporal._formula import Bound, Not, Or, Proposition, Since, Until,
 from sgstore.temporal._robustness import MarginTable
 from sgstore.temporal._verdicts import Settled
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.extend(str(Path(__file__).parents[1] / "tests" / name) for name in ("worlds", "reference"))
 from formulas import OnlineFormula, formula_of  # pyright: ignore[reportMissingImports]
 from oracle_robustness import of_rtamt  # pyright: ignore[reportMissingImports]
 

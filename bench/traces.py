@@ -34,7 +34,7 @@ from sgstore.mcap import McapFile, read_chunk_head
 from sgstore.model.world import TraceReport
 from sgstore.readers import open_trace
 
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.extend(str(Path(__file__).parents[1] / "tests" / name) for name in ("worlds", "reference"))
 import carla_recordings
 from recordings import Recorder, car
 

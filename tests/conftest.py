@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import typer.main
-from slow import seconds
 
 from sgstore.base import numba_loops
 
@@ -67,7 +66,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     Within a file nothing changes its place.
     """
-    items.sort(key=lambda item: -seconds(item.path.stem.removeprefix("test_")))
+    for item in items:
+        if hasattr(getattr(item, "module", None), "LONG") or "some" in vars(item.module):
+            item.add_marker("long")  # it tries more where SGSTORE_LONG is set
+    items.sort(key=lambda item: -_seconds(item))
+
+
+def _seconds(item: pytest.Item) -> float:
+    """Return the seconds of processor that the file of a test takes, roughly; 3 without the mark."""
+    mark = item.get_closest_marker("seconds")
+    return mark.args[0] if mark else 3
 
 
 def pytest_collection_finish() -> None:
@@ -79,9 +87,6 @@ def pytest_collection_finish() -> None:
 def pytest_unconfigure() -> None:
     """Let all of it be collected where the process ends: extension modules tell of what they think was lost."""
     gc.unfreeze()
-
-
-collect_ignore = ["learning.py"]  # a program that needs torch: make pyg
 
 
 @pytest.fixture(scope="session")
