@@ -238,7 +238,7 @@ NAMED: Final = (
     ),
     (
         "the gate is not closed",
-        "sgstore/store/_locking.py",
+        "sgstore/store/_gate.py",
         "_lock(self._lock, fcntl.LOCK_EX, self._path, deadline)",
         "_lock(self._lock, fcntl.LOCK_SH, self._path, deadline)",
     ),
