@@ -22,7 +22,7 @@ help:
 	@echo "make docs    build the documentation as a site, build/site/index.html; a link that leads nowhere is an error"
 	@echo "make lint    format, lint and types only"
 	@echo "make reproduce  make the tables of docs/reproduction.md again from public data (SGSTORE_DATA; minutes)"
-	@echo "make house   figures of the code, each beside its target: files, lines, classes, circles, what a find runs"
+	@echo "make house   figures of the code, each beside its ratchet (tools/ratchets.toml)"
 	@echo "make bench   print speeds and sizes, each beside a baseline measured in the same run"
 	@echo "make fuzz    look at 100,000 recordings, texts and stores that were hurt on purpose (about an hour)"
 	@echo "make fuzz-queries  ask 5,000 random queries of a store of 300 traces (an hour; FUZZ_STORE=FILE keeps the store)"
@@ -134,7 +134,7 @@ reproduce: $(VENV)/.dev
 	SGSTORE_LONG=1 $(TOOL) tools/reproduce.py
 
 house: $(VENV)/.dev
-	@$(TOOL) tools/house.py --walk
+	@$(TOOL) tools/house.py
 
 kill: $(VENV)/.dev
 	$(TOOL) tools/killing.py 200

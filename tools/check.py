@@ -86,7 +86,16 @@ PARTS_OF = {"apps", "base", "graphs", "maps", "model", "pipeline", "testsets"}
 """Packages whose parts have tests of their own."""
 
 WHOLE = {
-    *("architecture", "docstrings", "frozen", "fuzz", "mutants", "packaging", "public_paths"),
+    *(
+        "architecture",
+        "docstrings",
+        "frozen",
+        "house",
+        "fuzz",
+        "mutants",
+        "packaging",
+        "public_paths",
+    ),
 }
 """Tests of no room: of all of them together, and of programs beside the package."""
 

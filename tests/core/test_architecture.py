@@ -200,8 +200,9 @@ def test_interfaces_import_and_list_their_names() -> None:
 
 
 def _defined(body: list[ast.stmt]) -> set[str]:
-    """Names of the functions and classes of a module."""
-    return {n.name for n in body if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
+    """Names of the functions, classes and objects of a module."""
+    objects = {ast.unparse(t) for n in body if isinstance(n, ast.Assign) for t in n.targets}
+    return objects | {n.name for n in body if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
 
 
 def test_the_core_imports_no_outer_package() -> None:
