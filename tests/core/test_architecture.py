@@ -201,7 +201,7 @@ def test_interfaces_import_and_list_their_names() -> None:
 
 def _defined(body: list[ast.stmt]) -> set[str]:
     """Names of the functions, classes and objects of a module."""
-    objects = {ast.unparse(t) for n in body if isinstance(n, ast.Assign) for t in n.targets}
+    objects = {ast.unparse(n.target) for n in body if isinstance(n, ast.AnnAssign)}
     return objects | {n.name for n in body if isinstance(n, (ast.FunctionDef, ast.ClassDef))}
 
 
