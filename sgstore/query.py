@@ -13,13 +13,7 @@ from sgstore.lang.sql import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.model.criticality import KNOWN
 from sgstore.model.vocabulary import normalize_name
-from sgstore.store import (
-    IN_NOTEBOOK,
-    FrameRef,
-    StoreFile,
-    UserTables,
-    measured,
-)
+from sgstore.store import IN_NOTEBOOK, FrameRef, StoreFile, UserTables, measured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -128,7 +122,7 @@ class ClipAnimation:
         ExportError
             The file suffix does not match the form of the animation, or the file is not writable.
         """
-        from sgstore.base.files import write_bytes
+        from sgstore.base.output_files import write_bytes
         from sgstore.errors import ExportError
 
         if Path(path).suffix != f".{self.form}":
@@ -631,7 +625,7 @@ class Store:
         MissingExtraError
             The packages for drawing are not installed.
         """
-        from sgstore.base.files import working_folder
+        from sgstore.base.temporary_folders import working_folder
         from sgstore.draw import draw_clip
 
         frames = self._range_of(clip)

@@ -37,7 +37,8 @@ TESTS = {
     "draw": "draw draw_* timeline",
     "errors": "cli_errors",
     "exporters": "exports exports_docs export_*",
-    "files": "outputs folders moved",
+    "output_files": "outputs",
+    "temporary_folders": "folders moved",
     "geometry": "geometry",
     "ingest": "ingest ingest_* cases",
     "lang": "lang_* precision cookbook textmate tck union second_match sql_patterns needs notes"
@@ -125,7 +126,7 @@ def room_of(path: Path) -> str:
 
 
 def part_of(path: Path) -> str:
-    """The part of a package that has tests of its own, ``files`` of ``base/files.py``, or the package."""
+    """The part of a package that has tests of its own, ``online`` of ``graphs/online.py``, or the package."""
     package, *inside = path.parts[1:] if path.parts[0] == "sgstore" else path.parts
     part = inside[0].partition(".")[0] if inside and package in PARTS_OF else "__init__"
     return package.partition(".")[0] if part == "__init__" else part

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.apps.explorer import PAGE, Reads, answer, as_json, packed
-from sgstore.base.files import write_bytes
+from sgstore.base.output_files import write_bytes
 from sgstore.errors import SgstoreError
 from sgstore.model.user_notes import NotesFile
 

@@ -29,8 +29,8 @@ from itertools import islice
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, Self
 
-from sgstore.base.files import new_place
 from sgstore.base.processes import command
+from sgstore.base.temporary_folders import new_place
 from sgstore.errors import (
     QueryError,
     SgstoreError,

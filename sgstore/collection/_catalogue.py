@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.collection._storage import ABOUT, MissingObjectError, digest_of_file
 from sgstore.errors import ExportError, StoreError
 from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts, Type, own_type

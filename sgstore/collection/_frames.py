@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, Self
 
 import numpy as np
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _worker as worker
 from sgstore.lang.sql.collection_parts import PARTS
 from sgstore.store import (

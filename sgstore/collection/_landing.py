@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._pack import ATTEMPTS, Commit, groups, map_names, put_bundle
 from sgstore.collection._storage import digest_of_file, place_at

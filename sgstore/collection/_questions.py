@@ -20,7 +20,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _worker as worker
 from sgstore.collection._engines import engine_named, fault_of_question
@@ -80,7 +80,6 @@ if TYPE_CHECKING:
 
 _SHOWN: Final = 8
 """Number of bundles that a message names; further bundles are counted."""
-
 
 _ALL: Final = f"FROM {PARTS}"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from typing import TYPE_CHECKING
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._cache import bundle_path
 from sgstore.collection._pack import ATTEMPTS, put_bundle

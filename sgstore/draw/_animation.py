@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 from PIL.GifImagePlugin import getdata, getheader
 
-from sgstore.base.files import OutputFile
+from sgstore.base.output_files import OutputFile
 from sgstore.draw._page import (
     COMMONEST,
     FURTHEST,

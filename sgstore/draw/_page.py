@@ -21,7 +21,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from PIL import Image
 
-from sgstore.base.files import write_bytes
+from sgstore.base.output_files import write_bytes
 from sgstore.draw._palette import FAINT_INK, GROUND, INK, PAPER, RULE
 from sgstore.draw._view import clean
 from sgstore.errors import ExportError

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.files import HeldFolder, sweep, sweep_temporary
+from sgstore.base.temporary_folders import HeldFolder, sweep, sweep_temporary
 from sgstore.errors import ExportError
 from sgstore.mcap import digest_of
 

@@ -31,7 +31,7 @@ from mcap.records import Attachment, Message, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import ChannelCount, WrittenClip, clip_name, tool
 from sgstore.exporters._mcap_graphs import LAYOUT, Added, is_added, layout

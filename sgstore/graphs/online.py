@@ -17,14 +17,8 @@ import numpy as np
 
 from sgstore.base.geometry import wrapped
 from sgstore.base.tables import chained
-from sgstore.model.graph import (
-    Edges,
-    LaneDistances,
-    MapRecords,
-    SceneColumns,
-    StaticPresence,
-    edge_attributes,
-)
+from sgstore.model.graph import Edges, LaneDistances, StaticPresence
+from sgstore.model.scene_columns import MapRecords, SceneColumns, edge_attributes
 from sgstore.model.vocabulary import (
     ENTITY_KINDS,
     EVENT_KINDS,
@@ -67,10 +61,8 @@ if TYPE_CHECKING:
     from sgstore.model.world import Codes, Event, Floats, Ints
 
     Attributes = dict[str, Any]
-    Edge = tuple[int, str, int, Attributes]
 
 __all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper", "check_entities", "replayed"]
-
 
 _NAN: Final = math.nan
 _LIGHT: Final = 1

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.errors import failure
 from sgstore.maps.map_files import Maps, lost_lanes
 from sgstore.mcap import Loss, near

@@ -14,7 +14,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.errors import ConfigError, SgstoreError, StoreError, TraceError, url_named
 from sgstore.ingest import ingest, recordings
 from sgstore.mcap import digest_of, mark_of

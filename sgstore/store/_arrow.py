@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
 
-from sgstore.base.files import written_at
+from sgstore.base.output_files import written_at
 from sgstore.errors import MissingExtraError
 from sgstore.store._interrupts import interruptible
 

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
 
-from sgstore.base.files import temporary_folder
 from sgstore.base.quoting import literal
+from sgstore.base.temporary_folders import temporary_folder
 from sgstore.errors import StoreError
 from sgstore.lang.catalog import TableFacts, Type
 from sgstore.store._packing import TOLERANCE

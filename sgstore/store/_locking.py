@@ -24,9 +24,9 @@ from weakref import finalize
 import duckdb
 
 import sgstore.store._schema as shape
-from sgstore.base.files import new_place
 from sgstore.base.logs import logger
 from sgstore.base.quoting import literal
+from sgstore.base.temporary_folders import new_place
 from sgstore.errors import StoreError
 from sgstore.store._engine_errors import BusyError, translated
 from sgstore.store._gate import Deadline, closed_gate, pass_gate

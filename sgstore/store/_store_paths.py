@@ -6,7 +6,7 @@ import os
 import stat
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.files import HeldFolder, sweep
+from sgstore.base.temporary_folders import HeldFolder, sweep
 from sgstore.errors import StoreError, one_store_needed, url_named
 
 if TYPE_CHECKING:

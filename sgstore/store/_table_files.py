@@ -15,14 +15,9 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import duckdb
 import numpy as np
 
-from sgstore.base.files import (
-    temporary_folder,
-    without_controls,
-    working_folder,
-    written_at,
-    written_text,
-)
+from sgstore.base.output_files import without_controls, written_at, written_text
 from sgstore.base.quoting import literal, quoted
+from sgstore.base.temporary_folders import temporary_folder, working_folder
 from sgstore.errors import ExportError
 from sgstore.store._arrow import ROWS_AT_ONCE, package
 from sgstore.store._locking import default_memory

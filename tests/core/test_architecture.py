@@ -112,7 +112,7 @@ def is_type_checking(node: ast.AST) -> bool:
 
 
 def is_in(path: Path, places: set[str]) -> bool:
-    """Tell whether a file is one of some places, ``store`` or ``base/files``, or lies below one."""
+    """Tell whether a file is one of some places, ``store`` or ``base/temporary_folders``, or lies below one."""
     return any(f"{name_of(path)}/".startswith(f"{place}/") for place in places)
 
 

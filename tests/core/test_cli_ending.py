@@ -162,7 +162,6 @@ ENDLESS_IN_PYTHON: dict[str, Callable[[Store], object]] = {
     "check": lambda store: list(store.check(NEVER)),
 }
 
-
 ALARMED = """
 import signal, sys, threading, time
 sys.path[:0] = {paths!r}
@@ -594,7 +593,8 @@ def test_a_refused_export_removes_the_folders_of_a_killed_one(
     more = ["--format", "parquet"] if verb == "export" else []
     line = [verb, str(town_store), "MATCH (e:Ego) WHERE e.speed > 9", "--to", str(to), *more]
     code = (
-        "import os, signal, sys; from sgstore.apps import cli; from sgstore.base import files; "
+        "import os, signal, sys; from sgstore.apps import cli; "
+        "from sgstore.base import temporary_folders as files; "
         "sys.argv[0] = 'sgstore'\n"
         "if sys.argv[1] == 'kill':\n"
         "    files.HeldFolder.remove = lambda self: os.kill(os.getpid(), signal.SIGKILL)\n"

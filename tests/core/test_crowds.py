@@ -16,13 +16,14 @@ from scenes import crossroads
 from thorough import LONG
 
 import sgstore
-import sgstore.graphs.relations._pairs as crowds
+import sgstore.graphs.relations._crowds as crowds
+import sgstore.graphs.relations._pairs as pairs
 import sgstore.store._packing as packing
 import sgstore.store._staging as staging
 from sgstore.apps.cli import run
 from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
-from sgstore.model import graph as graphs
+from sgstore.model import scene_columns as graphs
 from sgstore.model.config import Config, configured
 from sgstore.model.graph import EdgeColumns
 from sgstore.pipeline.derive import derive
@@ -206,6 +207,7 @@ def test_edges_that_are_kept_in_pieces_are_the_same_edges(
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 25 bodies in one place the pairs are too many, of 20 they are not."""
+    monkeypatch.setattr(pairs, "MOST_PAIRS", 200)
     monkeypatch.setattr(crowds, "MOST_PAIRS", 200)
 
 

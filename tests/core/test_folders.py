@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from sgstore.base.files import HeldFolder, new_place, temporary_folder, working_folder
+from sgstore.base.temporary_folders import HeldFolder, new_place, temporary_folder, working_folder
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from sgstore.base.files import HeldFolder, temporary_folder
+from sgstore.base.temporary_folders import HeldFolder, temporary_folder
 held = HeldFolder(Path(sys.argv[1]), "kept-")
 (held.path / "data").write_bytes(b"x" * 1000)
 print(held.path, temporary_folder(), flush=True)

@@ -24,7 +24,7 @@ from opendrive_maps import (
 )
 
 from sgstore.maps.opendrive import read_map
-from sgstore.maps.opendrive._document import last_before
+from sgstore.maps.opendrive._piecewise import last_before
 
 if TYPE_CHECKING:
     from sgstore.maps.roads import LanePoints, RoadMap

@@ -9,7 +9,7 @@ import pytest
 from opendrive_maps import a_map, a_road, arc, element, lane, line, link, mark, section
 
 from sgstore.maps.opendrive import read_map
-from sgstore.maps.opendrive._network import permitted
+from sgstore.maps.opendrive._lane_changes import permitted
 from sgstore.model.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:

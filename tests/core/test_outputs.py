@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from sgstore.apps.cli import run
-from sgstore.base.files import OutputFile, write_bytes, written, written_at
+from sgstore.base.output_files import OutputFile, write_bytes, written, written_at
 from sgstore.errors import ExportError
 
 if TYPE_CHECKING:

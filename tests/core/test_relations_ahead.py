@@ -12,7 +12,7 @@ import shapely
 from builders import PaperMap, Patch, Recording, Thing, edges, frames, graph_of, thing
 from test_sgg_traces import graphs, opened, recording, recordings
 
-from sgstore.graphs.relations._following import Centrelines, LaneNet
+from sgstore.graphs.relations._lane_net import Centrelines, LaneNet
 from sgstore.model.config import Config, LaneSettings, RangeSettings
 from sgstore.model.vocabulary import KIND_CODE, RELATION_CODE, VEHICLES
 

@@ -171,7 +171,7 @@ def test_what_cannot_be_used_is_named_and_a_map_without_lanelets_refused() -> No
 def test_many_lanelets_in_one_place_are_no_neighbours_of_one_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("sgstore.maps.lanelet2._lanes._MOST_BESIDE", 3)
+    monkeypatch.setattr("sgstore.maps.lanelet2._lanelets._MOST_BESIDE", 3)
     made = LaneletMap()
     left, right = (made.way([(0, y), (9, y)]) for y in (3, 0))
     for _ in range(5):

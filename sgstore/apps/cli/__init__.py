@@ -31,7 +31,7 @@ from sgstore.apps.cli._options import ERROR, USAGE, Quiet, Verbose, Verbs
 from sgstore.apps.cli._output import complain, talk, talk_as_usual, write_error
 from sgstore.apps.cli._places import forget_asked, with_missing
 from sgstore.apps.cli._process import take_streams
-from sgstore.base.files import ReaderGoneError
+from sgstore.base.output_files import ReaderGoneError
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError, is_interruption
 
 if TYPE_CHECKING:

@@ -43,7 +43,7 @@ from sgstore.apps.cli._options import (
 from sgstore.apps.cli._output import json_text, say
 from sgstore.apps.cli._places import CollectionOptions, url_of
 from sgstore.apps.cli._process import was_ended
-from sgstore.base.files import without_controls, write_bytes
+from sgstore.base.output_files import without_controls, write_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -16,7 +16,8 @@ from enum import StrEnum
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.files import without_controls, working_folder, written_text
+from sgstore.base.output_files import without_controls, written_text
+from sgstore.base.temporary_folders import working_folder
 from sgstore.errors import ExportError
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from collections import namedtuple
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.files import Stream
+from sgstore.base.output_files import Stream
 from sgstore.errors import SqlError
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def take_streams() -> None:
     """Replace Python's standard streams, open or closed, by our own.
 
     A full disk behind stdout raises :class:`~sgstore.errors.ExportError`, and a reader that has
-    exited raises :class:`~sgstore.base.files.ReaderGoneError`. Failed writes to stderr are dropped,
+    exited raises :class:`~sgstore.base.output_files.ReaderGoneError`. Failed writes to stderr are dropped,
     because there is no other output.
     """
     if os.name != "posix":  # elsewhere Python's streams handle the console

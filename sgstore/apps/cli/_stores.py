@@ -25,7 +25,7 @@ from sgstore.apps.cli._options import (
     jobs_of,
 )
 from sgstore.apps.cli._output import say
-from sgstore.base.files import write_bytes
+from sgstore.base.output_files import write_bytes
 from sgstore.errors import ExportError
 
 if TYPE_CHECKING:

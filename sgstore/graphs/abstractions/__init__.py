@@ -6,14 +6,9 @@ entry point of the group ``sgstore.abstractions``. ``_classes`` defines classes.
 """
 
 from sgstore.graphs.abstractions._classes import Classes, classes_of, contents_of
-from sgstore.graphs.abstractions._columns import (
-    GraphColumns,
-    Labelled,
-    MapColumns,
-    found,
-    lane_roles,
-)
+from sgstore.graphs.abstractions._columns import GraphColumns, Labelled, MapColumns, found
 from sgstore.graphs.abstractions._features import GraphFeatures, of_frames, without
+from sgstore.graphs.abstractions._lane_roles import lane_roles
 from sgstore.graphs.abstractions._registry import (
     ABSTRACTIONS,
     AT_INGEST,

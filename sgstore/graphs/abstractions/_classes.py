@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sgstore.base.tables import ascending
-from sgstore.graphs.abstractions._columns import ego_lanes, found
+from sgstore.graphs.abstractions._columns import found
+from sgstore.graphs.abstractions._lane_roles import ego_lanes
 from sgstore.graphs.abstractions._subsets import OF_JUNCTION
 from sgstore.model.vocabulary import MOST_RELATIONS, RELATION_CODE
 
@@ -39,7 +40,6 @@ Arcs = dict[int, dict[int, int]]
 """Node → node → number of the label of the edge between them."""
 
 Form = tuple[object, ...]
-
 
 _DEEPEST: Final = 150
 """Greatest depth of nested individualised nodes."""

@@ -10,7 +10,7 @@ and ``conflictsWith``.
 
 These rules apply where our graphs have more than those of the literature:
 
-* ``EL``, ``RSV``: lanes are driving strands (:mod:`sgstore.graphs.abstractions._columns`). ``Ego Lane`` is
+* ``EL``, ``RSV``: lanes are driving strands (:mod:`sgstore.graphs.abstractions._lane_roles`). ``Ego Lane`` is
   the strand of the ego's primary lane. Strands next to it with the same direction are ``Left n``
   and ``Right n of Ego Lane``, if they are in range. Any other strand with an entity is an
   ``Opposing Lane k`` (CARLASGG's word, for both directions), ordered by the distance of its nearest
@@ -30,15 +30,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.graphs.abstractions._columns import (
-    EGO,
+from sgstore.graphs.abstractions._columns import EGO, Labelled, repeated
+from sgstore.graphs.abstractions._lane_roles import (
     NAMELESS,
     OFF_ROAD,
     UNNAMED,
-    Labelled,
     ego_lanes,
-    repeated,
     role_name,
+    strands_of,
 )
 from sgstore.graphs.abstractions._subsets import BETWEEN_ENTITIES, OF_JUNCTION
 from sgstore.model.vocabulary import (
@@ -118,7 +117,7 @@ def _with_roles(
     seen: GraphColumns, grounds: MapColumns, label: Ints, first: int
 ) -> tuple[Ints, list[str]]:
     """Return node labels and label texts, with lanes labelled by the role in their name."""
-    named = grounds.strands.named
+    named = strands_of(grounds).named
     roles = np.unique(named[named != UNNAMED])
     if not len(roles):
         return label, []
@@ -211,7 +210,7 @@ def _ground_labels(grounds: MapColumns, first: int) -> tuple[Ints, list[str]]:
             grounds.kind.tolist(), grounds.lane_type, grounds.driving.tolist(), strict=True
         )
     ]
-    named = grounds.strands.named
+    named = strands_of(grounds).named
     for row in np.flatnonzero(named != UNNAMED).tolist():
         text[row] = role_name(int(named[row]))
     table = {label: first + i for i, label in enumerate(dict.fromkeys(text))}

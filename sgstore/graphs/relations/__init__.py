@@ -8,29 +8,22 @@ frame.
 """
 
 from sgstore.graphs.relations._contact import contacts, contacts_of
+from sgstore.graphs.relations._crowds import NEAR, TOUCHING, Crowds, pieces
 from sgstore.graphs.relations._extent import Areas, EgoPoses, Extent
-from sgstore.graphs.relations._following import Parking, gaps
+from sgstore.graphs.relations._following import gaps
+from sgstore.graphs.relations._graph_filter import Keeping, renamed
 from sgstore.graphs.relations._hitches import Hitches
-from sgstore.graphs.relations._map_context import LaneContact, waypoints_of
+from sgstore.graphs.relations._map_context import LaneContact
 from sgstore.graphs.relations._pairs import (
-    NEAR,
-    TOUCHING,
-    Crowds,
     StillPairs,
     gathered,
     joined_pairs,
     near_pairs,
     of_kinds,
-    pieces,
     related_pairs,
 )
-from sgstore.graphs.relations._registry import (
-    Keeping,
-    as_markdown,
-    relations,
-    relations_under,
-    renamed,
-)
+from sgstore.graphs.relations._parking import Parking
+from sgstore.graphs.relations._registry import as_markdown, relations, relations_under
 from sgstore.graphs.relations._scene import (
     IS_SIGNAL,
     IS_UPRIGHT,
@@ -45,6 +38,7 @@ from sgstore.graphs.relations._scene import (
     edges_between,
     edges_to_map,
 )
+from sgstore.graphs.relations._waypoints import waypoints_of
 
 __all__ = [
     "IS_SIGNAL",

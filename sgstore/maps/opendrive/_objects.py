@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 import shapely
 
-from sgstore.maps.opendrive._signals import is_signal_object, node_columns, places, standing
+from sgstore.maps.opendrive._positions import node_columns, places, standing
+from sgstore.maps.opendrive._signals import is_signal_object
 from sgstore.maps.roads import MapNodes, PlainLane
 from sgstore.model.vocabulary import KIND_CODE
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from sgstore.maps.opendrive._document import Document
-    from sgstore.maps.opendrive._lanes import PlanView
+    from sgstore.maps.opendrive._plan_view import PlanView
     from sgstore.model.world import Floats, Ints
 
 

@@ -15,22 +15,21 @@ import shapely
 from sgstore.base.tables import chained
 from sgstore.errors import MapError
 from sgstore.maps.opendrive._document import Document, Record, Spoiled, read_document
-from sgstore.maps.opendrive._lanes import heights, odd_sections, read_lanes, read_plan_view, surface
-from sgstore.maps.opendrive._network import (
+from sgstore.maps.opendrive._lane_changes import read_broad_lines, read_lane_changes
+from sgstore.maps.opendrive._lanes import heights, odd_sections, read_lanes, surface
+from sgstore.maps.opendrive._network import Network, flows
+from sgstore.maps.opendrive._nodes import (
     FIRST_LANE,
-    Network,
     containment,
     flow_edges,
-    flows,
     junction_types,
     lane_nodes,
     neighbours,
-    read_broad_lines,
-    read_lane_changes,
     road_nodes,
     road_types,
 )
 from sgstore.maps.opendrive._objects import read_objects
+from sgstore.maps.opendrive._plan_view import read_plan_view
 from sgstore.maps.opendrive._signals import read_controllers, read_signals
 from sgstore.maps.roads import (
     MapNodes,
@@ -52,7 +51,6 @@ SIGNS: Final = Signs()
 """Default interpretation of signals."""
 _ROUNDS: Final = 8
 """Greatest number of readings of a text; each leaves out the roads with defects of the previous one."""
-
 
 _KEPT: Final = 4
 """Number of cached maps: a map with 30 MB of text and 6,000 lanes takes 95 MB, a town a tenth."""

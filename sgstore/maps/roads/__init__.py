@@ -9,7 +9,16 @@ is -1, then follow lanes, roads, junctions, roundabouts, crosswalks, signals and
 order. ``nodes`` lists them all.
 """
 
+from sgstore.maps.roads._conflicts import conflicts
+from sgstore.maps.roads._counts import summary
 from sgstore.maps.roads._courses import LaneCourses, lane_courses
+from sgstore.maps.roads._cross_sections import (
+    Sections,
+    cross_sections,
+    run_of,
+    sections_between,
+    thinned,
+)
 from sgstore.maps.roads._drawn import DrawnOutlines, drawn_outlines
 from sgstore.maps.roads._lane_lines import (
     END,
@@ -21,10 +30,8 @@ from sgstore.maps.roads._lane_lines import (
     Joint,
     LaneLine,
     about_lanes,
-    middle_between,
     plain_lanes,
     with_junctions,
-    with_shared_borders,
 )
 from sgstore.maps.roads._lane_text import (
     MAX_NAME,
@@ -39,15 +46,10 @@ from sgstore.maps.roads._lanes import (
     PlainLane,
     PlainObject,
     PlainSignal,
-    Sections,
-    cross_sections,
     edges_of,
     painted_across,
     plain_nodes,
     ribbons_of,
-    run_of,
-    sections_between,
-    thinned,
 )
 from sgstore.maps.roads._map import (
     OFF_ROAD,
@@ -60,12 +62,12 @@ from sgstore.maps.roads._map import (
     first_sections,
     lanes_ref,
     point_shapes,
-    summary,
     turn_words,
     within,
 )
 from sgstore.maps.roads._places import MapPlaces, broad_lines
-from sgstore.maps.roads._ribbons import LanePoints, Ribbons, conflicts, mean_widths, turned
+from sgstore.maps.roads._ribbons import LanePoints, Ribbons, mean_widths, turned
+from sgstore.maps.roads._shared_borders import middle_between, with_shared_borders
 
 __all__ = [
     "END",

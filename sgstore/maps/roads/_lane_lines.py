@@ -19,19 +19,18 @@ import numpy as np
 import shapely
 
 from sgstore.errors import MapError
-from sgstore.maps.roads._lanes import (
+from sgstore.maps.roads._cross_sections import (
     APART,
     WIDE,
-    PlainLane,
     Sections,
     along_line,
     cross_sections,
-    feet,
     half_width,
     run_of,
     thinned,
     way_between,
 )
+from sgstore.maps.roads._lanes import PlainLane
 from sgstore.maps.roads._map import STOREY
 from sgstore.model.vocabulary import DRIVING, TRAFFIC
 
@@ -268,9 +267,6 @@ def _check_numbers(lines: Sequence[LaneLine], areas: Sequence[Area]) -> None:
             raise MapError(f"{number:,} {what}; a map may have {limit:,}", element="lane")
 
 
-# Surfaces ------------------------------------------------------------------------------------------
-
-
 def _shaped(lines: Sequence[LaneLine]) -> _Network:
     """Compute the lane surfaces and return the network of lanes with a surface."""
     network = _Network([], [], {})
@@ -386,9 +382,6 @@ def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, fl
     return middle[at], float(np.arctan2(way[1], way[0])), width, float(sections.z[at])
 
 
-# Where traffic flows on ----------------------------------------------------------------------------
-
-
 _Joined = tuple[int, str, int, str]
 """Ends of lanes that touch: lane, its end, other lane, end of that lane."""
 
@@ -447,8 +440,6 @@ def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
         own = own.up_to(onward.left[0], onward.right[0], float(onward.z[0]))
         network.sections[row] = own if end == END else own.turned_round()
 
-
-# Side by side --------------------------------------------------------------------------------------
 
 _Sides = tuple[set[int], set[int]]
 """Lanes to the left and to the right of a line."""
@@ -568,9 +559,6 @@ def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float,
     return found
 
 
-# Roads and junctions -------------------------------------------------------------------------------
-
-
 def _names(network: _Network) -> list[str]:
     """Return unique names of lanes; an ambiguous name gets the lane's id as a suffix."""
     wanted = [line.name or line.ident for line in network.lines]
@@ -617,175 +605,6 @@ def _junctions(network: _Network) -> list[str]:
         junction[row] = name.setdefault(part, network.lines[row].ident)
     return junction
 
-
-# Lanes described by their borders only: the middle line, and lanes that share a border. The pieces
-# of a border have any order and direction; two of them can be next to each other, as double lines
-# are. The direction of a lane's line follows from its left and right border.
-
-MAX_PIECES: Final = 1_000
-"""Greatest number of pieces of a border. A lane with more is left out and named in a warning."""
-_DOUBLE: Final = 1.0
-"""Pieces of a border this close are parallel (a double line), unless one continues the other; m."""
-_ONE_SIDED: Final = 0.5
-"""Least share of the way between two borders along which left and right must be correct."""
-_BORDER_LOOKS: Final = 9
-"""Number of sample places along a lane and along a border."""
-_SHARED: Final = 0.1
-"""Least common part of a border of two neighbouring lanes, as a share of the shorter lane."""
-
-
-def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
-    """Return the line in the middle of two borders, by shares of their lengths.
-
-    Parameters
-    ----------
-    lefts, rights : sequence of (k, 3) float64
-        Pieces of the borders.
-
-    Returns
-    -------
-    middle : (n, 3) float64
-        Its direction has the left border on the left.
-
-    Raises
-    ------
-    ValueError
-        A border has no length or too many pieces, or the borders cross or are equal.
-    """
-    left, right = _chained(lefts, "left"), _chained(rights, "right")
-    along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
-    across = np.hypot(*(left[[0, -1]] - right[[-1, 0]])[:, :2].T).sum()
-    right = right if along <= across else right[::-1]
-    for end in (0, -1):
-        left, right = _cut_back(left, right, end), _cut_back(right, left, end)
-    shares = [run_of(line) / run_of(line)[-1] for line in (left, right)]
-    at = np.unique(np.concatenate(shares))
-    one, other = (
-        np.column_stack([np.interp(at, share, column) for column in line.T])
-        for share, line in zip(shares, (left, right), strict=True)
-    )
-    middle = (one + other) / 2
-    step, aside = np.diff(middle[:, :2], axis=0), (one - other)[:, :2]
-    aside = (aside[:-1] + aside[1:]) / 2
-    area = step[:, 0] * aside[:, 1] - step[:, 1] * aside[:, 0]
-    if not abs(area.sum()) > max(_ONE_SIDED * np.abs(area).sum(), APART * run_of(middle)[-1]):
-        raise ValueError("its boundaries cross, or are one and the same")
-    return thinned(middle if area.sum() > 0 else middle[::-1])
-
-
-def _chained(pieces: Sequence[Floats], side: str) -> Floats:
-    """Join the pieces of a border, beginning with the longest and continuing with the nearest end."""
-    left = [thin for piece in pieces if len(thin := thinned(piece)) > 1 and run_of(thin)[-1] > 0]
-    if not left:
-        raise ValueError(f"neither a centre line nor a boundary to its {side}")
-    if len(left) > MAX_PIECES:
-        raise ValueError(f"more than {MAX_PIECES} boundaries to its {side}")
-    left.sort(key=lambda piece: -run_of(piece)[-1])
-    chain, left = left[0], left[1:]
-    ends = np.array([piece[[0, -1], :2] for piece in left]).reshape(-1, 2, 2)
-    while left:
-        # (piece, end of the piece, end of the chain)
-        away = np.hypot(*np.moveaxis(ends[:, :, None] - chain[[0, -1], :2], -1, 0))
-        number, own, at = (int(i) for i in np.unravel_index(np.argmin(away), away.shape))
-        piece, ends = left.pop(number), np.delete(ends, number, axis=0)
-        half = run_of(piece)[-1] / 2
-        middle = np.array([[np.interp(half, run_of(piece), piece[:, i]) for i in (0, 1)]])
-        found = feet(middle, [chain])
-        if not found.is_end[0] and np.hypot(*(found.at - middle)[0]) <= _DOUBLE:
-            continue
-        if at == 1:
-            chain = np.concatenate((chain, piece if own == 0 else piece[::-1]))
-        else:
-            chain = np.concatenate((piece if own == 1 else piece[::-1], chain))
-    return thinned(chain)
-
-
-def _cut_back(line: Floats, other: Floats, end: int) -> Floats:
-    """Cut the part of a border that extends beyond the end of the other border."""
-    run = run_of(line)
-    found = feet(other[[end], :2], [line])
-    along, apart = float(found.along[0]), float(np.hypot(*(found.at[0] - other[end, :2])))
-    beyond = along if end == 0 else run[-1] - along
-    if beyond <= max(apart, APART) or not 0 < along < run[-1]:
-        return line
-    cut = np.array([[np.interp(along, run, column) for column in line.T]])
-    return (
-        np.concatenate((cut, line[run > along]))
-        if end == 0
-        else np.concatenate((line[run < along], cut))
-    )
-
-
-def with_shared_borders(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Add neighbours that share a border, on sides without known neighbours.
-
-    Two lanes share a border if they are on its two sides, along the same part of it.
-    """
-    users: dict[str, dict[tuple[int, int], Floats]] = defaultdict(dict)
-    for row, line in enumerate(lines):
-        if len(thinned(line.centre)) < 2:
-            continue
-        for side, borders in enumerate((line.lefts, line.rights)):
-            for border in borders:
-                if border.ident and len(border.line) > 1:
-                    users[border.ident][row, side] = thinned(border.line)
-    beside: dict[tuple[int, int], list[str]] = defaultdict(list)
-    for shared in users.values():
-        untold = [key for key in shared if not _told(lines, key)]
-        if len(shared) < 2 or not untold or min(map(len, shared.values())) < 2:
-            continue
-        places = {key: _place(lines[key[0]].centre, border) for key, border in shared.items()}
-        for key in untold:
-            beside[key] += [
-                lines[other[0]].ident
-                for other in shared
-                if other[0] != key[0] and _share(places[key], places[other])
-            ]
-    return [
-        replace(
-            line,
-            left_beside=line.left_beside or tuple(dict.fromkeys(beside[row, 0])),
-            right_beside=line.right_beside or tuple(dict.fromkeys(beside[row, 1])),
-        )
-        for row, line in enumerate(lines)
-    ]
-
-
-def _told(lines: Sequence[LaneLine], key: tuple[int, int]) -> bool:
-    row, side = key
-    return bool((lines[row].left_beside, lines[row].right_beside)[side])
-
-
-def _place(centre: Floats, border: Floats) -> tuple[float, float, bool]:
-    """Return start and end of a lane along a border, and True if it is on the border's left."""
-    centre, border = thinned(centre)[:, :2], border[:, :2]
-    own, at = _looks(centre), run_of(border)[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
-    onto, back = feet(own, [border]), feet(_looks(border), [centre])
-    beside = np.concatenate((~onto.is_end, ~back.is_end))
-    if not beside.any():
-        return 0.0, 0.0, True
-    along = np.concatenate((onto.along, at))[beside]
-    aside = np.concatenate((own - onto.at, back.at - _looks(border)))[beside]
-    piece = np.clip(np.searchsorted(run_of(border), along, "right") - 1, 0, len(border) - 2)
-    way = np.diff(border, axis=0)[piece]
-    left = float((way[:, 0] * aside[:, 1] - way[:, 1] * aside[:, 0]).sum()) > 0
-    return float(along.min()), float(along.max()), left
-
-
-def _looks(line: Floats) -> Floats:
-    """Return places (n, 2) along a line, at equal distances."""
-    run = run_of(line)
-    at = run[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
-    return np.column_stack([np.interp(at, run, column) for column in line[:, :2].T])
-
-
-def _share(one: tuple[float, float, bool], other: tuple[float, float, bool]) -> bool:
-    common = min(one[1], other[1]) - max(one[0], other[0])
-    shorter = min(one[1] - one[0], other[1] - other[0])
-    return one[2] != other[2] and common > max(_SHARED * shorter, APART)
-
-
-# Junctions of maps that know of none: lanes that lie on others' ways ---------------------------------
 
 _ON_ANOTHER: Final = 0.5
 """Least length of a centre line inside another lane that makes both a junction; m."""

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter, defaultdict
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from itertools import pairwise
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,15 +26,13 @@ from sgstore.maps.roads._places import (
 )
 from sgstore.maps.roads._ribbons import LanePoints, Ribbons, lane_polygons, waypoints
 from sgstore.maps.roads._zones import zones
-from sgstore.model.vocabulary import DRIVING, ENTITY_KINDS, KIND_CODE, KINDS, RELATION_CODE, SIGNALS
+from sgstore.model.vocabulary import DRIVING, KIND_CODE, KINDS, RELATION_CODE
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from sgstore.model.world import Bools, Codes, Floats, Ints
 
-
-# Distances along the lanes, over ``travelsTo`` ------------------------------------------------------
 
 FARTHEST: Final = 200.0
 """Greatest search distance along the lanes from one entity to another; m. The view ``pairs`` uses it too."""
@@ -79,9 +75,6 @@ def _downstream(
         yield lanes[row], other, best[row, other]
 
 
-# Places and shapes --------------------------------------------------------------------------------
-
-
 def point_shapes(x: Floats, y: Floats) -> NDArray[np.object_]:
     """Convert coordinates to shapely points, (N,)."""
     points: Any = shapely.points(np.column_stack([x, y]))
@@ -92,8 +85,6 @@ def within(outline: Any, places: Floats) -> NDArray[np.bool_]:
     """Return a mask (N,) of the places (N, 2) inside a shapely polygon."""
     return np.asarray(shapely.contains_xy(outline, *places.T), np.bool_)
 
-
-# The words for the turns of lanes, whatever a map was read from ---------------------------------
 
 STRAIGHT: Final = np.radians(30.0)
 """A lane through a junction with a smaller turn goes straight on; rad."""
@@ -795,81 +786,3 @@ def _rectangles(boxes: Floats) -> Geometries:
     y = boxes[:, 1:2] + sin * along + cos * across
     polygons: Any = shapely.polygons(np.stack((x, y), axis=-1))
     return polygons
-
-
-# What is in a road map, counted -----------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class MapCount:
-    """Number of parts of a map, of one kind.
-
-    Attributes
-    ----------
-    part : str
-        ``lane``, ``road``, ``junction``, ``crosswalk``, ``signal``, ``controller``, ``object`` or ``warning``.
-    kind : str
-        Type of the lanes, roads or junctions; kind of the signals or objects; text of the warning.
-    count : int
-    length : float or None
-        Total length; m.
-    """
-
-    part: str
-    kind: str
-    count: int
-    length: float | None = None
-
-
-def summary(road_map: RoadMap) -> list[MapCount]:
-    """Summarise a road map: lanes by type, most frequent first, other parts, and warnings last.
-
-    A road with several types counts under each type, with its length of that type.
-    """
-    nodes = road_map.nodes
-    kinds = [KINDS[int(code)] for code in nodes.kind]
-    lanes = [(nodes.lane_type[row], float(nodes.length[row])) for row in _of(kinds, "lane")]
-    junctions = [road_map.junction_types.get(nodes.name[r], "") for r in _of(kinds, "junction")]
-    signals = Counter(kind for kind in kinds if kind in SIGNALS)
-    objects = Counter(kind for kind in kinds if kind in ENTITY_KINDS and kind not in SIGNALS)
-    single = [
-        MapCount("crosswalk", "", kinds.count("crosswalk")),
-        *(MapCount("signal", kind, count) for kind, count in signals.most_common()),
-        MapCount("controller", "", len(road_map.controllers)),
-        *(MapCount("object", kind, count) for kind, count in objects.most_common()),
-    ]
-    return [
-        *_measured("lane", lanes),
-        *_measured("road", _stretches(road_map, kinds)),
-        *(MapCount("junction", kind, count) for kind, count in Counter(junctions).most_common()),
-        *(part for part in single if part.count),
-        *(MapCount("warning", text, count) for text, count in Counter(road_map.warnings).items()),
-    ]
-
-
-def _of(kinds: list[str], kind: str) -> list[int]:
-    return [row for row, found in enumerate(kinds) if found == kind]
-
-
-def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]:
-    """Count the parts and add up their lengths per kind, longest kind first."""
-    count: Counter[str] = Counter()
-    total: defaultdict[str, float] = defaultdict(float)
-    for kind, length in lengths:
-        count[kind] += 1
-        total[kind] += float(np.nan_to_num(length))
-    order = sorted(count, key=lambda kind: (-total[kind], kind))
-    return [MapCount(part, kind, count[kind], total[kind]) for kind in order]
-
-
-def _stretches(road_map: RoadMap, kinds: list[str]) -> Iterable[tuple[str, float]]:
-    """Yield types of roads and their lengths, each type once per road; empty for an unknown type."""
-    nodes = road_map.nodes
-    for row in _of(kinds, "road"):
-        length = float(nodes.length[row])
-        types = road_map.road_types.get(nodes.name[row], ())
-        cuts = [start if 0 <= start <= length else 0.0 for start, _ in types] + [length]
-        held: defaultdict[str, float] = defaultdict(float)
-        for (_, kind), (start, end) in zip(types, pairwise(cuts), strict=True):
-            held[kind] += max(end - start, 0.0)
-        yield from held.items() or [("", length)]

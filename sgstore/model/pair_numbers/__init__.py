@@ -36,14 +36,13 @@ from sgstore.model.pair_numbers._levels import (
     low_and_high_sql,
 )
 from sgstore.model.pair_numbers._pair_function import PairFunction
+from sgstore.model.pair_numbers._sql import pair_sql, pairs_view
 from sgstore.model.pair_numbers._table import (
     MARKS,
     PAIR_FUNCTIONS,
     STOREYS,
     columns_needed,
     needed_for,
-    pair_sql,
-    pairs_view,
     parts_of,
     stage_of,
 )

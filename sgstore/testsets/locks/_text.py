@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from sgstore.base.files import write_bytes
+from sgstore.base.output_files import write_bytes
 from sgstore.errors import ExportError, StoreError
 from sgstore.store import SCHEMA_VERSION
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sgstore.base.files import working_folder
+from sgstore.base.temporary_folders import working_folder
 from sgstore.store import merged_classes, write_coded
 from sgstore.testsets.coverage import ChosenFrames, Classed
 from sgstore.testsets.selection._cover import cheapest_alike

@@ -1,219 +1,39 @@
-"""Atomic output: files and folders appear complete or not at all.
+"""Atomic output: files appear complete or not at all.
 
-Temporary folders that end with their owner process.
-
-Each folder is locked while its process lives, and is removed at exit. The next process that needs a folder in
-the same place removes the folders of killed processes. It removes a folder only if its lock is free. On a file
-system without locks, it removes nothing.
+A file is written under a temporary name, then renamed. A full disk, a crash or an interrupt does not damage the
+previous file, and readers never see half a file. Places that a rename cannot replace (a pipe, a device,
+``/dev/stdout``) are written directly.
 """
 
 from __future__ import annotations
 
-import atexit
 import errno
 import io
 import os
 import re
-import secrets
 import select
 import shutil
 import stat
 import sys
-import tempfile
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.temporary_folders import HeldFolder, working_folder
 from sgstore.errors import ExportError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Generator
     from typing import BinaryIO, TextIO
 
-
-try:
-    import fcntl
-except ImportError:  # not on Windows: a folder in use cannot be removed there
-    fcntl = None
-
-
-PREFIX: Final = "sgstore-held-"
-"""Prefix of process folders in the folder for temporary files."""
-
-_FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
-
-
-class HeldFolder:
-    """New folder with a lock that its process holds until exit.
-
-    Parameters
-    ----------
-    parent : Path
-    prefix : str
-        Prefix of the folder name. Folders with this prefix are removed if their process has exited.
-    undo : callable, optional
-        Called with each such folder before its removal.
-
-    Attributes
-    ----------
-    path : Path
-
-    Raises
-    ------
-    OSError
-        The place is not writable.
-    """
-
-    def __init__(
-        self, parent: Path, prefix: str, undo: Callable[[Path], None] | None = None
-    ) -> None:
-        sweep(parent, prefix, undo)
-        self._parent, self._prefix = parent, prefix
-        self._owner = os.getpid()
-        self._lock: int | None = None
-        self.path = parent / f"{prefix}{self._owner}"
-        # An interrupt may come before the caller can remove the folder.
-        atexit.register(self.remove)
-        try:
-            while True:
-                self.path = parent / f"{prefix}{self._owner}-{secrets.token_hex(4)}"
-                self.path.mkdir(mode=0o700)
-                if self._locked():
-                    return
-        except OSError:
-            atexit.unregister(self.remove)
-            raise
-
-    def _locked(self) -> bool:
-        """Lock the folder. False if another process removed it before the lock."""
-        if fcntl is None:
-            return True
-        try:
-            lock = os.open(self.path, _FLAGS)
-        except FileNotFoundError:
-            return False
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        except OSError:  # a file system without locks: no process removes the folder
-            os.close(lock)
-            return True
-        with suppress(FileNotFoundError):
-            if os.path.samestat(self.path.stat(), os.fstat(lock)):
-                self._lock = lock
-                return True
-        os.close(lock)
-        return False
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        self.remove()
-
-    def remove(self) -> None:
-        """Remove the folder and its content. A forked child process does nothing."""
-        if os.getpid() != self._owner:
-            return
-        shutil.rmtree(self.path, ignore_errors=True)
-        if self._lock is not None:
-            with suppress(OSError):  # closed by a removal that was interrupted
-                os.close(self._lock)
-            self._lock = None
-        # A child process may outlive this process briefly, and write into the folder during its removal.
-        sweep(self._parent, self._prefix)
-        atexit.unregister(self.remove)
-
-
-def sweep(parent: Path, prefix: str, undo: Callable[[Path], None] | None = None) -> None:
-    """Remove the folders of :class:`HeldFolder` without a living process. Call ``undo`` before each removal."""
-    if fcntl is None:
-        return
-    names: list[str] = []
-    with suppress(OSError), os.scandir(parent) as entries:
-        names = [entry.name for entry in entries if entry.name.startswith(prefix)]
-    for name in names:
-        with suppress(OSError):  # it is in use, belongs to another user, or is already removed
-            _remove_dead(parent / name, undo)
-
-
-def _remove_dead(folder: Path, undo: Callable[[Path], None] | None) -> None:
-    lock = os.open(folder, _FLAGS)
-    try:
-        if fcntl is not None and os.fstat(lock).st_uid == os.geteuid():
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if undo is not None:
-                undo(folder)
-            shutil.rmtree(folder, ignore_errors=True)
-    finally:
-        os.close(lock)
-
-
-def sweep_temporary() -> None:
-    """Remove the folders for temporary files whose processes are gone."""
-    sweep(_root(), PREFIX)
-
-
-_mine: dict[tuple[int, Path], Path] = {}
-"""Folder of each process: (process id, folder for temporary files) → path."""
-
-
-def temporary_folder() -> Path:
-    """Return this process's folder for data that exceed memory. It is removed at exit.
-
-    If the creation fails, the folder does not exist, and later writes raise an error.
-    """
-    root = _root()
-    key = os.getpid(), root
-    if key not in _mine:
-        try:
-            held = HeldFolder(root, PREFIX)
-        except OSError:
-            _mine[key] = root / f"{PREFIX}{os.getpid()}-{secrets.token_hex(8)}"
-        else:
-            _mine[key] = held.path
-    return _mine[key]
-
-
-def new_place(name: str) -> Path:
-    """Return an unused path in the temporary folder of this process."""
-    return temporary_folder() / f"{name}-{secrets.token_hex(4)}"
-
-
-@contextmanager
-def working_folder(name: str) -> Generator[Path]:
-    """Create a temporary folder. It is removed at the end of the block.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be created.
-    """
-    folder = new_place(name)
-    folder.mkdir(mode=0o700, parents=True)
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _root() -> Path:
-    try:
-        return Path(tempfile.gettempdir()).resolve()
-    except FileNotFoundError:  # no usual place is writable, or the disks are full
-        return Path(os.environ.get("TMPDIR") or "/tmp").resolve()  # noqa: S108  only names it
-
-
-# Atomic output: files are written under a temporary name, then renamed --------------------------
-# A full disk, a crash or an interrupt does not damage the previous file, and readers never see half a file.
-# Places that a rename cannot replace (a pipe, a device, ``/dev/stdout``) are written directly.
 
 FILE_PREFIX: Final = ".sgstore-held-"
 """Prefix of the temporary folders next to output files."""
 
 _DESCRIPTOR: Final = re.compile(r"/dev/fd/(\d+)|/proc/self/fd/(\d+)")
+
 _NOT_THERE: Final = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV}
 """Errors of a place in which a file is writable but not replaceable."""
-
 
 _CONTROLS: Final = {
     code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"

@@ -1,23 +1,19 @@
-"""Settings of the scene graph generator: defaults, presets, validation, and TOML input and output.
+"""Settings of the scene graph generator: defaults, comments and validation.
 
 Every setting has a comment. ``sgstore config`` and ``docs/parameters.md`` print it.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import re
-import sys
-import tomllib
-from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
-from pathlib import Path
-from textwrap import wrap
-from typing import TYPE_CHECKING, Any, Final, TypeVar, get_args, get_origin, get_type_hints
+from collections.abc import Mapping  # noqa: TC003 (type hints are evaluated)
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base import plugins
 from sgstore.errors import ConfigError
+from sgstore.model.config._values import check, one_of, setting, unknown_setting, value_of
 from sgstore.model.vocabulary import (
     DIRECTIONS,
     ENTITY_KINDS,
@@ -38,10 +34,7 @@ from sgstore.model.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-COMMENT: Final = "comment"
-"""Metadata key of a setting's comment."""
+    from collections.abc import Callable, Iterable
 
 SHAPES: Final = ("radius", "rectangle", "polygon", "corridor")
 EXTENTS: Final = ("footprint", "centre")
@@ -62,17 +55,6 @@ MOST_LENGTH: Final = 100_000.0
 """Largest length of a range; m. No map is larger, and numbers stay exact."""
 
 _WORD: Final = re.compile(r"[a-z0-9][a-z0-9_]{0,39}|")
-
-T = TypeVar("T")
-
-
-def setting(default: T, comment: str) -> T:
-    """Return a dataclass field for a setting, with its default and its comment."""
-    plain: Any = default
-    metadata = {COMMENT: comment}
-    if isinstance(default, dict):
-        return field(default_factory=dict, metadata=metadata)  # pyright: ignore[reportReturnType]
-    return field(default=plain, metadata=metadata)
 
 
 @dataclass(frozen=True, slots=True)
@@ -431,24 +413,6 @@ class Config:
         return asdict(self)
 
 
-def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: FBT001
-    """Raise an error with the expected value if a setting is invalid.
-
-    Raises
-    ------
-    ConfigError
-        The message names the setting, its value, and the expected value.
-    """
-    if not holds:
-        raise ConfigError(f"setting '{name}' is {value!r}; expected {right}")
-
-
-def one_of(words: Iterable[str]) -> str:
-    """Format words as ``'a', 'b' or 'c'``."""
-    *most, last = (f"'{word}'" for word in words)
-    return f"{', '.join(most)} or {last}"
-
-
 def _make_known(name: str, add: Callable[[str], int], new: str) -> None:
     try:
         add(new)
@@ -543,383 +507,8 @@ def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict
         known: Mapping[str, Any] = getattr(relation, "parameters", {})
         for key in values:
             if key not in known:
-                raise _unknown(f"relations.{name}.", key, {*known})
+                raise unknown_setting(f"relations.{name}.", key, {*known})
         where = f"relations.{name}."
-        chosen = {key: _value(type(known[key]), v, where + key) for key, v in values.items()}
+        chosen = {key: value_of(type(known[key]), v, where + key) for key, v in values.items()}
         checked[name] = {**known, **chosen}
     return checked
-
-
-# Presets: the default, and configs that reproduce other tools -----------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Preset:
-    """Named config.
-
-    Attributes
-    ----------
-    summary : str
-        Description in one line.
-    notes : str
-        Notes for users, as lines of Markdown.
-    config : Config
-    """
-
-    summary: str
-    notes: str
-    config: Config
-
-
-_MET_BY_CARLASGG: Final = ("Person", "Bicycle", "Car", "Motorcycle", "Bus", "Train", "Truck")
-_CARLASGG: Final = Config(
-    range=RangeSettings(
-        shape="rectangle",
-        front=50.0,
-        rear=2.0,
-        side=25.0,
-        static_by="centre",
-        height=(-2.0, 2.0),
-        grade=0.1,
-        height_of_entities=False,
-    ),
-    proximity=Proximity(between="origins"),
-    direction=Direction(ties="carlasgg", sides="closed"),
-    pairs=PairSettings(
-        within=0.0,
-        ego_within=25.0,
-        kinds=tuple(("Ego", kind) for kind in _MET_BY_CARLASGG),
-    ),
-    lanes=LaneSettings(ahead=50.0, types=("driving",), sections=False),
-    sees=False,
-    kinds=(
-        *("Car", "Truck", "Van", "Bus", "Motorcycle", "Bicycle", "Person"),
-        *("TrafficLight", "StopSign", "YieldSign", "SpeedLimit", "Sign"),
-        *("Lane", "Road", "Junction", "OffRoad"),
-    ),
-    without=("leads", "follows", "overlaps", "sees", "tows"),
-)
-
-_ROADSCENE2VEC: Final = Config(
-    proximity=Proximity(
-        names=("near_coll", "super_near", "very_near", "near", "visible"),
-        upper=(4.0, 7.0, 10.0, 16.0, 25.0),
-    ),
-    direction=Direction(ties="both"),
-    pairs=PairSettings(
-        within=0.0,
-        ego_within=25.0,
-        kinds=(("Ego", "Vehicle"), ("Ego", "Person"), ("Ego", "Signal")),
-    ),
-    sees=False,
-    without=("leads", "follows", "overlaps", "sees", "tows"),
-)
-
-_OF_CARLASGG: Final = """\
-* *Imitated.* The rectangle, 50 m ahead, 2 m behind, 25 m to each side; in it count the footprints of
-  what moves and the centres of what stands. The rule that keeps roads of other storeys out (less than 2
-  m higher or lower, or a grade of less than 0.1), for the map alone. Distances between the origins of
-  actors. Which bearing is what, and who has the ties; what is dead ahead or dead behind is to the left.
-  Relations of the ego with people, bicycles, cars, motorcycles, buses, trains and trucks up to 25 m, and
-  of nobody else; vans it leaves out. Lanes of type driving alone, whatever their section, and `off_road`
-  for what touches none of them.
-* *Defects, not imitated.* It has no lane changes, although its documentation promises them. Its lanes
-  stick out by 1 m beyond their ends and beside their bends, and stop up to 2 m short of their ends. Of
-  lanes that begin in one place, one seems to lead to the others. A traffic light is there twice, as a
-  pole and as a landmark. What has no edge to a lane is "Off Road", lights and signs too. An entity is in
-  the lanes of every storey above and below it.
-* `python -m bench.against_carlasgg TRACE ORACLE` counts all of it against graphs that CARLASGG itself
-  made; its exit status is 1 where a row falls below its mark or a difference has no cause.
-"""
-
-_OF_ROADSCENE2VEC: Final = """\
-* On a bound of two directions both hold. Of the distances one holds, the nearest, as there.
-* Relations of the ego alone, up to 25 m, with what RoadScene2Vec knows: cars (whatever is as large, trams
-  too), motorcycles, bicycles, people, lights and signs.
-* The settings are those of relations. Its three lanes, and left and right by them, are what the abstraction
-  `roadscene2vec` makes of any graph, ingested with whatever settings.
-"""
-
-PRESETS: Final[Mapping[str, Preset]] = {
-    "default": Preset(
-        "All round the ego, all kinds, all lane types, storeys kept apart, numbers kept.",
-        "",
-        Config(),
-    ),
-    "carlasgg": Preset(
-        "The graphs of CARLASGG as its code computes them, without its defects.",
-        _OF_CARLASGG,
-        _CARLASGG,
-    ),
-    "roadscene2vec": Preset(
-        "The relations and thresholds of RoadScene2Vec, whose bins hold both their bounds.",
-        _OF_ROADSCENE2VEC,
-        _ROADSCENE2VEC,
-    ),
-}
-"""All presets by name."""
-
-
-def preset(name: str) -> Config:
-    """Return the config of a preset.
-
-    Raises
-    ------
-    ConfigError
-        The preset does not exist.
-    """
-    if name not in PRESETS:
-        like = suggestion(name, PRESETS)
-        hint = f"did you mean '{like}'?" if like else f"there are {', '.join(PRESETS)}"
-        raise ConfigError(f"no preset '{name}'; {hint}")
-    return PRESETS[name].config
-
-
-# Configs from TOML files, plain values and keyword arguments ------------------------------------
-
-MAX_CONFIG_BYTES: Final = 1 << 20
-
-
-def load(path: str | Path) -> Config:
-    """Read a config from a TOML file. Missing settings come from its preset, or keep their defaults.
-
-    Raises
-    ------
-    ConfigError
-        The file is not readable, is not TOML, or has an unknown or invalid setting.
-    """
-    path = Path(path)
-    try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
-            raise ConfigError(f"{path}: larger than {MAX_CONFIG_BYTES} bytes, which no config is")
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from error
-    try:
-        return from_dict(values)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
-
-
-def from_dict(values: Mapping[str, Any]) -> Config:
-    """Return the config described by plain values.
-
-    Parameters
-    ----------
-    values : mapping
-        Values as in TOML and JSON. ``preset`` names the preset for missing settings; without it, the defaults
-        apply.
-
-    Raises
-    ------
-    ConfigError
-        A setting is unknown, of the wrong type, or out of range.
-    """
-    values = dict(values)
-    name = values.pop("preset", "")
-    check(isinstance(name, str), "preset", name, "the name of a preset")
-    return _changed(preset(name) if name else Config(), values, "")
-
-
-def configured(**settings: Any) -> Config:
-    """Return the config described by keyword arguments. Tables are mappings or settings objects.
-
-    ::
-
-        configured(preset="carlasgg", range={"front": 80}, pairs=PairSettings(within=0), rate=2)
-
-    Raises
-    ------
-    ConfigError
-        See :func:`from_dict`.
-    """
-    return from_dict(settings)
-
-
-def _changed(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """Return a copy of a settings table with some values changed."""
-    hints = get_type_hints(type(config))
-    known = {f.name for f in fields(config)}
-    for name in values:
-        if name not in known:
-            raise _unknown(prefix, name, known)
-    changes = {
-        name: _value(hints[name], value, f"{prefix}{name}", getattr(config, name))
-        for name, value in values.items()
-    }
-    return replace(config, **changes)
-
-
-def _unknown(prefix: str, name: str, known: set[str]) -> ConfigError:
-    like = suggestion(name, known)
-    hint = f"did you mean '{prefix}{like}'?" if like else f"known: {', '.join(sorted(known))}"
-    return ConfigError(f"unknown setting '{prefix}{name}'; {hint}")
-
-
-_ENDLESS: Final = frozenset({"range.world"})
-"""Settings that can be infinite."""
-
-_PLAIN: Final[dict[object, str]] = {str: "a text", bool: "true or false", int: "a whole number"}
-
-
-def _value(hint: Any, value: Any, name: str, default: Any = None) -> Any:
-    """Convert a plain value to the type of a setting."""
-    if is_dataclass(hint):
-        return _table(hint, value, name, default)
-    if get_origin(hint) is Mapping:
-        check(isinstance(value, Mapping), name, value, f"a table [{name}]")
-        inner = get_args(hint)[1]
-        return {str(key): _value(inner, one, f'{name}."{key}"') for key, one in value.items()}
-    if hint is float:
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        endless = number and value == math.inf and name in _ENDLESS
-        check(endless or (number and abs(value) <= sys.float_info.max), name, value, "a number")
-        return float(value)
-    if hint is Any:
-        return value
-    if hint in _PLAIN:
-        check(type(value) is hint, name, value, _PLAIN[hint])
-        return value
-    check(isinstance(value, (list, tuple)), name, value, "a list")
-    return tuple(_value(get_args(hint)[0], item, f"{name}[{i}]") for i, item in enumerate(value))
-
-
-def _table(cls: Any, value: Any, name: str, default: Any) -> Any:
-    if isinstance(value, cls):
-        return value
-    check(isinstance(value, Mapping), name, value, f"a table [{name}]")
-    prefix = f"{name}."
-    return _built(cls, value, prefix) if default is None else _changed(default, value, prefix)
-
-
-def _built(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """Build a record from plain values. Fields without a default are required."""
-    hints = get_type_hints(cls)
-    for name in values:
-        if name not in hints:
-            raise _unknown(prefix, name, set(hints))
-    for part in fields(cls):
-        given = part.name in values or part.default is not MISSING
-        check(given, f"{prefix}{part.name}", None, "a value")
-    return cls(**{name: _value(hints[name], v, f"{prefix}{name}") for name, v in values.items()})
-
-
-# Configs as commented TOML, and the page of all settings ----------------------------------------
-
-WIDTH: Final = 98
-"""Line width of comments; characters."""
-
-
-def as_toml(config: Config) -> str:
-    """Return the whole config as TOML, each setting with its comment. :func:`load` restores the config."""
-    lines = ["# Settings of sgstore. Lengths are metres, angles degrees, times seconds.", ""]
-    tables: list[str] = []
-    for one in fields(config):
-        value = getattr(config, one.name)
-        if is_dataclass(value):
-            tables += ["", *(f"# {line}" for line in _summary(type(value))), f"[{one.name}]"]
-            for inner in fields(value):
-                tables += _setting(inner, getattr(value, inner.name))
-        elif one.name == "relations":
-            tables += ["", *_comment(one), *([] if value else ["[relations]"])]
-            for name, values in value.items():
-                tables.append(f"[relations.{name}]")
-                tables += [f"{k} = {_literal(v)}" for k, v in values.items()]
-        elif isinstance(value, Mapping):
-            tables += ["", *_comment(one), f"[{one.name}]"]
-            tables += [f"{_text(key)} = {_meaning(asdict(v))}" for key, v in value.items()]
-        else:
-            lines += _setting(one, value)
-    return "\n".join([*lines, *tables, ""])
-
-
-def _setting(one: Any, value: Any) -> Iterator[str]:
-    yield from _comment(one)
-    yield f"{one.name} = {_literal(value)}"
-
-
-def _comment(one: Any) -> Iterator[str]:
-    for paragraph in one.metadata[COMMENT].splitlines():
-        yield from (f"# {line}" for line in wrap(paragraph, WIDTH))
-
-
-def _summary(cls: type) -> list[str]:
-    return (cls.__doc__ or "").strip().splitlines()[:1]
-
-
-def _literal(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_literal, value))}]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return _text(value) if isinstance(value, str) else repr(value)
-
-
-def _text(value: str) -> str:
-    # Every JSON string of characters above U+001F is a TOML string, but for DEL.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _meaning(parts: dict[str, str]) -> str:
-    said = ", ".join(f"{name} = {_text(word)}" for name, word in parts.items() if word)
-    return f"{{ {said} }}"
-
-
-PAGE: Final = """\
-# Settings
-
-Everything that decides what is in a scene graph. A config is a TOML file
-(`sgstore ingest … --config FILE`), or keyword arguments:
-
-```python
-from sgstore.model.config import PairSettings, configured
-
-configured(preset="carlasgg", range={{"front": 80.0}}, pairs=PairSettings(within=0.0), rate=2.0)
-```
-
-What a file does not name keeps its default, or the value of the preset that it names in its first line
-(`preset = "carlasgg"`). A config is validated when it is read, and recorded with every trace.
-`sgstore config [--preset NAME]` prints this:
-
-```toml
-{settings}```
-
-## Table I of the paper
-
-| parameter of CARLASGG | here |
-|---|---|
-| entity classes, special classes, signal classes | `[types]`, before the shipped tables; `kinds` |
-| road granularity: none, lane, waypoints | `lanes.granularity`, `lanes.spacing`, `lanes.types` |
-| distance relationships: none, thresholds | `[proximity]`, with `kinds`; none: `names` and `upper` are `[]` |
-| angular relationships: none, thresholds | `[direction]`, `kinds`, `within`; none: so, and `sides = "none"` |
-| entity relationships: none, pairs | `[pairs]`; none: `ego = false` and `within = 0` |
-| `exclude_ids` | `exclude_ids` |
-| range: the geometry of what is in the graph | `[range]` |
-
-## Presets
-
-{presets}"""
-
-
-def as_markdown(presets: Mapping[str, Preset]) -> str:
-    """Return the page ``docs/parameters.md``: all settings with their defaults, and the presets."""
-    parts = [_preset_text(name, one) for name, one in presets.items()]
-    return PAGE.format(settings=as_toml(Config()), presets="\n".join(parts))
-
-
-def _preset_text(name: str, one: Preset) -> str:
-    different = list(_differences(Config().as_dict(), one.config.as_dict(), ""))
-    changes = ["```toml", *different, "```", ""] if different else []
-    return "\n".join([f"### `{name}`", "", one.summary, "", *changes, one.notes])
-
-
-def _differences(
-    default: Mapping[str, Any], other: Mapping[str, Any], prefix: str
-) -> Iterator[str]:
-    for name, value in other.items():
-        if isinstance(value, Mapping) and name not in {"types", "relations"}:
-            yield from _differences(default[name], value, f"{prefix}{name}.")
-        elif value != default[name]:
-            yield f"{prefix}{name} = {_literal(value)}"

@@ -1,0 +1,166 @@
+"""Road marks, and the lane changes that they permit.
+
+The mark of a lane is on its outer border; the mark of the centre lane is on the line between left and right.
+The attribute ``laneChange`` decides. Without it the type of the mark decides: broken lines may be crossed, and
+for a double line the one on one's own side counts. A border without a mark allows changes. (ASAM OpenDRIVE 1.8,
+11.9.)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.maps.opendrive._nodes import wide_pairs
+from sgstore.maps.roads import LaneChanges, broad_lines
+from sgstore.model.vocabulary import DRIVING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sgstore.maps.opendrive._document import Document
+    from sgstore.maps.opendrive._lanes import LaneTable
+    from sgstore.maps.roads import MapPlaces, Ribbons
+    from sgstore.model.world import Floats, Ints
+
+
+_ATTRIBUTE: Final = {
+    "both": (True, True),
+    "none": (False, False),
+    "increase": (True, False),
+    "decrease": (False, True),
+}
+"""``laneChange`` → permission to change towards higher ids (to the left along s), and towards lower ids."""
+
+_CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
+"""Types of marks that may be crossed from both sides."""
+
+
+def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
+    """Return the lane changes that a mark permits: towards higher and towards lower lane ids.
+
+    Parameters
+    ----------
+    kind, attribute : str
+        ``type`` and ``laneChange`` of the mark.
+    owner : int
+        Id of the lane with the mark. Double lines are named from the inside out, those of the
+        centre lane from left to right.
+    """
+    if attribute in _ATTRIBUTE:
+        return _ATTRIBUTE[attribute]
+    if kind in _CROSSED:
+        return True, True
+    if kind not in {"solid broken", "broken solid"}:
+        return False, False
+    # To the right of the centre, inside is to the left. Crossing is allowed from the side with the
+    # broken line.
+    left_is_broken = (kind == "broken solid") == (owner <= 0)
+    return not left_is_broken, left_is_broken
+
+
+_Stretch = tuple[float, float, bool, bool]
+"""Part of a border: start and end, and the permission to change to the left and to the right."""
+
+
+def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> LaneChanges:
+    """Return stretches for lane changes: neighbouring driving lanes with traffic in one direction."""
+    left, right = wide_pairs(lanes, ribbons)
+    driving = np.array([kind in DRIVING for kind in lanes.type], bool)
+    one_way = lanes.forward[left] == lanes.forward[right]
+    one_way |= lanes.both[left] | lanes.both[right]
+    kept = driving[left] & driving[right] & one_way
+    left, right = left[kept], right[kept]
+    marks = _marks(document, lanes)
+    rows: list[tuple[int, int, float, float]] = []
+    for a, b in zip(left.tolist(), right.tolist(), strict=True):
+        for start, end, to_left, to_right in marks(a, b):
+            rows += [(b, a, start, end)] * to_left + [(a, b, start, end)] * to_right
+    table = np.array(rows, np.float64).reshape(-1, 4)
+    lane, to = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    return _along(ribbons, lane, to, table[:, 2:])
+
+
+def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_Stretch]]:
+    """Return a function from two neighbouring lanes to the stretches of their common border."""
+    kind = "road/laneSection/lane/roadMark"
+    table = document[kind]
+    offsets = document.rough_numbers(kind, "sOffset").tolist()
+    columns = table.parent, offsets, table.texts("type", "none"), table.texts("laneChange")
+    records: dict[int, list[tuple[float, str, str]]] = {}
+    for raw, offset, mark, attribute in zip(*columns, strict=True):
+        if np.isfinite(offset):
+            record = (offset, mark.strip().lower(), attribute.strip().lower())
+            records.setdefault(raw, []).append(record)
+    of_lane = {int(lanes.row[raw]): marks for raw, marks in records.items()}
+    centres = {raw: int(lanes.centre[raw]) for raw in records}
+    of_centre = {centre: records[raw] for raw, centre in centres.items() if centre >= 0}
+
+    def between(left: int, right: int) -> list[_Stretch]:
+        section = int(lanes.section[left])
+        idents = int(lanes.ident[left]), int(lanes.ident[right])
+        owner = right if idents[1] > 0 else left
+        if idents[0] > 0 > idents[1]:
+            found, ident = of_centre.get(section, []), 0
+        else:
+            found, ident = of_lane.get(owner, []), int(lanes.ident[owner])
+        start, end = float(lanes.sections.start[section]), float(lanes.sections.end[section])
+        found = sorted([(-np.inf, "none", ""), *found], key=lambda record: record[0])
+        cuts = [min(max(start + offset, start), end) for offset, _, _ in found] + [end]
+        return [
+            (cuts[i], cuts[i + 1], *permitted(kind, attribute, ident))
+            for i, (_, kind, attribute) in enumerate(found)
+            if cuts[i + 1] > cuts[i]
+        ]
+
+    return between
+
+
+def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:
+    """Return ``bold`` markings: at the outer border of one lane, at the inner border of the next."""
+    kind = "road/laneSection/lane/roadMark"
+    table, offsets = document[kind], document.rough_numbers(kind, "sOffset").tolist()
+    columns = table.parent, offsets, table.texts("type", "none"), table.texts("weight")
+    records: dict[int, list[tuple[float, bool]]] = {}
+    for raw, offset, mark, weight in zip(*columns, strict=True):
+        if np.isfinite(offset):
+            bold = weight.strip().lower() == "bold" and mark.strip().lower() != "none"
+            records.setdefault(int(raw), []).append((offset, bold))
+    names = zip(lanes.section.tolist(), lanes.ident.tolist(), strict=True)
+    row_of = {name: row for row, name in enumerate(names)}
+    rows: list[tuple[int, bool, float, float]] = []
+    for raw, marks in records.items():
+        own, centre = int(lanes.row[raw]), int(lanes.centre[raw])
+        section = centre if own < 0 else int(lanes.section[own])
+        ident = 0 if own < 0 else int(lanes.ident[own])
+        outer = (1, -1) if ident == 0 else (ident + (1 if ident > 0 else -1),)
+        beside = [(own, False)] * (own >= 0)
+        beside += [(row_of[section, one], True) for one in outer if (section, one) in row_of]
+        start, end = float(lanes.sections.start[section]), float(lanes.sections.end[section])
+        cuts = [min(max(start + offset, start), end) for offset, _ in sorted(marks)] + [end]
+        for (_, bold), first, last in zip(sorted(marks), cuts, cuts[1:], strict=False):
+            for row, inner in beside if bold and last > first else ():
+                # Inside is left for a lane on the right of its road's direction.
+                left = inner == ((lanes.ident[row] < 0) == lanes.forward[row])
+                rows.append((row, bool(left), first, last))
+    lane = np.array([row[0] for row in rows], np.int64)
+    ends = np.sort(
+        [ribbons.along_at(lane, np.array([row[i] for row in rows], np.float64)) for i in (2, 3)],
+        axis=0,
+    )
+    return broad_lines(
+        [(row[0], row[1], *along) for row, along in zip(rows, ends.T.tolist(), strict=True)]
+    )
+
+
+def _along(ribbons: Ribbons, lane: Ints, to: Ints, ends: Floats) -> LaneChanges:
+    """Convert stretches from s to lengths of the centre line, and join consecutive ones."""
+    one, other = ribbons.along_at(lane, ends[:, 0]), ribbons.along_at(lane, ends[:, 1])
+    start, end = np.minimum(one, other), np.maximum(one, other)
+    order = np.lexsort((start, to, lane))
+    lane, to, start, end = lane[order], to[order], start[order], end[order]
+    follows = (np.diff(lane) == 0) & (np.diff(to) == 0) & (np.abs(start[1:] - end[:-1]) < 1e-6)
+    begins = np.concatenate((np.ones(min(len(lane), 1), bool), ~follows))
+    ends_here = np.concatenate((~follows, np.ones(min(len(lane), 1), bool)))
+    return LaneChanges(lane[begins], to[begins], start[begins], end[ends_here])

@@ -1,0 +1,134 @@
+"""Configs as commented TOML, and the page of all settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, fields, is_dataclass
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.model.config._settings import Config
+from sgstore.model.config._values import COMMENT
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.model.config._presets import Preset
+
+
+WIDTH: Final = 98
+"""Line width of comments; characters."""
+
+
+def as_toml(config: Config) -> str:
+    """Return the whole config as TOML, each setting with its comment. :func:`load` restores the config."""
+    lines = ["# Settings of sgstore. Lengths are metres, angles degrees, times seconds.", ""]
+    tables: list[str] = []
+    for one in fields(config):
+        value = getattr(config, one.name)
+        if is_dataclass(value):
+            tables += ["", *(f"# {line}" for line in _summary(type(value))), f"[{one.name}]"]
+            for inner in fields(value):
+                tables += _setting(inner, getattr(value, inner.name))
+        elif one.name == "relations":
+            tables += ["", *_comment(one), *([] if value else ["[relations]"])]
+            for name, values in value.items():
+                tables.append(f"[relations.{name}]")
+                tables += [f"{k} = {_literal(v)}" for k, v in values.items()]
+        elif isinstance(value, Mapping):
+            tables += ["", *_comment(one), f"[{one.name}]"]
+            tables += [f"{_text(key)} = {_meaning(asdict(v))}" for key, v in value.items()]
+        else:
+            lines += _setting(one, value)
+    return "\n".join([*lines, *tables, ""])
+
+
+def _setting(one: Any, value: Any) -> Iterator[str]:
+    yield from _comment(one)
+    yield f"{one.name} = {_literal(value)}"
+
+
+def _comment(one: Any) -> Iterator[str]:
+    for paragraph in one.metadata[COMMENT].splitlines():
+        yield from (f"# {line}" for line in wrap(paragraph, WIDTH))
+
+
+def _summary(cls: type) -> list[str]:
+    return (cls.__doc__ or "").strip().splitlines()[:1]
+
+
+def _literal(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_literal, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return _text(value) if isinstance(value, str) else repr(value)
+
+
+def _text(value: str) -> str:
+    # Every JSON string of characters above U+001F is a TOML string, but for DEL.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _meaning(parts: dict[str, str]) -> str:
+    said = ", ".join(f"{name} = {_text(word)}" for name, word in parts.items() if word)
+    return f"{{ {said} }}"
+
+
+PAGE: Final = """\
+# Settings
+
+Everything that decides what is in a scene graph. A config is a TOML file
+(`sgstore ingest … --config FILE`), or keyword arguments:
+
+```python
+from sgstore.model.config import PairSettings, configured
+
+configured(preset="carlasgg", range={{"front": 80.0}}, pairs=PairSettings(within=0.0), rate=2.0)
+```
+
+What a file does not name keeps its default, or the value of the preset that it names in its first line
+(`preset = "carlasgg"`). A config is validated when it is read, and recorded with every trace.
+`sgstore config [--preset NAME]` prints this:
+
+```toml
+{settings}```
+
+## Table I of the paper
+
+| parameter of CARLASGG | here |
+|---|---|
+| entity classes, special classes, signal classes | `[types]`, before the shipped tables; `kinds` |
+| road granularity: none, lane, waypoints | `lanes.granularity`, `lanes.spacing`, `lanes.types` |
+| distance relationships: none, thresholds | `[proximity]`, with `kinds`; none: `names` and `upper` are `[]` |
+| angular relationships: none, thresholds | `[direction]`, `kinds`, `within`; none: so, and `sides = "none"` |
+| entity relationships: none, pairs | `[pairs]`; none: `ego = false` and `within = 0` |
+| `exclude_ids` | `exclude_ids` |
+| range: the geometry of what is in the graph | `[range]` |
+
+## Presets
+
+{presets}"""
+
+
+def as_markdown(presets: Mapping[str, Preset]) -> str:
+    """Return the page ``docs/parameters.md``: all settings with their defaults, and the presets."""
+    parts = [_preset_text(name, one) for name, one in presets.items()]
+    return PAGE.format(settings=as_toml(Config()), presets="\n".join(parts))
+
+
+def _preset_text(name: str, one: Preset) -> str:
+    different = list(_differences(Config().as_dict(), one.config.as_dict(), ""))
+    changes = ["```toml", *different, "```", ""] if different else []
+    return "\n".join([f"### `{name}`", "", one.summary, "", *changes, one.notes])
+
+
+def _differences(
+    default: Mapping[str, Any], other: Mapping[str, Any], prefix: str
+) -> Iterator[str]:
+    for name, value in other.items():
+        if isinstance(value, Mapping) and name not in {"types", "relations"}:
+            yield from _differences(default[name], value, f"{prefix}{name}.")
+        elif value != default[name]:
+            yield f"{prefix}{name} = {_literal(value)}"
