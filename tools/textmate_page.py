@@ -13,7 +13,7 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
-from sgstore.lang.syntax._parse import tables
+from sgstore.lang.syntax._tables import tables
 
 PAGE: Final = Path(__file__).parents[1] / "editors" / "sgql.tmLanguage.json"
 _CONSTANTS: Final = {"TRUE", "FALSE", "NULL", "INF"}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from lark import Lark, UnexpectedInput
 
-import sgstore.lang.syntax._parse as tables
+import sgstore.lang.syntax._tables as tables
 from sgstore.errors import QuerySyntaxError
 from sgstore.lang.sql._explain import statements_text, tree_text
 from sgstore.lang.syntax import parse
@@ -60,7 +60,7 @@ def test_the_tables_that_are_shipped_are_those_of_the_grammar() -> None:
 
     made = tables.text_of(tables.made_from(GRAMMAR))
 
-    assert kept == made, "run: python -m sgstore.lang.syntax._parse"
+    assert kept == made, "run: python -m sgstore.lang.syntax._tables"
 
 
 def test_every_rule_of_the_grammar_has_a_builder_and_every_builder_a_rule() -> None:

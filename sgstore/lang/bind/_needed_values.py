@@ -1,4 +1,15 @@
-"""Needs of a query or check: values that a trace must know to answer it."""
+"""Needs of a query or check: values that a trace must know to answer it.
+
+An unknown condition is not true, and inside temporal operators it is false. So ``ALWAYS ego.speed < 20``
+would be false for a trace without an ego or without speeds. Such a trace cannot answer: it is left out, and
+its verdict is unknown. The needs of a query are an ego, and measured attributes of its variables that are
+known at least once.
+
+Only measured attributes count. Some attributes have a meaning even if they are absent (a lane without
+``turn`` is not in a junction, a car without ``special`` is an ordinary car); these are never unknown.
+``known``, ``IS NULL``, ``coalesce`` and ``CASE`` handle missing values themselves. Variables of blocks must
+only exist.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +29,6 @@ if TYPE_CHECKING:
     from sgstore.lang.catalog import TraceFacts
     from sgstore.lang.ir import BoundCheck
 
-
-# An unknown condition is not true, and inside temporal operators it is false. So ``ALWAYS ego.speed < 20``
-# would be false for a trace without an ego or without speeds. Such a trace cannot answer: it is left out, and
-# its verdict is unknown. This section finds the *needs* of a question: that there is an ego, and that
-# measured attributes of its variables are known at least once.
-#
-# Only measured attributes count. Some attributes have a meaning even if they are absent (a lane without
-# ``turn`` is not in a junction, a car without ``special`` is an ordinary car); these are never unknown.
-# ``known``, ``IS NULL``, ``coalesce`` and ``CASE`` handle missing values themselves. Variables of blocks must
-# only exist.
 
 MOTION: Final = frozenset({"speed", "vx", "vy", "vz", "accel", "ax", "ay", "az", "yaw_rate"})
 """Attributes that static nodes do not have."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import QueryNameError
 from sgstore.lang import ir as b
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Type
-from sgstore.lang.help._why_not import Writer, label_written
+from sgstore.lang.help._pattern_text import Writer, label_written
 from sgstore.lang.sql import value_text
 from sgstore.model.vocabulary import RELATIONS
 

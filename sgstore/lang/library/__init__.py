@@ -1,13 +1,7 @@
 """Library of named predicates, concepts, scenarios and properties."""
 
-from sgstore.lang.library._entries import (
-    NamedPattern,
-    entries,
-    pattern_named,
-    patterns,
-    predicates,
-    search,
-)
+from sgstore.lang.library._entries import NamedPattern, entries, pattern_named, patterns, predicates
+from sgstore.lang.library._search import search
 
 __all__ = [
     "NamedPattern",

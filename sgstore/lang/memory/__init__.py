@@ -1,6 +1,8 @@
 """Evaluation of patterns and expressions on one graph in memory."""
 
-from sgstore.lang.memory._evaluate import Binding, Columns, FrameView, NodePair, column_evaluator
+from sgstore.lang.memory._column_evaluation import Columns, column_evaluator
+from sgstore.lang.memory._evaluate import Binding
+from sgstore.lang.memory._frame_view import FrameView, NodePair
 from sgstore.lang.memory._search import ScopeSearch, expression
 from sgstore.lang.memory._stage_search import StageSearch
 

@@ -12,21 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sgstore.lang import ir as b
-from sgstore.lang.memory._evaluate import (
-    Attributes,
-    Binding,
-    Evaluate,
-    FrameView,
-    crowd,
-    crowd_test,
-    evaluator,
-)
+from sgstore.lang.memory._column_evaluation import crowd_test
+from sgstore.lang.memory._evaluate import Binding, Evaluate, evaluator
+from sgstore.lang.memory._frame_view import Attributes, FrameView, crowd
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.lang.ir import BlockValue, Edge, Scope
-    from sgstore.lang.memory._evaluate import Test
+    from sgstore.lang.memory._column_evaluation import Test
 
 
 @dataclass(slots=True)

@@ -13,7 +13,8 @@ from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang import ir as b
-from sgstore.lang.memory._evaluate import Binding, Evaluate, FrameView
+from sgstore.lang.memory._evaluate import Binding, Evaluate
+from sgstore.lang.memory._frame_view import FrameView
 from sgstore.lang.memory._search import ScopeSearch, expression
 from sgstore.lang.operators import OPERATORS
 from sgstore.lang.sql import path_ways

@@ -1,5 +1,6 @@
 """Parser of the query language: grammar, syntax trees, and hints for mistakes."""
 
+from sgstore.lang.syntax._example_patterns import node_of_kind, pattern_of
 from sgstore.lang.syntax._hints import (
     comparison_hint,
     condition_hint,
@@ -7,9 +8,10 @@ from sgstore.lang.syntax._hints import (
     said_of,
     variable_hint,
 )
-from sgstore.lang.syntax._parse import joined, keywords, parse
+from sgstore.lang.syntax._parse import joined, parse
 from sgstore.lang.syntax._table_function import pattern_tables
-from sgstore.lang.syntax._written_patterns import Pattern, node_of_kind, pattern_of
+from sgstore.lang.syntax._tables import keywords
+from sgstore.lang.syntax._written_patterns import Pattern
 
 __all__ = [
     "Pattern",
