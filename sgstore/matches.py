@@ -31,11 +31,11 @@ from sgstore.lang.sql import (
     joined_rows,
     rewritten,
 )
+from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.model.vocabulary import natural
 from sgstore.model.world import Clip, tolerance_ns
 from sgstore.store import (
     IN_NOTEBOOK,
-    SEQ_BITS,
     FrameRef,
     GivenTable,
     Tabular,

@@ -384,7 +384,8 @@ def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> l
 
 def _frames(store: Store, clip: Clip) -> tuple[FrameRef, ...]:
     from sgstore.exporters import ClipFrames, Export
-    from sgstore.store import SEQ_BITS, FrameRef
+    from sgstore.model.frame_ids import SEQ_BITS
+    from sgstore.store import FrameRef
 
     found = ClipFrames.of(Export(store, (clip,)), 1, clip)
     columns = (found.frame_id, found.seq, found.time_ns, found.log_time_ns, found.t)

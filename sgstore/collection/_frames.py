@@ -16,15 +16,8 @@ import numpy as np
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _worker as worker
 from sgstore.lang.sql.collection_parts import PARTS
-from sgstore.store import (
-    PartFile,
-    Rows,
-    Triples,
-    merged_arrays,
-    merged_classes,
-    merged_parts,
-    trace_of,
-)
+from sgstore.model.frame_ids import trace_of
+from sgstore.store import PartFile, Rows, Triples, merged_arrays, merged_classes, merged_parts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator

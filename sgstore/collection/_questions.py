@@ -43,11 +43,11 @@ from sgstore.lang.sql.collection_parts import PARTS, parted
 from sgstore.lang.sql.collection_pruning import Pruning, class_questions
 from sgstore.lang.syntax import pattern_tables
 from sgstore.matches import Interval, UnionMatches, merged, row_type
+from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.model.vocabulary import natural
 from sgstore.model.world import Clip, tolerance_ns
 from sgstore.query import Store
 from sgstore.store import (
-    SEQ_BITS,
     FrameRef,
     PartFile,
     SimilarFrames,

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ExportError, QueryError, TextSpan
+from sgstore.model.frame_ids import SEQ_BITS, frame_ids, trace_of
 from sgstore.model.world import tolerance_ns
-from sgstore.store import SEQ_BITS, frame_ids, trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping

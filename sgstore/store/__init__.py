@@ -58,7 +58,6 @@ from sgstore.store._merge import (
     write_part,
     write_rows,
 )
-from sgstore.store._packing import BUCKET_BITS, SEQ_BITS, begins, frame_ids, seq_of, trace_of
 from sgstore.store._publish import PresentError
 from sgstore.store._rebuild import OldMap, OldTrace, Remains, named_as, remains_of, take_place
 from sgstore.store._rows import IN_NOTEBOOK, Batches, Rows, Tabular, count_parquet
@@ -83,12 +82,10 @@ from sgstore.store._verify import verify_file
 from sgstore.store._write import OnMap, Segment
 
 __all__ = [
-    "BUCKET_BITS",
     "CATALOGUE",
     "DIGEST_BYTES",
     "IN_NOTEBOOK",
     "SCHEMA_VERSION",
-    "SEQ_BITS",
     "WINDOW",
     "Abstracted",
     "Batches",
@@ -122,12 +119,10 @@ __all__ = [
     "arrow_file",
     "as_told",
     "as_told_batches",
-    "begins",
     "count_parquet",
     "duckdb",
     "example_of",
     "facts_of",
-    "frame_ids",
     "frames_like",
     "free_name",
     "graph_digests",
@@ -151,13 +146,11 @@ __all__ = [
     "remains_of",
     "scope_of",
     "scope_text",
-    "seq_of",
     "split_segment",
     "subset_catalogs",
     "take_place",
     "trace_among",
     "trace_id_of",
-    "trace_of",
     "verify_file",
     "whole_segment",
     "write_batches",

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Final
 import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
+from sgstore.model.frame_ids import BUCKET_BITS, SEQ_BITS
 from sgstore.model.vocabulary import NAMES
 from sgstore.store._columns import MASKS, ORDERS, REPEATED, STATES, types_of
 from sgstore.store._creation import attach_empty
 from sgstore.store._engine_errors import translated
 from sgstore.store._locking import Access, default_memory, spill_folder
-from sgstore.store._packing import BUCKET_BITS, SEQ_BITS
 from sgstore.store._publish import SHARED
 from sgstore.store._staging import scratch
 

@@ -21,6 +21,7 @@ from sgstore.graphs.abstractions import (
     contents_of,
     lane_roles,
 )
+from sgstore.model.frame_ids import SEQ_BITS, trace_bucket
 from sgstore.model.world import BUCKET_FRAMES
 from sgstore.store._coded_classes import (
     CLASSES,
@@ -32,7 +33,7 @@ from sgstore.store._coded_classes import (
     triples,
 )
 from sgstore.store._graphs import Graphs
-from sgstore.store._packing import SEQ_BITS, masks_of, texts, trace_bucket
+from sgstore.store._packing import masks_of, texts
 from sgstore.store._publish import add, note, writing
 from sgstore.store._staging import Staging
 from sgstore.store._traces import frame_named, trace_named

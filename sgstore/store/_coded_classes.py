@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.graphs.abstractions import found
-from sgstore.store._packing import frames_of
+from sgstore.model.frame_ids import frames_of
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection

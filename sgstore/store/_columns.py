@@ -9,7 +9,8 @@ import numpy as np
 
 from sgstore.base.tables import ascending
 from sgstore.errors import StoreError
-from sgstore.store._packing import FRAME_BITS, MISSING, packed
+from sgstore.model.frame_ids import FRAME_BITS
+from sgstore.store._packing import MISSING, packed
 from sgstore.store._schema import expected
 
 if TYPE_CHECKING:

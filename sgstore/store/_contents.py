@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
-from sgstore.store._packing import seq_of, trace_of
+from sgstore.model.frame_ids import seq_of, trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -16,6 +16,8 @@ import numpy as np
 import sgstore.store._packing as packing
 import sgstore.store._schema as shape
 from sgstore.errors import AbstractionError, StoreError
+from sgstore.model import frame_ids
+from sgstore.model.frame_ids import FRAME_BITS
 from sgstore.model.graph import SceneGraph
 from sgstore.model.vocabulary import normalize_name
 from sgstore.model.world import (
@@ -29,7 +31,7 @@ from sgstore.model.world import (
     States,
 )
 from sgstore.store._graphs import Graphs, filled
-from sgstore.store._packing import FRAME_BITS, NodeKinds, as_json, texts
+from sgstore.store._packing import NodeKinds, as_json, texts
 from sgstore.store._publish import add, note, widen, writing
 from sgstore.store._rows import run
 from sgstore.store._staging import Staging
@@ -277,7 +279,7 @@ class Building:
         self._insert("derived_node", still | {"moves": np.zeros(len(still["mask"]), np.bool_)})
         frames = graph.frames
         seq = frames.seq[frames.frame_of]
-        bucket, node = packing.trace_bucket(self._trace_id, seq), frames.states.node
+        bucket, node = frame_ids.trace_bucket(self._trace_id, seq), frames.states.node
         first, mask = packing.masks_of((bucket, node), seq % BUCKET_FRAMES)
         moving: Columns = {
             "kind": self._kinds.of(node[first]),
@@ -299,7 +301,7 @@ class Building:
         self._staging.settle(whole=True)
         rows = seen.row_of(graphs.node_frame, graphs.node)
         rows = rows[rows >= 0]
-        bucket = packing.trace_bucket(self._trace_id, seq)
+        bucket = frame_ids.trace_bucket(self._trace_id, seq)
         at, node, kind = seen.node_frame[rows], seen.node[rows], seen.kind[rows]
         first, mask = packing.masks_of((bucket[at], node), seq[at] % BUCKET_FRAMES)
         self._insert(
@@ -395,7 +397,7 @@ class _StateReader:
             "SELECT origin_x, origin_y, origin_z, frames FROM trace WHERE trace_id = ?", [trace_id]
         ).fetchall()
         self._origin = Origin(*row[:3])
-        self._low = trace_id << packing.BUCKET_BITS
+        self._low = trace_id << frame_ids.BUCKET_BITS
         self._high = self._low + -(-row[3] // BUCKET_FRAMES)
         self._entities = connection.execute(_ENTITIES, {"trace": trace_id}).fetchnumpy()
         self._entities["kind"] = shape.codes_of(connection, "kind")[self._entities["kind"]]

@@ -12,10 +12,10 @@ import numpy as np
 
 from sgstore.base.quoting import literal
 from sgstore.graphs.abstractions import GraphColumns, MapColumns
+from sgstore.model.frame_ids import FRAME_BITS, SEQ_BITS, frames_of, trace_of
 from sgstore.model.graph import Edges, LaneDistances, StaticPresence
 from sgstore.model.scene_columns import MapRecords, SceneColumns, edge_attributes
 from sgstore.model.vocabulary import MAP_KINDS, RELATION_CODE
-from sgstore.store._packing import FRAME_BITS, SEQ_BITS, frames_of, trace_of
 from sgstore.store._rows import run
 from sgstore.store._schema import codes_of
 

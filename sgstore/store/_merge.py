@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, Final
 import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
+from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.model.vocabulary import NAMES
 from sgstore.store._engine_errors import translated
 from sgstore.store._interrupts import interruptible
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import shared_instance
 from sgstore.store._locking import default_memory, spill_folder
-from sgstore.store._packing import SEQ_BITS
 from sgstore.store._rows import Batches, arrays
 from sgstore.store._staging import scratch
 from sgstore.store._table_files import write_parquet

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 
 from sgstore.base.tables import ascending, taken
+from sgstore.model.frame_ids import frame_ids, trace_bucket
 from sgstore.model.world import (
     BUCKET_FRAMES,
     GAP,
@@ -43,15 +44,6 @@ MISSING: Final = -(1 << 31)
 EDGE_ROWS: Final = 1 << 18
 """Edges converted to rows at once, to limit the memory for intermediate arrays."""
 
-BUCKET_BITS: Final = 18
-"""Bits of the bucket number in a trace."""
-FRAME_BITS: Final = 6
-"""Bits of the frame number in a bucket."""
-MAX_FRAMES: Final = BUCKET_FRAMES << BUCKET_BITS
-
-SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
-"""Bits of a frame id below the trace id."""
-
 TOLERANCE: Final = f"greatest({TOLERANCE_NS}, coalesce(period_ns, 0) // {TOLERANCE_SHARE})"
 """SQL: :func:`sgstore.model.world.tolerance_ns` of a trace's ``period_ns``."""
 LONGEST_STEP: Final = f"{GAP} * period_ns + {TOLERANCE}"
@@ -77,46 +69,6 @@ class NodeKinds:
         kinds[nodes >= 0] = self.entities[nodes[nodes >= 0]]
         kinds[nodes < 0] = self.map[-1 - nodes[nodes < 0]]
         return kinds
-
-
-def trace_bucket(trace_id: int, seq: Ints) -> Ints:
-    """Return the bucket of each frame number of a trace."""
-    return (trace_id << BUCKET_BITS) + seq // BUCKET_FRAMES
-
-
-def frame_ids(trace_id: int, seq: Ints) -> Ints:
-    """Return the frame id of each frame number of a trace."""
-    return (trace_bucket(trace_id, seq) << FRAME_BITS) + seq % BUCKET_FRAMES
-
-
-def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
-    """Return the frame ids in bucket masks, and the row of each frame."""
-    ids: list[Ints] = []
-    rows: list[Ints] = []
-    for bit in range(BUCKET_FRAMES):
-        row = np.flatnonzero(mask >> bit & 1)
-        ids.append((bucket[row] << FRAME_BITS) + bit)
-        rows.append(row)
-    return np.concatenate(ids), np.concatenate(rows)
-
-
-def trace_of(frame_id: Ints) -> Ints:
-    """Return the trace id of each frame id."""
-    return frame_id >> SEQ_BITS
-
-
-def seq_of(frame_id: Ints) -> Ints:
-    """Return the frame number of each frame id."""
-    bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
-    return bucket * BUCKET_FRAMES + (frame_id & ((1 << FRAME_BITS) - 1))
-
-
-def begins(frame_id: Ints) -> Bools:
-    """Return a mask (N,) of the frames that do not directly follow the previous row's frame."""
-    trace, seq = trace_of(frame_id), seq_of(frame_id)
-    found = np.ones(len(frame_id), np.bool_)
-    found[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
-    return found
 
 
 def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints]:

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.errors import StoreError
+from sgstore.model.frame_ids import frame_ids
 from sgstore.model.vocabulary import suggestion
 from sgstore.model.world import nearest_frames
 from sgstore.store._columns import chained
-from sgstore.store._packing import frame_ids, texts
+from sgstore.store._packing import texts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence

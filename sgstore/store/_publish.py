@@ -15,6 +15,7 @@ import numpy as np
 import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import SgstoreError, StoreError
+from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS
 from sgstore.model.vocabulary import NAMES
 from sgstore.model.world import BUCKET_FRAMES
 from sgstore.store._checksums import Checksum, columns_of, expressions
@@ -30,7 +31,7 @@ from sgstore.store._columns import (
 )
 from sgstore.store._engine_errors import translated
 from sgstore.store._locking import spill_folder, transaction
-from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, MISSING, plain
+from sgstore.store._packing import MISSING, plain
 from sgstore.store._staging import PIECE_ROWS, Staging, scratch
 from sgstore.store._table_stream import FILE, TableFile
 from sgstore.store._traces import already_stored, free_name, id_of, place_below, stored_name

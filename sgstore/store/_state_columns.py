@@ -12,7 +12,7 @@ import numpy as np
 
 from sgstore.base.quoting import quoted
 from sgstore.errors import StoreError
-from sgstore.store._packing import frame_ids, seq_of
+from sgstore.model.frame_ids import frame_ids, seq_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

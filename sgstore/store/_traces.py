@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import SgstoreError, StoreError, place_named, url_named
+from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS
 from sgstore.model.pair_numbers import UNEVEN
 from sgstore.model.vocabulary import natural, suggestion
 from sgstore.model.world import tolerance_ns
-from sgstore.store._packing import BUCKET_BITS, FRAME_BITS, as_json, plain
+from sgstore.store._packing import as_json, plain
 from sgstore.store._rows import run
 
 if TYPE_CHECKING:

@@ -16,11 +16,13 @@ import numpy as np
 import sgstore.store._packing as packing
 import sgstore.store._payloads as payloads
 from sgstore.errors import StoreError
+from sgstore.model import frame_ids
+from sgstore.model.frame_ids import MAX_FRAMES
 from sgstore.model.graph import LeftOut
 from sgstore.model.vocabulary import KINDS
 from sgstore.model.world import BUCKET_FRAMES, Origin, longest_step_ns, origin_of, quantize
 from sgstore.store._classes import IngestedClasses
-from sgstore.store._packing import MAX_FRAMES, NodeKinds, texts
+from sgstore.store._packing import NodeKinds, texts
 from sgstore.store._payloads import FrameTimes, Happenings
 from sgstore.store._staging import Sealed, Staging
 from sgstore.store._traces import uri_of
@@ -186,7 +188,7 @@ class Segment:
             Row or line of each graph in the file, and number of source frames that it covers.
         """
         columns = {
-            "bucket": packing.trace_bucket(self._identity.trace_id, seq),
+            "bucket": frame_ids.trace_bucket(self._identity.trace_id, seq),
             "bit": seq % BUCKET_FRAMES,
             "graph": texts(graphs),
             "place": places,
@@ -209,7 +211,7 @@ class Segment:
             frame, src, relation, dst, name, value = zip(*own, strict=True)
             of_node = np.array(relation) < 0
             columns: Columns = {
-                "frame_id": packing.frame_ids(self._identity.trace_id, seq)[list(frame)],
+                "frame_id": frame_ids.frame_ids(self._identity.trace_id, seq)[list(frame)],
                 "node_id": np.array(src, np.int64),
                 "relation": packing.unless(np.array(relation, np.int64), of_node),
                 "dst": packing.unless(np.array(dst, np.int64), of_node),
@@ -308,7 +310,7 @@ class Segment:
 
     def _insert_payloads(self, columns: Columns) -> None:
         seq = columns.pop("seq")
-        bucket = packing.trace_bucket(self._identity.trace_id, seq)
+        bucket = frame_ids.trace_bucket(self._identity.trace_id, seq)
         places = {"bucket": bucket, "bit": seq % BUCKET_FRAMES, **columns}
         self._staging.insert("payload", self._owned(places))
         self._staging.write("payload")
@@ -321,7 +323,7 @@ class Segment:
         joined = (seq > 0) & (step >= 0) & (step <= longest_step_ns(period_ns))
         starts = seq[::BUCKET_FRAMES]
         columns = {
-            "bucket": packing.trace_bucket(self._identity.trace_id, starts),
+            "bucket": frame_ids.trace_bucket(self._identity.trace_id, starts),
             "valid": np.bitwise_or.reduceat(one, starts),
             "joined": np.bitwise_or.reduceat(np.where(joined, one, 0), starts),
         }

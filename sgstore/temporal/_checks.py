@@ -18,8 +18,9 @@ from sgstore.lang.bind import not_computed, of_check
 from sgstore.lang.help import compared_in_check
 from sgstore.lang.sql import compile_checks, entities, relation, traces_of, value_text
 from sgstore.matches import Interval, notes_in
+from sgstore.model.frame_ids import trace_of
 from sgstore.model.vocabulary import natural
-from sgstore.store import IN_NOTEBOOK, scope_of, trace_of
+from sgstore.store import IN_NOTEBOOK, scope_of
 from sgstore.temporal._check_plan import (
     FAVOURABLE,
     SIGNS,

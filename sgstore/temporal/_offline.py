@@ -27,9 +27,9 @@ from sgstore.lang.sql import (
     traces_of,
 )
 from sgstore.matches import TooMuchError, Windows
+from sgstore.model.frame_ids import trace_of
 from sgstore.model.vocabulary import RELATIONS
 from sgstore.model.world import JUMP_NS, longest_step_ns, seconds_of, tolerance_ns
-from sgstore.store import trace_of
 from sgstore.temporal._check_plan import FAVOURABLE, SIGNS, CheckPlan
 from sgstore.temporal._formula import Formula, propositions, tolerant
 from sgstore.temporal._plan import Ask, ask_text

@@ -17,8 +17,8 @@ from sgstore.lang import ir as b
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import extents
 from sgstore.matches import Windows
+from sgstore.model.frame_ids import BUCKET_BITS, seq_of, trace_of
 from sgstore.model.world import BUCKET_FRAMES, longest_step_ns, tolerance_ns
-from sgstore.store import BUCKET_BITS, seq_of, trace_of
 from sgstore.temporal._match_values import over_rows, picked
 from sgstore.temporal._offline import (
     BUCKET_SHIFT,

@@ -11,8 +11,8 @@ from sgstore.lang.ir import Bound, OverMatch, Query, SignalCall, StepTime, is_fo
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import ExternalRelation, Window, relation, value_text
 from sgstore.matches import TooMuchError
+from sgstore.model.frame_ids import BUCKET_BITS
 from sgstore.model.world import JUMP_NS, seconds_of
-from sgstore.store import BUCKET_BITS
 from sgstore.temporal._formula import formula_text
 from sgstore.temporal._match_values import Stretches, picked
 from sgstore.temporal._offline import (

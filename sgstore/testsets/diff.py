@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.model.frame_ids import seq_of, trace_of
 from sgstore.model.vocabulary import natural
-from sgstore.store import seq_of, trace_of
 from sgstore.temporal import unknown_notes
 from sgstore.testsets.coverage import UNKNOWN, ReportTable, names_of, of_unknown, shared, traces_of
 

@@ -14,8 +14,9 @@ from recordings import Recorder, car
 import sgstore
 from sgstore.ingest import ingest
 from sgstore.model.config import Config
+from sgstore.model.frame_ids import frame_ids
 from sgstore.model.world import Event
-from sgstore.store import StoreFile, frame_ids
+from sgstore.store import StoreFile
 from sgstore.store._payloads import Happenings
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from graph_blocks import RandomTrace, map_stub
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sgstore.model.frame_ids import frame_ids
 from sgstore.model.vocabulary import MOST_RELATIONS
 from sgstore.model.world import BUCKET_FRAMES, Origin, origin_of
-from sgstore.store import frame_ids
 from sgstore.store._columns import marked, parted
 from sgstore.store._packing import NodeKinds, edge_columns, masks_of, state_columns
 

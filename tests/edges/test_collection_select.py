@@ -13,8 +13,9 @@ from thorough import some
 
 from sgstore.collection import Collection, pack
 from sgstore.errors import ConfigError
+from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.query import Store
-from sgstore.store import SEQ_BITS, StoreFile
+from sgstore.store import StoreFile
 from sgstore.testsets.coverage import ChosenFrames, classed, frames_of
 from sgstore.testsets.selection import (
     SelectionSpec,

@@ -18,9 +18,9 @@ from recordings import Recorder, car, person
 import sgstore
 from sgstore.errors import ConfigError, QueryError
 from sgstore.ingest import ingest
+from sgstore.model.frame_ids import seq_of, trace_of
 from sgstore.pipeline.importing import import_graphs
 from sgstore.query import Store
-from sgstore.store import seq_of, trace_of
 from sgstore.testsets.coverage import ChosenFrames, classed, expected_classes, selection_of
 from sgstore.testsets.selection import (
     Budget,

@@ -16,8 +16,8 @@ import sgstore
 from sgstore.apps.cli import run
 from sgstore.errors import ConfigError
 from sgstore.ingest import ingest
+from sgstore.model.frame_ids import seq_of
 from sgstore.query import Store
-from sgstore.store import seq_of
 from sgstore.testsets.coverage import ChosenFrames, classed
 from sgstore.testsets.locks import frames_of_lock, intersect, read_lock, union, verify
 from sgstore.testsets.selection import (

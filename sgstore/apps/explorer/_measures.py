@@ -14,9 +14,10 @@ from sgstore.apps.sandbox import tell
 from sgstore.base.json_text import finite
 from sgstore.errors import StoreError
 from sgstore.exporters import Export, write_export
+from sgstore.model.frame_ids import frame_ids
 from sgstore.model.world import Clip
 from sgstore.query import Store
-from sgstore.store import frame_ids, lengths_of_messages
+from sgstore.store import lengths_of_messages
 from sgstore.testsets.coverage import ChosenFrames, classed, classes, combos, covered, growth
 from sgstore.testsets.diff import by_frame, scenes
 from sgstore.testsets.locks import lock_of

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from sgstore.errors import AbstractionError
-from sgstore.store import begins, trace_of
+from sgstore.model.frame_ids import begins, trace_of
 from sgstore.testsets.coverage._frames import ChosenFrames, run_begins, traces_of
 from sgstore.testsets.coverage._slots import slot_sets
 

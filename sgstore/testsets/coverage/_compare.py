@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.errors import ConfigError
-from sgstore.store import begins, trace_of
+from sgstore.model.frame_ids import begins, trace_of
 from sgstore.testsets.coverage._classes import UNKNOWN, CountedUnit, shared
 from sgstore.testsets.coverage._frames import SHARES, ReportTable, names_of, of_unknown, share
 

@@ -14,10 +14,11 @@ import numpy as np
 
 from sgstore.errors import StoreError, one_store_needed, url_named
 from sgstore.lang.syntax import node_of_kind
+from sgstore.model.frame_ids import begins, seq_of, trace_of
 from sgstore.model.vocabulary import KINDS
 from sgstore.model.world import longest_step_ns
 from sgstore.query import Store
-from sgstore.store import begins, scope_of, seq_of, trace_of
+from sgstore.store import scope_of
 from sgstore.testsets.locks import ENDING as LOCK
 from sgstore.testsets.locks import frames_of_lock, read_lock, store_beside
 

@@ -20,8 +20,8 @@ from sgstore.errors import ConfigError
 from sgstore.lang.library import pattern_named, patterns
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import MatchClause
+from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.world import JUMP_NS
-from sgstore.store import SEQ_BITS, trace_of
 from sgstore.testsets.coverage._features import MOST
 from sgstore.testsets.coverage._frames import (
     SHARES,

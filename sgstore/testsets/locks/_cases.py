@@ -10,20 +10,11 @@ import numpy as np
 
 from sgstore.errors import StoreError, TraceError
 from sgstore.mcap import digest_of
+from sgstore.model.frame_ids import frame_ids, seq_of, trace_of
 from sgstore.model.vocabulary import natural
 from sgstore.query import Store
 from sgstore.readers import read_messages
-from sgstore.store import (
-    DIGEST_BYTES,
-    WINDOW,
-    frame_ids,
-    graph_digests,
-    marks,
-    messages_of,
-    seq_of,
-    trace_id_of,
-    trace_of,
-)
+from sgstore.store import DIGEST_BYTES, WINDOW, graph_digests, marks, messages_of, trace_id_of
 from sgstore.testsets.locks._text import (
     Lock,
     LockedCase,

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.model.frame_ids import frame_ids
 from sgstore.query import Store
-from sgstore.store import frame_ids, graph_digests, marks, trace_id_of
+from sgstore.store import graph_digests, marks, trace_id_of
 from sgstore.testsets.locks._cases import by_bundle, locked, payload_digests, rows_of
 from sgstore.testsets.locks._text import Lock, LockedCase, LockedTrace, lock_from, made_with
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ConfigError
+from sgstore.model.frame_ids import seq_of, trace_of
 from sgstore.query import Store
-from sgstore.store import seq_of, trace_of
 from sgstore.testsets.coverage import (
     UNKNOWN,
     WITHIN_S,

@@ -24,8 +24,8 @@ import numpy as np
 
 from sgstore.errors import ConfigError
 from sgstore.model.criticality import RECORDED, encounters
+from sgstore.model.frame_ids import trace_of
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
-from sgstore.store import trace_of
 from sgstore.testsets.coverage import UNKNOWN, ReportTable, classed, told_outcomes
 from sgstore.testsets.locks import lock_of
 from sgstore.testsets.selection._choose import BudgetTracker, names_of_units

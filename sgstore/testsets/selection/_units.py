@@ -12,7 +12,8 @@ import numpy as np
 from sgstore.errors import ConfigError, QueryError
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import Call, MatchClause
-from sgstore.store import lengths_of_messages, trace_of
+from sgstore.model.frame_ids import trace_of
+from sgstore.store import lengths_of_messages
 from sgstore.testsets.coverage import (
     UNKNOWN,
     check_sequences,

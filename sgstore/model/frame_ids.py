@@ -1,0 +1,65 @@
+"""Ids of frames: the trace id, the bucket number and the frame number in the bucket, as bits of one number."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.model.world import BUCKET_FRAMES
+
+if TYPE_CHECKING:
+    from sgstore.model.world import Bools, Ints
+
+
+BUCKET_BITS: Final = 18
+"""Bits of the bucket number in a trace."""
+
+FRAME_BITS: Final = 6
+"""Bits of the frame number in a bucket."""
+
+MAX_FRAMES: Final = BUCKET_FRAMES << BUCKET_BITS
+"""Largest number of frames of a trace."""
+
+SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
+"""Bits of a frame id below the trace id."""
+
+
+def trace_bucket(trace_id: int, seq: Ints) -> Ints:
+    """Return the bucket of each frame number of a trace."""
+    return (trace_id << BUCKET_BITS) + seq // BUCKET_FRAMES
+
+
+def frame_ids(trace_id: int, seq: Ints) -> Ints:
+    """Return the frame id of each frame number of a trace."""
+    return (trace_bucket(trace_id, seq) << FRAME_BITS) + seq % BUCKET_FRAMES
+
+
+def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
+    """Return the frame ids in bucket masks, and the row of each frame."""
+    ids: list[Ints] = []
+    rows: list[Ints] = []
+    for bit in range(BUCKET_FRAMES):
+        row = np.flatnonzero(mask >> bit & 1)
+        ids.append((bucket[row] << FRAME_BITS) + bit)
+        rows.append(row)
+    return np.concatenate(ids), np.concatenate(rows)
+
+
+def trace_of(frame_id: Ints) -> Ints:
+    """Return the trace id of each frame id."""
+    return frame_id >> SEQ_BITS
+
+
+def seq_of(frame_id: Ints) -> Ints:
+    """Return the frame number of each frame id."""
+    bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
+    return bucket * BUCKET_FRAMES + (frame_id & ((1 << FRAME_BITS) - 1))
+
+
+def begins(frame_id: Ints) -> Bools:
+    """Return a mask (N,) of the frames that do not directly follow the previous row's frame."""
+    trace, seq = trace_of(frame_id), seq_of(frame_id)
+    found = np.ones(len(frame_id), np.bool_)
+    found[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
+    return found
