@@ -22,11 +22,8 @@ from sgstore.lang.memory import FrameView
 from sgstore.lang.sql import each_match, recorded_events
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import CheckClause, Define, MatchClause, Parameter
-from sgstore.maps.map_files import Maps, lost_lanes
 from sgstore.model.config import Config
 from sgstore.model.world import seconds_of
-from sgstore.readers import on_map, open_trace
-from sgstore.sgg import SceneGraphGenerator
 from sgstore.temporal._check_monitor import CheckMonitor
 from sgstore.temporal._checks import Verdict, within_range
 from sgstore.temporal._expression_monitor import sequence_monitor
@@ -114,7 +111,8 @@ def opened(
         with _live(source, ego, sensors) as told:
             yield told
         return
-    from sgstore.readers import RecordedCameras  # it loads the media of messages
+    from sgstore.maps.map_files import Maps, lost_lanes  # searches need no maps and readers
+    from sgstore.readers import RecordedCameras, on_map, open_trace
 
     path = Path(source)
     with open_trace(path, ego=ego or config.ego) as trace:
@@ -244,6 +242,8 @@ class Monitor:
         sgsm_compat: bool = False,
         on_step: Callable[[FrameTime, Sequence[SceneGraph]], object] | None = None,
     ) -> None:
+        from sgstore.sgg import SceneGraphGenerator  # searches need no generator
+
         config = config or Config()
         self.generator = SceneGraphGenerator(road_map, config)
         self.trace = trace

@@ -8,7 +8,7 @@ import re
 import sys
 from collections import Counter
 from dataclasses import dataclass, fields, is_dataclass
-from functools import wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
 
@@ -183,9 +183,13 @@ class Verbs(typer.Typer):
         return registered
 
 
+_hints = cache(partial(get_type_hints, include_extras=True))
+"""Types of parameters or fields; many verbs share the dataclasses of options."""
+
+
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Convert a function with dataclass parameters to one with their fields as parameters."""
-    hints = get_type_hints(function, include_extras=True)
+    hints = _hints(function)
     bundles: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     parameters: list[inspect.Parameter] = []
     for one in inspect.signature(function).parameters.values():
@@ -193,7 +197,7 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
         if bundle is None:
             parameters.append(one.replace(annotation=hints[one.name], kind=one.KEYWORD_ONLY))
             continue
-        own = get_type_hints(bundle, include_extras=True)
+        own = _hints(bundle)
         for field in fields(bundle):
             option = inspect.Parameter(field.name, one.KEYWORD_ONLY, default=field.default)
             parameters.append(option.replace(annotation=own[field.name]))

@@ -1,0 +1,185 @@
+"""The application of all verbs, and one run of it: exit codes, errors and interruptions."""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+import sgstore.apps.cli._process as ending
+from sgstore.apps.cli import (
+    _checks,
+    _collections,
+    _coverage,
+    _exports,
+    _prioritize,
+    _queries,
+    _recordings,
+    _serve,
+    _stores,
+)
+from sgstore.apps.cli._options import ERROR, USAGE, Quiet, Verbose, Verbs
+from sgstore.apps.cli._output import complain, talk, talk_as_usual, write_error
+from sgstore.apps.cli._places import forget_asked, with_missing
+from sgstore.apps.cli._process import take_streams
+from sgstore.base.output_files import ReaderGoneError
+from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError, is_interruption
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+app = Verbs(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback(invoke_without_command=True)
+def sgstore(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Find the driving scenes that matter.
+
+    Recordings go in (ingest), frames are found by what happens in them (find, sql), looked at (show), and
+    exported as clips (export). SGSTORE_STORE names the store of verbs that are given none.
+    """
+    talk(quiet=quiet, verbose=verbose)
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"sgstore {version_of('sgstore')}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+for _verbs in (  # in the order of help
+    _recordings.verbs,
+    _stores.verbs,
+    _queries.verbs,
+    _checks.verbs,
+    _coverage.verbs,
+    _prioritize.verbs,
+    _exports.verbs,
+    _serve.verbs,
+):
+    app.add_typer(_verbs)
+for _group, _panel in (
+    (_queries.library, _queries.PANEL),
+    (_coverage.coverage, _coverage.PANEL),
+    (_coverage.lock, _coverage.PANEL),
+    (_collections.collection, _collections.PANEL),
+):
+    app.add_typer(_group, rich_help_panel=_panel)
+
+
+def _verb_in(arguments: Sequence[str]) -> Sequence[str]:
+    """Return the verb of a command line, after global options; at most one."""
+    return [one for one in arguments if one not in {"--quiet", "--verbose"}][:1]
+
+
+_PUBLISHING: Final = ("ingest", "import", "derive")
+"""Verbs that work in parts, where each finished part is already in the store."""
+
+
+_MULTIPLYING: Final = {"coverage", "select", "diff", "lock"}
+"""Verbs with large matrix products."""
+
+
+def main() -> None:
+    """Run the command line of this process and end it with the right exit code."""
+    # Numpy starts a thread for each core on import; only large matrix products need them.
+    if not {*_verb_in(sys.argv[1:])} & _MULTIPLYING:
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Imported objects are never garbage: a search for garbage during imports takes a tenth of a
+    # short run.
+    gc.set_threshold(50_000)
+    take_streams()
+    try:
+        ending.heed_signals()
+        code = run(sys.argv[1:])
+        ending.ignore_signals()
+    except KeyboardInterrupt:  # before the run began, or after its end
+        ending.ignore_signals()
+        complain(ending.word())
+        code = ending.exit_code()
+    sys.exit(code)
+
+
+def _wants_json(arguments: list[str]) -> bool:
+    """True if the output, including errors, is for programs."""
+    forms = {"--format=json", "--format=ndjson"}
+    named = {value for name, value in pairwise(arguments) if name == "--format"}
+    return "--json" in arguments or bool(forms & set(arguments)) or bool(named & {"json", "ndjson"})
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command line.
+
+    Returns
+    -------
+    int
+        The exit code, as listed in :mod:`sgstore.apps.cli`.
+    """
+    try:
+        code = _ran(arguments)
+    except SgstoreError as error:
+        return 0 if isinstance(error, ReaderGoneError) else _refused(error, arguments)
+    except BrokenPipeError:
+        # The reader of our output has exited (`| head`): there is nothing to report or flush.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        # Wrong usage: the class of these errors differs between versions of typer, their attributes
+        # do not.
+        show = getattr(error, "show", None)
+        if not callable(show):
+            raise
+        show()
+        return USAGE
+    finally:
+        ending.clear_deadline()
+        talk_as_usual()
+        forget_asked()
+    if code == ending.INTERRUPTED:  # typer also converts Ctrl-C to this code
+        more = (
+            "; what was finished is in the store" if {*_verb_in(arguments)} & {*_PUBLISHING} else ""
+        )
+        complain(f"{ending.word()}{more}")
+        return ending.exit_code()
+    return code
+
+
+def _ran(arguments: list[str]) -> int:
+    """Run one command line; return the exit code, also after a lost interruption."""
+    try:
+        code = int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
+        code = with_missing(code)
+        if code != ending.INTERRUPTED:
+            sys.stdout.flush()
+    except (Exception, KeyboardInterrupt) as error:
+        ended = isinstance(error, typer.Abort) or ending.was_ended()
+        if not (ended or is_interruption(error)):
+            raise
+        code = ending.INTERRUPTED
+    if ending.was_ended():  # an interruption can appear as the error of one recording
+        code = ending.INTERRUPTED
+    if code == ending.INTERRUPTED:
+        ending.refuse_late()
+    return code
+
+
+def _refused(error: SgstoreError, arguments: list[str]) -> int:
+    """Report an error; return the exit code."""
+    if _wants_json(arguments):
+        write_error(error.as_dict())
+    else:
+        complain(str(error))
+    return USAGE if isinstance(error, QueryError | SqlError | ConfigError) else ERROR
