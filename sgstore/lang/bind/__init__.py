@@ -1,7 +1,6 @@
 """Binder: converts syntax trees to bound queries, and finds the values that a trace must know."""
 
 from sgstore.lang.bind._aggregates import PLACE, sql_of
-from sgstore.lang.bind._beyond import is_limited, within
 from sgstore.lang.bind._bind import bind_query
 from sgstore.lang.bind._checks import CheckInCatalog, bind_checks
 from sgstore.lang.bind._datasets import CLASSES_GIVEN, traces_in
@@ -28,6 +27,7 @@ from sgstore.lang.bind._unknowns import (
     undecided,
     unknown,
 )
+from sgstore.lang.bind._world_scope import is_limited, within
 
 __all__ = [
     "CLASSES_GIVEN",

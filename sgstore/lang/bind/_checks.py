@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from sgstore.errors import TextSpan
 from sgstore.lang import ir as b
-from sgstore.lang.bind._beyond import looks_less
 from sgstore.lang.bind._bind import chosen, refuse_strange, refuse_unused
 from sgstore.lang.bind._patterns import ALL_BINDERS, kinds_of
 from sgstore.lang.bind._results import bind_column
 from sgstore.lang.bind._sequences import StepScope
 from sgstore.lang.bind._symbols import RESERVED, Session, Symbol, SymbolTable
 from sgstore.lang.bind._temporal import settled
+from sgstore.lang.bind._world_scope import looks_less
 from sgstore.lang.catalog import Catalog, Type
 from sgstore.lang.syntax import tree as s
 from sgstore.lang.syntax.tree import CheckClause as WrittenCheck

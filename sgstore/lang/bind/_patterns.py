@@ -6,7 +6,6 @@ from typing import Final
 
 from sgstore.errors import TextSpan
 from sgstore.lang import ir as b
-from sgstore.lang.bind._beyond import whole_block
 from sgstore.lang.bind._expressions import BINDERS, edge_attribute, node_attribute
 from sgstore.lang.bind._functions import call
 from sgstore.lang.bind._match_values import over_match
@@ -14,6 +13,7 @@ from sgstore.lang.bind._recorded_events import happens
 from sgstore.lang.bind._stages import name_path
 from sgstore.lang.bind._symbols import RESERVED, THE_EGO, Binders, Session, Symbol, SymbolTable
 from sgstore.lang.bind._temporal import tense, timespan
+from sgstore.lang.bind._world_scope import whole_block
 from sgstore.lang.catalog import Type
 from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import (

@@ -12,9 +12,9 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
-from sgstore.lang.bind._beyond import beyond_graph, bounded_in, holds
 from sgstore.lang.bind._in_range import in_traces, related
 from sgstore.lang.bind._needed_values import MEASURED, MOTION
+from sgstore.lang.bind._world_scope import beyond_graph, bounded_in, holds
 from sgstore.lang.catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, RelationScope, Type
 from sgstore.model.pair_numbers import columns_needed
 from sgstore.model.vocabulary import (

@@ -266,7 +266,7 @@ class _RowStatement:
 
     def statement(self) -> SqlStatement:
         values = [column.value for column in self.result.columns]
-        keys = [c.value for c in self.result.columns if not _aggregates(c)]
+        keys = [c.value for c in self.result.columns if not is_counted(c.value)]
         apart: list[NodeAttribute] = []
         if self.grouped:
             apart = owners_of(keys, self.query, self.writer.catalog)
@@ -289,7 +289,7 @@ class _RowStatement:
         select.distinct = self.result.distinct or self.result.framed
         if self.result.aggregated:
             listed = enumerate(self.result.columns, start=1)
-            select.group = [str(place) for place, column in listed if not _aggregates(column)]
+            select.group = [str(place) for place, column in listed if not is_counted(column.value)]
             select.group += [_column(owner) for owner in dict.fromkeys([*apart, *self.top_owners])]
             if self.result.having is not None:
                 select.having.append(self._text(self.result.having))
@@ -329,7 +329,7 @@ class _RowStatement:
             edges = (edge.key for edge in self.query.scope.edges if edge.key in self.edges)
             texts += [f"{_ROWS}.{quoted(f'{key}.type')}" for key in edges]
         for column in self.result.columns:
-            whole = self.result.aggregated and not _aggregates(column)
+            whole = self.result.aggregated and not is_counted(column.value)
             text = self._of_group(column.name) if whole else self._text(column.value)
             texts.append(shortest_text(text) if column.single and not self.grouped else text)
         return list(zip(names_of(self.query), texts, strict=True))
@@ -682,10 +682,6 @@ def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
 def in_order(part: Bound) -> bool:
     """True if an expression depends on the order of matches, as ``collect`` does."""
     return isinstance(part, Aggregate) and part.word == "collect" and not part.distinct
-
-
-def _aggregates(column: ReturnColumn) -> bool:
-    return is_counted(column.value)
 
 
 def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatement:

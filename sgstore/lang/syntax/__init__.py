@@ -9,9 +9,9 @@ from sgstore.lang.syntax._hints import (
     variable_hint,
 )
 from sgstore.lang.syntax._parse import joined, parse
+from sgstore.lang.syntax._pattern_builder import Pattern
 from sgstore.lang.syntax._table_function import pattern_tables
 from sgstore.lang.syntax._tables import keywords
-from sgstore.lang.syntax._written_patterns import Pattern
 
 __all__ = [
     "Pattern",

@@ -69,11 +69,6 @@ _SHORT: Final = 4_000
 """Longest text whose statements are cached; characters."""
 
 
-@lru_cache(maxsize=64)
-def _parsed_once(text: str) -> tuple[Statement, ...]:
-    return _parsed(text)
-
-
 def _parsed(text: str) -> tuple[Statement, ...]:
     if len(text) > MAX_LENGTH:
         reason = f"the text has {len(text)} characters, more than {MAX_LENGTH}"
@@ -87,6 +82,9 @@ def _parsed(text: str) -> tuple[Statement, ...]:
         if stack[-1].state == machine.end:
             return stack[-1].value
         position = token.span.end
+
+
+_parsed_once = lru_cache(maxsize=64)(_parsed)
 
 
 def joined(texts: Sequence[str]) -> str:
