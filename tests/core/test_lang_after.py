@@ -24,7 +24,7 @@ pytestmark = pytest.mark.seconds(4)
 
 
 @pytest.mark.parametrize("first", range(0, 400, 50) if LONG else [50])
-def test_random_results_are_what_their_definition_says(first: int) -> None:
+def test_random_results_equal_their_definition(first: int) -> None:
     seen = try_many_after(first, 50)
 
     assert seen["tried"] > 30
@@ -82,7 +82,7 @@ def world() -> World:
         ),
     ],
 )
-def test_results_are_what_their_definition_says(text: str, world: World) -> None:
+def test_results_equal_their_definition(text: str, world: World) -> None:
     problem, rows = disagreement_after(f"MATCH (v:Entity) {text}", world)
 
     assert problem == ""
@@ -106,7 +106,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
         yield opened
 
 
-def test_pages_are_the_rows_of_all(store: Store) -> None:
+def test_pages_together_are_all_rows(store: Store) -> None:
     text = "MATCH (e:Ego) RETURN trace.name, frame.seq, e.speed"
     every = store.find(text).rows()
 
@@ -118,7 +118,7 @@ def test_pages_are_the_rows_of_all(store: Store) -> None:
     assert store.find(f"{text} SKIP 70").limit(3).rows() == every[70:73]
 
 
-def test_frames_and_clips_of_chosen_rows_are_those_of_the_rows(store: Store) -> None:
+def test_frames_and_clips_belong_to_the_sampled_rows(store: Store) -> None:
     text = "MATCH (e:Ego) RETURN e.speed AS v ORDER BY v DESC LIMIT 2 PER trace.name"
     matches = store.find(text)
 
@@ -132,7 +132,7 @@ def test_frames_and_clips_of_chosen_rows_are_those_of_the_rows(store: Store) -> 
     assert store.find("MATCH (e:Ego) RETURN e.id SKIP 77").count() == 3
 
 
-def test_intervals_are_chosen_by_their_ends(store: Store) -> None:
+def test_intervals_are_sampled_by_their_ends(store: Store) -> None:
     text = "MATCH (e:Ego) WHERE e.speed % 10 < 8 RETURN INTERVALS"
     every = store.find(text).rows()
 
@@ -144,7 +144,7 @@ def test_intervals_are_chosen_by_their_ends(store: Store) -> None:
     assert store.find(f"{text} SKIP 3").rows() == every[3:]
 
 
-def test_lists_are_written_in_every_form(store: Store, tmp_path: Path) -> None:
+def test_lists_are_written_in_every_format(store: Store, tmp_path: Path) -> None:
     text = "MATCH (e:Ego) WHERE frame.seq < 3 RETURN trace.name AS run, collect(e.speed) AS v"
     matches = store.find(text)
 
@@ -155,7 +155,7 @@ def test_lists_are_written_in_every_form(store: Store, tmp_path: Path) -> None:
     assert json.loads(rows[1][1]) == [0.0, 1.0, 2.0]
 
 
-def test_a_shell_shows_lists_and_groups(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shell_prints_lists_and_groups(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     text = "MATCH (e:Ego) RETURN trace.name AS run, MAX(e.speed) AS v, collect(DISTINCT e.kind) HAVING v > 5"
 
     assert run_verb(["find", str(store.file.path), text, "--json"]) == 0
@@ -165,7 +165,7 @@ def test_a_shell_shows_lists_and_groups(store: Store, capsys: pytest.CaptureFixt
     ]
 
 
-def test_case_over_time_chooses_by_other_frames(store: Store) -> None:
+def test_case_can_use_other_frames(store: Store) -> None:
     faster = "CASE WHEN prev(e.speed) < e.speed THEN 'faster' ELSE 'no faster' END"
 
     found = store.find(

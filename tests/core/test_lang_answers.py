@@ -50,7 +50,7 @@ def lanes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 
 
 @pytest.mark.parametrize("relation", ["laneChange", "conflictsWith", "controlsTrafficOf"])
-def test_a_map_without_such_edges_says_that_there_are_none(lanes: Store, relation: str) -> None:
+def test_edge_absent_from_map_is_false(lanes: Store, relation: str) -> None:
     some = lanes.find(f"MATCH (:Lane|Signal)-[:{relation}]-(:Lane)")
     none = lanes.find(
         f"MATCH (e:Ego) WHERE NOT EXISTS {{(:Lane|Signal)-[:{relation}]-(:Lane)}} RETURN FRAMES"
@@ -106,7 +106,7 @@ def said(related: Store) -> dict[tuple[Any, ...], bool]:
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_pairs_in_range_are_those_that_are_related(
+def test_in_range_pairs_are_the_related_pairs(
     name: str, stated: set[tuple[Any, ...]], said: dict[tuple[Any, ...], bool]
 ) -> None:
     of_it = {pair: found for pair, found in said.items() if pair[0] == name}
@@ -116,7 +116,7 @@ def test_pairs_in_range_are_those_that_are_related(
     assert not all(of_it.values())
 
 
-def test_no_edge_to_what_is_in_range_says_that_there_is_none(related: Store) -> None:
+def test_missing_edge_in_range_is_false(related: Store) -> None:
     text = "MATCH (a:Car&!Ego), (b:Truck) WHERE trace.name = $name AND NOT EXISTS {(a)-[:visible]->(b)}"
     given = "default, centres"
 
@@ -124,18 +124,18 @@ def test_no_edge_to_what_is_in_range_says_that_there_is_none(related: Store) -> 
     assert related.find(f"{text} AND in_range(a, b) RETURN FRAMES", name=given).count() == 0
 
 
-def test_parts_of_the_map_are_no_pair(related: Store) -> None:
+def test_map_parts_are_not_in_range_pairs(related: Store) -> None:
     assert related.find("MATCH (e:Ego), (x) WHERE in_range(e, x) AND x.lane = 1").count() == 0
 
 
-def test_of_settings_that_are_not_known_nothing_is_said() -> None:
+def test_in_range_is_unknown_for_unknown_settings() -> None:
     assert RelationScope.of({}) is None
     traces = [TraceFacts(1, "imported", "", frozenset())]
     assert in_range("a", "b", traces) == Value(None, in_range("a", "b", traces).type)
 
 
 @pytest.mark.parametrize("name", [name for name in CONFIGS if not name.startswith("nobody,")])
-def test_online_the_same_is_said(name: str) -> None:
+def test_in_range_agrees_with_relations_online(name: str) -> None:
     pairs = "(a:Entity), (b:Entity) WHERE in_range(a, b)"
     checks = f"""
         CHECK said: ALWAYS NOT EXISTS {{{pairs} AND NOT EXISTS {{(a)-[:visible]->(b)}}}};

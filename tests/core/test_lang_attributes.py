@@ -77,7 +77,7 @@ def same(found: Any, expected: Any) -> bool:
 
 
 @pytest.mark.parametrize("attribute", NODE_ATTRIBUTES.values(), ids=lambda one: one.name)
-def test_an_attribute_of_nodes(attribute: Attribute, found: Found, view: FrameView) -> None:
+def test_attribute_of_nodes(attribute: Attribute, found: Found, view: FrameView) -> None:
     here = in_memory(NodeAttribute("n", attribute, attribute.type), view)
 
     rows = found(plainly(f"n.{attribute.name}", WHOLE))
@@ -88,7 +88,7 @@ def test_an_attribute_of_nodes(attribute: Attribute, found: Found, view: FrameVi
 
 
 @pytest.mark.parametrize("function", PAIR_FUNCTIONS)
-def test_a_number_of_pairs(function: str, store: Store, view: FrameView) -> None:
+def test_pair_number(function: str, store: Store, view: FrameView) -> None:
     query = f"MATCH (e:Ego), (n) WHERE frame.seq = {SEQ} RETURN n.id, {function}(e, n), {function}(n, e)"
     (ego,) = [node for node, about in view.nodes.items() if about["is_ego"]]
 
@@ -102,7 +102,7 @@ def test_a_number_of_pairs(function: str, store: Store, view: FrameView) -> None
     assert not known & set(MAP_KINDS)
 
 
-def test_without_labels_numbers_of_pairs_are_of_entities(store: Store) -> None:
+def test_pair_numbers_without_labels_are_of_entities(store: Store) -> None:
     plain = store.find("MATCH (a), (b) WHERE dist(a, b) < 10 RETURN FRAMES")
     labelled = store.find("MATCH (a:Entity), (b:Entity) WHERE dist(a, b) < 10 RETURN FRAMES")
 
@@ -113,7 +113,7 @@ def test_without_labels_numbers_of_pairs_are_of_entities(store: Store) -> None:
 @pytest.mark.parametrize(
     "attribute", [*FRAME_ATTRIBUTES.values(), *ENV_ATTRIBUTES.values()], ids=lambda one: one.name
 )
-def test_an_attribute_of_frames(attribute: Attribute, store: Store, view: FrameView) -> None:
+def test_attribute_of_frames(attribute: Attribute, store: Store, view: FrameView) -> None:
     name = (
         attribute.name
         if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}
@@ -125,7 +125,7 @@ def test_an_attribute_of_frames(attribute: Attribute, store: Store, view: FrameV
 
 
 @pytest.mark.parametrize("attribute", TRACE_ATTRIBUTES.values(), ids=lambda one: one.name)
-def test_an_attribute_of_traces(attribute: Attribute, store: Store, view: FrameView) -> None:
+def test_attribute_of_traces(attribute: Attribute, store: Store, view: FrameView) -> None:
     query = f"MATCH (e:Ego) WHERE frame.seq = {SEQ} RETURN trace.{attribute.name} AS value"
     ((value,),) = store.find(query).rows()
 
@@ -233,7 +233,7 @@ def some_of(values: list[Any], attribute: Attribute) -> Any:
 
 
 @pytest.mark.parametrize(("name", "attribute", "pattern"), asked_of())
-def test_an_attribute_in_every_form(
+def test_attribute_in_every_form(
     name: str, attribute: Attribute, pattern: str, store: Store, found: Found
 ) -> None:
     asking = plainly(name, pattern)
@@ -260,7 +260,7 @@ def test_an_attribute_in_every_form(
 
 
 @pytest.mark.parametrize(("name", "attribute", "pattern"), some(asked_of(), 2))
-def test_an_attribute_in_what_is_returned(
+def test_attribute_in_returned_values(
     name: str, attribute: Attribute, pattern: str, store: Store, found: Found
 ) -> None:
     values = [row[-1] for row in found(plainly(name, pattern))]
@@ -291,7 +291,7 @@ def test_an_attribute_in_what_is_returned(
 @pytest.mark.parametrize(
     ("name", "attribute", "pattern"), [one for one in asked_of() if one.id[:2] in {"n.", "r."}]
 )
-def test_an_attribute_as_a_property(
+def test_attribute_as_property(
     name: str, attribute: Attribute, pattern: str, store: Store, found: Found
 ) -> None:
     plain = [(n, frame, value) for frame, n, *_, value in found(plainly(name, pattern))]

@@ -130,7 +130,7 @@ def rows(store: Store, text: str) -> list[tuple[Any, ...]]:
 
 @pytest.mark.parametrize("trace", TRACES)
 @pytest.mark.parametrize("asked", ASKED)
-def test_nearness_beyond_graphs_is_that_of_graphs_as_wide(
+def test_distance_relations_beyond_graph_equal_wider_graph(
     near: Store, wide: Store, asked: str, trace: str
 ) -> None:
     text = f"MATCH {named(asked, trace)} AND trace.name = '{trace}' RETURN v.name, FRAMES"
@@ -139,7 +139,7 @@ def test_nearness_beyond_graphs_is_that_of_graphs_as_wide(
 
 
 @pytest.mark.parametrize("trace", TRACES)
-def test_a_search_in_memory_finds_the_same_beyond_graphs(near: Store, trace: str) -> None:
+def test_memory_search_equals_sql_beyond_graph(near: Store, trace: str) -> None:
     sql = f"SELECT frame_id FROM frames WHERE trace = '{trace}' AND seq % 8 = 2"
     frames = [frame for (frame,) in near.sql(sql).values]
     found, seen = dict[str, int](), dict[str, int]()
@@ -154,14 +154,14 @@ def test_a_search_in_memory_finds_the_same_beyond_graphs(near: Store, trace: str
     assert seen == found
 
 
-def test_some_are_near_beyond_graphs(near: Store) -> None:
+def test_distance_relations_exist_beyond_graph(near: Store) -> None:
     for asked in ASKED[:5]:
         text = f"MATCH {named(asked, 'usual')} AND trace.name = 'usual'"
         assert rows(near, f"USING SCOPE world {text}") != rows(near, text)
 
 
 @pytest.mark.parametrize("trace", TRACES)
-def test_a_check_of_nearness_is_that_of_graphs_as_wide(
+def test_check_of_distance_relations_equals_wider_graph(
     near: Store, wide: Store, trace: str
 ) -> None:
     text = named(
@@ -220,7 +220,7 @@ PEOPLE: Final = Scene(
 @pytest.mark.parametrize(
     "config", [Config(kinds=("Vehicle", "Lane", "Road")), Config(exclude_ids=("p",))]
 )
-def test_a_check_of_what_settings_exclude_is_unknown(
+def test_check_of_excluded_entities_is_unknown(
     tmp_path: Path, check: str, expected: str, config: Config
 ) -> None:
     store = store_of(tmp_path / "s.sgstore", {"road": [PEOPLE]}, {"road": config})
@@ -263,7 +263,7 @@ USING RANGE 80 CHECK names: FORALL (v:Vehicle WHERE v.speed > 16) ALWAYS v.lengt
 """
 
 
-def test_a_check_looks_no_farther_than_it_says(tmp_path: Path) -> None:
+def test_check_ignores_entities_beyond_its_range(tmp_path: Path) -> None:
     settings = {"cut": (50, 80), "world": (50, 200), "wide": (200, 0), "all": (50, float("inf"))}
     told: dict[str, dict[str, tuple[Any, ...]]] = {}
     for name, (radius, world) in settings.items():

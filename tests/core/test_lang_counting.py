@@ -59,7 +59,7 @@ def counted(rows: Rows, holds: Callable[[int], bool]) -> set[tuple[int, int, int
 
 @pytest.mark.parametrize("sign", SIGNS)
 @pytest.mark.parametrize("number", [-1, 0, 0.5, 1, 2, 2.5, 3, 7, 90])
-def test_sums_of_masks_find_the_frames_that_counting_finds(sign: str, number: float) -> None:
+def test_mask_sums_equal_counted_frames(sign: str, number: float) -> None:
     if SIGNS[sign](0, number):
         return  # such a comparison is asked the other way round
     rng = random.Random(3)
@@ -73,7 +73,7 @@ def test_sums_of_masks_find_the_frames_that_counting_finds(sign: str, number: fl
 
 @pytest.mark.parametrize("bound", [1, MOST - 1, MOST, MOST + 1, MOST + 2])
 @pytest.mark.parametrize("most", [MOST, MOST + 1, *[40_000] * LONG])
-def test_a_count_is_right_however_many_rows_there_are(bound: int, most: int) -> None:
+def test_count_is_right_for_many_rows(bound: int, most: int) -> None:
     """Some buckets have as many rows as can be added up, or more, and some frames are in all of them."""
     rng = random.Random(1)
     rows = [(1, 1, rng.getrandbits(60) | 1 << 59 | 1 << 11) for _ in range(most)]
@@ -89,7 +89,7 @@ def world() -> World:
 
 
 @pytest.mark.parametrize("sign", SIGNS)
-def test_a_count_of_a_block_is_what_the_matches_of_the_block_say(sign: str, world: World) -> None:
+def test_block_count_equals_block_matches(sign: str, world: World) -> None:
     text = f"MATCH (a:Entity) WHERE COUNT {{(a)-[:near|visible]->(b)-[r]-(c)}} {sign} 3 RETURN frame.id, a"
     each = "MATCH (a:Entity) RETURN frame.id, a, COUNT {(a)-[:near|visible]->(b)-[r]-(c)} AS n"
 
@@ -118,7 +118,7 @@ COUNTS = [
 
 
 @pytest.mark.parametrize("text", COUNTS)
-def test_counts_by_buckets_are_counts_by_frames(
+def test_bucket_counts_equal_frame_counts(
     text: str, world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled = compile_query(text, world.catalog)
@@ -140,9 +140,7 @@ def test_counts_by_buckets_are_counts_by_frames(
 @pytest.mark.parametrize(
     "returned", ["COUNT(*), AVG(a.x)", "COUNT(*), a.speed", "COUNT(a.speed)", "COUNT(*), frame.seq"]
 )
-def test_what_changes_from_frame_to_frame_is_not_counted_by_buckets(
-    returned: str, world: World
-) -> None:
+def test_changing_values_are_not_counted_by_bucket(returned: str, world: World) -> None:
     statement = compile_query(f"MATCH (a)-[:near]->(b) RETURN {returned}", world.catalog).rows()
 
     assert "held" not in statement.sql

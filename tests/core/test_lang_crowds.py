@@ -62,7 +62,7 @@ def condition(rng: random.Random, depth: int) -> str:
     return rng.choice(words).format(one, other)
 
 
-def test_random_conditions_have_the_same_answers() -> None:
+def test_random_conditions_agree_in_columns_and_singly() -> None:
     rng = random.Random(4)
     views = [view_of(f) for n in range(3) for f in random_world(n, frames=4, static=n == 1).frames]
     catalog = random_world(0, frames=4).catalog
@@ -97,14 +97,14 @@ def test_random_conditions_have_the_same_answers() -> None:
         "b.id = 3",
     ],
 )
-def test_what_no_number_tells_is_asked_of_one_after_the_other(text: str) -> None:
+def test_non_numeric_condition_is_evaluated_node_by_node(text: str) -> None:
     catalog = random_world(0, frames=4).catalog
     scope = compile_query(f"MATCH (a:Car), (b:Car) WHERE {text}", catalog).bound.scope
 
     assert [part for part in scope.where if crowd_test(part, "b") is not None] == []
 
 
-def test_a_crowd_without_entities_has_no_answers() -> None:
+def test_columns_without_entities_are_empty() -> None:
     (view, *_) = [view_of(f) for f in random_world(0, frames=4).frames]
     catalog = random_world(0, frames=4).catalog
     scope = compile_query("MATCH (a:Ego), (b:Train) WHERE dist(a, b) < 5", catalog).bound.scope

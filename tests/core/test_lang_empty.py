@@ -103,7 +103,7 @@ def watched(text: str) -> None:
     monitor.finish()
 
 
-def test_nothing_but_errors_of_sgstore_is_raised_where_nothing_matches(alone: Store) -> None:
+def test_queries_without_matches_raise_only_sgstore_errors(alone: Store) -> None:
     answered, refused = 0, 0
     with alone.file.snapshot():
         for text in constructs():
@@ -120,7 +120,7 @@ def test_nothing_but_errors_of_sgstore_is_raised_where_nothing_matches(alone: St
     assert refused < answered
 
 
-def test_the_mean_of_no_match_is_no_row(alone: Store) -> None:
+def test_average_without_matches_has_no_row(alone: Store) -> None:
     for word in ("AVG", "SUM"):
         text = f"{NOTHING} AND abs(prev(v.speed)) > 0 RETURN INTERVALS, {word}(v.speed) OVER match AS x"
         assert alone.find(text).rows() == []

@@ -63,7 +63,7 @@ def empty() -> duckdb.DuckDBPyConnection:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_queries_give_what_the_file_says(path: Path, empty: duckdb.DuckDBPyConnection) -> None:
+def test_queries_give_golden_results(path: Path, empty: duckdb.DuckDBPyConnection) -> None:
     cases = [case.strip("\n").split("\n---- ") for case in path.read_text("utf-8").split("====\n")]
     given = [f"{query}\n---- {outcome(query, empty)}" for query, *_ in cases]
     expected = ["\n---- ".join(case) for case in cases]
@@ -93,7 +93,7 @@ TO_IMPROVE = sorted((FOLDER / "to_improve").glob("*.txt"))
 
 
 @pytest.mark.parametrize("path", TO_IMPROVE, ids=lambda path: path.stem)
-def test_errors_that_should_be_better_are_no_better_yet(path: Path, empty) -> None:
+def test_error_texts_marked_as_weak_are_unchanged(path: Path, empty) -> None:
     for case in path.read_text("utf-8").split("====\n"):
         query, now, wanted = case.strip("\n").split("\n---- ")
 
@@ -101,5 +101,5 @@ def test_errors_that_should_be_better_are_no_better_yet(path: Path, empty) -> No
         assert wanted.removeprefix("wanted\n").strip() not in now
 
 
-def test_there_are_golden_files() -> None:
+def test_golden_files_exist() -> None:
     assert {path.stem for path in FILES} >= {"patterns", "blocks", "results", "syntax_errors"}

@@ -43,7 +43,7 @@ def looked(text: str, speed: float = 30.0) -> Horizon:
         ("ALWAYS NOT same_lane(ego, v)", math.inf),
     ],
 )
-def test_who_is_asked_for_by_every_is_looked_for_so_far(formula: str, metres: float) -> None:
+def test_horizon_of_quantified_entities(formula: str, metres: float) -> None:
     assert looked(f"CHECK FORALL (v:Vehicle) {formula}") == Horizon(metres, 0)
 
 
@@ -67,17 +67,17 @@ def test_who_is_asked_for_by_every_is_looked_for_so_far(formula: str, metres: fl
         ("USING RANGE 80 CHECK FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5", 5, 0),
     ],
 )
-def test_who_is_missed_matters_for_one_verdict(text: str, true: float, false: float) -> None:
+def test_missing_entities_affect_only_one_verdict(text: str, true: float, false: float) -> None:
     assert looked(text) == Horizon(true, false)
 
 
-def test_safe_distances_grow_with_the_greatest_speed() -> None:
+def test_safe_distance_grows_with_greatest_speed() -> None:
     text = "CHECK FORALL (v:Vehicle) ALWAYS NOT rss_margin(ego, v) < 0"
     slow, fast = looked(text, 10.0).true, looked(text, 33.0).true
     assert 50 < slow < 133 < fast < 500
 
 
-def test_reasons_name_what_is_needed_and_what_is_known() -> None:
+def test_reason_names_needed_and_known_range() -> None:
     assert short_range(Horizon(120, 0), 50).of(holds=False) == ""
     reason = short_range(Horizon(119.2, 0), 50).of(holds=True)
     assert reason == "it depends on 120 m around the ego, and the trace knows 50 m"
@@ -92,18 +92,18 @@ def test_reasons_name_what_is_needed_and_what_is_known() -> None:
         ("USING RANGE 50 MATCH (e:Ego)", "USING RANGE belongs to CHECK"),
     ],
 )
-def test_settings_that_are_none_are_refused(text: str, said: str) -> None:
+def test_invalid_settings_are_refused(text: str, said: str) -> None:
     with pytest.raises(QueryError, match=said):
         compile_query(text, Catalog())
 
 
 @pytest.mark.parametrize("said", ["far", "-3"])
-def test_a_range_is_a_distance(said: str) -> None:
+def test_range_is_a_distance(said: str) -> None:
     with pytest.raises(QueryError, match="is no distance"):
         looked(f"USING RANGE '{said}' CHECK ALWAYS ego.speed < 3")
 
 
-def test_a_pattern_is_about_graphs_and_a_check_about_the_world() -> None:
+def test_pattern_uses_graph_and_check_uses_world() -> None:
     assert not compile_query("MATCH (e:Ego)", Catalog()).bound.world
     assert compile_query("USING SCOPE world MATCH (e:Ego)", Catalog()).bound.world
     for setting, world in (("", True), ("USING SCOPE world", True), ("USING SCOPE graph", False)):
@@ -111,7 +111,7 @@ def test_a_pattern_is_about_graphs_and_a_check_about_the_world() -> None:
         assert found.check.world is world
 
 
-def test_edges_in_braces_are_asked_of_all_that_is_known() -> None:
+def test_edges_in_braces_use_all_known_data() -> None:
     text = "MATCH (e:Ego)-[:near]->(v:Car) WHERE EXISTS {(v)-[:isIn]->(:Lane)} AND lead(e, v)"
     scope = compile_query(text, Catalog()).bound.scope
     blocks = [block.scope.edges for one in scope.where for block in ir.blocks_of(one)]

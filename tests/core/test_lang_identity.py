@@ -59,7 +59,7 @@ def entity(trace: str, road_map: str, node: int) -> tuple[str, int]:
 
 
 @pytest.mark.parametrize("label", KINDS)
-def test_nodes_of_several_traces_are_counted_apart(label: str, store: Store) -> None:
+def test_nodes_are_counted_per_trace(label: str, store: Store) -> None:
     entities = [entity(*row) for row in matched(store, label)]
 
     assert store.find(f"MATCH (v:{label}) RETURN COUNT(DISTINCT v), COUNT(v)").rows() == [
@@ -68,7 +68,7 @@ def test_nodes_of_several_traces_are_counted_apart(label: str, store: Store) -> 
 
 
 @pytest.mark.parametrize("label", KINDS)
-def test_nodes_of_several_traces_are_grouped_apart(label: str, store: Store) -> None:
+def test_nodes_are_grouped_per_trace(label: str, store: Store) -> None:
     wanted = Counter(entity(*row) for row in matched(store, label))
 
     rows = store.find(f"MATCH (v:{label}) RETURN v, COUNT(*)").rows()
@@ -94,7 +94,7 @@ def test_nodes_of_several_traces_are_distinct(label: str, store: Store) -> None:
     )
 
 
-def test_two_variables_are_told_apart_together(store: Store) -> None:
+def test_two_variables_are_distinguished_by_trace(store: Store) -> None:
     rows = store.find(
         "MATCH (a:Car)-[:isIn]->(l:Lane) RETURN trace.name, trace.map, a.id, l.id"
     ).rows()
@@ -109,7 +109,7 @@ def test_two_variables_are_told_apart_together(store: Store) -> None:
     )
 
 
-def test_samples_are_taken_of_each_entity(store: Store) -> None:
+def test_sample_per_entity(store: Store) -> None:
     entities = {entity(*row) for row in matched(store, "%")}
     present = store.find("MATCH (v) RETURN v, INTERVALS SAMPLE 1 PER v").rows()
 
@@ -120,7 +120,7 @@ def test_samples_are_taken_of_each_entity(store: Store) -> None:
     assert Counter(row[-1] for row in present) == Counter(node for _, node in entities)
 
 
-def test_sequences_tell_entities_apart(store: Store) -> None:
+def test_sequences_distinguish_entities(store: Store) -> None:
     text = f"{MOVES} {WEST}"
     rows = store.find(text.format("trace.name, v.id")).rows()
 
@@ -133,14 +133,14 @@ def test_sequences_tell_entities_apart(store: Store) -> None:
     assert len(store.find(text.format("DISTINCT v")).rows()) == len(set(rows))
 
 
-def test_what_says_the_trace_tells_apart_by_itself(store: Store) -> None:
+def test_returned_trace_distinguishes_nodes(store: Store) -> None:
     for told in ("trace.name", "trace.id", "frame.id"):
         rows = store.find(f"MATCH (v:Car) RETURN {told} AS t, v.id").rows()
         found = store.find(f"MATCH (v:Car) RETURN {told} AS t, v, COUNT(*)").rows()
         assert Counter({row[:2]: row[2] for row in found}) == Counter(rows)
 
 
-def test_the_other_faces_count_the_same(
+def test_cli_and_sandbox_counts_equal_python(
     store: Store, path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = "MATCH (v) RETURN COUNT(DISTINCT v) AS many"
@@ -157,7 +157,7 @@ def test_the_other_faces_count_the_same(
 # Samples and their order
 
 
-def test_a_sample_is_the_first_by_the_order(store: Store) -> None:
+def test_sample_is_first_in_order(store: Store) -> None:
     rows = store.find("MATCH (v:Vehicle) RETURN trace.name, v.x AS x ORDER BY x DESC").rows()
     for direction, end in (("DESC", 1), ("", -1)):
         found = store.find(
@@ -168,7 +168,7 @@ def test_a_sample_is_the_first_by_the_order(store: Store) -> None:
             assert [x for name, x in found if name == trace] == wanted
 
 
-def test_a_sample_of_intervals_is_the_first_by_the_order(store: Store) -> None:
+def test_interval_sample_is_first_in_order(store: Store) -> None:
     text = "MATCH (v:Vehicle) RETURN v, INTERVALS ORDER BY frames DESC"
     whole = store.find(text).rows()
     found = store.find(f"{text} SAMPLE 2 PER trace").rows()
@@ -178,7 +178,7 @@ def test_a_sample_of_intervals_is_the_first_by_the_order(store: Store) -> None:
         assert [row[7] for row in found if row[0] == trace] == wanted
 
 
-def test_a_sample_without_an_order_is_any_and_always_the_same(store: Store) -> None:
+def test_sample_without_order_is_repeatable(store: Store) -> None:
     text = "MATCH (v:Vehicle) RETURN frame.id AS id, v SAMPLE 2 PER trace.name"
     whole = store.find("MATCH (v:Vehicle) RETURN frame.id AS id, v").rows()
 
@@ -215,7 +215,7 @@ PLACES = {
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_where_the_ego_is_named_others_are_not_the_ego(place: str, store: Store) -> None:
+def test_other_nodes_are_not_the_named_ego(place: str, store: Store) -> None:
     told = "frame.id AS f, v.id AS who"
     text = PLACES[place]
     text = text.format(told) if "{}" in text else f"{text} RETURN {told}"
@@ -237,7 +237,7 @@ def test_where_the_ego_is_named_others_are_not_the_ego(place: str, store: Store)
     assert store.find("MATCH (v:Car) RETURN frame.id AS f, v.id AS who").rows() != wanted
 
 
-def test_the_ego_that_has_a_label_is_the_one_that_is_named(store: Store) -> None:
+def test_labelled_ego_is_the_named_ego(store: Store) -> None:
     rows = store.find("MATCH (e:Ego) RETURN frame.id, e.id, ego.id, ego.speed, e.speed").rows()
 
     assert len(rows) == store.find("MATCH (e:Ego)").count()
@@ -312,7 +312,7 @@ def is_a(label: str, node: dict[str, Any]) -> bool:
     [(place, "") for place in LISTED]
     + [(place, "hero2") for place in ("labelled, at the other end", "alone", "not in the pattern")],
 )
-def test_the_values_of_the_ego_are_those_of_every_match(
+def test_ego_values_are_equal_in_every_match(
     place: str, hero: str, store: Store, world: World
 ) -> None:
     match = f"USING EGO '{hero}' MATCH {LISTED[place]}" if hero else f"MATCH {LISTED[place]}"
@@ -373,7 +373,7 @@ MOVES, WEST = "MATCH (v:Vehicle) WHERE v.speed > 0", "THEN MATCH (v) WHERE v.x <
         f"{MOVES} THEN NOT MATCH (v)-[:near]->(ego) {WEST}",
     ],
 )
-def test_of_sequences_too(text: str, store: Store) -> None:
+def test_other_nodes_in_sequences_are_not_the_ego(text: str, store: Store) -> None:
     told = "trace.name AS t, v.id AS who"
     whole = store.find(f"{text.partition(' THEN')[0]} RETURN DISTINCT {told}").rows()
     matches = store.find(text.format(told))
@@ -387,7 +387,7 @@ def test_of_sequences_too(text: str, store: Store) -> None:
     assert rows <= set(whole)
 
 
-def test_an_ego_that_is_only_returned_costs_no_more_than_one_that_is_matched(store: Store) -> None:
+def test_returned_ego_costs_no_more_than_matched_ego(store: Store) -> None:
     for pattern in ("(a)", "(a)-[:near]->(b)", "(a), (b:Lane)"):
         one = store.find(f"MATCH {pattern}, (e:Ego) RETURN frame.id, a.id, e.x").rows()
         other = store.find(f"MATCH {pattern} RETURN frame.id, a.id, ego.x").rows()
@@ -397,7 +397,7 @@ def test_an_ego_that_is_only_returned_costs_no_more_than_one_that_is_matched(sto
 # Names behind AS
 
 
-def test_an_alias_wins_over_a_variable_of_its_name(store: Store) -> None:
+def test_alias_hides_variable(store: Store) -> None:
     speeds = [s for (s,) in store.find("MATCH (w:Car) RETURN w.speed").rows() if s is not None]
 
     def ordered(order: str) -> list[float]:
@@ -411,7 +411,7 @@ def test_an_alias_wins_over_a_variable_of_its_name(store: Store) -> None:
     assert ordered("abs(v - 5), v") == sorted(speeds, key=lambda s: (abs(s - 5), s))
 
 
-def test_an_alias_wins_in_samples_and_intervals(store: Store) -> None:
+def test_alias_hides_variable_in_samples_and_intervals(store: Store) -> None:
     kinds = {kind for (kind,) in store.find("MATCH (v:Vehicle) RETURN DISTINCT v.kind").rows()}
 
     rows = store.find("MATCH (v:Vehicle) RETURN v.kind AS v, frame.id AS f SAMPLE 1 PER v").rows()
@@ -436,7 +436,7 @@ def test_an_alias_wins_in_samples_and_intervals(store: Store) -> None:
         (r"'(car|truck)\x20\d'", r"(car|truck)\x20\d"),
     ],
 )
-def test_a_regular_expression_keeps_its_backslashes(written: str, means: str, store: Store) -> None:
+def test_regular_expression_keeps_backslashes(written: str, means: str, store: Store) -> None:
     names = [name for (name,) in store.find("MATCH (v) RETURN DISTINCT v.name AS name").rows()]
 
     rows = store.find(f"MATCH (v) WHERE v.name =~ {written} RETURN DISTINCT v.name AS name").rows()
@@ -456,7 +456,7 @@ def test_a_regular_expression_keeps_its_backslashes(written: str, means: str, st
         (r"'50\%'", r"50\%"),
     ],
 )
-def test_what_a_backslash_means_in_a_text(written: str, means: str, store: Store) -> None:
+def test_backslash_in_text(written: str, means: str, store: Store) -> None:
     (row,) = store.find(f"MATCH (e:Ego) RETURN {written} AS text LIMIT 1").rows()
 
     assert row == (means,)

@@ -72,7 +72,7 @@ def found(text: str, world: World) -> Counter[tuple[Any, ...]]:
 
 
 @pytest.mark.parametrize("first", [0, 100] if LONG else [0])
-def test_random_patterns_find_in_memory_what_exhaustive_search_finds(first: int) -> None:
+def test_random_patterns_in_memory_equal_exhaustive_search(first: int) -> None:
     tried = matched = 0
     for number in range(first, first + 50):
         if number % 25 == 0:
@@ -97,7 +97,7 @@ def small_world() -> World:
 
 
 @pytest.mark.parametrize("text", QUERIES)
-def test_queries_find_in_memory_what_exhaustive_search_finds(text: str) -> None:
+def test_queries_in_memory_equal_exhaustive_search(text: str) -> None:
     world = small_world()
 
     assert found(text, world) == answer(text, world)[0]
@@ -123,7 +123,7 @@ def asked_again(query: Query, parts: tuple[str, ...], frame: Frame, world: World
     return Matcher(again).holds(view_of(frame))
 
 
-def test_whatever_is_found_instead_can_be_pasted() -> None:
+def test_suggested_text_can_be_pasted() -> None:
     asked = 0
     for number in range(100):
         if number % 25 == 0:
@@ -141,7 +141,7 @@ def test_whatever_is_found_instead_can_be_pasted() -> None:
     assert asked > 500
 
 
-def test_what_fails_is_named_exactly_where_nothing_matches() -> None:
+def test_failed_part_is_named_exactly_without_match() -> None:
     failed = held = 0
     for number in range(60):  # what is said is a query again, with what holds and with what fails
         if number % 20 == 0:
@@ -182,7 +182,7 @@ def test_what_fails_is_named_exactly_where_nothing_matches() -> None:
         ("MATCH (e:Ego)-[:safety_hazard]->(v:Bus)", "(e)-[:safety_hazard]->(v)", "dist(e, v) = "),
     ],
 )
-def test_the_first_part_that_fails_is_shown_with_what_is_there(
+def test_first_failed_part_is_shown_with_actual_values(
     town: Store, text: str, failed: str, found: str
 ) -> None:
     answer = town.why_not("town@20s", text)
@@ -192,14 +192,14 @@ def test_the_first_part_that_fails_is_shown_with_what_is_there(
     assert answer.held[0] == "(e:Ego)"
 
 
-def test_a_case_that_fails_is_told_as_it_is_written(town: Store) -> None:
+def test_failed_case_is_shown_as_written(town: Store) -> None:
     case = "CASE WHEN e.speed < 1 THEN 'slow' WHEN e.speed < 2 THEN 'walk' ELSE 'fast' END = 'none'"
     answer = town.why_not("town@20s", f"MATCH (e:Ego) WHERE {case}")
 
     assert answer.failed == case
 
 
-def test_the_nearest_is_the_one_that_misses_by_the_least(town: Store) -> None:
+def test_nearest_match_has_smallest_shortfall(town: Store) -> None:
     answer = town.why_not("town@20s", "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 1")
     distances = town.sql(
         "SELECT p.distance, n.name FROM pairs p JOIN frames f USING (frame_id)"
@@ -213,7 +213,7 @@ def test_the_nearest_is_the_one_that_misses_by_the_least(town: Store) -> None:
     assert answer.found == f"dist(e, v) = {least:.4g}"
 
 
-def test_what_a_trace_cannot_answer_is_said(tmp_path: Path) -> None:
+def test_unanswerable_trace_is_reported(tmp_path: Path) -> None:
     with Recorder(tmp_path / "field.mcap") as recorder:
         recorder.ground_truth(0.0, [car(1, 0, 0), car(2, 9, 0)], host=1)
     assert ingest(tmp_path / "s.sgstore", [tmp_path / "field.mcap"])[0].error is None
@@ -247,7 +247,7 @@ def scenes(town: Store) -> list[tuple[FrameRef, SceneGraph]]:
         "MATCH (a:Car)-[d:near|very_near]->(b:Person) WHERE abs(rel_heading(a, b)) > 60",
     ],
 )
-def test_a_graph_of_the_store_gives_in_memory_what_sql_gives(
+def test_stored_graph_in_memory_equals_sql(
     town: Store, scenes: list[tuple[FrameRef, SceneGraph]], text: str
 ) -> None:
     matches = town.find(text)
@@ -266,7 +266,7 @@ def _sorted(rows: list[Any]) -> list[list[tuple[str, int]]]:
     )
 
 
-def test_the_class_of_a_frame_is_asked_for_only_where_a_query_asks_and_once() -> None:
+def test_frame_class_is_computed_once_and_only_if_used() -> None:
     asked: list[str] = []
 
     def classes(name: str) -> str:
@@ -289,7 +289,7 @@ def test_the_class_of_a_frame_is_asked_for_only_where_a_query_asks_and_once() ->
 
 
 @pytest.mark.parametrize("shape", ["1 / ({} + 1)", "7 % ({} + 1)", "sqrt({} + 1)", "pow({}, 1)"])
-def test_operators_in_one_another_are_planned_at_once(town: Store, shape: str) -> None:
+def test_nested_operators_are_planned_together(town: Store, shape: str) -> None:
     deep, of_nothing = "e.speed", "e.speed * 0 - 1"
     for _ in range(16):
         deep, of_nothing = shape.format(deep), shape.format(of_nothing)

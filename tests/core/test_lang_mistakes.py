@@ -35,12 +35,12 @@ def sql(text: str, **parameters: object) -> str:
         "MATCH (a:Car) WHERE a.speed > 3 AND (a)-->(b)",
     ],
 )
-def test_an_edge_that_is_misspelt_is_not_dropped_as_a_comment(text: str) -> None:
+def test_misspelt_edge_is_not_a_comment(text: str) -> None:
     assert refused(text).span is not None
 
 
 @pytest.mark.parametrize("blank", ["", " ", "  ", "\t"])
-def test_an_edge_of_two_dashes_may_have_blanks_around_it(blank: str) -> None:
+def test_edge_of_two_dashes_may_have_blanks(blank: str) -> None:
     assert sql(f"MATCH (a:Car){blank}--{blank}(b:Car)") == sql("MATCH (a:Car)--(b:Car)")
 
 
@@ -49,7 +49,7 @@ def test_comments_stay_comments(comment: str) -> None:
     assert sql(f"MATCH (a:Car){comment}") == sql("MATCH (a:Car)")
 
 
-def test_the_ego_by_its_name_is_the_ego_whatever_it_is_labelled() -> None:
+def test_node_named_ego_is_the_ego_with_any_label() -> None:
     inside = "MATCH (p:Person) WHERE EXISTS {{(ego:{})-[:near]->(p)}}"
 
     assert sql("MATCH (ego:Car)-[:near]->(p:Person)") == sql(
@@ -59,35 +59,35 @@ def test_the_ego_by_its_name_is_the_ego_whatever_it_is_labelled() -> None:
     assert "no node" in refused("MATCH (ego:Lane)").reason
 
 
-def test_a_label_or_a_relation_without_its_colon_is_no_name() -> None:
+def test_label_without_colon_is_not_a_name() -> None:
     assert "(:Car)" in str(refused("MATCH (Car)"))
     assert "-[:near]->" in str(refused("MATCH (a)-[near]->(b)"))
     assert sql("MATCH (car)-[near:near]->(b)")
     assert sql("MATCH (Car:Car)-[:near]->(b), (Car)-[:near]->(c)")
 
 
-def test_what_is_counted_is_counted_with_distinct_as_without() -> None:
+def test_count_is_equal_with_and_without_distinct() -> None:
     query = "MATCH (e:Ego)-[:near]->(p:Person) RETURN {} p.name AS who, COUNT(*) AS n, AVG(p.speed)"
 
     assert sql(query.format("DISTINCT")) == sql(query.format(""))
 
 
 @pytest.mark.parametrize("text", ["[[:alpha:]]+", "[[a]", "[a&&b]", "[a--b]", "[a||b]", "[a~~b]"])
-def test_a_set_in_a_set_is_refused_because_two_engines_read_it_differently(text: str) -> None:
+def test_nested_regex_set_is_refused(text: str) -> None:
     assert "a set in a set" in refused(f"MATCH (v:Car) WHERE v.ident =~ '{text}'").reason
     escaped = text[0] + text[1:].replace("[", r"\\[")
     if "[[" in text:
         assert sql(f"MATCH (v:Car) WHERE v.ident =~ '{escaped}'")
 
 
-def test_a_list_is_no_value_that_a_row_may_have() -> None:
+def test_list_is_not_a_row_value() -> None:
     error = refused("MATCH (a:Car) RETURN a.speed, [1, 2] AS both")
 
     assert error.reason == "a list cannot be returned"
     assert error.span is not None
 
 
-def test_only_a_value_can_have_been_another_one_before() -> None:
+def test_prev_takes_only_values() -> None:
     error = refused("MATCH (v:Vehicle) WHERE prev(v) = 3")
 
     assert error.reason == "prev() takes a value, not a node"
@@ -96,18 +96,18 @@ def test_only_a_value_can_have_been_another_one_before() -> None:
 
 
 @pytest.mark.parametrize("form", ["INTERVALS", "CLIPS(-1s, +1s)", "p.id, INTERVALS"])
-def test_intervals_are_distinct_as_they_are(form: str) -> None:
+def test_intervals_are_distinct(form: str) -> None:
     query = "MATCH (e:Ego)-[:near]->(p:Person) RETURN {} {} SAMPLE 3"
 
     assert sql(query.format("DISTINCT", form)) == sql(query.format("", form))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 10**400])
-def test_a_parameter_is_a_number_that_a_text_could_hold(value: float) -> None:
+def test_parameter_is_limited_to_numbers_of_the_language(value: float) -> None:
     assert "expected a number" in refused("MATCH (e:Ego) WHERE e.speed > $v", v=value).reason
 
 
-def test_a_whole_number_that_is_too_large_for_the_database_is_a_number_all_the_same() -> None:
+def test_integer_too_large_for_the_database_is_a_number() -> None:
     statement = compile_query("MATCH (e:Ego) WHERE e.speed > $v", CATALOG, {"v": 2**70}).rows()
 
     assert 2.0**70 in statement.values
@@ -128,7 +128,7 @@ def test_a_whole_number_that_is_too_large_for_the_database_is_a_number_all_the_s
         ("one\r\ntwo\u2028 bad\r\nthree", "  two  bad ", "       ^^^"),
     ],
 )
-def test_carets_stand_below_what_is_wrong(text: str, line: str, carets: str) -> None:
+def test_carets_mark_the_error(text: str, line: str, carets: str) -> None:
     start = text.index("bad")
 
     message = str(QueryError("no", text=text, span=TextSpan(start, start + 3)))
@@ -137,7 +137,7 @@ def test_carets_stand_below_what_is_wrong(text: str, line: str, carets: str) -> 
 
 
 @pytest.mark.parametrize("at", [0, 70, 5_000, 9_990])
-def test_of_a_long_line_what_is_around_the_mistake_is_shown(at: int) -> None:
+def test_long_line_is_cut_around_the_error(at: int) -> None:
     text = "x " * 5_000
     text = f"{text[:at]}bad {text[at:]}"
 
@@ -147,7 +147,7 @@ def test_of_a_long_line_what_is_around_the_mistake_is_shown(at: int) -> None:
     assert line[carets.index("^") : carets.index("^") + 3] == "bad"
 
 
-def test_what_was_found_is_told_in_short_and_so_that_it_can_be_seen() -> None:
+def test_unexpected_text_is_short_and_visible() -> None:
     assert "U+0000" in refused("MATCH (e:Ego)\0").reason
     assert "U+200B" in refused("MATCH (e:Ego)\u200b").reason
     assert len(refused(f"MATCH (e:Ego) {'x' * 50_000}").reason) < 200
@@ -156,7 +156,7 @@ def test_what_was_found_is_told_in_short_and_so_that_it_can_be_seen() -> None:
 # For people ---------------------------------------------------------------------------------------
 
 
-def test_what_was_asked_for_by_name_is_not_left_out_for_people() -> None:
+def test_named_columns_are_displayed() -> None:
     columns = ("frame_id", "trace", "seq", "time_ns", "t", "v", "v.name", "p.id", "q.name")
 
     shown, rows = for_people(
@@ -167,7 +167,7 @@ def test_what_was_asked_for_by_name_is_not_left_out_for_people() -> None:
     assert list(rows) == [("a#3", 0.123, "car 5", 8, "car 9")]
 
 
-def test_intervals_for_people_begin_with_their_first_frame() -> None:
+def test_displayed_intervals_begin_with_first_frame() -> None:
     columns = (
         "trace",
         "start_seq",
@@ -205,12 +205,12 @@ DIGITS = "9" * 400
         f"MATCH (e:Ego) RETURN CLIPS(-{DIGITS}s, +1s)",
     ],
 )
-def test_a_number_or_a_time_of_400_digits_is_refused_where_it_stands(text: str) -> None:
+def test_number_of_400_digits_is_refused_at_its_place(text: str) -> None:
     error = refused(text)
 
     assert str(error).startswith(("too large a number", "no length of time"))
 
 
 @pytest.mark.parametrize("value", [10**400, 1e300, -1e300, f"{DIGITS}s", f"{DIGITS}frames"])
-def test_a_parameter_that_is_no_length_of_time_of_a_trace_is_refused(value: object) -> None:
+def test_parameter_with_invalid_duration_is_refused(value: object) -> None:
     assert "no length of time" in str(refused("MATCH (e:Ego) FOR >= $p", p=value))

@@ -11,14 +11,14 @@ pytestmark = pytest.mark.seconds(8)
 
 
 @pytest.mark.parametrize("first", [0, 100, 200] if LONG else [0])
-def test_random_patterns_find_what_exhaustive_search_finds(first: int) -> None:
+def test_random_patterns_equal_exhaustive_search(first: int) -> None:
     seen = try_many(first, 100)
 
     assert seen["tried"] > 80
     assert seen["matched"] > 20
 
 
-def test_several_processes_try_what_one_tries(capsys: pytest.CaptureFixture[str]) -> None:
+def test_several_processes_try_the_same_patterns(capsys: pytest.CaptureFixture[str]) -> None:
     count = 60 if LONG else 30
     seen = tried(0, count, jobs=2)
 
@@ -121,7 +121,7 @@ QUERIES = [
 
 
 @pytest.mark.parametrize("text", QUERIES)
-def test_queries_find_what_exhaustive_search_finds(text: str, world: World) -> None:
+def test_queries_equal_exhaustive_search(text: str, world: World) -> None:
     problem, frames = disagreement(text, world)
 
     assert problem == ""
@@ -142,14 +142,12 @@ def test_queries_find_what_exhaustive_search_finds(text: str, world: World) -> N
         "MATCH (a:Car) WHERE NOT EXISTS {(:Lane)<-[:isIn]-(a), (ego)}",
     ],
 )
-def test_the_ego_after_return_is_the_node_that_has_its_label(
-    text: str, returned: str, world: World
-) -> None:
+def test_ego_after_return_is_the_labelled_node(text: str, returned: str, world: World) -> None:
     problem, rows = disagreement_of_results(f"{text} RETURN {returned}", world)
 
     assert problem == ""
     assert rows
 
 
-def test_most_of_these_queries_have_matches() -> None:
+def test_most_queries_have_matches() -> None:
     assert sum(frames > 0 for frames in FOUND.values()) >= len(FOUND) - 2

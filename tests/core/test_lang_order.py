@@ -40,7 +40,7 @@ def order(text: str) -> list[str]:
     return re.findall(r'"edge" AS "#\d+:(\w+)"', text)
 
 
-def test_the_order_follows_the_counts_and_the_answer_does_not(world: World) -> None:
+def test_edge_order_follows_counts_without_changing_results(world: World) -> None:
     found: dict[tuple[str, ...], list[tuple[int, ...]]] = {}
     for rare, more, most in permutations(RELATIONS):
         counts = {rare: 1, more: 100, most: 10_000}
@@ -55,7 +55,7 @@ def test_the_order_follows_the_counts_and_the_answer_does_not(world: World) -> N
     assert all(rows == first for rows in others)
 
 
-def test_a_rare_edge_waits_for_one_that_leads_to_it(world: World) -> None:
+def test_rare_edge_follows_a_connected_edge(world: World) -> None:
     """After the rarest comes the rarest that is connected, lest everything be joined with everything."""
     text = (
         "MATCH (a:Car)-[:near]->(b)-[:visible]->(c)-[:inDFrontOf]->(d) RETURN frame.id, a, b, c, d"
@@ -67,7 +67,7 @@ def test_a_rare_edge_waits_for_one_that_leads_to_it(world: World) -> None:
     assert order(statement.sql) == ["near", "visible", "inDFrontOf"]
 
 
-def test_the_catalog_of_a_store_counts_its_rows_exactly(world: World) -> None:
+def test_catalog_counts_rows_exactly(world: World) -> None:
     catalog = catalog_of(world.connection)
 
     for table, counts in (("edge", catalog.edges), ("map_edge", catalog.map_edges)):
@@ -88,7 +88,7 @@ PATHS = [
 
 
 @pytest.mark.parametrize("text", PATHS)
-def test_paths_begin_where_other_edges_lead_and_find_the_same(
+def test_paths_start_at_bound_nodes_without_changing_results(
     text: str, world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def rows() -> tuple[str, list[tuple[object, ...]]]:
@@ -105,7 +105,7 @@ def test_paths_begin_where_other_edges_lead_and_find_the_same(
     assert disagreement(text, world)[0] == ""
 
 
-def test_paths_are_looked_for_in_traces_that_can_answer(world: World) -> None:
+def test_paths_are_searched_in_answerable_traces(world: World) -> None:
     text = PATHS[0]
     silent, *others = world.catalog.traces
     catalog = replace(world.catalog, traces=(replace(silent, answers=frozenset()), *others))

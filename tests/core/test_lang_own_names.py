@@ -35,7 +35,7 @@ def told(text: str) -> list[Any]:
 
 
 @pytest.mark.parametrize("pattern", SEQUENCES, ids=lambda one: one.name)
-def test_a_pattern_of_the_library_with_other_names_is_its_text_with_other_names(
+def test_renamed_library_pattern_equals_renamed_text(
     pattern: Any,
 ) -> None:
     outside = pattern.query
@@ -87,7 +87,7 @@ THEN MATCH (e), ({0}) WHERE dist(e, {0}) > 1 AS {3}"""
         ),
     ],
 )
-def test_a_scenario_finds_what_its_text_finds(
+def test_scenario_equals_its_text(
     steps: str, spelled: list[tuple[str, int, str, str]], values: str, store: Store
 ) -> None:
     text = " THEN ".join(SPELLED.format(*one) for one in spelled)
@@ -98,7 +98,7 @@ def test_a_scenario_finds_what_its_text_finds(
     assert found
 
 
-def test_what_braces_bind_is_nobody_elses(store: Store) -> None:
+def test_names_in_braces_are_local(store: Store) -> None:
     """A scenario asks that there be no person, whatever the text around it calls ``x``."""
     asked = f"{PASSING} MATCH (x:Car) THEN WITHIN 0.3s MATCH passing(v = a) RETURN trace.name, x, a"
     text = f"MATCH (x:Car) THEN WITHIN 0.3s {SPELLED.format('a', 3, 'begun', 'over')}"
@@ -109,7 +109,7 @@ def test_what_braces_bind_is_nobody_elses(store: Store) -> None:
     assert found
 
 
-def test_a_name_of_a_parameter_wins_over_that_of_a_variable() -> None:
+def test_parameter_name_hides_variable() -> None:
     text = "DEFINE SCENARIO fast(v = 3) AS MATCH (v:Car) WHERE v.speed > $v; MATCH fast(v = {})"
 
     assert "v.speed > 5" in str(told(text.format(5)))

@@ -55,7 +55,7 @@ NO_SENTENCES = [
 ]
 
 
-def test_the_tables_that_are_shipped_are_those_of_the_grammar() -> None:
+def test_shipped_tables_match_the_grammar() -> None:
     kept = LANG.joinpath(tables.TABLES).read_text(encoding="utf-8")
 
     made = tables.text_of(tables.made_from(GRAMMAR))
@@ -63,7 +63,7 @@ def test_the_tables_that_are_shipped_are_those_of_the_grammar() -> None:
     assert kept == made, "run: python -m sgstore.lang.syntax._tables"
 
 
-def test_every_rule_of_the_grammar_has_a_builder_and_every_builder_a_rule() -> None:
+def test_grammar_rules_and_builders_match() -> None:
     names = {rule.name for rule in tables.tables().rules if not rule.name.startswith("_")}
     inlined = {rule.name for rule in tables.tables().rules if rule.inline}
 
@@ -72,14 +72,14 @@ def test_every_rule_of_the_grammar_has_a_builder_and_every_builder_a_rule() -> N
 
 
 @pytest.mark.parametrize("text", SENTENCES)
-def test_a_sentence_is_parsed_by_ours_and_by_larks_parser(text: str) -> None:
+def test_lark_accepts_every_accepted_text(text: str) -> None:
     lark().parse(text)
 
     assert parse(text)
 
 
 @pytest.mark.parametrize("text", NO_SENTENCES)
-def test_what_is_no_sentence_is_refused_by_ours_and_by_larks_parser(text: str) -> None:
+def test_lark_refuses_every_refused_text(text: str) -> None:
     with pytest.raises(UnexpectedInput):
         lark().parse(text)
     with pytest.raises(QuerySyntaxError):
@@ -87,7 +87,7 @@ def test_what_is_no_sentence_is_refused_by_ours_and_by_larks_parser(text: str) -
 
 
 @pytest.mark.data
-def test_every_example_of_the_proposed_language_is_a_sentence(data: Path) -> None:
+def test_every_example_is_accepted(data: Path) -> None:
     proposal = data.parent / "reference" / "applications.md"
     if not proposal.is_file():
         pytest.skip("the proposal is not there")
@@ -98,7 +98,7 @@ def test_every_example_of_the_proposed_language_is_a_sentence(data: Path) -> Non
     assert len(statements) > 100
 
 
-def test_keywords_are_words_where_a_keyword_cannot_stand() -> None:
+def test_keyword_is_a_name_at_other_places() -> None:
     (match,) = parse("match (limit:Car) where limit.frames > 3 return limit.match as match")
 
     assert isinstance(match, s.MatchClause)
@@ -107,7 +107,7 @@ def test_keywords_are_words_where_a_keyword_cannot_stand() -> None:
     assert match.returns.items[0].name == "match"
 
 
-def test_comments_are_no_edges_and_edges_no_comments() -> None:
+def test_comments_and_edges_are_distinguished() -> None:
     (match,) = parse("MATCH (a)--(b)-->(c)<--(d) -- a comment (e)\n, (f) /* and\n(g) */ , (h) --")
 
     assert isinstance(match, s.MatchClause)
@@ -115,7 +115,7 @@ def test_comments_are_no_edges_and_edges_no_comments() -> None:
     assert [e.direction for e in match.block.paths[0].edges] == ["any", "right", "left"]
 
 
-def test_arithmetic_binds_as_in_school() -> None:
+def test_operator_precedence() -> None:
     (match,) = parse("MATCH (a) WHERE 1 + 2 * 3 - -4 = 11 AND TRUE OR NOT FALSE AND TRUE")
 
     assert isinstance(match, s.MatchClause)
@@ -129,7 +129,7 @@ def test_arithmetic_binds_as_in_school() -> None:
     assert [sign for sign, _ in comparison.left.rest] == ["+", "-"]
 
 
-def test_texts_keep_what_is_escaped() -> None:
+def test_texts_keep_escaped_characters() -> None:
     (match,) = parse(r"""MATCH (a) WHERE a.name IN ['it\'s', "a\"b", 'c\\d', 'e\nf']""")
 
     assert isinstance(match, s.MatchClause)
@@ -170,7 +170,7 @@ def test_depth_and_length_are_bounded(text: str) -> None:
         parse(text)
 
 
-def test_many_terms_in_a_row_are_no_nesting() -> None:
+def test_many_terms_are_not_nested() -> None:
     text = "MATCH (a) WHERE " + " AND ".join(["1 + 1 + 1 = 3"] * 2000)
 
     (match,) = parse(text)
@@ -180,7 +180,7 @@ def test_many_terms_in_a_row_are_no_nesting() -> None:
     assert len(match.block.where.operands) == 2000
 
 
-def test_a_tree_is_printed_without_places() -> None:
+def test_tree_is_printed_without_spans() -> None:
     printed = tree_text(parse("MATCH (e:Ego) WHERE e.speed > 3")[0])
 
     assert "NodePattern name='e'" in printed

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @pytest.mark.parametrize("first", range(0, 600, 50) if LONG else [50])
-def test_random_queries_find_what_their_definition_says(first: int) -> None:
+def test_random_queries_equal_their_definition(first: int) -> None:
     seen = try_many_parts(first, 50 if LONG else 25)
 
     assert seen["tried"] > 15
@@ -55,7 +55,7 @@ WIDE = "{(c:Ego) WHERE v.x > 101 OR EXISTS {(d) WHERE c.width IS KNOWN OR w.x > 
         f"MATCH p = (v)-[:near*1..2]-(w) WHERE EXISTS {WIDE} OR length(p) = 1 RETURN v, w",
     ],
 )
-def test_parts_are_what_their_definition_says(text: str, world: World) -> None:
+def test_stages_equal_their_definition(text: str, world: World) -> None:
     problem, rows = disagreement_of_parts(f"MATCH (v:Entity) {text}", world)
 
     assert problem == ""
@@ -79,7 +79,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
         yield opened
 
 
-def test_what_is_absent_is_null_in_every_form(store: Store, tmp_path: Path) -> None:
+def test_absent_node_is_null_in_every_form(store: Store, tmp_path: Path) -> None:
     text = "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 30"
     matches = store.find(text)
 
@@ -100,7 +100,7 @@ def test_what_is_absent_is_null_in_every_form(store: Store, tmp_path: Path) -> N
     assert store.find(f"{text} RETURN DISTINCT v").rows() == [(3,), (None,)]
 
 
-def test_matches_are_listed_once_whatever_is_not_passed_on(world: World) -> None:
+def test_matches_are_listed_once_after_with(world: World) -> None:
     for text in (
         "USING NODES any MATCH p = (a)-[:near*1..2]->(b) WITH b, a",
         "MATCH (v:Entity) WITH v.kind AS k, v.id AS i, COUNT(*) AS n WITH k",
@@ -108,7 +108,7 @@ def test_matches_are_listed_once_whatever_is_not_passed_on(world: World) -> None
         assert disagreement_of_matches(text, world)[0] == ""
 
 
-def test_with_counts_and_chooses_in_each_frame(store: Store) -> None:
+def test_with_counts_and_filters_in_each_frame(store: Store) -> None:
     counted = "MATCH (e:Ego), (v:Car) WITH e, COUNT(v) AS many WHERE many > 2"
     nearest = "MATCH (e:Ego), (v:Car) WITH e, v ORDER BY dist(e, v) DESC LIMIT 1"
 
@@ -120,7 +120,7 @@ def test_with_counts_and_chooses_in_each_frame(store: Store) -> None:
     assert [len(row.names) for row in listed] == [3, 4]
 
 
-def test_a_shell_shows_what_is_absent(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+def test_shell_prints_absent_nodes(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     text = "MATCH (e:Ego) WHERE frame.seq IN [9, 10] OPTIONAL MATCH (v:Car) WHERE v.x > 45 RETURN v.name AS v"
 
     assert run_verb(["find", str(store.file.path), text, "--json"]) == 0
@@ -140,7 +140,7 @@ def test_paths_are_lists_of_nodes_in_every_form(store: Store, tmp_path: Path) ->
     assert json.loads(json.dumps([list(row) for row in found]))[-1] == [[0, 1, 2, 3], 3]
 
 
-def test_why_not_and_explain_speak_of_the_parts(store: Store) -> None:
+def test_why_not_and_explain_name_the_stages(store: Store) -> None:
     text = (
         "MATCH (e:Ego) WHERE e.speed > 20 OPTIONAL MATCH (v:Car) WITH e, COUNT(v) AS n WHERE n > 1"
     )
@@ -151,7 +151,7 @@ def test_why_not_and_explain_speak_of_the_parts(store: Store) -> None:
     assert "with each e, count(v) AS n\n  where (n > 1)" in explained
 
 
-def test_a_monitor_tells_when_rows_of_parts_begin() -> None:
+def test_monitor_reports_start_of_staged_matches() -> None:
     """Three cars stand behind one another; in the third frame one is gone, and one id returns far away."""
     monitor = Monitor(
         "MATCH (e:Ego) OPTIONAL MATCH (v:Car) WHERE v.x - e.x > 20;"

@@ -24,7 +24,7 @@ def store(open_town: Store) -> Store:
     return open_town
 
 
-def test_a_pattern_built_step_by_step_finds_what_its_text_finds(store: Store) -> None:
+def test_built_pattern_equals_its_text(store: Store) -> None:
     pattern = (
         Pattern()
         .node("e", "Ego")
@@ -40,7 +40,7 @@ def test_a_pattern_built_step_by_step_finds_what_its_text_finds(store: Store) ->
     assert len(rows) > 10
 
 
-def test_a_graph_drawn_in_networkx_finds_what_its_text_finds(store: Store) -> None:
+def test_networkx_pattern_equals_its_text(store: Store) -> None:
     graph = nx.DiGraph()
     graph.add_node("e", label="Ego")
     graph.add_node("lane", kind="lane", lane_type="driving")
@@ -51,7 +51,7 @@ def test_a_graph_drawn_in_networkx_finds_what_its_text_finds(store: Store) -> No
     assert store.find(graph).count() == store.find(TEXT).count() > 10
 
 
-def test_edges_of_a_graph_without_directions_run_either_way(store: Store) -> None:
+def test_undirected_graph_gives_undirected_edges(store: Store) -> None:
     graph = nx.MultiGraph()
     graph.add_nodes_from([(1, {"label": "Ego"}), (2, {"label": "Bus"})])
     graph.add_edge(2, 1, relation=["inDFrontOf", "atDRearOf"])
@@ -60,7 +60,7 @@ def test_edges_of_a_graph_without_directions_run_either_way(store: Store) -> Non
     assert store.find(graph).count() == store.find(text).count() > 0
 
 
-def test_a_frame_of_the_store_is_a_pattern_that_finds_it(store: Store) -> None:
+def test_example_frame_pattern_matches_its_frame(store: Store) -> None:
     graph = store.graph("town@20s")
     near = [n for n, d in graph.nodes(data=True) if d["kind"] == "bus" or d["is_ego"]]
     drawn = nx.MultiDiGraph()
@@ -83,12 +83,12 @@ def test_a_frame_of_the_store_is_a_pattern_that_finds_it(store: Store) -> None:
         lambda: str(Pattern()),
     ],
 )
-def test_what_cannot_stand_in_a_pattern_is_refused(build: Any) -> None:
+def test_invalid_pattern_parts_are_refused(build: Any) -> None:
     with pytest.raises(QueryError):
         build()
 
 
-def test_values_are_bound_and_never_written_into_the_text() -> None:
+def test_pattern_values_are_bound_parameters() -> None:
     pattern = Pattern().node("v", "Vehicle", special="x'; DROP TABLE inside.trace --")
 
     assert str(pattern) == "MATCH (v:Vehicle {special: $v_special})"

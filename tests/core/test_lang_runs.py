@@ -57,7 +57,7 @@ def walked(rows: Rows, joined: dict[int, int]) -> Runs:
 
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("gaps", [0.0, 0.02, 0.5])
-def test_runs_are_those_that_one_meets_from_frame_to_frame(seed: int, gaps: float) -> None:
+def test_runs_equal_frame_by_frame_definition(seed: int, gaps: float) -> None:
     rng = random.Random(seed)
     buckets = [(trace << 18) + n for trace in TRACES for n in range(6)]
     joined = {b: sum((rng.random() >= gaps) << bit for bit in range(60)) for b in buckets}
@@ -70,7 +70,7 @@ def test_runs_are_those_that_one_meets_from_frame_to_frame(seed: int, gaps: floa
     assert found(rows, joined) == walked(rows, joined)
 
 
-def test_a_run_that_lasts_for_many_buckets_is_one() -> None:
+def test_run_across_many_buckets_is_one_run() -> None:
     buckets = [(7 << 18) + n for n in range(40)]
     joined = dict.fromkeys(buckets, FULL) | {buckets[0]: FULL & ~1}
     rows: Rows = {(bucket, 1): FULL for bucket in buckets}

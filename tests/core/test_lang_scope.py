@@ -156,7 +156,7 @@ def in_graphs(rule: str) -> str:
         ("r_g1_safe_distance", "blocked"),
     ],
 )
-def test_a_safe_distance_is_violated_60_m_ahead(near: Store, name: str, trace: str) -> None:
+def test_safe_distance_is_violated_60_m_ahead(near: Store, name: str, trace: str) -> None:
     (found,) = (one for one in near.check(patterns()[name].text) if one.trace == trace)
     assert found.verdict == "false"
     assert found.first_violation is not None
@@ -166,7 +166,7 @@ def test_a_safe_distance_is_violated_60_m_ahead(near: Store, name: str, trace: s
     assert found.first_violation is None or found.first_violation.start_seq > 0
 
 
-def test_who_stops_behind_a_car_60_m_ahead_may(near: Store) -> None:
+def test_stop_behind_car_60_m_ahead_is_allowed(near: Store) -> None:
     text = patterns()["r_i1_stopping"].text
     assert verdict(near, "standing", text) == "true"
     graph = in_graphs(text)
@@ -177,9 +177,7 @@ CHECKS: Final = sorted(one.name for one in patterns().values() if one.is_check)
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_rules_say_the_same_of_a_world_and_of_a_graph_as_wide(
-    near: Store, wide: Store, name: str
-) -> None:
+def test_rules_in_world_equal_wider_graph(near: Store, wide: Store, name: str) -> None:
     text = patterns()[name].text
     assert verdicts(near, text) == verdicts(wide, text)
 
@@ -220,29 +218,25 @@ def rows(store: Store, text: str) -> list[tuple[Any, ...]]:
 
 
 @pytest.mark.parametrize("asked", ASKED)
-def test_a_pattern_finds_in_the_world_what_it_finds_in_a_graph_as_wide(
-    near: Store, wide: Store, asked: str
-) -> None:
+def test_pattern_in_world_equals_wider_graph(near: Store, wide: Store, asked: str) -> None:
     bound = re.findall(r"\((\w):", asked.partition(" WHERE ")[0])
     named = ", ".join(SHOWN[one] for one in bound if one in SHOWN)
     found = rows(near, f"USING SCOPE world MATCH {asked} RETURN {named}, FRAMES")
     assert found == rows(wide, f"MATCH {asked} RETURN {named}, FRAMES")
 
 
-def test_patterns_find_something_beyond_graphs(near: Store) -> None:
+def test_patterns_match_beyond_the_graph(near: Store) -> None:
     for asked in ASKED[:3]:
         assert rows(near, f"USING SCOPE world MATCH {asked}") != rows(near, f"MATCH {asked}")
 
 
 @pytest.mark.parametrize("asked", ASKED)
-def test_the_scope_of_a_pattern_is_the_graph(near: Store, alone: Store, asked: str) -> None:
+def test_default_scope_of_pattern_is_the_graph(near: Store, alone: Store, asked: str) -> None:
     text = f"MATCH {asked}"
     assert rows(near, text) == rows(alone, text) == rows(near, f"USING SCOPE graph {text}")
 
 
-def test_a_pattern_in_the_graph_is_the_same_statement_as_without_a_world(
-    near: Store, alone: Store
-) -> None:
+def test_graph_scope_gives_the_same_sql_without_world(near: Store, alone: Store) -> None:
     for asked in ASKED[:-1]:
         text = f"MATCH {asked}"
         emitted = (store.explain(text).partition("---- emit")[2] for store in (near, alone))
@@ -264,26 +258,26 @@ def test_a_pattern_in_the_graph_is_the_same_statement_as_without_a_world(
         "(v:Vehicle)-[:isIn]->(l:Lane)-[:travelsTo]->(m:Lane)",
     ],
 )
-def test_an_edge_of_a_pattern_is_one_of_the_graph_in_both_scopes(near: Store, edges: str) -> None:
+def test_pattern_edge_is_in_the_graph_in_both_scopes(near: Store, edges: str) -> None:
     text = f"MATCH {edges}"
     assert rows(near, text)
     assert rows(near, f"USING SCOPE world {text}") == rows(near, text)
 
 
-def test_who_is_asked_for_by_every_may_be_beyond_the_graph(near: Store) -> None:
+def test_quantified_entity_may_be_beyond_the_graph(near: Store) -> None:
     text = "CHECK c: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) > 60"
     assert verdict(near, "fast", text) == "false"
     assert verdict(near, "fast", f"USING SCOPE graph {text}") == "true"
 
 
-def test_relations_that_end_do_not_hold_beyond_the_graph(near: Store) -> None:
+def test_relations_with_limited_range_are_false_beyond_the_graph(near: Store) -> None:
     text = (
         "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) > 55 AND NOT EXISTS {(v)-[:near|overlaps]-(e)}"
     )
     assert rows(near, f"USING SCOPE world {text}")
 
 
-def test_an_abstraction_has_a_world_around_it(near: Store, wide: Store) -> None:
+def test_abstraction_has_world_scope(near: Store, wide: Store) -> None:
     asked = "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) > 55 RETURN v.name, FRAMES"
     text = f"USING SCOPE world, ABSTRACTION ER {asked}"
     found = rows(near, text)
@@ -326,21 +320,23 @@ def judged(folder: Path, text: str, limit: float) -> str:
         ("(dist(ego, v) > 50 OR EXISTS {(ego)-[:sees]->(v)})", "true"),
     ],
 )
-def test_a_relation_that_was_not_computed_beyond_the_graph_is_unknown(
+def test_uncomputed_relation_beyond_the_graph_is_unknown(
     tmp_path: Path, asked: str, expected: str
 ) -> None:
     text = f"CHECK c: FORALL (v:Vehicle) ALWAYS {asked}"
     assert judged(tmp_path, text, 50) == expected
 
 
-def test_nothing_is_beyond_a_graph(tmp_path: Path) -> None:
+def test_check_of_uncomputed_relation_is_unknown_in_world(tmp_path: Path) -> None:
     text = "CHECK c: FORALL (v:Vehicle) ALWAYS NOT EXISTS {(v)-[:sees]->(ego)}"
     assert judged(tmp_path, text, 50) == "unknown"
     assert judged(tmp_path, f"USING SCOPE graph {text}", 50) == "true"
 
 
 @pytest.mark.parametrize(("limit", "expected"), [(50, "false"), (200, "false")])
-def test_two_beyond_the_graph_are_near(tmp_path: Path, limit: float, expected: str) -> None:
+def test_two_entities_beyond_the_graph_can_be_near(
+    tmp_path: Path, limit: float, expected: str
+) -> None:
     rungs = "near|very_near|super_near|near_coll"
     text = f"CHECK c: ALWAYS NOT EXISTS {{(v:Vehicle)-[:{rungs}]->(w:Vehicle)}}"
     assert judged(tmp_path, text, limit) == expected
@@ -368,7 +364,7 @@ SEEN: Final = {name for name in CHECKS if "[:sees]" in patterns()[name].query}
 """Rules about what the ego sees, which is computed within graphs alone."""
 
 
-def test_rules_say_the_same_of_the_bundled_recording(tmp_path: Path) -> None:
+def test_rules_agree_on_the_bundled_recording(tmp_path: Path) -> None:
     names = some_of(sorted({*CHECKS} - SEEN), 4)
     assert _same_rules(RECORDING, tmp_path, names) == len(names) > 10
 
@@ -381,7 +377,7 @@ RECORDINGS: Final = (
 
 
 @pytest.mark.parametrize("name", RECORDINGS if LONG else RECORDINGS[:1])
-def test_rules_say_the_same_of_shared_recordings(data: Path, tmp_path: Path, name: str) -> None:
+def test_rules_agree_on_shared_recordings(data: Path, tmp_path: Path, name: str) -> None:
     names = sorted({*CHECKS} - SEEN)
     names = names if LONG else ["yield_821", "turn_lanes_846", "rss_distance", "r_i1_stopping"]
     assert _same_rules(data / "traces" / f"{name}.mcap", tmp_path, names)
@@ -396,9 +392,7 @@ def some(near: Store) -> list[int]:
 
 
 @pytest.mark.parametrize("asked", ASKED[:-1])
-def test_a_search_in_memory_finds_what_the_database_finds(
-    near: Store, some: list[int], asked: str
-) -> None:
+def test_memory_search_equals_database(near: Store, some: list[int], asked: str) -> None:
     for scope in ("graph", "world"):
         matches = near.find(f"USING SCOPE {scope} MATCH {asked}")
         query = compile_query(f"USING SCOPE {scope} MATCH {asked}", near.catalog()).bound
@@ -426,7 +420,7 @@ USING SCOPE graph CHECK graph: FORALL (v:Vehicle) ALWAYS NOT lead(ego, v)
 
 
 @pytest.mark.parametrize("trace", sorted(SCENES))
-def test_a_monitor_says_of_the_world_what_a_store_says(near: Store, trace: str) -> None:
+def test_monitor_in_world_equals_store(near: Store, trace: str) -> None:
     (scene,) = SCENES[trace]
     texts = [MONITORED, *(patterns()[name].text for name in CHECKS)]
     monitor = Monitor(
@@ -444,7 +438,7 @@ def test_a_monitor_says_of_the_world_what_a_store_says(near: Store, trace: str) 
             assert (found and (found.start_seq, found.end_seq)) == first, name
 
 
-def test_a_frame_has_a_world_around_its_graph(
+def test_known_graph_equals_wider_graph(
     near: Store, alone: Store, wide: Store, some: list[int]
 ) -> None:
     for frame in some:
@@ -486,7 +480,7 @@ SLOW: Final = "CHECK slow: FORALL (v:Vehicle) ALWAYS v.speed < 25"
         (400, 0, "true", "false"),
     ],
 )
-def test_a_verdict_is_unknown_where_the_trace_knows_less_than_the_check_looks(
+def test_verdict_is_unknown_beyond_known_range(
     tmp_path: Path, radius: float, world: float, apart: str, slow: str
 ) -> None:
     config = ranged(radius, world)
@@ -504,7 +498,7 @@ def test_a_verdict_is_unknown_where_the_trace_knows_less_than_the_check_looks(
         assert found.verdict == ("false" if radius > 300 and text is SLOW else "true")
 
 
-def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
+def test_left_out_entities_are_counted(tmp_path: Path) -> None:
     scene = Scene(
         WAYS,
         ego(along(RIGHT), 20),

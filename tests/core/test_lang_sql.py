@@ -53,7 +53,7 @@ def found(world: World, text: str, **parameters: Any) -> list[tuple[Any, ...]]:
 # Formulas
 
 
-def test_numbers_of_pairs_are_those_of_arrays(world: World) -> None:
+def test_pair_numbers_equal_arrays(world: World) -> None:
     calls = ", ".join(f"{function}(a, b)" for function in NUMBERS)
     states = {(frame.frame_id, n): s for frame in world.frames for n, s in frame.states.items()}
 
@@ -85,7 +85,7 @@ def test_numbers_of_pairs_are_those_of_arrays(world: World) -> None:
         np.testing.assert_allclose(ours, expected, atol=1e-9, err_msg=name)
 
 
-def test_numbers_of_pairs_are_those_of_the_view(world: World) -> None:
+def test_pair_numbers_equal_the_view(world: World) -> None:
     calls = ", ".join(f"{function}(a, b)" for function in NUMBERS)
 
     ours = found(world, f"MATCH (a:Ego), (b:Vehicle) RETURN frame.id, b.id, {calls}")
@@ -106,7 +106,7 @@ def test_numbers_of_pairs_are_those_of_the_view(world: World) -> None:
         *("2 > ttc(a, b)", "ttc(a, b) <= 0", "2 > closing_time(a, b)"),
     ],
 )
-def test_the_cheap_bound_loses_nothing(condition: str, world: World) -> None:
+def test_cheap_bound_keeps_all_matches(condition: str, world: World) -> None:
     (number,) = re.findall(r"(\w+)\(", condition)
     pattern = "MATCH (a:Entity), (b:Entity)"
 
@@ -130,7 +130,7 @@ VIEW_NAMES = {"id": "node_id"}
 
 
 @pytest.mark.parametrize("attribute", NODE_ATTRIBUTES.values(), ids=lambda a: a.name)
-def test_attributes_are_the_columns_of_the_view_nodes(attribute: Any, world: World) -> None:
+def test_attributes_equal_columns_of_view_nodes(attribute: Any, world: World) -> None:
     name = VIEW_NAMES.get(attribute.name, attribute.name)
     columns = {row[0] for row in world.connection.execute("DESCRIBE nodes").fetchall()}
     if name not in columns or name == "node_id":
@@ -145,7 +145,7 @@ def test_attributes_are_the_columns_of_the_view_nodes(attribute: Any, world: Wor
     assert {row[:2]: row[2] for row in ours} == pytest.approx({row[:2]: row[2] for row in theirs})
 
 
-def test_units_are_those_that_people_see(world: World) -> None:
+def test_units_are_display_units(world: World) -> None:
     (row, *_) = found(
         world, "MATCH (a:Car) WHERE a.heading > 10 RETURN a.heading, a.x, a.name, a.kind"
     )
@@ -156,7 +156,7 @@ def test_units_are_those_that_people_see(world: World) -> None:
     assert row[3] == "car"
 
 
-def test_constants_of_entities_are_found_where_they_are_kept(world: World) -> None:
+def test_entity_constants_are_read_from_their_table(world: World) -> None:
     rows = found(
         world, "MATCH (a:Entity) WHERE a.ident = 'id1' RETURN DISTINCT a.id, a.ident, a.is_static"
     )
@@ -180,7 +180,7 @@ def test_every_unit_is_used() -> None:
 # Views
 
 
-def test_two_rows_of_the_view_edges_joined_in_plain_sql_are_the_pattern(world: World) -> None:
+def test_pattern_equals_join_of_view_edges(world: World) -> None:
     sql = """
         SELECT DISTINCT a.frame_id, a.src, a.dst, b.src
         FROM edges a JOIN edges b ON b.frame_id = a.frame_id AND b.dst = a.dst
@@ -194,7 +194,7 @@ def test_two_rows_of_the_view_edges_joined_in_plain_sql_are_the_pattern(world: W
     assert pattern
 
 
-def test_static_edges_of_the_view_are_those_of_the_pattern(world: World) -> None:
+def test_static_edges_of_view_equal_pattern(world: World) -> None:
     sql = "SELECT frame_id, src, dst FROM edges WHERE relation = 'travelsTo'"
 
     pattern = found(world, "USING UNKNOWN false MATCH (l)-[:travelsTo]->(m) RETURN frame.id, l, m")
@@ -205,7 +205,7 @@ def test_static_edges_of_the_view_are_those_of_the_pattern(world: World) -> None
 # Compiling
 
 
-def test_values_of_the_user_are_bound_and_never_written(world: World) -> None:
+def test_user_values_are_bound(world: World) -> None:
     evil = "x'; DROP TABLE inside.edge; --"
 
     statement = compile_query(
@@ -217,7 +217,7 @@ def test_values_of_the_user_are_bound_and_never_written(world: World) -> None:
     assert rows_of(world, statement) == []
 
 
-def test_names_of_the_user_are_quoted(world: World) -> None:
+def test_user_names_are_quoted(world: World) -> None:
     rows = found(
         world,
         "MATCH (select:Car)-[from:near]->(where_) RETURN select.id AS group, type(from) AS order",
@@ -226,7 +226,7 @@ def test_names_of_the_user_are_quoted(world: World) -> None:
     assert rows
 
 
-def test_an_unused_parameter_is_refused(world: World) -> None:
+def test_unused_parameter_is_refused(world: World) -> None:
     with pytest.raises(QueryError, match="no parameter 'y'"):
         compile_query("MATCH (a:Car)", world.catalog, {"y": 3})
 
@@ -271,7 +271,7 @@ def unchanged(of: Any, _: Catalog, **__: bool) -> Any:
 
 
 @pytest.mark.parametrize("rule", OPTIONAL)
-def test_a_rule_changes_no_answer(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rewriting_rule_keeps_results(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     world = random_world(11)
     tried = 0
     for number in range(400, 416):
@@ -288,7 +288,7 @@ def test_a_rule_changes_no_answer(rule: str, monkeypatch: pytest.MonkeyPatch) ->
     assert tried > 10
 
 
-def test_the_same_text_gives_the_same_sql(world: World) -> None:
+def test_same_text_gives_same_sql(world: World) -> None:
     text = (
         "MATCH (a:Car)-[:near]->(b) WHERE COUNT {(b)-[:isIn]->(:Lane)} > a.speed AND gap(a, b) < 3"
     )
@@ -298,7 +298,7 @@ def test_the_same_text_gives_the_same_sql(world: World) -> None:
     assert first == second
 
 
-def test_the_stages_can_be_printed(world: World) -> None:
+def test_stages_can_be_printed(world: World) -> None:
     text = "MATCH (a:Car)-[:near]->(b) WHERE NOT EXISTS {(b)-[:isIn]->(:Lane)} AND a.speed > 3"
 
     printed = compile_query(text, world.catalog).stages()
@@ -328,7 +328,7 @@ QUERIES = [
 
 
 @pytest.mark.parametrize("text", QUERIES)
-def test_windows_together_give_the_whole(text: str, world: World) -> None:
+def test_windows_together_give_all_rows(text: str, world: World) -> None:
     compiled = compile_query(text, world.catalog)
     buckets = world.connection.execute(
         "SELECT DISTINCT bucket FROM inside.bucket ORDER BY 1"
@@ -386,7 +386,7 @@ def test_windows_cover_every_bucket_once(
     assert not whole_traces or all(w is not None and w.low in starts for w in found)
 
 
-def test_windows_grow_while_rows_are_few_and_shrink_where_they_are_many() -> None:
+def test_window_size_follows_number_of_rows() -> None:
     steps = Windows([(0, 100_000)])
     lengths: list[int] = []
     for rows, window in zip((0, 0, 0, 10_000_000, 10_000_000, 0, 0), steps, strict=False):
@@ -396,7 +396,7 @@ def test_windows_grow_while_rows_are_few_and_shrink_where_they_are_many() -> Non
     assert lengths == [1024, 16384, 16384, 16384, 1638, 163, 2608]
 
 
-def test_who_wants_all_rows_gets_them_in_one_window() -> None:
+def test_all_rows_are_read_in_one_window() -> None:
     assert list(Windows([(0, 100), (1000, 60)], first=LAST_WINDOW)) == [None]
     assert len(list(Windows([(0, 100), (1000, 60)], first=100))) == 2
 

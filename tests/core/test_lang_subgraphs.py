@@ -59,7 +59,7 @@ def in_memory(text: str, world: World) -> Counter[Shape]:
 
 
 @pytest.mark.parametrize("first", [0, 40] if LONG else [0])
-def test_random_patterns_give_the_same_graphs_in_sql_and_in_memory(first: int) -> None:
+def test_random_subgraphs_in_sql_equal_memory(first: int) -> None:
     tried = matched = 0
     for number in range(first, first + 40):
         if number % 20 == 0:
@@ -77,7 +77,7 @@ def test_random_patterns_give_the_same_graphs_in_sql_and_in_memory(first: int) -
     assert matched > 8
 
 
-def test_the_nodes_of_the_graphs_are_those_of_exhaustive_search() -> None:
+def test_subgraph_nodes_equal_exhaustive_search() -> None:
     world, compared = random_world(77), 0
     for number in range(60):
         text = Writer(number).query()
@@ -107,7 +107,7 @@ def store(open_town: Store) -> Store:
 LEADS = "MATCH (e:Ego)-[:isIn]->(l:Lane)<-[r:isIn]-(v:Vehicle) WHERE EXISTS {(v)-[:leads]->(e)}"
 
 
-def test_a_graph_knows_what_the_scene_graph_knows(store: Store) -> None:
+def test_subgraph_attributes_equal_scene_graph(store: Store) -> None:
     graphs = list(store.find(f"{LEADS} LIMIT 3").subgraphs())
 
     assert len(graphs) == 3
@@ -127,7 +127,7 @@ def test_a_graph_knows_what_the_scene_graph_knows(store: Store) -> None:
             assert data["overlap"] == pytest.approx(theirs["overlap"])
 
 
-def test_a_path_of_exactly_n_edges_is_there_edge_by_edge(store: Store) -> None:
+def test_path_of_fixed_length_is_shown_edge_by_edge(store: Store) -> None:
     query = "MATCH (e:Ego)-[:isIn*3]->(j:Junction) RETURN SUBGRAPHS LIMIT 4"
 
     for graph in store.find(query).subgraphs():
@@ -139,7 +139,7 @@ def test_a_path_of_exactly_n_edges_is_there_edge_by_edge(store: Store) -> None:
         )
 
 
-def test_values_stand_beside_graphs_and_order_them(store: Store) -> None:
+def test_values_are_returned_beside_subgraphs(store: Store) -> None:
     found = store.find(
         "MATCH (e:Ego)-[:near|very_near]->(v:Vehicle)"
         " RETURN dist(e, v) AS d, SUBGRAPHS ORDER BY v.speed DESC LIMIT 20"
@@ -155,7 +155,7 @@ def test_values_stand_beside_graphs_and_order_them(store: Store) -> None:
     assert all(7 < graph.graph["d"] <= 16 for graph in graphs)
 
 
-def test_frames_and_clips_are_those_of_the_pattern(store: Store) -> None:
+def test_frames_and_clips_of_subgraphs_equal_the_pattern(store: Store) -> None:
     plain, graphs = store.find(LEADS), store.find(f"{LEADS} RETURN SUBGRAPHS")
 
     assert graphs.count() == plain.count() > 10
@@ -165,7 +165,7 @@ def test_frames_and_clips_are_those_of_the_pattern(store: Store) -> None:
 
 
 @pytest.mark.parametrize("safe", [[], ["--safe", "--timeout", "20s"]])
-def test_the_command_line_gives_what_networkx_reads(safe: list[str], store: Store) -> None:
+def test_cli_output_is_readable_by_networkx(safe: list[str], store: Store) -> None:
     arguments = ["find", str(store.file.path), f"{LEADS} RETURN SUBGRAPHS LIMIT 2", *safe]
 
     rows = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)
@@ -181,7 +181,7 @@ def test_the_command_line_gives_what_networkx_reads(safe: list[str], store: Stor
     assert "-isIn->" in people
 
 
-def test_graphs_go_to_arrow(store: Store) -> None:
+def test_subgraphs_convert_to_arrow(store: Store) -> None:
     arrow = pytest.importorskip("pyarrow")
 
     table = store.find(f"{LEADS} RETURN SUBGRAPHS LIMIT 5").arrow()
