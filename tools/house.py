@@ -124,7 +124,7 @@ def is_at_home(module: str, inner: str) -> bool:
 
 
 def module_of(path: Path) -> str:
-    """``lang/bind/_bind.py`` as ``lang.bind._bind``, ``lang/__init__.py`` as ``lang``."""
+    """``lang/bind/_queries.py`` as ``lang.bind._queries``, ``lang/__init__.py`` as ``lang``."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(part for part in parts if part != "__init__")
 

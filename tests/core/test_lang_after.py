@@ -89,9 +89,6 @@ def test_results_equal_their_definition(text: str, world: World) -> None:
     assert rows or "1000" in text
 
 
-# Over a store -------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     """Two traces of 40 frames: in the first the ego goes at 0 to 39 m/s, in the second at 5."""

@@ -37,9 +37,6 @@ def scene(road: Any = ROAD) -> Scene:
     return Scene(road, *PEOPLE, seconds=1.0)
 
 
-# Relations that a map has no edge of ------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def lanes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     path = tmp_path_factory.mktemp("lanes") / "lanes.sgstore"
@@ -61,8 +58,6 @@ def test_edge_absent_from_map_is_false(lanes: Store, relation: str) -> None:
     assert {row[1] for row in none.rows()} == {"street"}
     assert some.left_out == none.left_out == ("nowhere",)
 
-
-# Whether a pair was looked at --------------------------------------------------------------------------------
 
 PAIRS = {
     "default": PairSettings(),

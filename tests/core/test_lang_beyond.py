@@ -190,8 +190,6 @@ def test_check_of_distance_relations_equals_wider_graph(
         assert one.first_violation == theirs[check].first_violation, check
 
 
-# Kinds that settings exclude ------------------------------------------------------------------------
-
 PEOPLE: Final = Scene(
     WAYS,
     ego(along(RIGHT), 10),
@@ -235,8 +233,6 @@ def test_check_of_excluded_entities_is_unknown(
     (inside,) = store.check(f"USING SCOPE graph {text}")
     assert inside.verdict != "unknown"
 
-
-# How far a check looks ------------------------------------------------------------------------------
 
 PASSING: Final = Scene(
     WAYS,

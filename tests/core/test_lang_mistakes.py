@@ -21,9 +21,6 @@ def sql(text: str, **parameters: object) -> str:
     return compile_query(text, CATALOG, parameters).rows().sql
 
 
-# What is not taken for something else --------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -114,9 +111,6 @@ def test_integer_too_large_for_the_database_is_a_number() -> None:
     assert all(isinstance(value, float) for value in statement.values if value == 2**70)
 
 
-# Where it is wrong --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("text", "line", "carets"),
     [
@@ -151,9 +145,6 @@ def test_unexpected_text_is_short_and_visible() -> None:
     assert "U+0000" in refused("MATCH (e:Ego)\0").reason
     assert "U+200B" in refused("MATCH (e:Ego)\u200b").reason
     assert len(refused(f"MATCH (e:Ego) {'x' * 50_000}").reason) < 200
-
-
-# For people ---------------------------------------------------------------------------------------
 
 
 def test_named_columns_are_displayed() -> None:

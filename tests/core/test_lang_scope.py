@@ -145,9 +145,6 @@ def in_graphs(rule: str) -> str:
     return f"USING SCOPE graph {rule}"
 
 
-# Rules about what is beyond the graph --------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("name", "trace"),
     [
@@ -181,8 +178,6 @@ def test_rules_in_world_equal_wider_graph(near: Store, wide: Store, name: str) -
     text = patterns()[name].text
     assert verdicts(near, text) == verdicts(wide, text)
 
-
-# Patterns ------------------------------------------------------------------------------------------
 
 ASKED: Final = (
     "(v:Vehicle) WHERE dist(ego, v) > 55",
@@ -342,9 +337,6 @@ def test_two_entities_beyond_the_graph_can_be_near(
     assert judged(tmp_path, text, limit) == expected
 
 
-# Recordings ----------------------------------------------------------------------------------------
-
-
 def _same_rules(recording: Path, folder: Path, names: Sequence[str]) -> int:
     """How many verdicts of rules are the same with 50 m and a world of 200 m as with graphs of 200 m."""
     told: list[Store] = []
@@ -381,9 +373,6 @@ def test_rules_agree_on_shared_recordings(data: Path, tmp_path: Path, name: str)
     names = sorted({*CHECKS} - SEEN)
     names = names if LONG else ["yield_821", "turn_lanes_846", "rss_distance", "r_i1_stopping"]
     assert _same_rules(data / "traces" / f"{name}.mcap", tmp_path, names)
-
-
-# In memory, and frame by frame -----------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -460,8 +449,6 @@ def test_known_graph_equals_wider_graph(
             assert ours == theirs, name
         assert alone.file.graph(frame).known().nodes.keys() == alone.file.graph(frame).nodes.keys()
 
-
-# What settings leave out -----------------------------------------------------------------------------
 
 LONG_ROAD: Final = Scene(
     WAYS, ego(along(RIGHT), 20), actor("v", along(LEFT), 30, start=390), seconds=1

@@ -1,7 +1,6 @@
 """Binder: converts syntax trees to bound queries, and finds the values that a trace must know."""
 
 from sgstore.lang.bind._aggregates import PLACE, sql_of
-from sgstore.lang.bind._bind import bind_query
 from sgstore.lang.bind._checks import CheckInCatalog, bind_checks
 from sgstore.lang.bind._datasets import CLASSES_GIVEN, traces_in
 from sgstore.lang.bind._functions import FUNCTIONS
@@ -15,6 +14,7 @@ from sgstore.lang.bind._kinds import (
     kind_conditions,
 )
 from sgstore.lang.bind._needed_values import MOTION, Need, not_computed, of_check, of_query
+from sgstore.lang.bind._queries import bind_query
 from sgstore.lang.bind._temporal import FUTURE
 from sgstore.lang.bind._text_tests import regex
 from sgstore.lang.bind._unknowns import (

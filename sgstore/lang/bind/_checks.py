@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from sgstore.errors import TextSpan
 from sgstore.lang import ir as b
-from sgstore.lang.bind._bind import chosen, refuse_strange, refuse_unused
 from sgstore.lang.bind._patterns import ALL_BINDERS, kinds_of
+from sgstore.lang.bind._queries import chosen, refuse_strange, refuse_unused
 from sgstore.lang.bind._results import bind_column
 from sgstore.lang.bind._sequences import StepScope
 from sgstore.lang.bind._symbols import RESERVED, Session, Symbol, SymbolTable

@@ -545,4 +545,5 @@ BINDERS: Final[Binders] = {
     s.Negative: _negative,
     s.Case: _case,
 }
-"""Binders of basic expressions. :mod:`~sgstore.lang.bind._bind` adds those of calls, blocks and time."""
+"""Binders of basic expressions. :data:`~sgstore.lang.bind._patterns.ALL_BINDERS` adds those of calls, blocks
+and time."""
