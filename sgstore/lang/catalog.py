@@ -1,4 +1,4 @@
-"""Catalog of a store for the compiler: its attributes and its contents.
+"""Catalog for the query compiler: the known attributes, and the contents of one store.
 
 The attributes are fixed by the schema and are the same for every store. A :class:`Catalog` describes one
 store: the kinds of nodes in each table, the triples (relation, kind, kind) with their numbers of rows, and
@@ -44,7 +44,7 @@ Triple = tuple[str, str, str]
 
 
 class Home(StrEnum):
-    """Table that stores the values of an attribute."""
+    """Table of the store that holds the values of an attribute."""
 
     state = "state"
     """Values of entities that move or change, frame by frame: table ``state``."""
@@ -57,7 +57,7 @@ class Home(StrEnum):
 
 
 class DisplayUnit(StrEnum):
-    """Conversion of a value in the database to the value that users see."""
+    """Conversion of a stored database value to the value that users see, such as its unit."""
 
     plain = "plain"
     degrees = "degrees"
@@ -110,7 +110,7 @@ class DisplayUnit(StrEnum):
 
 
 class Type(StrEnum):
-    """Types of values in expressions."""
+    """Types of values in query expressions, such as number or text."""
 
     number = "number"
     whole = "whole number"  # type of a user-defined attribute in a catalog; in expressions it is a number
@@ -133,7 +133,7 @@ _ON_ROADS: Final = frozenset({"lane", "junction", "road", "crosswalk", *SIGNALS}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attribute:
-    """Attribute of nodes, edges, frames or traces.
+    """Attribute that queries can use, of a node, an edge, a frame or a trace.
 
     Attributes
     ----------
@@ -183,13 +183,16 @@ class Attribute:
 
     @property
     def kinds(self) -> frozenset[str]:
-        """All kinds that may have the attribute. If all entities have it, this includes added kinds."""
+        """All kinds of node that may have the attribute.
+
+        If all entities have it, this includes kinds added by users.
+        """
         every = self.own_kinds >= _ENTITIES
         return self.own_kinds | entity_kinds() if every else self.own_kinds
 
     @property
     def of_store(self) -> bool:
-        """True if the value comes from a table other than the frame's graph."""
+        """True if the value of the attribute comes from a table other than the scene graph of the frame."""
         other = {DisplayUnit.seen, DisplayUnit.counted, DisplayUnit.weather, DisplayUnit.clock}
         return bool(self.table) or self.unit in other
 
@@ -211,7 +214,7 @@ def _constant(name: str, column: str, meaning: str, values: Sequence[str] = ()) 
 
 
 def _repeated(name: str, meaning: str, values: Sequence[str] = ()) -> Attribute:
-    """Return a constant of entities that is repeated in each of their states."""
+    """Return a text attribute of entities that is constant and stored in each of their states."""
     homes = {Home.state: name, Home.entity: name}
     return Attribute(name, Type.text, homes, meaning, own_kinds=_ENTITIES, values=values)
 
@@ -419,14 +422,17 @@ NODE_ATTRIBUTES: Final = _named(
 
 @cache
 def own_attribute(name: str, kind: Type) -> Attribute:
-    """Return a user-defined attribute, which nodes of any kind or edges of any relation may have."""
+    """Return the definition of a user-defined attribute.
+
+    Nodes of any kind and edges of any relation may have it.
+    """
     whole = kind is Type.whole
     kind = Type.number if whole else kind
     return Attribute(name, kind, {}, "of a client's own", DisplayUnit.own, whole=whole)
 
 
 def own_type(types: Collection[Type]) -> Type:
-    """Return the type of a user-defined attribute from its types in several traces.
+    """Return one type for a user-defined attribute that has several types in several traces.
 
     A number in one trace makes the attribute a number. Texts in other traces then count as missing values.
     """
@@ -503,7 +509,10 @@ EDGE_ALIASES: Final = {"offset": "laneoffset", "primary": "isprimary"}
 
 
 def class_attribute(abstraction: str, name: str = "") -> Attribute:
-    """Return the attribute for the class of a frame in an abstraction. NULL if it is not in the store."""
+    """Return the attribute for the class of a frame's graph in an abstraction.
+
+    Frames without a stored class have NULL.
+    """
     return Attribute(
         name or f"class_{abstraction}",
         Type.text,
@@ -612,7 +621,7 @@ PAIR_NAMES: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class RelationScope:
-    """Pairs of entities for which relations are computed, as in :class:`sgstore.model.config.Pairs`.
+    """Settings that select the pairs of entities with relations, as in :class:`sgstore.model.config.Pairs`.
 
     Attributes
     ----------
@@ -647,7 +656,10 @@ class RelationScope:
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Self | None:
-        """Return the scope from the settings of a trace. ``None`` means that the settings have no pairs."""
+        """Return the relation scope (selection of entity pairs) from a trace's settings.
+
+        ``None`` means that the settings have no pairs.
+        """
         pairs = settings.get("pairs")
         if pairs is None:
             return None
@@ -676,7 +688,7 @@ def _pairs_of(labels: Iterable[Iterable[str]]) -> tuple[tuple[str, ...], ...]:
 
 
 def excluded_kinds(labels: Iterable[str], counted: Iterable[str]) -> frozenset[str]:
-    """Return the kinds whose nodes the settings leave out, all or some of them.
+    """Return the kinds of node that the settings of a scene graph remove, completely or in part.
 
     Parameters
     ----------
@@ -692,7 +704,7 @@ def excluded_kinds(labels: Iterable[str], counted: Iterable[str]) -> frozenset[s
 
 @dataclass(frozen=True, slots=True)
 class TraceFacts:
-    """Facts about a trace that the compiler needs.
+    """Facts about a trace that the query compiler needs.
 
     Attributes
     ----------
@@ -730,7 +742,7 @@ class TraceFacts:
 
 @dataclass(frozen=True, slots=True)
 class TableFacts:
-    """Facts about a user table that the compiler needs.
+    """Facts about a user table that the query compiler needs.
 
     Attributes
     ----------
@@ -752,7 +764,10 @@ class TableFacts:
     joins: bool = True
 
     def attribute(self, column: str) -> Attribute | None:
-        """Return the frame attribute of a column, ignoring case. ``None`` means an unknown column."""
+        """Return the query attribute for a column of a user table, ignoring case.
+
+        ``None`` means an unknown column.
+        """
         name = next((one for one in self.columns if one.lower() == column.lower()), None)
         if name is None:
             return None
@@ -762,7 +777,7 @@ class TableFacts:
 
 @dataclass(frozen=True, slots=True)
 class Catalog:
-    """Contents of a store that the compiler needs.
+    """Description of a store for the query compiler: traces, tables, relations and attributes.
 
     Attributes
     ----------
@@ -852,7 +867,10 @@ class Catalog:
         return found[-1](self) if found else None
 
     def in_world(self) -> Catalog:
-        """Return the catalog for scope ``world``. Without data beyond the graphs, only ``around`` changes."""
+        """Return the catalog for ``USING SCOPE world``, which includes entities outside the scene graphs.
+
+        If the store has no such data, only ``around`` changes.
+        """
         if self.world or not (self.beyond or self.beyond_edges):
             return replace(self, around=True)
         edges = dict(self.edges)

@@ -1,4 +1,6 @@
-"""Intermediate representation (IR): bound patterns, sequences and checks.
+"""Intermediate representation of queries, between parser and SQL: patterns, sequences and checks.
+
+Names are resolved, and types are known ("bound").
 
 All names are resolved and all values have types. The stages after the binder share these classes.
 
@@ -23,7 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Kinds:
-    """Kinds that a node may have: one set for the ego, one set for other nodes."""
+    """Kinds of node (such as car or lane) that a query variable may match.
+
+    There is one set for the ego and one for other nodes.
+    """
 
     ego: frozenset[str]
     other: frozenset[str]
@@ -42,32 +47,32 @@ class Kinds:
         return bool(self.ego or self.other)
 
     def only(self, kinds: frozenset[str]) -> Kinds:
-        """Return a copy limited to the given kinds."""
+        """Return a copy of the allowed node kinds, limited to the given kinds."""
         return Kinds(self.ego & kinds, self.other & kinds)
 
     @property
     def every(self) -> frozenset[str]:
-        """All kinds, of the ego or of other nodes."""
+        """All allowed kinds of node, for the ego or for other nodes."""
         return self.ego | self.other
 
     @property
     def one_a_frame(self) -> bool:
-        """True if the node must be the ego, so that a frame has at most one such node."""
+        """True if only the ego is allowed, so that a frame has at most one such node."""
         return not self.other
 
 
 def any_kinds() -> Kinds:
-    """Return all known kinds. Readers, settings and stores may add kinds."""
+    """Return all known kinds of node, for the ego and for others. Readers, settings and stores may add kinds."""
     return Kinds(entity_kinds(), frozenset(KINDS))
 
 
 def ego_kinds() -> Kinds:
-    """Return all known kinds for the ego, and no kinds for other nodes."""
+    """Return the allowed kinds of a node that must be the ego: all entity kinds for the ego, none for others."""
     return Kinds(entity_kinds(), frozenset())
 
 
 def any_relation() -> frozenset[str]:
-    """Return all known relations. Stores and settings may add relations."""
+    """Return the names of all known relations. Stores and settings may add relations."""
     return frozenset(RELATIONS)
 
 
@@ -77,7 +82,7 @@ Scopes = tuple[tuple[RelationScope | None, tuple[int, ...]], ...]
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """Node of a pattern.
+    """Node of a graph pattern in a query.
 
     Attributes
     ----------
@@ -97,7 +102,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """Edge of a pattern, or a path of ``low`` to ``high`` edges.
+    """Edge of a graph pattern in a query, or a path of ``low`` to ``high`` edges.
 
     Attributes
     ----------
@@ -135,7 +140,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """Bound constant.
+    """Constant in a query expression, with its type.
 
     Attributes
     ----------
@@ -159,13 +164,13 @@ class Value:
 
     @property
     def shown(self) -> float | str | bool | None:
-        """Constant as written in the query, before rounding."""
+        """Constant as the user wrote it in the query, before rounding."""
         return self.value if self.written is None else self.written
 
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """List of constants after ``IN``."""
+    """List of constants after ``IN`` in a query condition."""
 
     items: tuple[Value, ...]
     type: Type = Type.list
@@ -173,7 +178,7 @@ class Choices:
 
 @dataclass(frozen=True, slots=True)
 class NodeValue:
-    """Reference to a node."""
+    """Expression that refers to a node of the pattern."""
 
     node: str
     type: Type = Type.node
@@ -181,7 +186,7 @@ class NodeValue:
 
 @dataclass(frozen=True, slots=True)
 class NodeAttribute:
-    """Attribute of a node."""
+    """Expression for an attribute of a node, such as ``v.speed``."""
 
     node: str
     attribute: Attribute
@@ -190,7 +195,7 @@ class NodeAttribute:
 
 @dataclass(frozen=True, slots=True)
 class LabelTest:
-    """Test that a node, bound outside, has a label."""
+    """Condition that a node of an outer pattern has a label."""
 
     node: str
     kinds: Kinds
@@ -199,7 +204,7 @@ class LabelTest:
 
 @dataclass(frozen=True, slots=True)
 class EdgeRelation:
-    """Relation that an edge variable is bound to."""
+    """Expression for the name of the relation that an edge variable matches."""
 
     edge: str
     type: Type = Type.text
@@ -207,7 +212,7 @@ class EdgeRelation:
 
 @dataclass(frozen=True, slots=True)
 class EdgeAttribute:
-    """Attribute of an edge from an entity to a lane."""
+    """Expression for an attribute of an edge between an entity and a lane."""
 
     edge: str
     attribute: Attribute
@@ -216,7 +221,7 @@ class EdgeAttribute:
 
 @dataclass(frozen=True, slots=True)
 class FrameAttribute:
-    """Attribute of the frame: ``frame.name``."""
+    """Expression for an attribute of the frame: ``frame.name``."""
 
     attribute: Attribute
     type: Type
@@ -224,7 +229,7 @@ class FrameAttribute:
 
 @dataclass(frozen=True, slots=True)
 class TraceAttribute:
-    """Attribute of the trace: ``trace.name``."""
+    """Expression for an attribute of the trace: ``trace.name``."""
 
     attribute: Attribute
     type: Type
@@ -242,7 +247,7 @@ class PairNumber:
 
 @dataclass(frozen=True, slots=True)
 class Happened:
-    """Test that the recording has an event of a kind in this frame.
+    """Condition that the recording has an event of some kind in this frame.
 
     Attributes
     ----------
@@ -263,7 +268,7 @@ class Happened:
 
 @dataclass(frozen=True, slots=True)
 class Operation:
-    """Operator or function with its operands: ``AND``, ``<``, ``+``, ``abs``, ``IN``, ``IS NULL``."""
+    """Operator or function with its operands, such as ``AND``, ``<``, ``+``, ``abs`` or ``IS NULL``."""
 
     word: str
     operands: tuple[Bound, ...]
@@ -272,7 +277,10 @@ class Operation:
 
 @dataclass(frozen=True, slots=True)
 class BlockValue:
-    """Bound block: ``EXISTS {…}``, ``COUNT {…}`` or ``MIN {… | value}``. ``number`` is unique in the query."""
+    """Pattern in braces:
+
+    ``EXISTS {…}``, ``COUNT {…}`` or ``MIN {… | value}``. ``number`` is unique in the query.
+    """
 
     word: str
     scope: Scope
@@ -282,7 +290,7 @@ class BlockValue:
 
     @property
     def inside(self) -> tuple[Bound, ...]:
-        """The conditions inside the braces, and the value after them."""
+        """Conditions inside the braces, and the value after ``|``."""
         return self.scope.where if self.value is None else (*self.scope.where, self.value)
 
 
@@ -302,7 +310,10 @@ class Aggregate:
 
 @dataclass(frozen=True, slots=True)
 class GroupKey:
-    """Grouping value of an aggregating query. ``name`` is the name of its column."""
+    """Value by which a query groups matches, if it also aggregates them.
+
+    ``name`` is the name of its result column.
+    """
 
     name: str
     type: Type
@@ -310,7 +321,7 @@ class GroupKey:
 
 @dataclass(frozen=True, slots=True)
 class Tense:
-    """Temporal operator: its operands are evaluated at other frames.
+    """Temporal operator, such as ``EVENTUALLY``: its operands are evaluated at other frames.
 
     Attributes
     ----------
@@ -335,7 +346,7 @@ class Tense:
 
 @dataclass(frozen=True, slots=True)
 class SignalCall:
-    """Function of a value over time, such as ``prev`` or ``delta``.
+    """Call of a function of a value over time, such as ``prev(x)`` or ``delta(x, 2s)``.
 
     Attributes
     ----------
@@ -385,7 +396,7 @@ PLACES: Final = frozenset({"argmin", "argmax"})
 
 @dataclass(frozen=True, slots=True)
 class OverMatch:
-    """Function over the frames of a match, or over a part of the match.
+    """Aggregate over the frames of a match, or of some steps, such as ``MIN(ttc(e, v)) OVER match``.
 
     Attributes
     ----------
@@ -434,7 +445,9 @@ Bound = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scope:
-    """Pattern of one ``MATCH`` or one block. Two scopes are equal only if they are the same object.
+    """Graph pattern (nodes, edges, conditions) of one ``MATCH`` or one pair of braces.
+
+    Two scopes are equal only if they are the same object.
 
     Attributes
     ----------
@@ -456,7 +469,7 @@ class Scope:
     distinct: frozenset[tuple[str, str]]
 
     def kinds(self, key: str) -> Kinds:
-        """Return the kinds of a node of this scope, or of an outer node that it uses."""
+        """Return the allowed kinds of a node of this pattern, or of an outer node that the pattern uses."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
 
@@ -484,7 +497,7 @@ Form = Literal["rows", "intervals", "clips", "subgraphs"]
 
 @dataclass(frozen=True, slots=True)
 class ReturnColumn:
-    """Returned value with its column name.
+    """Value that a query returns, with the name of its result column.
 
     Attributes
     ----------
@@ -501,7 +514,7 @@ class ReturnColumn:
 
 @dataclass(frozen=True, slots=True)
 class SortKey:
-    """Sort key: a value, or the name of a result column."""
+    """Key of ``ORDER BY``: an expression, or the name of a result column."""
 
     value: Bound | str
     descending: bool
@@ -509,7 +522,7 @@ class SortKey:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """Limit of ``number`` results for each value of ``per``.
+    """Limit of a query result: at most ``number`` results for each value of ``per``.
 
     If ``per`` is ``None``, the limit is for all results.
     """
@@ -520,7 +533,7 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Columns and form in which matches are returned.
+    """Result clause of a query: its columns, and its form (rows, intervals, subgraphs or clips).
 
     Attributes
     ----------
@@ -566,7 +579,7 @@ class Result:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the identifying columns: those of frames, intervals or clips."""
+        """Names of the result columns that identify a frame, an interval or a clip."""
         if self.form == "subgraphs":
             return FRAME_COLUMNS
         if self.form != "rows":
@@ -575,7 +588,7 @@ class Result:
 
     @property
     def values(self) -> list[Bound]:
-        """All expressions of the result: columns, ``HAVING``, sort keys and sampling keys."""
+        """All expressions in the result clause: columns, ``HAVING``, sort keys and sampling keys."""
         per = [chosen.per for chosen in (self.sample, self.top) if chosen is not None]
         values = [*(column.value for column in self.columns), *(key.value for key in self.order)]
         every = (*values, self.having, *per)
@@ -583,18 +596,18 @@ class Result:
 
     @property
     def aggregated(self) -> bool:
-        """True if the result aggregates over matches instead of listing them."""
+        """True if the result has aggregates such as ``COUNT(*)``, instead of a list of matches."""
         having = [] if self.having is None else [self.having]
         values = (*(column.value for column in self.columns), *having)
         return any(isinstance(e, Aggregate) for value in values for e in walk(value))
 
     @property
     def chooses(self) -> bool:
-        """True if only some rows are returned: with ``SKIP`` or ``LIMIT``."""
+        """True if the query returns only some of the rows, because of ``SKIP`` or ``LIMIT``."""
         return self.limit is not None or self.top is not None or self.skip > 0
 
     def changed(self, change: Callable[[Bound], Bound]) -> Result:
-        """Return a copy with a function applied to every value."""
+        """Return a copy of the result clause with a function applied to every expression."""
 
         def key(value: Bound | str) -> Bound | str:
             return value if isinstance(value, str) else change(value)
@@ -614,7 +627,7 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class PathValue:
-    """Named path. Its value is the list of its nodes.
+    """Named path of a pattern. Its value is the list of its nodes.
 
     Attributes
     ----------
@@ -633,7 +646,7 @@ class PathValue:
 
 @dataclass(frozen=True, slots=True)
 class PathWay:
-    """Pattern with fixed lengths of its named paths. ``nodes`` are the node keys of each path."""
+    """Graph pattern in which each named path has a fixed length. ``nodes`` are the node keys of each path."""
 
     scope: Scope
     nodes: tuple[tuple[str, ...], ...]
@@ -641,7 +654,7 @@ class PathWay:
 
 @dataclass(frozen=True, slots=True)
 class MatchStage:
-    """``MATCH`` stage of a query with several stages.
+    """``MATCH`` or ``OPTIONAL MATCH`` clause in a query with several clauses.
 
     Attributes
     ----------
@@ -662,7 +675,7 @@ class MatchStage:
 
 @dataclass(frozen=True, slots=True)
 class WithStage:
-    """``WITH`` stage: selects the variables and values that later stages can use, frame by frame.
+    """``WITH`` clause: selects the variables and values that later clauses can use, frame by frame.
 
     Attributes
     ----------
@@ -700,12 +713,12 @@ class WithStage:
 
     @property
     def expressions(self) -> tuple[Bound, ...]:
-        """All expressions of the stage."""
+        """All expressions in the ``WITH`` clause."""
         order = (key.value for key in self.order if not isinstance(key.value, str))
         return (*(column.value for column in self.values), *order, *self.where)
 
     def changed(self, change: Callable[[Bound], Bound]) -> WithStage:
-        """Return a copy with a function applied to every expression."""
+        """Return a copy of the ``WITH`` clause with a function applied to every expression."""
         values = tuple(replace(column, value=change(column.value)) for column in self.values)
         order = tuple(
             replace(key, value=change(key.value))
@@ -724,7 +737,7 @@ PASSED: Final = ":with "
 def passed_on(
     name: str, kind: Type, precision: str = "", *, stored: bool = False
 ) -> FrameAttribute:
-    """Return a new placeholder for a value that ``WITH`` passes on."""
+    """Return a new placeholder expression for a value that ``WITH`` passes on."""
     attribute = Attribute(name, kind, {}, "", DisplayUnit.whole, precision=precision, stored=stored)
     return FrameAttribute(attribute, kind)
 
@@ -735,13 +748,13 @@ def is_passed_on(value: Bound) -> TypeGuard[FrameAttribute]:
 
 
 def is_path(value: Bound) -> bool:
-    """True if the expression is a placeholder for a path."""
+    """True if the expression is a placeholder for a named path."""
     return is_passed_on(value) and value.attribute.name.rpartition(" ")[2][0] == "p"
 
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """Bound query.
+    """Query with resolved names and known types, as the SQL generator uses it.
 
     Attributes
     ----------
@@ -789,7 +802,7 @@ class Query:
 
     @property
     def ways(self) -> tuple[StepWay, ...]:
-        """Sequences that the steps form; usually one."""
+        """Alternative sequences of the query's steps; usually one. Groups such as ``(A | B)`` give several."""
         if self.alternatives:
             return self.alternatives
         happen = tuple(n for n, step in enumerate(self.steps) if not step.absent)
@@ -797,17 +810,17 @@ class Query:
 
     @property
     def spans(self) -> bool:
-        """True if a match may span several frames. Such a match is returned once."""
+        """True if a match of the query may span several frames. Such a match is returned once."""
         return len(self.steps) > 1 or bool(self.alternatives)
 
     @property
     def certain(self) -> frozenset[int]:
-        """Numbers of the steps that occur in every match."""
+        """Numbers of the sequence steps that occur in every match."""
         return frozenset.intersection(*(frozenset(way.happen) for way in self.ways))
 
     @property
     def patterns(self) -> tuple[Scope, ...]:
-        """All patterns: those of the steps and stages, or the only pattern."""
+        """All graph patterns of the query, from sequence steps or from ``MATCH`` clauses."""
         stages = (stage.scope for stage in self.stages if isinstance(stage, MatchStage))
         found = (*(step.scope for step in self.steps), *stages)
         return found or (self.scope,)
@@ -820,12 +833,12 @@ class Query:
 
     @property
     def first(self) -> Scope:
-        """First single-frame pattern of the query."""
+        """Graph pattern of the first ``MATCH`` clause for single frames."""
         return self.required[0]
 
 
 def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
-    """Return placeholders for the passed values that a match has after the last stage."""
+    """Return placeholders for the ``WITH`` values and paths that a match has after the last clause."""
     found: tuple[FrameAttribute, ...] = ()
     for stage in query.stages:
         if isinstance(stage, WithStage):
@@ -836,7 +849,10 @@ def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
 
 
 def any_of(conditions: Iterable[Bound]) -> Bound:
-    """Return the condition that at least one condition is true. Without conditions it is false."""
+    """Return a condition that is true if at least one of the given conditions is true.
+
+    Without conditions it is false.
+    """
     found = tuple(conditions)
     if len(found) < 2:
         return found[0] if found else Value(value=False, type=Type.boolean)
@@ -844,7 +860,7 @@ def any_of(conditions: Iterable[Bound]) -> Bound:
 
 
 def all_of(*conditions: Bound) -> Bound:
-    """Return the condition that all given conditions are true. At least one condition is required."""
+    """Return a condition that is true if all given conditions are true. At least one condition is required."""
     return conditions[0] if len(conditions) == 1 else Operation("AND", conditions, Type.boolean)
 
 
@@ -865,7 +881,7 @@ def node_among(node: str, ids: Iterable[int]) -> Operation:
 
 
 def operands_of(expression: Bound) -> tuple[Bound, ...]:
-    """Return the direct operands of an expression. The content of blocks is not included."""
+    """Return the direct operands of an expression. The content of patterns in braces is not included."""
     match expression:
         case Operation(operands=operands) | Tense(operands=operands):
             return operands
@@ -878,7 +894,7 @@ def operands_of(expression: Bound) -> tuple[Bound, ...]:
 
 
 def with_operands(expression: Bound, change: Callable[[Bound], Bound]) -> Bound:
-    """Return an expression with a function applied to each of its :func:`operands_of`."""
+    """Return a copy of an expression with a function applied to each direct operand."""
     match expression:
         case Operation(operands=operands) | Tense(operands=operands):
             return replace(expression, operands=tuple(map(change, operands)))
@@ -891,28 +907,30 @@ def with_operands(expression: Bound, change: Callable[[Bound], Bound]) -> Bound:
 
 
 def walk(expression: Bound) -> Iterator[Bound]:
-    """Yield an expression and all its subexpressions. The content of blocks is not included."""
+    """Yield an expression and all its subexpressions. The content of patterns in braces is not included."""
     yield expression
     for operand in operands_of(expression):
         yield from walk(operand)
 
 
 def conjuncts(expression: Bound) -> list[Bound]:
-    """Return the conditions that an expression joins by ``AND``."""
+    """Return the list of conditions that ``AND`` joins in an expression."""
     if isinstance(expression, Operation) and expression.word == "AND":
         return [part for operand in expression.operands for part in conjuncts(operand)]
     return [expression]
 
 
 def is_temporal(expression: Bound) -> bool:
-    """True if an expression uses more than one frame."""
+    """True if the value of an expression depends on more than one frame."""
     return any(
         isinstance(part, Tense | SignalCall | StepTime | OverMatch) for part in walk(expression)
     )
 
 
 def is_formula(expression: Bound) -> bool:
-    """True if part of a value is a condition over time. Such a condition is never unknown.
+    """True if an expression is a condition over time, such as ``NOT EVENTUALLY x``.
+
+    Such a condition is never unknown.
 
     Conditions joined by ``AND`` are handled separately, as in ``WHERE``. A condition on this frame alone may
     be unknown.
@@ -943,7 +961,7 @@ def is_counted(expression: Bound) -> bool:
 
 
 def nodes_of(expression: Bound) -> frozenset[str]:
-    """Return keys of the nodes used in an expression. For a block, only nodes outside it count."""
+    """Return the keys of the nodes that an expression uses. For a pattern in braces, only outer nodes count."""
     found: set[str] = set()
     for part in walk(expression):
         match part:
@@ -961,19 +979,19 @@ def nodes_of(expression: Bound) -> frozenset[str]:
 
 
 def edges_of(expression: Bound) -> frozenset[str]:
-    """Return keys of the edges used in an expression, without the edges inside blocks."""
+    """Return the keys of the edges that an expression uses, without the edges inside braces."""
     edges = (EdgeRelation, EdgeAttribute)
     return frozenset(part.edge for part in walk(expression) if isinstance(part, edges))
 
 
 def blocks_of(expression: Bound) -> tuple[BlockValue, ...]:
-    """Return the blocks in an expression, without blocks nested in them."""
+    """Return the patterns in braces, such as ``EXISTS {…}``, in an expression. Nested ones are not included."""
     return tuple(part for part in walk(expression) if isinstance(part, BlockValue))
 
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """Duration of ``amount`` nanoseconds or frames."""
+    """Duration in a query: ``amount`` nanoseconds or frames."""
 
     amount: int
     frames: bool
@@ -991,7 +1009,7 @@ _COMPARE: Final[Mapping[str, Callable[[Any, int, int], Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class BoundHold:
-    """Duration that a step must have, from the first to the last frame of its run.
+    """Condition on the duration of a sequence step, from the first to the last frame in which it matches.
 
     Attributes
     ----------
@@ -1007,7 +1025,7 @@ class BoundHold:
     inclusive: bool
 
     def fits(self, length: Any, tolerance: int) -> Any:
-        """Return true for runs whose length meets the comparison.
+        """Return True if a duration meets the condition. Arrays of durations give arrays.
 
         Parameters
         ----------
@@ -1026,7 +1044,7 @@ class BoundHold:
 
 @dataclass(frozen=True, slots=True)
 class StepLink:
-    """Relation in time between a step and the previous step.
+    """Time relation between a sequence step and the previous step, such as ``THEN WITHIN 5s``.
 
     Attributes
     ----------
@@ -1043,7 +1061,7 @@ class StepLink:
 
 @dataclass(frozen=True, slots=True)
 class StepWay:
-    """Sequence of steps that an expression of steps allows.
+    """One of the step sequences that a query with alternative steps allows.
 
     Attributes
     ----------
@@ -1061,7 +1079,7 @@ class StepWay:
 
 @dataclass(frozen=True, slots=True)
 class BoundStep:
-    """Bound step of a sequence.
+    """Step of a sequence: a graph pattern, with its conditions and duration.
 
     Attributes
     ----------
@@ -1084,7 +1102,7 @@ class BoundStep:
 
 @dataclass(frozen=True, slots=True)
 class BoundQuantifier:
-    """Bound ``FORALL`` or ``FORSOME`` over the entities of a trace.
+    """Quantifier of a check: ``FORALL`` or ``FORSOME`` over the entities of a trace.
 
     Attributes
     ----------
@@ -1105,7 +1123,7 @@ class BoundQuantifier:
 
 @dataclass(frozen=True, slots=True)
 class BoundCheck:
-    """Bound check: a condition that must be true from the first frame of a trace.
+    """``CHECK`` statement with resolved names: a condition that must be true from the first frame of a trace.
 
     Attributes
     ----------

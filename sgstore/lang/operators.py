@@ -1,4 +1,4 @@
-"""Operators and functions of values, each declared once for SQL, single bindings and columns.
+"""Operators and functions of query expressions, each defined once: as SQL, for one value, and for arrays.
 
 An operand may be unknown. Most operators are *strict*: if an operand is unknown, the value is unknown. So
 they are written for known values only. Logic, tests of ``NULL``, ``coalesce`` and ``IN`` have their own
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Values for many bindings or frames, with a mask of the known values.
+    """Array of the values of an expression, with a mask of the known values.
 
     Attributes
     ----------
@@ -44,23 +44,23 @@ class Column:
 
     @property
     def flags(self) -> Bools:
-        """Values as booleans."""
+        """Values of the column as an array of booleans."""
         return np.asarray(self.values, np.bool_)
 
     @property
     def true(self) -> Any:
-        """Mask of entries that are known and true."""
+        """Mask of the values that are known and true."""
         return self.flags if self.known is True else self.known & self.flags
 
     @property
     def false(self) -> Any:
-        """Mask of entries that are known and false."""
+        """Mask of the values that are known and false."""
         flags = np.logical_not(self.flags)
         return flags if self.known is True else self.known & flags
 
 
 def all_known(columns: Iterable[Column]) -> Any:
-    """Return the mask of entries that are known in all columns. ``True`` means all entries."""
+    """Return the mask of positions where all columns have known values. ``True`` means all positions."""
     found: Any = True
     for column in columns:
         if column.known is not True:
@@ -70,7 +70,7 @@ def all_known(columns: Iterable[Column]) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """Operator or function, implemented for each engine.
+    """Operator or function of query expressions: as SQL, for one value, and for arrays.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ def operand_text(text: str) -> str:
 
 
 def _is_call(text: str) -> bool:
-    """True if SQL is in brackets already, optionally after the name of a function."""
+    """True if an SQL text is one call or one expression in brackets."""
     if not re.match(r"\w*\(", text):
         return False
     depth = 0
@@ -117,7 +117,7 @@ def _is_call(text: str) -> bool:
 
 
 def _sql(form: str | SqlOf) -> SqlOf:
-    """Return the function that builds the SQL of an operator from a template.
+    """Return a function that builds the SQL of an operator from a template and its operands.
 
     ``abs(...)`` is a call, ``(... AND ...)`` joins all operands, ``{0} = {1}`` has a place for each operand.
     """
@@ -133,12 +133,15 @@ def _sql(form: str | SqlOf) -> SqlOf:
 
 
 def _odd(parts: Sequence[str]) -> str:
-    """Return the SQL of an ``XOR``. The value is unknown if an operand is unknown, as with ``<>``."""
+    """Return the SQL of ``XOR``, true if an odd number of operands is true.
+
+    Like ``<>``, it is NULL if an operand is NULL.
+    """
     return reduce(lambda left, right: f"({left} <> {right})", map(operand_text, parts))
 
 
 def _where(part: str, condition: str) -> str:
-    """Return the SQL of a value if a condition on it (``v``) is true, otherwise NULL.
+    """Return SQL for a value that becomes NULL unless a condition on it (``v``) is true.
 
     The value is written only once. Otherwise, the text of nested operators would grow exponentially.
     """
@@ -146,7 +149,7 @@ def _where(part: str, condition: str) -> str:
 
 
 def _not_zero(part: str) -> str:
-    """Return the SQL of a divisor, with NULL instead of zero.
+    """Return the SQL of a divisor, in which NULL replaces zero.
 
     ``nullif`` is faster, but it is a macro that plans its argument twice. So only the innermost of several
     nested divisors uses it.
@@ -191,7 +194,7 @@ def _strict(
     infix: bool = False,
     partial: bool = False,
 ) -> Operator:
-    """Return an operator that is unknown if one of its operands is unknown.
+    """Return an operator whose result is unknown if one of its operands is unknown.
 
     Without ``partial``, the operator has a value for all known operands. With ``partial``, ``one`` returns
     ``None`` for a missing value, and ``columns`` returns the values and a mask of valid values.
@@ -259,7 +262,7 @@ def _sign(a: float) -> int:
 
 
 def _finite(function: Callable[..., float]) -> Callable[..., float | None]:
-    """Wrap a function of :mod:`math` so that it returns ``None`` instead of a non-finite number."""
+    """Return a version of a :mod:`math` function with the result ``None`` for errors and non-finite numbers."""
 
     def one(*values: float) -> float | None:
         try:
@@ -272,7 +275,7 @@ def _finite(function: Callable[..., float]) -> Callable[..., float | None]:
 
 
 def _each(one: Callable[..., float | None]) -> Callable[..., Any]:
-    """Return a column function that computes each value separately.
+    """Return an array version of a number function, which computes each value separately.
 
     Functions of numpy differ in the last bit from the C library, which Python and the database use.
     """
@@ -288,13 +291,13 @@ def _each(one: Callable[..., float | None]) -> Callable[..., Any]:
 
 
 def _computed(sql: str, function: Callable[..., float]) -> Operator:
-    """Return an operator from a function of :mod:`math`. It is unknown if the result is not finite."""
+    """Return an operator for a function of :mod:`math`. A result that is not finite counts as unknown."""
     one = _finite(function)
     return _strict(sql, one, _each(one), partial=True)
 
 
 def _rounded(a: float) -> float:
-    """Round to an integer, with halves away from zero, as in SQL."""
+    """Return the nearest integer of a number. Halves are rounded away from zero, as in SQL."""
     return math.copysign(math.floor(abs(a) + 0.5), a)
 
 
@@ -308,7 +311,7 @@ def _float32_columns(numbers: Any) -> tuple[Any, Any]:
 
 
 def microseconds(seconds: float) -> float:
-    """Round a time in seconds to whole microseconds, with halves away from zero."""
+    """Return a time in seconds, rounded to whole microseconds. Halves are rounded away from zero."""
     return _rounded(seconds * 1e6) / 1e6
 
 
@@ -325,7 +328,7 @@ def _greatest(*values: Any) -> Any:
 
 
 def _ufunc(name: str) -> Callable[..., Any]:
-    """Return a numpy function by name, imported on first use because the import is slow."""
+    """Return a numpy function by name, imported at its first call because the import is slow."""
 
     def of_columns(*values: Any) -> Any:
         return getattr(np, name)(*values)
@@ -363,7 +366,10 @@ def _ruled(
     *,
     infix: bool = False,
 ) -> Operator:
-    """Return an operator that also handles unknown operands. ``one`` reads its operands lazily."""
+    """Return an operator with its own rule for unknown operands, such as ``AND``.
+
+    ``one`` reads the operands lazily.
+    """
 
     def of_one(parts: Sequence[Callable[[Any], Any]]) -> Callable[[Any], Any]:
         return lambda at: one(part(at) for part in parts)

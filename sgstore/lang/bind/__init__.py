@@ -1,4 +1,7 @@
-"""Binder: converts syntax trees to bound queries, and finds the values that a trace must know."""
+"""Binder of the query language: resolves the names and types of a parsed query.
+
+It also finds the values that a trace must know.
+"""
 
 from sgstore.lang.bind._aggregates import PLACE, sql_of
 from sgstore.lang.bind._checks import CheckInCatalog, bind_checks

@@ -1,4 +1,4 @@
-"""Aggregates: functions that count, sum or collect values over all matches.
+"""Aggregate functions of the query language: ``COUNT``, ``AVG``, ``collect`` and others, over all matches.
 
 They are allowed after ``RETURN``. Unknown values are ignored. Without values, ``COUNT`` is 0, ``collect`` is
 an empty list, and the others are NULL.
@@ -27,7 +27,7 @@ PLACE: Final = '":rows".":place"'
 
 @dataclass(frozen=True, slots=True)
 class AggregateFunction:
-    """Aggregate with its SQL and its types.
+    """Definition of an aggregate function such as ``COUNT``: its SQL, and the types of operand and result.
 
     Attributes
     ----------
@@ -61,7 +61,10 @@ def _quantile(inner: str, share: float) -> str:
 
 
 def _collected(inner: str, _: float) -> str:
-    """Return the SQL of ``collect``: a list, sorted by value for ``DISTINCT``. Without matches it is empty."""
+    """Return the SQL of the aggregate ``collect``: a list of all values, which is empty without matches.
+
+    With ``DISTINCT`` the list is sorted by value.
+    """
     value = inner.removeprefix("DISTINCT ")
     order = PLACE if value == inner else value
     return f"coalesce(list({inner} ORDER BY {order}) FILTER (WHERE {value} IS NOT NULL), [])"
@@ -85,13 +88,13 @@ EXTREMES: Final = frozenset({"min", "max"})
 
 
 def is_aggregate(e: s.Call) -> bool:
-    """True if a call is an aggregate, and not a function with the same name."""
+    """True if a call aggregates over all matches, as ``max(x)`` does, unlike the function ``max(x, y)``."""
     name = normalize_name(e.name)
     return name in AGGREGATES and (name not in EXTREMES or len(e.arguments) == 1)
 
 
 def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
-    """Bind a call of an aggregate.
+    """Resolve the names and types in a call of an aggregate such as ``COUNT(x)``; return the bound expression.
 
     Raises
     ------
@@ -121,7 +124,7 @@ def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
 
 
 def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
-    """Return a percentage as a fraction of one."""
+    """Return the percentage in the second argument of an aggregate call as a fraction from 0 to 1."""
     found = names.bind(written)
     if not isinstance(found, b.Value) or isinstance(found.value, bool | str | None):
         names.session.refuse(
@@ -135,7 +138,7 @@ def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
 
 
 def sql_of(one: b.Aggregate, inner: str) -> str:
-    """Return the SQL of an aggregate from the SQL of its operand."""
+    """Return the SQL of an aggregate such as ``AVG(x)``. ``inner`` is the SQL of its operand."""
     if one.operand is not None and one.operand.type is Type.number and one.word in _REAL:
         inner = f"CAST({inner} AS DOUBLE)"
     if one.distinct:

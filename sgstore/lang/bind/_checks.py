@@ -1,4 +1,4 @@
-"""Binding of ``CHECK``: rules for whole traces."""
+"""Binder of ``CHECK`` statements, which are rules for whole traces: resolves names and types."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CheckInCatalog:
-    """Check with the catalog to which it was bound: of the store, or of an abstraction."""
+    """Bound ``CHECK`` statement, with the catalog that resolved its names: of the store, or of an abstraction."""
 
     check: b.BoundCheck
     catalog: Catalog
@@ -41,7 +41,9 @@ def bind_checks(
     seen: Callable[[Statement], Catalog],
     parameters: Mapping[str, Any],
 ) -> tuple[CheckInCatalog, ...]:
-    """Bind every ``CHECK`` of a text, with the predicates defined before it.
+    """Resolve the names and types of every ``CHECK`` in a text.
+
+    A check can use the predicates defined before it.
 
     Parameters
     ----------
@@ -125,12 +127,12 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
 
 
 def _knows_no_more(traces: Iterable[TraceFacts], limit: float) -> bool:
-    """True if no trace has data on entities beyond the limit around the ego."""
+    """True if no trace has data on entities farther from the ego than a limit; m."""
     return all(one.reach is not None and one.reach.farthest <= limit for one in traces)
 
 
 def _returned(written: WrittenCheck, names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
-    """Bind the values that are returned for each violation."""
+    """Return the bound columns of a check's ``RETURN``: the values reported for each violation."""
     inner = replace(names, over=True)
     found = tuple(bind_column(item, inner) for item in written.returns)
     taken = [node.name for one in written.quantifiers for node in one.nodes]

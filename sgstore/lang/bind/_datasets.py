@@ -31,7 +31,9 @@ def traces_in(
     *,
     part: bool = False,
 ) -> frozenset[int] | None:
-    """Return the ids of the traces of a dataset. ``None`` means an unknown dataset.
+    """Return the ids of the traces in a dataset, which is a name pattern or a user table.
+
+    ``None`` means an unknown dataset.
 
     Parameters
     ----------
@@ -50,7 +52,7 @@ def traces_in(
 
 
 def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
-    """Return the ids of the traces that ``USING DATASET`` selects.
+    """Return the ids of the traces that a ``USING DATASET`` clause selects. An unknown name raises an error.
 
     Raises
     ------
@@ -70,7 +72,7 @@ def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
 def seen_in(
     classes: b.FrameAttribute, name: str, span: TextSpan, session: Session
 ) -> b.FrameAttribute:
-    """Return the condition that the class of a frame occurs in a dataset of traces or frames.
+    """Return the condition that the graph class of a frame also occurs in a dataset of traces or frames.
 
     Raises
     ------
@@ -98,7 +100,7 @@ def seen_in(
 
 
 def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
-    """Return the number of frames with the class of this frame, in the store or in all parts."""
+    """Return the attribute for the number of frames with the same graph class, in the store or collection."""
     attribute = Attribute(
         f"class_count({abstraction})",
         Type.number,
@@ -111,7 +113,7 @@ def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
 
 
 def abstraction_named(name: str, span: TextSpan, session: Session) -> str:
-    """Return the exact name of an abstraction whose frame classes are in the store.
+    """Return the exact spelling of an abstraction's name. The store must hold its frame classes.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Binding of expressions: resolve names, check types, and normalise words of the vocabulary."""
+"""Binder of expressions: resolves names, checks types, and corrects the spelling of known words."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _parameter(e: s.Parameter, names: SymbolTable) -> b.Bound:
 
 
 def parameter(e: s.Parameter, names: SymbolTable) -> Any:
-    """Return the value of a query parameter.
+    """Return the value that the caller passes for a query parameter such as ``$limit``.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def _attribute(e: s.AttributeOf, names: SymbolTable) -> b.Bound:
 
 
 def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
-    """Bind a column of a user table: the value in its row for the frame."""
+    """Return the bound expression for a column of a user table: the value in the row of the frame."""
     table, session = names.session.tables[e.owner.name], names.session
     found = table.attribute(e.name)
     if found is None:
@@ -161,7 +161,10 @@ def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
 
 
 def _class_attribute(name: str, names: SymbolTable) -> Attribute | None:
-    """Return the attribute ``class_NAME``, also written ``class('NAME')``, or None."""
+    """Return the attribute ``class_NAME`` (class of a frame in abstraction NAME), or None for another name.
+
+    Its other spelling is ``class('NAME')``.
+    """
     of = (
         one
         for one in names.session.classed
@@ -183,7 +186,7 @@ def _tail(e: s.AttributeOf) -> TextSpan:
 
 
 def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b.NodeAttribute:
-    """Bind an attribute of a node.
+    """Return the bound expression for an attribute of a node, such as ``v.speed``.
 
     Raises
     ------
@@ -216,7 +219,10 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
 
 
 def _own_attribute(name: str, own: Mapping[str, Type]) -> Attribute | None:
-    """Return a user-defined attribute. An exact spelling wins over one that ignores case and underscores."""
+    """Return the user-defined attribute with a name, or None.
+
+    An exact spelling wins over one that ignores case and underscores.
+    """
     wanted = normalize_name(name)
     same = next((one for one in own if normalize_name(one) == wanted), None)
     spelled = name if name in own else same
@@ -224,7 +230,7 @@ def _own_attribute(name: str, own: Mapping[str, Type]) -> Attribute | None:
 
 
 def _no_attribute(name: str) -> str | None:
-    """Suggest a relation or a predicate for an unknown attribute name, or None."""
+    """Return a hint for an unknown attribute name that is a relation or a predicate; otherwise None."""
     if relation_named(name):
         return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
     return call_hint(name)
@@ -234,7 +240,7 @@ FOLLOWED: Final = tuple(frozenset({relation}) for relation in FOLLOWING)
 
 
 def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b.EdgeAttribute:
-    """Bind an attribute of an edge.
+    """Return the bound expression for an attribute of an edge.
 
     Raises
     ------
@@ -296,7 +302,7 @@ def _logic(e: s.Logic, names: SymbolTable) -> b.Operation:
 
 
 def _between(operands: tuple[s.Expression, ...], names: SymbolTable) -> str:
-    """Return the text between the first and the second operand."""
+    """Return the query text between the first and the second operand, which contains the operator."""
     return names.session.text[operands[0].span.end : operands[1].span.start]
 
 
@@ -329,7 +335,7 @@ def _comparison(e: s.Comparison, names: SymbolTable) -> b.Operation:
 
 
 def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> None:
-    """Reject comparisons with NULL or with a list."""
+    """Raise an error if a comparison has NULL or a list on one side."""
     prop = isinstance(e.left, s.Variable) and not e.left.name
     where = "in place of the property, behind WHERE: x." if prop else ""
     if prop:
@@ -347,7 +353,7 @@ def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTa
 
 
 def _of_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> str | None:
-    """Return a hint for a comparison with an unexpected type on one side, or None."""
+    """Return a hint for a comparison of values with different types, or None."""
     for written, side, other in ((e.left, left, right), (e.right, right, left)):
         if isinstance(written, s.Parameter):
             return f"${written.name} is the {side.type.value} {names.session.parameters[written.name]!r}"
@@ -359,7 +365,7 @@ def _of_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable
 
 
 def _of_name(e: s.Expression, side: b.Bound, other: b.Bound, names: SymbolTable) -> str | None:
-    """Suggest the name attribute if an id is compared with a text, or None."""
+    """Return a hint to use the attribute ``name`` if a query compares an id with a text; otherwise None."""
     of_trace = isinstance(side, b.TraceAttribute)
     ids = isinstance(side, b.NodeAttribute | b.TraceAttribute) and side.attribute.name in {
         "id",
@@ -373,7 +379,7 @@ def _of_name(e: s.Expression, side: b.Bound, other: b.Bound, names: SymbolTable)
 
 
 def _canonical(value: b.Bound, other: b.Bound, span: TextSpan, names: SymbolTable) -> b.Bound:
-    """Return a compared text in the canonical spelling of a closed vocabulary."""
+    """Return a compared text in its standard spelling, if the attribute has a fixed list of values."""
     known = _vocabulary(other)
     if not known or not isinstance(value, b.Value) or not isinstance(value.value, str):
         return value
@@ -450,7 +456,10 @@ def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
 
 
 def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttribute:
-    """Bind ``frame.class IN dataset_classes('train')``. A second argument repeats the abstraction."""
+    """Return the bound condition ``frame.class IN dataset_classes('train')``.
+
+    A second argument of the function must repeat the abstraction.
+    """
     session = names.session
     if (
         not isinstance(operand, b.FrameAttribute)
@@ -475,7 +484,7 @@ def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttri
 
 
 def _case(e: s.Case, names: SymbolTable) -> b.Operation:
-    """Bind a ``CASE``: condition and value of each branch, then the ``ELSE`` value or NULL."""
+    """Return the bound form of ``CASE``: condition and value of each branch, then the ``ELSE`` value or NULL."""
     operands: list[b.Bound] = []
     written = [branch.value for branch in e.branches]
     written += [e.otherwise] if e.otherwise is not None else []

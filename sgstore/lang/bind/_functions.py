@@ -1,4 +1,4 @@
-"""Binding of calls: functions of entities and numbers, predicates, and aggregates."""
+"""Binder of function calls: functions of entities and numbers, predicates, and aggregates."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ MAX_CALLS: Final = 30
 
 
 def call(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Bind a call of a function or predicate.
+    """Resolve the names and types in a call of a function or predicate; return the bound expression.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def call(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _refuse_aggregate(e: s.Call, names: SymbolTable) -> NoReturn:
-    """Reject an aggregate in an expression about a single match."""
+    """Raise an error for an aggregate such as ``COUNT(x)`` outside ``RETURN`` or inside another aggregate."""
     word = e.name.upper()
     if names.aggregated:
         names.session.refuse("what is counted of all matches cannot stand in another", e.span)
@@ -132,7 +132,10 @@ def _refuse_aggregate(e: s.Call, names: SymbolTable) -> NoReturn:
 
 
 def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
-    """Bind a predicate of the standard library, which is parsed on first use."""
+    """Return the bound expression for a call of a predicate from the standard library.
+
+    The library is parsed on first use.
+    """
     found = predicates().get(name)
     if found is None:
         defined = [*names.session.predicates.values(), *predicates().values()]
@@ -144,7 +147,7 @@ def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _no_function(name: str) -> str | None:
-    """Suggest an attribute, relation or sequence for an unknown function name, or None."""
+    """Return a hint for an unknown function name that is an attribute, relation or sequence; otherwise None."""
     word = normalize_name(name)
     if (said := said_of("functions", name)) is not None:
         return said
@@ -168,7 +171,10 @@ def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:
 
 
 def _signature(name: str) -> str | None:
-    """Return the signature and meaning of a two-entity function or library predicate."""
+    """Return the signature and meaning of a library predicate, or of a function of two entities.
+
+    ``None`` means an unknown name.
+    """
     if name in PAIR_NAMES:
         function = PAIR_NAMES[name]
         about = PAIR_FUNCTIONS.get(function) or RECORDED[function]
@@ -215,7 +221,7 @@ def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _refuse_sort(e: s.Call, names: SymbolTable) -> None:
-    """Reject ``lane_dist(e, junction)`` with a hint that names the right function."""
+    """Raise an error for ``lane_dist(e, junction)``, with a hint that names the right function."""
     one, other = e.arguments
     if isinstance(other, s.Temporal) and other.word == "NEXT":
         (other,) = other.operands
@@ -312,7 +318,7 @@ def _type(e: s.Call, names: SymbolTable) -> b.EdgeRelation:
 
 
 def _path_function(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Bind ``nodes(p)``, the list of nodes of a path, or ``length(p)``."""
+    """Return the bound form of ``nodes(p)``, the list of nodes of a path, or of ``length(p)``."""
     _expect(e, 1, 1, names)
     found = names.bind(e.arguments[0])
     if not b.is_path(found):

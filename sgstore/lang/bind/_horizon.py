@@ -57,7 +57,7 @@ class Horizon:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Bounds on the position of an entity relative to the ego.
+    """Upper bounds on the distance of an entity from the ego, as implied by conditions.
 
     Attributes
     ----------
@@ -75,23 +75,23 @@ class _Place:
 
     @property
     def reach(self) -> float:
-        """Largest distance from the ego; m."""
+        """Largest possible distance of the entity from the ego; m."""
         return min(self.away, self.along) if self.lanes else self.away
 
     def both(self, other: _Place) -> _Place:
-        """Return the bounds if both conditions hold."""
+        """Return the distance bounds of an entity that meets the conditions of both ``self`` and ``other``."""
         lanes = self.lanes or other.lanes
         return _Place(min(self.away, other.away), min(self.along, other.along), lanes)
 
     def either(self, other: _Place) -> _Place:
-        """Return the bounds if one of two conditions holds."""
+        """Return the distance bounds of an entity that meets the conditions of ``self`` or of ``other``."""
         lanes = self.lanes and other.lanes
         away = max(self.reach, other.reach)
         return _Place(away, max(self.along, other.along), lanes)
 
 
 def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
-    """Return the range around the ego that a check depends on.
+    """Return the range around the ego that can influence the verdict of a check.
 
     Parameters
     ----------
@@ -122,7 +122,9 @@ def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
 
 
 def spoken_kinds(check: BoundCheck) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the kinds whose missing nodes can make a check wrongly true, and wrongly false.
+    """Return the node kinds whose missing nodes can make a check wrongly true, and wrongly false.
+
+    The result is a pair of sets.
 
     Parameters
     ----------
@@ -149,7 +151,10 @@ def _farther(found: Horizon, reach: float, *, true: bool, false: bool) -> Horizo
 
 @dataclass(frozen=True, slots=True)
 class _Missed:
-    """Node in braces with its kinds and reach, and the verdicts that are wrong if it is missing."""
+    """Node of a pattern in braces: its kinds, its largest distance from the ego, and wrong verdicts.
+
+    ``true`` and ``false`` are set if a missing node can cause that wrong verdict.
+    """
 
     kinds: frozenset[str]
     reach: float
@@ -158,13 +163,13 @@ class _Missed:
 
     @property
     def either(self) -> _Missed:
-        """Copy in which the missing node can make both verdicts wrong."""
+        """Return a copy in which a missing node can make the verdict wrongly true and wrongly false."""
         return replace(self, true=True, false=True)
 
 
 @dataclass(slots=True)
 class _Looking:
-    """Distances of variables from the ego, and the greatest speed, for the analysis of a check."""
+    """Analysis of the range of a check: known distances of variables from the ego, and the greatest speed."""
 
     known: dict[str, float]
     speed: float
@@ -172,7 +177,9 @@ class _Looking:
     def blocks(  # noqa: C901, PLR0912 - a case each
         self, formula: Bound, *, up: bool = True
     ) -> Iterable[_Missed]:
-        """Yield the nodes in the blocks of a formula.
+        """Yield the nodes in the patterns in braces of a formula, such as ``EXISTS {…}``.
+
+        Each has the wrong verdicts that a missing node can cause.
 
         ``up``: true if a true formula supports a true verdict.
         """
@@ -203,7 +210,10 @@ class _Looking:
                             yield one.either
 
     def of_block(self, block: b.BlockValue, *, up: bool) -> Iterable[_Missed]:
-        """Yield the nodes of a block. A missing node makes ``EXISTS`` false and ``COUNT`` smaller."""
+        """Yield the nodes of a pattern in braces, with the wrong verdicts that a missing node can cause.
+
+        A missing node makes ``EXISTS`` false and ``COUNT`` smaller.
+        """
         scope = block.scope
         for key, node in scope.nodes.items():
             if node.kinds.other:
@@ -217,7 +227,7 @@ class _Looking:
             yield from inner.blocks(part, up=up)
 
     def in_scope(self, scope: Scope, key: str) -> _Place:
-        """Return the position bounds of a node of a pattern or block, if there is a match."""
+        """Return bounds on the distance between the ego and a node of a matched pattern."""
         found = _Place()
         for part in scope.where:
             found = found.both(self.place(part, key, wanted=True))
@@ -236,7 +246,10 @@ class _Looking:
     def place(  # noqa: PLR0911 - a case each
         self, formula: Bound, key: str, *, wanted: bool
     ) -> _Place:
-        """Return the position bounds of a variable for which a formula is true, or false, in a frame."""
+        """Return bounds on the distance between ego and entity that follow from a formula.
+
+        The formula is true or false, as ``wanted``.
+        """
         match formula:
             case b.Operation("NOT", (one,)):
                 return self.place(one, key, wanted=not wanted)
@@ -269,7 +282,7 @@ class _Looking:
         return found.both(self._measured(_MIRRORED[word], other, one, key))
 
     def _measured(self, word: str, one: Bound, other: Bound, key: str) -> _Place:
-        """Return the position bounds of a variable from a comparison of a pair number."""
+        """Return bounds on the distance between ego and entity from a comparison such as ``dist(e, v) < 20``."""
         whole = isinstance(one, b.Operation) and one.word == "abs"
         pair = one.operands[0] if isinstance(one, b.Operation) and whole else one
         if not isinstance(pair, b.PairNumber) or key not in {pair.a, pair.b}:
@@ -307,7 +320,7 @@ def _any(places: list[_Place]) -> _Place:
 
 
 def _joined(scope: Scope, key: str, known: Mapping[str, float]) -> bool:
-    """True if a pattern connects a node by lanes to a node near the ego."""
+    """True if edges of a pattern connect a node to another node whose distance from the ego is limited."""
     reached, grown = {key}, True
     while grown:
         fresh = {
@@ -326,7 +339,7 @@ _COMPLEMENT: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>
 
 
 def _safe(margin: float, speed: float) -> float:
-    """Return the largest RSS safe distance for oncoming vehicles; m."""
+    """Return the largest RSS safe distance of two oncoming vehicles for a margin and a maximum speed; m."""
     fast = speed + 3.5
     return margin + 2 * (speed + 1.75) + fast * fast / 6 + fast * fast / 8 + BODY
 
@@ -348,7 +361,7 @@ _BRAKING: Final = {"a_long_req": -1.0, "drac": 1.0, "btn": 11.5}
 
 
 def bounds(value: Bound, speed: float) -> Interval:
-    """Return the smallest and largest possible value of a number, for a maximum speed in the trace.
+    """Return the smallest and largest possible value of a numeric expression, for a maximum speed of vehicles.
 
     Parameters
     ----------

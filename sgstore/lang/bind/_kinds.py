@@ -1,4 +1,4 @@
-"""Kinds of nodes in tables, and kinds implied by conditions."""
+"""Kinds of nodes (such as car or lane): the tables that store them, and restrictions by conditions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FEW: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Kinds of the nodes that a variable may be bound to, grouped by the table that stores them."""
+    """Kinds of node that a query variable can match, grouped by the table that stores these nodes."""
 
     moving: frozenset[str]
     fixed: frozenset[str]
@@ -33,7 +33,7 @@ class Profile:
 
     @classmethod
     def of(cls, kinds: Kinds, catalog: Catalog) -> Profile:
-        """Return the profile for a set of kinds.
+        """Return the profile for a set of kinds: the kinds grouped by the table that stores their nodes.
 
         Unused entity kinds count as moving, other unused kinds as mapped.
         """
@@ -46,7 +46,7 @@ class Profile:
 
     @property
     def kinds(self) -> frozenset[str]:
-        """All kinds of the profile."""
+        """All kinds of node in the profile, from all tables."""
         return self.moving | self.fixed | self.mapped
 
     @property
@@ -66,7 +66,7 @@ class Profile:
 
 
 def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
-    """Return the tables to join for an attribute of nodes with a given profile.
+    """Return the tables to join in SQL for an attribute of nodes of some kinds.
 
     The state of a moving entity is joined anyway. So a constant that states repeat is read from the state.
     """
@@ -78,7 +78,9 @@ def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
 
 
 def kind_conditions(kinds: Kinds, kind: str, ego: str | None, held: frozenset[str]) -> list[str]:
-    """Return SQL conditions on a kind column and an ego column. ``None`` means never the ego.
+    """Return SQL conditions that restrict the kind of a node, and if it is the ego.
+
+    ``ego=None`` means that no row is the ego.
 
     ``held`` are all kinds in the column. A condition that all of them meet is omitted.
     """
@@ -103,7 +105,7 @@ def _among(kinds: frozenset[str], column: str, held: frozenset[str]) -> list[str
 
 
 def _one_of(column: str, words: list[str], others: Sequence[str] = ()) -> str:
-    """Return the condition that a column is one of some words. ``others`` are the other possible words."""
+    """Return the SQL condition that a column equals one of some words. ``others`` are the other possible words."""
     if len(words) > _FEW >= len(others) > 0:
         return " AND ".join(f"{column} <> {literal(word)}" for word in others)
     if len(words) == 1:
@@ -114,7 +116,9 @@ def _one_of(column: str, words: list[str], others: Sequence[str] = ()) -> str:
 def edge_conditions(
     catalog: Catalog, scope: Scope, edge: Edge, alias: str, *, moving: bool, swapped: bool = False
 ) -> list[str]:
-    """Return SQL conditions on relation and kinds for a row of ``edge`` or ``map_edge``.
+    """Return SQL conditions for the rows of an edge table: allowed relations, and allowed kinds of both nodes.
+
+    The table is ``edge`` or ``map_edge``.
 
     ``moving`` selects the table ``edge``. ``swapped``: the row runs from ``dst`` to ``src`` of the edge.
     """
@@ -139,14 +143,16 @@ def edge_conditions(
 
 
 def alias_of(edge: Edge) -> str:
-    """Return the SQL alias of an edge: its key, plus its relation if it has only one."""
+    """Return the SQL alias of a pattern edge: its key, plus its relation if it has only one."""
     return (
         f"{edge.key}:{next(iter(edge.relations))}" if len(edge.relations) == 1 else f"{edge.key}:"
     )
 
 
 def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
-    """Restrict nodes to entities if a condition compares a number of their pair.
+    """Return a scope in which nodes must be entities if a condition compares a number of their pair.
+
+    An example is ``ttc(a, b) < 2``.
 
     For other kinds of nodes the number is unknown, so the comparison is never true. Without this restriction,
     a node without a label would be tried with every part of the map.
@@ -170,7 +176,7 @@ _ON_LANES: Final = frozenset({"lane", "road", "junction", "roundabout", "crosswa
 
 
 def _needed(expression: Bound) -> Iterator[PairNumber]:
-    """Yield the pair numbers that must be known for the expression to be known."""
+    """Yield the pair numbers (such as ``ttc(a, b)``) without which an expression is NULL."""
     match expression:
         case PairNumber():
             yield expression

@@ -1,4 +1,4 @@
-"""Needs of a query or check: values that a trace must know to answer it.
+"""Needs of a query or check: the values that a trace must contain for an answer, such as an ego or speeds.
 
 An unknown condition is not true, and inside temporal operators it is false. So ``ALWAYS ego.speed < 20``
 would be false for a trace without an ego or without speeds. Such a trace cannot answer: it is left out, and
@@ -47,7 +47,7 @@ _TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """Fact that a trace must know.
+    """Data that a trace must contain for a query or check: an attribute, an event, an ego or a map.
 
     Attributes
     ----------
@@ -72,12 +72,12 @@ class Need:
 
     @property
     def is_ego(self) -> bool:
-        """True if the need is that an ego exists."""
+        """True if the required data is the ego vehicle itself, and not an attribute, event or map."""
         return self.attribute is None and not self.event and not self.lanes
 
     @property
     def reason(self) -> str:
-        """Message about a trace that does not meet the need."""
+        """Message that explains which required data a trace lacks."""
         if self.lanes:
             return (
                 "it has no map with heights" if self.lanes == "slope" else "it has no map of lanes"
@@ -91,7 +91,7 @@ class Need:
 
 
 def of_check(check: BoundCheck) -> tuple[Need, ...]:
-    """Return the needs of a check. The result is empty with ``USING UNKNOWN false``."""
+    """Return the data that a trace must contain for a check. The result is empty with ``USING UNKNOWN false``."""
     if check.unknown_is_false:
         return ()
     nodes = check.scope.nodes
@@ -103,7 +103,7 @@ def of_check(check: BoundCheck) -> tuple[Need, ...]:
 
 
 def not_computed(check: BoundCheck, facts: TraceFacts) -> str:
-    """Return a message about relations of a check that a trace lacks, or an empty text."""
+    """Return a message about relations that a check uses and a trace lacks, or an empty text."""
     if check.unknown_is_false:
         return ""
     missing = check.relations - facts.answers
@@ -114,7 +114,7 @@ def not_computed(check: BoundCheck, facts: TraceFacts) -> str:
 
 
 def _of_entities(expression: Bound) -> frozenset[str]:
-    """Return the relations that an expression uses between entities."""
+    """Return the names of the relations between entities that an expression uses."""
     found: set[str] = set()
     for part in b.walk(expression):
         match part:
@@ -134,7 +134,7 @@ def _of_entities(expression: Bound) -> frozenset[str]:
 
 
 def of_query(query: b.Query) -> tuple[Need, ...]:
-    """Return the needs of a query: the facts that a trace must know to have a match.
+    """Return the data that a trace must contain so that a query can have a match in it.
 
     For an ``OR`` without temporal operators, only needs common to all its conditions count.
     """
@@ -172,7 +172,10 @@ def _of_each(
 def _needed(  # noqa: C901, PLR0911, PLR0912 - a case each
     expression: b.Bound, nodes: Mapping[str, b.Node], *, strict: bool
 ) -> set[Need]:
-    """Return the needs of an expression. If ``strict``, all its parts count, even in an ``OR``."""
+    """Return the data that a trace must contain for an expression.
+
+    If ``strict``, all operands count, even of an ``OR``.
+    """
 
     def of_node(key: str, name: str) -> set[Need]:
         if key not in nodes or name not in MEASURED:

@@ -1,4 +1,4 @@
-"""Binding of patterns: nodes, edges, labels and blocks."""
+"""Binder of graph patterns: resolves the nodes, edges, labels and blocks (patterns in braces)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sgstore.model.vocabulary import (
 
 
 def bind_block(block: s.Block, names: SymbolTable) -> None:
-    """Bind the paths and the condition of a block into the scope of ``names``.
+    """Add the paths and the condition of a graph pattern to the current scope, with names resolved.
 
     All nodes and edges are bound before any condition. So a condition inside a node can use later nodes.
     """
@@ -94,7 +94,7 @@ def _node(node: s.NodePattern, names: SymbolTable) -> str:
 
 
 def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
-    """Reject ``(Car)``, which is a node named Car. The user probably means ``(:Car)``."""
+    """Raise an error for ``(Car)``, a node with the name of a label. The user probably means ``(:Car)``."""
     if node.name and node.name[0].isupper() and not node.label and node.name in labels():
         names.session.refuse(
             f"({node.name}) would be any node, called {node.name}",
@@ -104,7 +104,10 @@ def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
 
 
 def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
-    """Return the key of a node that is already bound. ``None`` means a new node."""
+    """Return the key of a pattern node whose name is known from earlier in the query.
+
+    ``None`` means a new node.
+    """
     if node.name is None:
         return None
     if node.name in RESERVED:
@@ -119,7 +122,7 @@ def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
 
 
 def _the_ego(node: s.NodePattern, names: SymbolTable) -> str | None:
-    """Return the key of the ego if the node has the reserved name ``ego``, or None."""
+    """Return the key of the ego vehicle if a pattern node has the reserved name ``ego``; otherwise None."""
     if node.name != THE_EGO:
         return None
     if names.scope.parent is None:
@@ -175,7 +178,7 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str
 
 
 def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable) -> None:
-    """Bind the properties and the condition inside a node or an edge."""
+    """Add the properties and the condition written inside a node or edge to the current scope."""
     for prop in pattern.properties:
         attribute_of = node_attribute if isinstance(pattern, s.NodePattern) else edge_attribute
         attribute = attribute_of(key, prop.name, prop.name_span, names)
@@ -185,7 +188,10 @@ def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable
 
 
 def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bound:
-    """Bind the property ``name: value`` as a comparison. The attribute gets a name unavailable to queries."""
+    """Return the bound comparison for a property ``name: value`` of a node or edge.
+
+    The attribute gets an internal name that queries cannot use.
+    """
     inner = names.body({"": Symbol(value=attribute)})
     inner.parent = names
     span = TextSpan(prop.name_span.start, prop.value.span.end)
@@ -193,7 +199,7 @@ def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bou
 
 
 def kinds_of(label: s.LabelExpression, session: Session) -> b.Kinds:
-    """Return the kinds that a label allows.
+    """Return the kinds of node that a label expression such as ``Car|Truck`` allows.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Precision of comparisons: a number is rounded to the precision that the store has for the other side.
+"""Precision of comparisons: numbers are rounded like the stored values with which they are compared.
 
 The store keeps most attributes of nodes and edges in 32 bits, so a car whose width is 1.8 m has the width
 1.7999999523162842. The compared number is rounded to 32 bits first. Times since the
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Precision(Enum):
-    """Rounding of a value before it is compared. The member value is the name of the operator."""
+    """Rounding of a number before a comparison. The member value is the name of the rounding operator."""
 
     float32 = "float32"
     microseconds = "microseconds"
@@ -45,7 +45,10 @@ _OVER_TIME: Final = frozenset({"prev", "min_over", "max_over", "avg_over"})
 
 
 def precision_of(value: b.Bound) -> Precision | None:
-    """Return the precision of a value. ``None`` means that it is computed in 64 bits."""
+    """Return the precision with which the store keeps an expression's value.
+
+    ``None`` means computed in 64 bits.
+    """
     if value.type is not Type.number:
         return None
     match value:
@@ -63,7 +66,10 @@ def precision_of(value: b.Bound) -> Precision | None:
 
 
 def _of_whole(attribute: Attribute) -> Precision | None:
-    """Return the precision of an attribute of a frame or trace, or of a value passed by ``WITH``."""
+    """Return the stored precision of an attribute of a frame or trace, or of a value passed by ``WITH``.
+
+    ``None`` means 64 bits.
+    """
     if attribute.precision:
         return Precision(attribute.precision)
     timed = attribute.unit in {DisplayUnit.seconds, DisplayUnit.span}
@@ -71,7 +77,7 @@ def _of_whole(attribute: Attribute) -> Precision | None:
 
 
 def _of_many(value: b.Bound) -> Precision | None:
-    """Return the precision of a value that is selected from many."""
+    """Return the stored precision of a value that is selected from several values. ``None`` means 64 bits."""
     match value:
         case b.OverMatch(word="argmin" | "argmax", at=at) if at is not None:
             return precision_of(at)
@@ -88,7 +94,7 @@ def _of_many(value: b.Bound) -> Precision | None:
 
 
 def _common(operands: tuple[b.Bound, ...]) -> Precision | None:
-    """Return the common precision of alternative values, ignoring constants."""
+    """Return the precision that all operands share, ignoring constants. ``None`` if they differ."""
     found = {precision_of(one) for one in operands if not isinstance(one, b.Value)}
     return found.pop() if len(found) == 1 else None
 
@@ -115,7 +121,7 @@ def _is_computed(part: b.Bound) -> bool:
 
 
 def compared(*sides: b.Bound) -> tuple[b.Bound, ...]:
-    """Round the sides of a comparison to the lowest precision among them."""
+    """Return the sides of a comparison, rounded to the lowest precision among them."""
     known = {precision_of(side) for side in sides} - {None}
     for precision in Precision:
         if precision in known:
@@ -124,7 +130,7 @@ def compared(*sides: b.Bound) -> tuple[b.Bound, ...]:
 
 
 def chosen(value: b.Bound, choices: b.Choices) -> tuple[b.Bound, b.Choices]:
-    """Round a value and the constants of the list in which it is searched."""
+    """Return a value and the constants of its ``IN`` list, rounded to the lowest precision among them."""
     operand, *items = compared(value, *choices.items)
     return operand, b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
 
@@ -141,7 +147,7 @@ def _rounded(value: b.Bound, precision: Precision) -> b.Bound:
 
 
 def _is_exact(value: b.Bound, precision: Precision) -> bool:
-    """True if the stored value already has the given precision."""
+    """True if a stored value already has the given precision, so that rounding is unnecessary."""
     if precision_of(value) is not precision:
         return False
     if isinstance(value, b.Operation) and value.word in {"abs", "negative"}:

@@ -1,4 +1,4 @@
-"""Binding of queries: converts the syntax tree of a ``MATCH`` and its settings to the IR.
+"""Binder of queries: resolves names and types of a parsed ``MATCH`` and its settings.
 
 The binder and the parser find all errors of the user, before any SQL is built.
 """
@@ -50,7 +50,9 @@ SCOPES: Final = ("graph", "world")
 def bind_query(
     text: str, statements: Sequence[s.Statement], catalog: Catalog, parameters: Mapping[str, Any]
 ) -> b.Query:
-    """Bind the single ``MATCH`` of a text, with the predicates that the text defines.
+    """Return the bound query of a text with one ``MATCH``: names resolved, types known.
+
+    The text may also define predicates.
 
     Parameters
     ----------
@@ -112,7 +114,7 @@ def _of_match(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _is_plain(match: s.MatchClause) -> bool:
-    """True if the query is a single pattern, without a duration or a name."""
+    """True if a query has only one step (one pattern for single frames), without a duration or a name."""
     first = match.sequence.steps[0]
     if len(match.sequence.steps) > 1 or not isinstance(first, s.StepClause):
         return False
@@ -120,7 +122,10 @@ def _is_plain(match: s.MatchClause) -> bool:
 
 
 def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
-    """Bind a single-frame pattern. If it uses other frames, bind it as a sequence of one step."""
+    """Return the bound query of a pattern for single frames.
+
+    If it uses other frames, the result is a sequence of one step.
+    """
     names = SymbolTable(session, ScopeBuilder(session))
     bind_block(match.block, names)
     result = bind_result(match.returns, names)
@@ -135,7 +140,7 @@ def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
-    """Bind a sequence of steps."""
+    """Return the bound query of a sequence of steps (patterns that match one after another)."""
     found = bind_sequence(match.sequence, session, bind_block)
     names = SymbolTable(session, found.scope(), found.meanings)
     result = bind_result(match.returns, names)
@@ -148,7 +153,7 @@ def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _told(scope: b.Scope) -> b.Scope:
-    """Return the scope of a match: named nodes and edges, the ends of these edges, and the ego."""
+    """Return the nodes and edges that a match reports: named ones, the ends of named edges, and the ego."""
     edges = tuple(edge for edge in scope.edges if edge.named)
     ends = {end for edge in edges for end in (edge.src, edge.dst)}
     told = {
@@ -189,7 +194,9 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.MatchC
 
 
 def define(statement: s.Define, session: Session) -> None:
-    """Add a definition of a predicate or scenario to the session.
+    """Add a predicate or scenario that the query text defines to the known names.
+
+    Duplicate names raise an error.
 
     Raises
     ------
@@ -207,7 +214,7 @@ def define(statement: s.Define, session: Session) -> None:
 
 @dataclass(slots=True)
 class UsingChoice:
-    """Settings from ``USING``. ``None`` means not set."""
+    """Settings from the ``USING`` clauses of a statement. ``None`` means that a setting is absent."""
 
     ego: str | None = None
     unknown_is_false: bool = False
@@ -219,7 +226,7 @@ class UsingChoice:
 
 
 def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) -> UsingChoice:
-    """Return the ``USING`` settings of a statement.
+    """Return the settings from the ``USING`` clauses of a statement.
 
     Raises
     ------
@@ -260,7 +267,7 @@ _CHOICES: Final = {
 
 
 def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session) -> None:
-    """Store a setting that has a closed list of values."""
+    """Store one ``USING`` setting whose value must be one of some fixed words, such as ``NODES any``."""
     name, word = normalize_name(setting.name), value.lower()
     if word not in _CHOICES[name]:
         session.unknown(f"value of {setting.name}", value, setting.span, _CHOICES[name])
@@ -280,7 +287,7 @@ def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session
 
 
 def _metres(value: str, setting: s.Setting, session: Session) -> float:
-    """Return the range of a check in metres."""
+    """Return the distance of ``USING RANGE``, the range of a check around the ego; m."""
     try:
         metres = float(value)
     except ValueError:
@@ -299,7 +306,7 @@ def _setting_value(setting: s.Setting, session: Session) -> str:
 
 
 def refuse_unused(session: Session) -> None:
-    """Reject parameters that the query does not use."""
+    """Raise an error if the caller passes a query parameter that the query does not use."""
     unused = sorted(set(session.parameters) - session.used)
     if unused:
         name, hint = unused[0], f"it would be written ${unused[0]}"
@@ -309,7 +316,7 @@ def refuse_unused(session: Session) -> None:
 
 
 def refuse_strange(session: Session, catalog: Catalog) -> None:
-    """Reject relations that the abstraction does not have."""
+    """Raise an error if the query uses a relation that the abstraction (kind of scene graph) lacks."""
     if catalog.relations is None:
         return
     strange = sorted(session.relations - catalog.relations)

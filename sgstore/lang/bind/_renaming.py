@@ -1,4 +1,4 @@
-"""Named patterns as steps, with renamed variables: ``MATCH cut_in(v = w)``.
+"""Use of named patterns as steps, with renamed variables, as in ``MATCH cut_in(v = w)``.
 
 A renamed variable has its new name everywhere in the pattern. Other variables keep their names, so the same
 name is the same entity in every step.
@@ -24,7 +24,7 @@ _NAMED = (s.NodePattern, s.EdgePattern, s.StepClause, s.Variable)
 def values_given(
     step: s.ScenarioStep, parameters: Mapping[str, str], session: Session
 ) -> list[s.Argument]:
-    """Return the arguments that set parameters of a pattern.
+    """Return the arguments of a step such as ``cut_in(gap = 5)`` that set parameters of the named pattern.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def own_names(
     taken: frozenset[str],
     session: Session,
 ) -> dict[str, str]:
-    """Return the new names of the variables of a pattern: old name → new name.
+    """Return the new names for the variables of a named pattern that is used as a step: old name → new name.
 
     Variables bound in braces are invisible outside. If their name is already used, they get a name that
     queries cannot write.
@@ -111,7 +111,7 @@ def own_names(
 
 
 def _variables(steps: Sequence[s.StepClause]) -> Iterator[str]:
-    """Yield the names that steps bind (nodes, edges, steps), then the variables that they use."""
+    """Yield the names that steps define (nodes, edges, steps), then the variables that their conditions use."""
     for step in steps:
         yield from (name for name in _bound(step.block) if name != THE_EGO)
         if step.name is not None:
@@ -121,13 +121,13 @@ def _variables(steps: Sequence[s.StepClause]) -> Iterator[str]:
 
 
 def _bound(block: s.Block) -> list[str]:
-    """Return the names of the nodes and edges of a block."""
+    """Return the names of the nodes and edges of a graph pattern."""
     parts = [part for path in block.paths for part in (*path.nodes, *path.edges)]
     return [part.name for part in parts if part.name]
 
 
 def _spoken_of(part: Any, own: tuple[str, ...]) -> Iterator[str]:
-    """Yield the variables used in a part of a text, except those bound by enclosing braces."""
+    """Yield the variables in a part of a syntax tree, except nodes and edges of an enclosing ``EXISTS {…}``."""
     if isinstance(part, s.Variable):
         yield from () if part.name in own else (part.name,)
         return
@@ -141,7 +141,7 @@ def _spoken_of(part: Any, own: tuple[str, ...]) -> Iterator[str]:
 
 
 def names_written(sequence: s.SequenceClause) -> frozenset[str]:
-    """Return the names that a sequence binds or uses."""
+    """Return the names that a sequence of steps defines or uses."""
     found: set[str] = set()
     for step in sequence.steps:
         if isinstance(step, s.GroupStep):
@@ -154,7 +154,7 @@ def names_written(sequence: s.SequenceClause) -> frozenset[str]:
 
 
 def renamed(step: s.StepClause, names: Mapping[str, str]) -> s.StepClause:
-    """Return a copy of a step with renamed variables."""
+    """Return a copy of a sequence step with renamed variables."""
     return _renamed(step, names) if names else step
 
 

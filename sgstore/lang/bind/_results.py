@@ -1,4 +1,4 @@
-"""Binding of results: ``RETURN``, ``ORDER BY``, ``SAMPLE`` and ``TOP``."""
+"""Binder of query results: ``RETURN``, ``ORDER BY``, ``SAMPLE`` and ``TOP``."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def bind_result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
 
 
 def _special(returns: s.Returns, session: Session) -> s.Item | None:
-    """Return the item ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``, or None."""
+    """Return the item ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS`` of a ``RETURN`` clause, or None."""
     special = [item for item in returns.items if item.form not in {"value", "all"}]
     if len(special) > 1:
         session.refuse("one of FRAMES, INTERVALS, SUBGRAPHS and CLIPS at a time", special[1].span)
@@ -60,7 +60,10 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
 
 
 def bind_columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
-    """Bind the values to return. An aggregating value may use the grouping values of the same ``RETURN``."""
+    """Return the bound columns of a ``RETURN`` clause.
+
+    An aggregate may use the grouping values of the same clause.
+    """
     items = [item for item in items if item.form == "value"]
     found = [bind_column(item, names) for item in items]
     keys = _group_keys(found)
@@ -79,7 +82,7 @@ def _group_keys(columns: Iterable[b.ReturnColumn]) -> dict[b.Bound, str]:
 
 
 def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
-    """Replace grouping values in an expression by references to their columns."""
+    """Return an expression in which grouping values are replaced by references to their result columns."""
     if value in keys:
         return b.GroupKey(keys[value], value.type)
     if isinstance(value, b.Operation):
@@ -97,7 +100,7 @@ def bind_column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
 
 
 def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
-    """Reject a value that mixes single matches with an aggregate over all matches."""
+    """Raise an error for an expression that mixes an aggregate with a value of a single match."""
     if b.is_counted(value) and _of_each(value):
         session.refuse(
             "a value of each match cannot stand beside one of all matches",
@@ -107,14 +110,14 @@ def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
 
 
 def _of_each(value: b.Bound) -> bool:
-    """True if a value depends on single matches outside its aggregates."""
+    """True if an expression uses values of single matches outside an aggregate such as ``COUNT``."""
     if isinstance(value, b.Operation):
         return any(_of_each(operand) for operand in value.operands)
     return not isinstance(value, b.Aggregate | b.GroupKey | b.Value | b.Choices)
 
 
 def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) -> b.Bound | None:
-    """Return the condition on groups of matches or on intervals, or None."""
+    """Return the bound ``HAVING`` condition on groups of matches or on intervals, or None."""
     if written is None:
         return None
     session = names.session
@@ -150,7 +153,7 @@ def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) 
 
 
 def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound | str:
-    """Return a sort or sampling key: the name of a result, or a value of each match."""
+    """Return the bound key of a sort or sample: the name of a result column, or an expression on each match."""
     own = {column.name: column.value for column in result.columns}
     known = (*result.names, *own)
     taken = isinstance(value, s.Variable) and names.meaning(value.name) is not None
@@ -197,7 +200,7 @@ _TRACE_NAME: Final = b.TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 
 
 def _top(top: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampling | None:
-    """Bind ``LIMIT n PER value``: the first rows for each value."""
+    """Return the bound form of ``LIMIT n PER value``, which keeps the first n rows for each value; or None."""
     if top is None or top.per is None:
         return None
     per = _key(top.per, result, names)

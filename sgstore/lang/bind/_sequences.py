@@ -1,4 +1,4 @@
-"""Binding of sequences: steps and links of a ``MATCH``, with scenarios replaced by their steps.
+"""Binder of sequences (steps and links of a ``MATCH``). Named scenarios are replaced by their steps.
 
 Each step has its own scope, about one frame. A node of several steps has the same key in all of them: it is
 the same entity.
@@ -36,7 +36,7 @@ SEQUENCES: Final = frozenset({"concept", "scenario"})
 
 @dataclass(slots=True)
 class StepScope(ScopeBuilder):
-    """Scope of one step, which can use nodes bound by other steps.
+    """Nodes and conditions of one sequence step during binding. The step can use nodes of other steps.
 
     Attributes
     ----------
@@ -47,16 +47,16 @@ class StepScope(ScopeBuilder):
     known: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
 
     def mention(self, key: str) -> None:
-        """Record the use of a node. A node of another step becomes a node of this step too."""
+        """Record that the step uses a node. A node of another step is added to this step."""
         if key not in self.nodes and key in self.known:
             self.nodes[key] = self.known[key]
 
     def kinds(self, key: str) -> b.Kinds:
-        """Return the kinds that a node may have in this step."""
+        """Return the kinds that a node may have in this sequence step."""
         return self.nodes[key].kinds if key in self.nodes else self.known[key].kinds
 
     def the_ego(self, span: TextSpan) -> str:
-        """Return the key of the ego node, of this step or another step, or add one."""
+        """Return the key of the ego node from any step of the sequence, or add an ego node to this step."""
         for node in (*self.nodes.values(), *self.known.values()):
             if not node.kinds.other:
                 self.mention(node.key)
@@ -66,7 +66,7 @@ class StepScope(ScopeBuilder):
 
 @dataclass(slots=True)
 class BoundSequence:
-    """Sequence during binding.
+    """Sequence of steps with their nodes and links, while the binder resolves it.
 
     Attributes
     ----------
@@ -96,11 +96,11 @@ class BoundSequence:
     ways: list[b.StepWay] = field(default_factory=list[b.StepWay])
 
     def scope(self) -> ScopeBuilder:
-        """Return the scope of values of a match: named nodes, named edges and the ego."""
+        """Return the nodes and edges that values of a match can use: named ones and the ego."""
         return ScopeBuilder(self.session, nodes=self.ends | self.known, edges=list(self.edges))
 
     def take_in_ego(self, told: ScopeBuilder) -> None:
-        """Add the ego to the last required step if the query uses it, but no step contains it.
+        """Add the ego to the last required step of the sequence, if the query uses the ego outside all steps.
 
         ``told`` is the scope of the values of a match.
         """
@@ -127,7 +127,7 @@ class BoundSequence:
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """Step as written, with the parameter values of its scenario.
+    """Step of a sequence as a syntax tree, with the parameter values of its scenario.
 
     ``called`` is the place of the call, if the text of the scenario is in the library.
     """
@@ -140,13 +140,13 @@ class _Written:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenSteps:
-    """Steps as written, with the links between them."""
+    """Steps of a sequence as syntax trees, with the links between neighbouring steps."""
 
     steps: list[_Written | _WrittenGroup]
     links: list[tuple[s.LinkClause, Mapping[str, Any] | None]]
 
     def changed(self, change: Callable[[_Written], _Written]) -> _WrittenSteps:
-        """Return a copy with a function applied to every step."""
+        """Return a copy of the sequence in which a function is applied to every step."""
         return _WrittenSteps(
             [
                 change(one)
@@ -158,7 +158,7 @@ class _WrittenSteps:
         )
 
     def given(self, values: Mapping[str, Any]) -> _WrittenSteps:
-        """Return a copy with parameter values added to steps and links. Existing values are kept."""
+        """Return a copy of the sequence with parameter values added to steps and links. Existing values stay."""
         links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = [
             (link, {**values, **(more or {})}) for link, more in self.links
         ]
@@ -171,7 +171,7 @@ class _WrittenSteps:
         return _WrittenSteps(steps, links)
 
     def flat(self) -> Iterator[_Written]:
-        """Yield every step in reading order."""
+        """Yield every step of the sequence in reading order, including steps in groups of alternatives."""
         for one in self.steps:
             if isinstance(one, _Written):
                 yield one
@@ -182,7 +182,7 @@ class _WrittenSteps:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenGroup:
-    """Group of alternative sequences with its number of repetitions."""
+    """Group of alternative step sequences in brackets, with its number of repetitions."""
 
     group: s.GroupStep
     alternatives: list[_WrittenSteps]
@@ -191,7 +191,7 @@ class _WrittenGroup:
 def bind_sequence(
     sequence: s.SequenceClause, session: Session, bind_block: Callable[[s.Block, SymbolTable], None]
 ) -> BoundSequence:
-    """Bind the steps of a ``MATCH``.
+    """Return the bound steps and links of a ``MATCH``, with names resolved and scenarios replaced by steps.
 
     Parameters
     ----------
@@ -232,7 +232,10 @@ MAX_WAYS: Final = 100
 def _ways(
     written: _WrittenSteps, before: list[_Way], span: TextSpan, session: Session
 ) -> list[_Way]:
-    """Return all sequences that the steps stand for, appended to the given beginnings."""
+    """Return all step sequences without groups that a sequence with groups stands for.
+
+    Each one is appended to each of the given beginnings.
+    """
     found = before or [([], [])]
     for number, one in enumerate(written.steps):
         if number:
@@ -250,7 +253,7 @@ def _ways(
 
 
 def _ways_on(written: _WrittenGroup, before: list[_Way], session: Session) -> list[_Way]:
-    """Return sequences extended by all repetitions and alternatives of a group."""
+    """Return the given step sequences, extended by all repetitions and alternatives of a group."""
     group, found = written.group, list[_Way]()
     again = s.LinkClause("then", None, None, group.span)
     open_ended = before
@@ -276,7 +279,7 @@ def _bind_steps(
     *,
     again: bool = False,
 ) -> None:
-    """Bind steps in reading order. ``again`` is true if they are repeated."""
+    """Bind the steps of a sequence in reading order. ``again`` is true if the steps are repeated."""
     for one in written.steps:
         if isinstance(one, _Written):
             if again and one.step.name is not None:
@@ -297,7 +300,7 @@ def _bind_group(
     *,
     again: bool,
 ) -> None:
-    """Bind alternatives. Later steps can use only the names that all alternatives bind."""
+    """Bind the alternatives of a group of steps. Later steps can use only names that all alternatives define."""
     session = found.session
     known, meanings, keys = dict(found.known), dict(found.meanings), set(session.keys)
     edges, ends, partial = list(found.edges), dict(found.ends), set(found.partial)
@@ -324,7 +327,7 @@ def _bind_group(
 
 
 def _either(nodes: list[b.Node]) -> b.Node:
-    """Return a node that allows the kinds of all alternatives."""
+    """Return one node that allows the kinds of several nodes with the same name."""
     kinds = nodes[0].kinds
     for node in nodes[1:]:
         kinds = kinds | node.kinds
@@ -332,7 +335,7 @@ def _either(nodes: list[b.Node]) -> b.Node:
 
 
 def _spelled_out(sequence: s.SequenceClause, session: Session, depth: int) -> _WrittenSteps:
-    """Return steps and links with scenarios replaced by their steps."""
+    """Return the steps and links of a sequence, with named scenarios replaced by their own steps."""
     steps: list[_Written | _WrittenGroup] = []
     links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = []
     taken = names_written(sequence)
@@ -376,7 +379,7 @@ def _with_own_names(
     taken: frozenset[str],
     session: Session,
 ) -> _WrittenSteps:
-    """Return the steps of a pattern with its variables renamed by the caller."""
+    """Return the steps of a named pattern, with variables renamed by the arguments of the call."""
     names = own_names(step, [one.step for one in inner.flat()], parameters, taken, session)
     return inner.changed(lambda one: replace(one, step=renamed(one.step, names)))
 
@@ -393,7 +396,10 @@ def _parameters_shipped(step: s.ScenarioStep) -> dict[str, str]:
 
 
 def _shipped(step: s.ScenarioStep, session: Session) -> s.SequenceClause | None:
-    """Return the sequence of a library pattern. ``None`` if the query defines the name or it is unknown."""
+    """Return the sequence of a pattern from the standard library.
+
+    ``None`` if the query defines the name or it is unknown.
+    """
     entry = None if normalize_name(step.name) in session.predicates else _entry(step)
     if entry is None or entry.kind not in SEQUENCES:
         return None
@@ -430,7 +436,7 @@ def _scenario(step: s.ScenarioStep, session: Session) -> s.Define:
 
 
 def _values(step: s.ScenarioStep, definition: s.Define, session: Session) -> dict[str, Any]:
-    """Return the parameter values of a scenario: arguments, otherwise defaults."""
+    """Return the parameter values of a scenario call: name → argument, or the default."""
     formals = {formal.name: formal for formal in definition.parameters}
     names = SymbolTable(session, ScopeBuilder(session))
     values: dict[str, Any] = {f.name: _value(f.default) for f in formals.values() if f.default}
@@ -460,7 +466,7 @@ def _value(value: s.Given) -> Any:
 def _check_absent(
     steps: list[_Written], links: list[tuple[s.LinkClause, Any]], session: Session
 ) -> None:
-    """Reject a ``NOT MATCH`` without the required neighbours."""
+    """Raise an error for a ``NOT MATCH`` step whose place or neighbouring links are not allowed."""
     for number, written in enumerate(steps):
         if not written.step.absent:
             continue
@@ -553,7 +559,7 @@ def _parameters(
     name: str = "",
     called: TextSpan | None = None,
 ) -> Generator[None]:
-    """Context in which a scenario is bound: its own parameters, and its name in errors."""
+    """Context manager that binds a scenario with its own parameter values, and names it in errors."""
     outside = session.parameters
     if values is not None:
         session.parameters = values

@@ -1,4 +1,4 @@
-"""Binding of queries with ``OPTIONAL MATCH``, ``WITH``, later ``MATCH`` clauses or named paths.
+"""Binder of queries in stages: ``OPTIONAL MATCH``, ``WITH``, later ``MATCH`` clauses or named paths.
 
 All stages are about one frame. A stage can use the variables of earlier stages, as a block can use the
 variables around it. A variable that ``WITH`` does not pass on loses its name. Without grouping, it remains
@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class StagedScope(ScopeBuilder):
-    """Scope of all stages bound so far. The ego is always bound by the first pattern.
+    """Nodes and edges of all query stages (``MATCH`` and ``WITH`` clauses) bound until now.
+
+    The first pattern always binds the ego.
 
     Attributes
     ----------
@@ -49,7 +51,7 @@ class StagedScope(ScopeBuilder):
     ego: str = ""
 
     def the_ego(self, span: TextSpan) -> str:
-        """Return the key of the ego."""
+        """Return the key of the ego node, which the first pattern of the query binds."""
         self.ego = self.first.the_ego(span)
         self.nodes.setdefault(self.ego, replace(self.first.nodes[self.ego], role="unnamed"))
         return self.ego
@@ -57,14 +59,14 @@ class StagedScope(ScopeBuilder):
 
 @dataclass(slots=True)
 class _With:
-    """Bound ``WITH`` stage, with the nodes before and after it."""
+    """Bound ``WITH`` clause of a query, with the nodes before and after it."""
 
     stage: b.WithStage
     before: dict[str, b.Node]
     after: dict[str, b.Node]
 
     def finished(self, ego: b.Node | None) -> b.WithStage:
-        """Return the final stage. If a later stage uses the ego, this stage passes it on."""
+        """Return the final ``WITH`` stage. It passes the ego on if a later clause uses it."""
         stage = self.stage
         if ego is not None:
             self.before.setdefault(ego.key, ego)
@@ -76,7 +78,7 @@ class _With:
 
 
 class StageBinder:
-    """Binder of the stages of a query, in order.
+    """Binder of the clauses (``MATCH``, ``OPTIONAL MATCH``, ``WITH``) of a query, in order.
 
     Parameters
     ----------
@@ -146,7 +148,10 @@ class StageBinder:
             )
 
     def _checked(self, value: b.Bound) -> b.Bound:
-        """Return a single-frame expression. Its blocks must not use values passed by ``WITH``."""
+        """Return an expression unchanged, or raise an error if it is not allowed in a query with stages.
+
+        Temporal operators, and ``WITH`` values in braces, are not allowed.
+        """
         found = settled(value, self._session)
         if b.is_temporal(found):
             self._session.refuse(
@@ -213,7 +218,7 @@ class StageBinder:
     def _passed(
         self, clause: s.WithClause, names: SymbolTable
     ) -> tuple[dict[str, Symbol], tuple[b.ReturnColumn, ...], tuple[b.FrameAttribute, ...]]:
-        """Return the symbols after a ``WITH``, its computed values, and their placeholders."""
+        """Return the names known after a ``WITH`` clause, its computed values, and their placeholders."""
         symbols: dict[str, Symbol] = {}
         written: list[s.Item] = []
         for item in clause.items:
@@ -241,7 +246,7 @@ class StageBinder:
     def _named(
         self, item: s.Item, names: SymbolTable, written: list[s.Item]
     ) -> Mapping[str, Symbol]:
-        """Return the symbol that an item passes on: a variable, or a value to bind later."""
+        """Return the name that an item of ``WITH`` passes on: of a variable, or of a value that is bound later."""
         value = item.value
         if isinstance(value, s.Variable):
             symbol = names.meaning(value.name)
@@ -260,7 +265,10 @@ class StageBinder:
     def _renamed(
         self, symbols: dict[str, Symbol]
     ) -> tuple[tuple[tuple[str, str], ...], tuple[tuple[b.Edge, str], ...]]:
-        """Return the keys of passed nodes and edges, after and before ``WITH``. Updates ``symbols``."""
+        """Return the node and edge keys that ``WITH`` passes on: the key after it with the key before it.
+
+        ``symbols`` is updated.
+        """
         nodes: list[tuple[str, str]] = []
         edges: list[tuple[b.Edge, str]] = []
         known = {edge.key: edge for edge in self._told.edges}
@@ -284,7 +292,7 @@ class StageBinder:
     # The whole
 
     def result(self, result: b.Result) -> b.Result:
-        """Return a result whose whole matches also contain the values passed by ``WITH``."""
+        """Return the result of the query. Whole matches get extra columns for the values passed by ``WITH``."""
         for value in result.values:
             self._checked(value)
         if not result.whole:
@@ -298,11 +306,11 @@ class StageBinder:
         return replace(result, columns=(*more, *result.columns))
 
     def scope(self) -> b.Scope:
-        """Return all nodes and edges bound after the last stage."""
+        """Return all nodes and edges that are bound after the last clause of the query."""
         return _bare(self._told.nodes, self._told.edges)
 
     def stages(self) -> tuple[b.Stage, ...]:
-        """Return all stages. Call this last, because the ego may be named anywhere."""
+        """Return all bound clauses of the query. Call this last: any clause may be the first to use the ego."""
         told = self._told
         ego = told.first.nodes.get(told.ego)
         ego = ego and replace(ego, role="unnamed")
@@ -321,7 +329,7 @@ MOST_WAYS: Final = 100
 
 
 def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribute:
-    """Return a new placeholder for a named value. ``value=None`` means a path."""
+    """Return a new placeholder for a value that ``WITH`` passes on. ``value=None`` means a path."""
     session.numbers += 1
     if value is None or b.is_path(value):
         return b.passed_on(f"{b.PASSED}{name} p{session.numbers}", Type.list)
@@ -332,7 +340,7 @@ def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribu
 
 
 def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTable) -> None:
-    """Bind a named path, whose value is the list of its nodes.
+    """Define the name of a path, as in ``p = (a)-[:near]->(b)``. Its value is the list of its nodes.
 
     Raises
     ------
@@ -355,12 +363,12 @@ def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTab
 
 
 def _bare(nodes: Mapping[str, b.Node], edges: Iterable[b.Edge]) -> b.Scope:
-    """Return a scope of nodes and edges without conditions."""
+    """Return a pattern of nodes and edges without conditions."""
     return b.Scope(nodes, {}, tuple(edges), (), frozenset())
 
 
 def _in_blocks(values: Iterable[b.Bound]) -> Iterable[b.Bound]:
-    """Yield all expressions inside the blocks of some expressions."""
+    """Yield all subexpressions inside patterns in braces, such as ``EXISTS {…}``, of some expressions."""
     for value in values:
         for block in b.blocks_of(value):
             for inner in block.inside:

@@ -1,4 +1,4 @@
-"""Symbol table of the binder: names and their meanings, and scopes.
+"""Symbol table of the query language: the names that a query can use at a place, and their meanings.
 
 There are two chains from the inside out. *Names*: a block can use the names around it, the body of a
 predicate can use only its parameters. *Scopes* hold nodes: a node used in an inner scope becomes an outer
@@ -54,7 +54,7 @@ Binders = Mapping[type, Binder]
 
 @dataclass(slots=True)
 class Session:
-    """State shared by the whole query during binding.
+    """State that all parts of a query share while the binder resolves its names.
 
     Attributes
     ----------
@@ -124,18 +124,18 @@ class Session:
     beyond: b.Scopes = ()
 
     def ask(self, catalog: Catalog) -> None:
-        """Copy the needed facts of the store from a catalog."""
+        """Copy the facts that name resolution needs from a catalog of the store."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
         self.own, self.own_edges, self.part = catalog.own, catalog.own_edges, catalog.part
         self.online = catalog.online
 
     def look_beyond(self, catalog: Catalog, *, world: bool) -> None:
-        """Set the relation scopes of the traces, if the statement uses data beyond the graphs."""
+        """Set the pair settings of the traces, if the statement also uses entities outside the scene graphs."""
         if world and (catalog.world or catalog.online):
             self.beyond = scopes_of(self.traces)
 
     def key(self, name: str | None) -> str:
-        """Return an unused key: the name if possible, or ``#1``, ``#2``, … without a name."""
+        """Return an unused key for a node or edge: its name if possible, or ``#1``, ``#2``, … without a name."""
         self.numbers += name is None
         wanted = name or f"#{self.numbers}"
         key, copy = wanted, 2
@@ -145,7 +145,7 @@ class Session:
         return key
 
     def refuse(self, reason: str, span: TextSpan, hint: str | None = None) -> NoReturn:
-        """Raise a :class:`QueryError` about a part of the text."""
+        """Raise a :class:`QueryError` that marks a part of the query text."""
         raise QueryError(reason, text=self.text, span=span, hint=hint)
 
     def unknown(
@@ -158,7 +158,7 @@ class Session:
 
 @dataclass(slots=True)
 class ScopeBuilder:
-    """Scope during binding."""
+    """Nodes, edges and conditions of a pattern, while the binder collects them."""
 
     session: Session
     parent: ScopeBuilder | None = None
@@ -169,22 +169,22 @@ class ScopeBuilder:
 
     @property
     def top(self) -> ScopeBuilder:
-        """The scope of ``MATCH``."""
+        """Outermost scope: the nodes and edges of the ``MATCH`` that encloses a pattern in braces."""
         return self.parent.top if self.parent else self
 
     def kinds(self, key: str) -> Kinds:
-        """Return the kinds that a node may have in this scope."""
+        """Return the kinds that a pattern node may have in this scope."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
     def mention(self, key: str) -> None:
-        """Record the use of a node of this scope or of an enclosing scope."""
+        """Record that this pattern uses a node, which may belong to an enclosing pattern."""
         if key in self.nodes or key in self.outer or self.parent is None:
             return
         self.parent.mention(key)
         self.outer[key] = self.parent.kinds(key)
 
     def narrow(self, key: str, kinds: Kinds) -> None:
-        """Restrict a node to some kinds in this scope."""
+        """Restrict a pattern node to some kinds of node, in this pattern only."""
         if key in self.outer:
             self.outer[key] = self.outer[key] & kinds
         else:
@@ -192,25 +192,25 @@ class ScopeBuilder:
             self.nodes[key] = replace(node, kinds=node.kinds & kinds)
 
     def add(self, name: str | None, kinds: Kinds, span: TextSpan, *, named: bool) -> str:
-        """Add a node and return its key."""
+        """Add a node to the pattern and return its key."""
         key = self.session.key(name)
         self.nodes[key] = Node(key, kinds, "named" if named else "unnamed", span)
         return key
 
     def the_ego(self, span: TextSpan) -> str:
-        """Return the key of the ego node of the ``MATCH``, or add one."""
+        """Return the key of the ego node of the pattern. Add an ego node if there is none."""
         for node in self.nodes.values():
             if not node.kinds.other:
                 return node.key
         return self.add(THE_EGO, ego_kinds(), span, named=False)
 
     def finished(self) -> Scope:
-        """Return the finished scope, with the pairs of nodes that must differ."""
+        """Return the finished pattern, with the pairs of its nodes that must differ."""
         where = tuple(self.where)
         return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
 
     def distinct(self) -> frozenset[tuple[str, str]]:
-        """Return the pairs of nodes that must differ: own nodes from each other and from outer nodes."""
+        """Return the pairs of pattern nodes that must differ: own nodes from each other and from outer nodes."""
         if not self.session.injective:
             return frozenset()
         pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
@@ -226,7 +226,7 @@ class ScopeBuilder:
 
 @dataclass(slots=True)
 class SymbolTable:
-    """Names that a part of a text can use, with its scope.
+    """Names that a part of a query can use, with the pattern that it belongs to.
 
     Attributes
     ----------
@@ -258,15 +258,18 @@ class SymbolTable:
     aliases: Mapping[str, Bound] = field(default_factory=dict[str, "Bound"])
 
     def block(self) -> SymbolTable:
-        """Return the symbol table of a block at this place."""
+        """Return the symbol table of a nested pattern in braces."""
         return SymbolTable(self.session, ScopeBuilder(self.session, self.scope), parent=self)
 
     def body(self, meanings: dict[str, Symbol]) -> SymbolTable:
-        """Return the symbol table for the body of a predicate called at this place."""
+        """Return the symbol table for the body of a predicate called at this place.
+
+        The body sees only the given names.
+        """
         return SymbolTable(self.session, self.scope, meanings)
 
     def meaning(self, name: str) -> Symbol | None:
-        """Return the meaning of a name, or None if unknown. The name ``ego`` is not resolved here."""
+        """Return the meaning of a name in a query, or None if unknown. The name ``ego`` is not resolved here."""
         names: SymbolTable | None = self
         while names is not None:
             if name in names.meanings:
@@ -275,7 +278,7 @@ class SymbolTable:
         return None
 
     def node(self, name: str, span: TextSpan) -> str:
-        """Return the key of the node that a name means, and record its use.
+        """Return the key of the pattern node with a name, and record that the pattern uses it.
 
         Raises
         ------
@@ -301,7 +304,7 @@ class SymbolTable:
         return key
 
     def _hint(self, name: str) -> str | None:
-        """Return a hint for a name that is unknown here."""
+        """Return a hint for a name that is unknown at this place of the query, or None."""
         if self.session.calls:
             return f"{self.session.calls[-1]}() knows its parameters and ego only"
         if name in self.session.dropped:
@@ -310,7 +313,7 @@ class SymbolTable:
         return variable_hint(name, self.visible(), elsewhere) or call_hint(name)
 
     def bind(self, expression: s.Expression) -> Bound:
-        """Bind an expression of any type.
+        """Return the bound form of an expression of any type: names resolved, value type known.
 
         Raises
         ------
@@ -322,7 +325,7 @@ class SymbolTable:
         return self.session.binders[type(expression)](expression, self)
 
     def condition(self, expression: s.Expression) -> Bound:
-        """Bind an expression that is true, false or unknown.
+        """Return the bound form of an expression that must be a condition (true, false or unknown).
 
         Raises
         ------
@@ -340,7 +343,7 @@ class SymbolTable:
         return found
 
     def number(self, expression: s.Expression) -> Bound:
-        """Bind an expression that is a number.
+        """Return the bound form of an expression that must be a number.
 
         Raises
         ------
@@ -358,13 +361,13 @@ class SymbolTable:
         return found
 
     def visible(self) -> set[str]:
-        """Return all names that can be used here, except ``frame``, ``trace`` and ``env``."""
+        """Return all variable names usable at this place of a query, except ``frame``, ``trace`` and ``env``."""
         outside = self.parent.visible() if self.parent else {THE_EGO}
         return outside | set(self.meanings) | set(self.aliases)
 
 
 def call_hint(name: str) -> str | None:
-    """Return a hint with the signature of a two-entity function or predicate, or None."""
+    """Return a hint with the signature of a predicate or function of two entities, or None for another name."""
     word = normalize_name(name)
     if (found := predicates().get(word)) is not None:
         formals = ", ".join(formal.name for formal in found.parameters)

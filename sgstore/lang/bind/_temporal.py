@@ -1,4 +1,4 @@
-"""Binding of temporal operators, functions over time, and durations.
+"""Binder of temporal operators, functions over time, and durations.
 
 Temporal operators, functions over time and durations are allowed in conditions and results of a ``MATCH``,
 and in a ``CHECK``. Inside braces, conditions are about one frame.
@@ -32,7 +32,7 @@ _LENGTH: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min|frames)", re.IGNORECAS
 
 
 def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
-    """Bind a temporal operator.
+    """Return the bound form of a temporal operator such as ``EVENTUALLY``.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
 
 
 def length(e: s.Duration | s.Parameter, names: SymbolTable) -> b.Length:
-    """Bind a duration: as written, or a parameter value in seconds or as text such as ``2s``.
+    """Return the bound form of a duration. A parameter value is a number of seconds, or text such as ``2s``.
 
     Raises
     ------
@@ -92,14 +92,14 @@ def _given(e: s.Parameter, names: SymbolTable) -> tuple[float, str]:
 
 
 def timespan(e: s.Duration, _: SymbolTable) -> b.Value:
-    """Bind a duration as a number of seconds, or of frames."""
+    """Return the bound constant of a duration: a number of seconds, or of frames."""
     if e.unit == "frames":
         return b.Value(e.amount, Type.number, unit="frames", span=e.span)
     return b.Value(e.ns / 1e9, Type.number, unit="s", span=e.span)
 
 
 def course(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Bind a function over time: ``prev``, ``delta``, a window, ``run_length``, …, or ``t``.
+    """Return the bound call of a function over time: ``prev``, ``delta``, a window, ``run_length``, ….
 
     Raises
     ------
@@ -133,7 +133,7 @@ def _delta(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def _how_far(e: s.Call, names: SymbolTable) -> b.Length:
-    """Return the duration in the second argument of a call."""
+    """Return the bound duration in the second argument of a function over time, such as ``delta(x, 2s)``."""
     back = e.arguments[1]
     if not isinstance(back, s.Duration | s.Parameter):
         names.session.refuse("expected a length of time such as 2s", back.span)
@@ -141,7 +141,7 @@ def _how_far(e: s.Call, names: SymbolTable) -> b.Length:
 
 
 def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
-    """Bind a function over a window of the last frames."""
+    """Return the bound call of a function over a time window that ends at the current frame."""
     word = _WINDOWS[normalize_name(e.name)]
     value = names.number(e.arguments[0])
     _refuse_nested(e, value, names)
@@ -242,7 +242,9 @@ def _refuse_nested(e: s.Call, value: b.Bound, names: SymbolTable) -> None:
 
 
 def settled(expression: b.Bound, session: Session) -> b.Bound:
-    """Return an expression whose run lengths have the unit of the compared value: frames or time.
+    """Return an expression in which run lengths have the unit of the compared value: frames or time.
+
+    A run is a series of frames in which a condition holds.
 
     Raises
     ------
@@ -270,7 +272,7 @@ def _settled(expression: b.Bound) -> b.Bound:
 
 
 def _compared(parts: tuple[b.Bound, ...]) -> tuple[b.Bound, ...]:
-    """Return the sides of a comparison, with run lengths in the unit of the compared numbers."""
+    """Return the sides of a comparison, with ``run_length`` in the unit of the other side: frames or time."""
     inside = [part for side in parts for part in b.walk(side)]
     if not any(isinstance(p, b.SignalCall) and p.word in _RUNS for p in inside):
         return parts
@@ -295,7 +297,7 @@ def _counting(expression: b.Bound, frames: bool | None) -> b.Bound:  # noqa: FBT
 
 
 def _lengths(expression: b.Bound) -> Iterator[b.Value]:
-    """Yield the constants in an expression and in its blocks."""
+    """Yield the constants in an expression, and in its patterns in braces."""
     for part in b.walk(expression):
         match part:
             case b.Value():

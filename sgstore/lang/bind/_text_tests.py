@@ -1,4 +1,4 @@
-"""Tests of texts: ``CONTAINS`` and similar, and regular expressions."""
+"""Binder of text comparisons: ``CONTAINS`` and similar words, and regular expressions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NOT_RE2: Final = re.compile(r"\(\?(?!:|P<\w+>|[ims]+[:)])|\\[1-9NuUZ]|[*+?}]\+"
 
 
 def text_test(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> b.Operation:
-    """Bind a test of one text by another, such as ``CONTAINS`` or ``=~``.
+    """Return the bound comparison of two texts, such as ``CONTAINS`` or ``=~``.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Conditions under which a value of a frame is unknown, although its entities are present.
+"""Conditions under which a value in a frame is unknown (not recorded), although its entities are present.
 
 A value is *unknown* if a measured quantity (a speed, a size, the weather) was not recorded, or if a relation
 was not computed because an entity is beyond the graph. A value that does not exist is not unknown: two
@@ -59,7 +59,7 @@ _LOOSE: Final = 1 << 20
 
 
 def unknown(value: b.Bound) -> b.Bound | None:
-    """Return the condition that a value of a frame is unknown. ``None`` means that it is always known.
+    """Return the condition that an expression is unknown in a frame. ``None`` means that it is always known.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def unknown(value: b.Bound) -> b.Bound | None:
 
 
 def has_pairs(value: b.Bound) -> bool:
-    """True if a value uses pair numbers, which some pairs do not have."""
+    """True if an expression uses a number of two entities, such as ``ttc(a, b)``. Some pairs do not have it."""
     match value:
         case b.PairNumber():
             return True
@@ -82,7 +82,7 @@ def has_pairs(value: b.Bound) -> bool:
 
 
 def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
-    """Return the negation of a condition, with ``NOT`` only before its smallest parts."""
+    """Return the negation of a condition, with ``NOT`` only before conditions without ``AND`` and ``OR``."""
     match condition:
         case b.Operation("NOT", (operand,)):
             return pushed(operand)
@@ -104,7 +104,7 @@ def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
 
 
 def pushed(condition: b.Bound) -> b.Bound:
-    """Return an equivalent condition, with ``NOT`` only before its smallest parts."""
+    """Return an equivalent condition, with ``NOT`` only before conditions without ``AND`` and ``OR``."""
     match condition:
         case b.Operation("NOT", (operand,)):
             return negated(operand)
@@ -119,7 +119,7 @@ def pushed(condition: b.Bound) -> b.Bound:
 
 
 def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
-    """Return an ``XOR`` expressed by ``AND``, ``OR`` and ``NOT``."""
+    """Return an equivalent of ``XOR`` that uses only ``AND``, ``OR`` and ``NOT``."""
     first, *rest = operands
     for second in rest:
         ways = (
@@ -133,7 +133,7 @@ def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
 def certain(  # noqa: PLR0911 - a case each
     condition: b.Bound, *, decided: bool = False
 ) -> b.Bound:
-    """Return the condition that a condition is true for all possible unknown values.
+    """Return a stronger condition: true if the given condition is true for all possible values of unknowns.
 
     A comparison without a value is false. If it compares pair numbers, its negation is false too.
 
@@ -167,7 +167,7 @@ def certain(  # noqa: PLR0911 - a case each
 
 
 def possible(condition: b.Bound) -> b.Bound:
-    """Return the condition that a condition is true for some possible unknown values."""
+    """Return a weaker condition: true if the given condition is true for some possible values of unknowns."""
     match condition:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(possible, operands)))
@@ -184,7 +184,9 @@ def possible(condition: b.Bound) -> b.Bound:
 
 
 def undecided(condition: b.Bound) -> b.Bound | None:
-    """Return the condition that a condition may be true, but is unknown. ``None`` means always known.
+    """Return the condition that the truth of another condition is unknown but possible.
+
+    ``None`` means that it is always known.
 
     It also holds if the condition is true and one of its parts is unknown.
     """
@@ -201,7 +203,7 @@ def _smallest(condition: b.Bound) -> Iterable[b.Bound]:
 
 
 def _of_blocks(condition: b.Bound) -> bool:
-    """True if a condition contains blocks, which count matches even with unknown values."""
+    """True if a condition contains patterns in braces, such as ``EXISTS {…}``."""
     return any(isinstance(part, b.BlockValue) for part in b.walk(condition))
 
 
@@ -244,7 +246,7 @@ def _attribute(node: str, name: str) -> b.Bound:
 
 
 def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
-    """Return the condition that a measured attribute of a node was not recorded."""
+    """Return the condition that a measured attribute of a node, such as its speed, was not recorded."""
     if name not in MOTION:
         return _is_null(value)
     still = b.Operation("coalesce", (_attribute(node, "is_static"), _FALSE), Type.boolean)
@@ -253,7 +255,10 @@ def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
 
 @lru_cache(maxsize=1024)
 def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
-    """Return the conditions that a block has a match with unknown values. The result is cached."""
+    """Return conditions that a pattern in braces may match, but depends on unknown values.
+
+    The result is cached.
+    """
     where = tuple(map(pushed, block.scope.where))
     doubts = [one for part in where for leaf in _smallest(part) for one in _unknown(leaf)]
     if block.value is not None:
@@ -267,7 +272,7 @@ def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
 
 
 def _of_apart(block: b.BlockValue) -> b.Bound | None:
-    """Return the condition that a block has a match with an edge that was not computed, or None."""
+    """Return the condition that a pattern in braces may match with an edge that was not computed, or None."""
     apart = {edge.key: one for edge in block.scope.edges if (one := _not_computed(edge, block))}
     if not apart:
         return None
@@ -280,7 +285,7 @@ def _of_apart(block: b.BlockValue) -> b.Bound | None:
 
 @lru_cache(maxsize=1024)
 def _sure(block: b.BlockValue) -> b.BlockValue:
-    """Return an ``EXISTS`` or ``COUNT`` limited to certain matches."""
+    """Return a copy of ``EXISTS {…}`` or ``COUNT {…}`` that counts only certain matches."""
     doubted = any(_of_blocks(one) and unknown(one) is not None for one in block.scope.where)
     loose = [
         b.inverse(b.any_of(doubts))
@@ -299,7 +304,7 @@ def _sure(block: b.BlockValue) -> b.BlockValue:
 def _exists(
     block: b.BlockValue, edges: tuple[b.Edge, ...], where: tuple[b.Bound, ...], number: int
 ) -> b.Bound:
-    """Return the condition that a block has a match, with other edges and conditions."""
+    """Return an ``EXISTS {…}`` like the given pattern in braces, but with other edges and conditions."""
     asked = frozenset().union(*({edge.src, edge.dst} for edge in edges), *map(b.nodes_of, where))
     nodes = {key: node for key, node in block.scope.nodes.items() if key in asked}
     if not nodes and not edges:
@@ -323,7 +328,7 @@ def _exists(
 
 
 def _counted(condition: b.Bound) -> tuple[list[b.BlockValue], str, b.Value] | None:
-    """Return the blocks of a comparison of counts with a number, its operator and the number, or None."""
+    """Split a comparison such as ``COUNT {…} > 2`` into its patterns, operator and number, or return None."""
     match condition:
         case b.Operation(word, (counts, b.Value(value=int() | float()) as limit)):
             pass
@@ -348,7 +353,7 @@ def _summands(value: b.Bound) -> list[b.BlockValue]:
 
 
 def _of_counts(condition: b.Operation, *, least: bool) -> b.Bound:
-    """Return the condition that a comparison of counts is certain (``least``) or possible."""
+    """Return the condition that a comparison such as ``COUNT {…} > 2`` is certain (``least``) or possible."""
     found = _counted(condition)
     assert found is not None  # noqa: S101 - it was asked before
     blocks, word, limit = found
@@ -370,7 +375,7 @@ def _of_counts(condition: b.Operation, *, least: bool) -> b.Bound:
 
 
 def _can_be_counted(block: b.BlockValue) -> bool:
-    """Return True if the nodes of a block alone give its possible matches beyond the graph."""
+    """True if the nodes of a pattern in braces alone give its possible matches outside the scene graph."""
     beyond = _of_apart(block)
     told = not any(edge.named for edge in block.scope.edges)
     return beyond is None or (told and isinstance(beyond, b.BlockValue))
@@ -385,7 +390,7 @@ def _total(blocks: Iterable[b.BlockValue]) -> b.Bound:
 
 
 def _all_of(block: b.BlockValue) -> Iterable[b.BlockValue]:
-    """Yield blocks that together have all possible matches of a block."""
+    """Yield patterns in braces that together have all possible matches of the given pattern."""
     where = tuple(possible(pushed(part)) for part in block.scope.where)
     scope = replace(block.scope, where=where)
     yield replace(block, scope=scope, number=block.number + 8 * _LOOSE)
@@ -400,13 +405,16 @@ def _edges_of(condition: b.Bound) -> frozenset[str]:
 
 
 def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
-    """Return the condition that an edge in braces is unknown. ``None`` means that it is always known."""
+    """Return the condition that an edge of a pattern in braces is unknown.
+
+    ``None`` means that it is always known.
+    """
     found = [*_beyond(edge, block.scope), *_unmeasured_ends(edge, block.scope)]
     return b.any_of(found) if found else None
 
 
 def _beyond(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
-    """Yield the condition that an edge was not computed because an end is beyond the graph.
+    """Yield the condition that an edge was not computed because one node is outside the scene graph.
 
     A relation does not hold between entities that the settings do not relate. A distance relation does not
     hold beyond its distance.
@@ -429,7 +437,7 @@ def _related(edge: b.Edge, reach: RelationScope | None) -> b.Bound:
 
 
 def _unmeasured_ends(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
-    """Yield conditions that a missing measurement of an end may hide an edge."""
+    """Yield conditions that an edge may be missing because a measurement of one of its nodes is missing."""
     for forward in (True, False) if edge.both else (True,):
         for end, key in enumerate((edge.src, edge.dst) if forward else (edge.dst, edge.src)):
             every = scope.kinds(key).every

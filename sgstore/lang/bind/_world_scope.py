@@ -1,4 +1,4 @@
-"""Distance relations of entities beyond the graph, computed from their definition.
+"""Distance relations between entities outside the scene graph of a frame, computed from positions.
 
 A graph has edges between its own entities only. The distance relations of ``[proximity]`` and ``overlaps``
 are defined by positions and sizes, which are also known beyond the graph. In scope ``world`` a block with
@@ -34,7 +34,7 @@ _SIDES: Final = 10.0
 
 
 def beyond_graph(edge: b.Edge) -> b.Bound:
-    """Return the condition that the ends of an edge differ, and are not both in the graph."""
+    """Return the condition that the nodes of an edge differ, and are not both in the frame's scene graph."""
     keys = edge.src, edge.dst
     two = b.Operation("<>", tuple(map(b.NodeValue, keys)), Type.boolean)
     ends = (b.NodeAttribute(key, IN_GRAPH, Type.boolean) for key in keys)
@@ -42,7 +42,7 @@ def beyond_graph(edge: b.Edge) -> b.Bound:
 
 
 def whole_block(block: b.BlockValue, number: int) -> b.Bound:
-    """Return a block that includes pairs beyond the graph.
+    """Return an expression for a pattern in braces that also includes entities outside the scene graph.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def whole_block(block: b.BlockValue, number: int) -> b.Bound:
 
 
 def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
-    """True if an edge beyond the graph can be computed from its definition."""
+    """True if the relation of an edge can be computed from distances, for entities outside the scene graph."""
     if edge.high > 1 or edge.named or not edge.beyond:
         return False
     kinds = [block.scope.kinds(key) for key in (edge.src, edge.dst)]
@@ -84,7 +84,7 @@ def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
 
 
 def bounded_in(scopes: b.Scopes) -> frozenset[str]:
-    """Return the relations with a limited distance, from the settings of some traces."""
+    """Return the names of the relations that have a distance limit, according to the settings of some traces."""
     rungs = (name for reach, _ in scopes if reach is not None for name, _ in reach.rungs)
     return frozenset({"overlaps", *PROXIMITY, *rungs}) - frozenset(DIRECTIONS)
 
@@ -95,7 +95,10 @@ def _reach(edge: b.Edge, reach: RelationScope) -> float:
 
 
 def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.BlockValue:
-    """Return a copy of a block for pairs beyond the graph, with some edges replaced by their definition."""
+    """Return a copy of a pattern in braces for entities outside the scene graph.
+
+    Some edges become conditions on distances.
+    """
     told = {edge.key for edge in edges}
     where = [*block.scope.where]
     for edge in edges:
@@ -105,7 +108,7 @@ def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.B
 
 
 def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
-    """Return a copy of a check in which entities farther away than its limit are absent.
+    """Return a copy of a check that ignores all entities farther from the ego than the range of the check.
 
     Parameters
     ----------
@@ -131,7 +134,7 @@ def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
 
 
 def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
-    """Return a value whose blocks match only entities within the limit around the ego."""
+    """Return a copy of an expression whose patterns in braces match only entities within a distance of the ego."""
     again = partial(_limited, ego=ego, limit=limit)
     if not isinstance(value, b.BlockValue):
         return b.with_operands(value, again)
@@ -146,7 +149,7 @@ def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
 
 
 def is_limited(node: b.Node) -> bool:
-    """True if a node may be an entity other than the ego."""
+    """True if a node may be an entity other than the ego, to which a distance limit applies."""
     return bool(node.kinds.other & entity_kinds())
 
 
@@ -173,7 +176,7 @@ def within(key: str, ego: str, limit: float) -> b.Bound:
 
 
 def holds(edge: b.Edge, names: Iterable[str]) -> b.Bound:
-    """Return the condition that an edge has one of some relations, from their definition.
+    """Return the condition that the nodes of an edge meet the definition of one of the named relations.
 
     For a trace with unknown settings: the condition that the edge may have one of them.
     """

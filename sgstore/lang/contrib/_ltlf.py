@@ -1,4 +1,4 @@
-"""Translator of LTLf formulas, in the syntax of ``ltlf2dfa``."""
+"""Translator of LTLf formulas (temporal logic on finite traces), in the syntax of ``ltlf2dfa``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ _WORDS: Final = {"->": "IMPLIES", "|": "OR", "&": "AND", "U": "UNTIL", "R": "REL
 
 
 class LtlFormula:
-    """Translator of LTL formulas in the syntax of ``ltlf2dfa``. ``$[N][…]`` means N frames in a row."""
+    """Translator of temporal logic formulas (LTLf) in the syntax of ``ltlf2dfa``.
+
+    ``$[N][…]`` means N frames in a row.
+    """
 
     def __init__(self, text: str, defined: Mapping[str, str]) -> None:
         self._formula = text
@@ -97,7 +100,7 @@ class LtlFormula:
         return f"({inner})"
 
     def _in_a_row(self, times: int, inner: str) -> str:
-        """Return the condition that a formula holds in N consecutive frames at some time."""
+        """Return the query condition that a formula is true in N consecutive frames at some time."""
         if not 0 < times <= MAX_TIMES:
             raise self._refused(f"expected 1 to {MAX_TIMES} frames")
         last = times - 1

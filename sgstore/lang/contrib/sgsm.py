@@ -1,4 +1,4 @@
-"""Translator from SGSM properties, written in its scene graph language (SGL), to the query language.
+"""Translator from SGSM properties, written in the Scene Graph Language (SGL), to the query language.
 
 The input is Python code for SGSM, with nested calls or nested ``partial``. It is parsed, but never run::
 
@@ -80,7 +80,7 @@ _SIGNS: Final[dict[type[ast.cmpop], str]] = {
 
 
 def translated(text: str) -> str:
-    """Translate SGSM properties to the query language.
+    """Return the text of SGSM properties as text of the query language.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def translated(text: str) -> str:
 
 
 def _check(found: str) -> None:
-    """Reject a translation that is not valid in the query language."""
+    """Raise an error if the text of a translation is not valid in the query language."""
     if not found.strip():
         return
     try:
@@ -137,7 +137,7 @@ def _place(text: str, error: SyntaxError) -> TextSpan:
 
 @dataclass
 class _Found:
-    """Set of nodes as a pattern. ``node`` is the variable of its members."""
+    """Set of scene graph nodes as a query pattern. ``node`` is the variable for a member of the set."""
 
     node: str
     label: str = ""
@@ -145,7 +145,7 @@ class _Found:
     where: list[str] = field(default_factory=list[str])
 
     def text(self) -> str:
-        """Return the text in the braces of a block."""
+        """Return the query text that stands inside the braces of ``EXISTS {…}`` for a set of nodes."""
         paths = self.paths or [f"({self.node}{self.label})"]
         return ", ".join(paths) + (f" WHERE {' AND '.join(self.where)}" if self.where else "")
 
@@ -216,7 +216,7 @@ class _Translation:
     # Truth values and numbers
 
     def truth(self, value: ast.expr) -> str:
-        """Translate a truth value to a condition."""
+        """Return a truth value of an SGL formula as text of a query condition."""
         word, arguments = self._call(value)
         if word in _COMPARISONS:
             return self._comparison(_COMPARISONS[word], *arguments)
@@ -253,7 +253,7 @@ class _Translation:
         return f"COUNT {{({member}) WHERE {self._member(arguments[0], member)}}}"
 
     def _written(self, value: ast.expr, at: ast.expr) -> str:
-        """Return a number as text of the query language."""
+        """Return a number of an SGL formula as text of the query language."""
         number = value.value if isinstance(value, ast.Constant) else None
         if isinstance(number, bool) or not isinstance(number, int | float):
             raise self._refused("expected a number", at)
@@ -264,7 +264,10 @@ class _Translation:
     # Sets of nodes
 
     def _set(self, value: ast.expr, node: str = "") -> _Found:
-        """Translate a set of nodes to a pattern. ``node`` is the variable name for its members."""
+        """Return a set of nodes in an SGL formula as a query pattern.
+
+        ``node`` is the variable name for its members.
+        """
         node = node or self._name()
         value = self._resolved(value)
         if isinstance(value, ast.Constant) and value.value in {"Ego", "G"}:
@@ -326,7 +329,7 @@ class _Translation:
         return f"{_ATTRIBUTES[name].format(node)} {sign} {self._number(compared.comparators[0])}"
 
     def _resembling(self, node: str, name: str, test: ast.Constant) -> str:
-        """Translate a regular expression in SGL to a condition on the matching values."""
+        """Return a regular expression of an SGL formula as a query condition on the matching values."""
         try:
             wanted = regex(str(test.value))
         except re.error as error:
@@ -375,7 +378,7 @@ class _Translation:
         )
 
     def _member(self, of: ast.expr, node: str) -> str:
-        """Return the condition that a node is in a set."""
+        """Return the query condition that a node is in a set of an SGL formula."""
         found = self._set(of, node)
         if found.paths:
             return f"EXISTS {{{found.text()}}}"
@@ -389,7 +392,7 @@ class _Translation:
         return f"n{self._numbers}"
 
     def _resolved(self, value: ast.expr) -> ast.expr:
-        """Return the expression that a name is assigned to."""
+        """Return the expression that a variable name in the SGL text is assigned to."""
         for _ in range(MAX_NAMES):
             if not isinstance(value, ast.Name) or value.id not in self._names:
                 return value
@@ -397,7 +400,7 @@ class _Translation:
         raise self._refused("a name is defined by itself", value)
 
     def _call(self, value: ast.expr) -> tuple[str, list[ast.expr]]:
-        """Return the function name and the arguments of a call or a ``partial``."""
+        """Return the function name and the arguments of a Python call or a ``functools.partial``."""
         value = self._resolved(value)
         if not isinstance(value, ast.Call):
             raise self._refused("expected a call", value)
@@ -443,7 +446,10 @@ _LINE: Final = re.compile(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+")
 
 
 def _function(value: ast.expr) -> str:
-    """Return the name of the called function without its module. It is empty for other expressions."""
+    """Return the name of the called function without its module.
+
+    Expressions other than calls give an empty text.
+    """
     return _last_name(value.func) if isinstance(value, ast.Call) else ""
 
 

@@ -1,4 +1,4 @@
-"""Help for users: explanations of failed matches, notes on a query, words for completion."""
+"""Help for users of the query language: reasons for failed matches, notes on a query, words for completion."""
 
 from sgstore.lang.help._completion import words
 from sgstore.lang.help._notes import Compared, compared_in_check, compared_in_query, notes_on

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def words(catalog: Catalog) -> dict[str, Any]:
-    """Labels, relations, attributes, functions, predicates and keywords, with meanings.
+    """Return the words that a query can use, with meanings: labels, relations, attributes, functions, keywords.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Notes on texts in a query that no attribute value of the store equals.
+"""Notes about likely mistakes in a query: compared texts that occur nowhere in the store.
 
 A misspelt name finds nothing, without an error. So the notes list the texts that are not values in the store,
 each with the nearest value. The compiler finds the comparisons. The caller looks the texts up in the store.
@@ -44,7 +44,7 @@ Compared = tuple[str, str]
 
 
 def compared_in_query(query: b.Query) -> list[Compared]:
-    """Return the comparisons with texts in a bound query, without duplicates."""
+    """Return the comparisons of attributes with texts in a query, without duplicates."""
     returned = [column.value for column in query.result.columns]
     found = list(_comparisons(returned, query.scope))
     for scope in () if query.steps else query.patterns:
@@ -58,7 +58,7 @@ def compared_in_query(query: b.Query) -> list[Compared]:
 
 
 def compared_in_check(check: BoundCheck) -> list[Compared]:
-    """Return the comparisons with texts in a bound check, without duplicates."""
+    """Return the comparisons of attributes with texts in a check, without duplicates."""
     values = [check.formula, *(one.where for one in check.quantifiers if one.where is not None)]
     values += [check.reset] if check.reset is not None else []
     return list(dict.fromkeys(_comparisons([*values, *check.scope.where], check.scope)))
@@ -104,7 +104,7 @@ def _type_of(kinds: b.Kinds) -> str:
 def notes_on(
     compared: Iterable[Compared], query: str, parameters: Mapping[str, object], ask: Ask
 ) -> tuple[str, ...]:
-    """Return notes about texts in a query that no value of the store equals.
+    """Return notes about likely mistakes: texts in a query that no attribute value of the store equals.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def _note(name: str, text: str, ask: Ask) -> str:
 
 
 def _all_values(name: str) -> str:
-    """Return SQL for all values of an attribute."""
+    """Return SQL that selects all values of an attribute in the store."""
     places = (
         Select([f'{column} AS "value"'], [table], [f"({column}) IS NOT NULL", *where])
         for column, table, *where in _TEXTS_OF[name]

@@ -1,4 +1,4 @@
-"""Splitting of a pattern into independent parts, each a query, for given nodes.
+"""Splitting of a graph pattern into independent parts, each a query. Some nodes may be fixed.
 
 The split follows from logic: "there is an x such that A and B" can be split if only one of A and B uses x.
 Given nodes are constants, so conditions on given nodes are separate parts. Conditions and edges that share a
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DrawnEdge:
-    """Edge of a pattern for a drawing: keys of its ends, label, and true if undirected."""
+    """Pattern edge for a drawing: keys of its two nodes, label, and True if undirected."""
 
     src: str
     dst: str
@@ -34,7 +34,7 @@ class DrawnEdge:
 
 @dataclass(frozen=True, slots=True)
 class PatternPart:
-    """Independent part of a pattern.
+    """Part of a graph pattern that shares no free variable with the other parts.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ _Atom = b.Edge | b.Node | b.Bound
 
 
 def parts_of(query: b.Query, given: Mapping[str, int]) -> Iterator[PatternPart]:
-    """Yield the independent parts of a bound query for given nodes, step by step.
+    """Yield the independent parts of a query's graph patterns, step by step. ``given`` fixes some nodes to ids.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def parts_of(query: b.Query, given: Mapping[str, int]) -> Iterator[PatternPart]:
 
 
 def has_nodes(query: b.Query, names: Iterable[str]) -> bool:
-    """True if a pattern has nodes with the given names."""
+    """True if the pattern of a query has nodes with all the given names."""
     return {name.lower() for name in names} <= _keys_of(query).keys()
 
 
@@ -166,7 +166,10 @@ def _label(edge: b.Edge) -> str:
 def _groups(
     scope: b.Scope, when: tuple[b.Bound, ...], pins: Mapping[str, int]
 ) -> Iterator[list[_Atom]]:
-    """Yield groups of atoms that share variables that are not given, in reading order."""
+    """Yield groups of atoms (nodes, edges, conditions) that share free variables, in reading order.
+
+    A variable is free if its node is not fixed.
+    """
     conditions = [part for one in scope.where for part in b.conjuncts(one)]
     atoms: list[_Atom] = [*scope.edges, *conditions, *when]
     said = {key for atom in atoms for key in _nodes(atom)}
@@ -194,7 +197,7 @@ def _groups(
 
 
 def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
-    """Return the shared variables of an atom: nodes that are not given, and bound edges."""
+    """Return the free variables of an atom (node, edge or condition): nodes without fixed id, and named edges."""
     ties = {f"node {key}" for key in _nodes(atom) if key not in pins}
     if isinstance(atom, b.Edge):
         return ties | ({f"edge {atom.key}"} if atom.named or atom.key in asked else set())
@@ -204,7 +207,7 @@ def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
 
 
 def _apart(scope: b.Scope, pins: Mapping[str, int]) -> Iterator[tuple[str, str]]:
-    """Yield pairs of nodes, neither given, that must differ and could be the same."""
+    """Yield the pairs of pattern nodes that must differ, if neither is fixed and both allow a common kind."""
     for one, other in scope.distinct:
         if one not in pins and other not in pins and (scope.kinds(one) & scope.kinds(other)):
             yield one, other
@@ -221,7 +224,10 @@ def _nodes(atom: _Atom) -> frozenset[str]:
 
 
 def _spoken_of(atoms: Iterable[_Atom], scope: b.Scope) -> list[str]:
-    """Return the node keys that atoms use, in scope order. If none are used, return one key."""
+    """Return the keys of the nodes that some atoms (nodes, edges, conditions) use, in pattern order.
+
+    Without such nodes, return one key.
+    """
     found = {key for atom in atoms for key in _nodes(atom)}
     keys = [key for key in scope.nodes if key in found]
     anyone = sorted(scope.nodes, key=lambda key: bool(scope.nodes[key].kinds.other))
@@ -235,7 +241,10 @@ def _narrowed(
     pins: Mapping[str, int],
     when: tuple[b.Bound, ...],
 ) -> b.Scope:
-    """Return the scope of some atoms, with given nodes fixed to their ids."""
+    """Return a smaller graph pattern with only some atoms (nodes, edges, conditions).
+
+    Given nodes are fixed to their ids.
+    """
     edges = tuple(atom for atom in atoms if isinstance(atom, b.Edge))
     where = [
         atom
@@ -259,7 +268,7 @@ _ID: Final = NODE_ATTRIBUTES["id"]
 
 
 def _relations(edges: list[b.Edge], conditions: list[b.Bound]) -> frozenset[str]:
-    """Return the relations of edges, including edges in blocks of conditions."""
+    """Return the names of all relations in some edges, and in the patterns in braces of some conditions."""
     found = frozenset[str]().union(*(edge.relations for edge in edges))
     for condition in conditions:
         for block in b.blocks_of(condition):

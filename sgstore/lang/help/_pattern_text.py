@@ -1,4 +1,4 @@
-"""Text of bound patterns in the query language, which users can paste into a query.
+"""Query text of a graph pattern, which users can paste into a query.
 
 Nodes and edges without a name get one if the text needs it: ``lane`` for a lane, ``lane2`` for the second.
 """
@@ -22,12 +22,12 @@ _ESCAPES: Final = {"\\": "\\\\", "'": "\\'", "\n": "\\n", "\t": "\\t", "\r": "\\
 
 
 def text_written(text: str) -> str:
-    """Return a text in quotes, with escapes."""
+    """Return a text constant in quotes with escapes, as a query writes it."""
     return "'" + "".join(_ESCAPES.get(letter, letter) for letter in text) + "'"
 
 
 def label_written(kinds: b.Kinds) -> str:
-    """Return the label for a set of kinds. It is empty if all kinds are allowed."""
+    """Return the label, such as ``Car|Truck``, for a set of node kinds. It is empty if all kinds are allowed."""
     if kinds == b.any_kinds():
         return ""
     if not kinds.other:
@@ -44,7 +44,7 @@ def label_written(kinds: b.Kinds) -> str:
 
 
 def kind_label(kind: str) -> str:
-    """Return the label for a single kind."""
+    """Return the label, such as ``Car``, for a single kind of node."""
     return _label(frozenset({kind}))
 
 
@@ -70,7 +70,7 @@ def _camel(name: str) -> str:
 
 
 class Writer:
-    """Writer of the parts of one pattern in the query language.
+    """Writer of a graph pattern as query text. It gives names to unnamed nodes.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Writer:
         return name
 
     def name(self, key: str, kinds: b.Kinds | None = None) -> str:
-        """Return the name of a node or an edge."""
+        """Return the variable name of a node or edge in the query text, or create an unused one."""
         if key not in self._names:
             every = kinds.every if kinds else frozenset[str]()
             self._names[key] = self._free(next(iter(every)) if len(every) == 1 else "any")
@@ -107,12 +107,12 @@ class Writer:
     # Patterns
 
     def node(self, key: str, kinds: b.Kinds) -> str:
-        """Return a node as text, such as ``(lane:Lane)``."""
+        """Return a pattern node as query text, such as ``(lane:Lane)``."""
         label = label_written(kinds)
         return f"({self.name(key, kinds)}{':' if label else ''}{label})"
 
     def edge(self, edge: b.Edge, scope: b.Scope) -> str:
-        """Return an edge as text, such as ``(e)-[:isIn]->(lane)``, without the labels of its nodes."""
+        """Return a pattern edge as query text, such as ``(e)-[:isIn]->(lane)``, without labels of its nodes."""
         ends = (f"({self.name(key, scope.kinds(key))})" for key in (edge.src, edge.dst))
         return self._arrow(edge).join(ends)
 
@@ -124,13 +124,13 @@ class Writer:
         return f"-[{name}{label or (':%' if times else '')}{times}]{'-' if edge.both else '->'}"
 
     def edge_name(self, key: str) -> str:
-        """Return the name of an edge."""
+        """Return the variable name of an edge in the query text, or create an unused one."""
         if key not in self._names:
             self._names[key] = self._free("edge")
         return self._names[key]
 
     def block(self, scope: b.Scope) -> str:
-        """Return the text in the braces of a block."""
+        """Return the query text inside the braces of ``EXISTS {…}`` or similar."""
         tests = [one for one in scope.where if isinstance(one, b.LabelTest)]
         paths = [self.node(test.node, test.kinds) for test in tests]
         said = {test.node for test in tests}.union(*((e.src, e.dst) for e in scope.edges))
@@ -144,7 +144,7 @@ class Writer:
     # Expressions
 
     def expression(self, value: b.Bound, *, inner: bool = False) -> str:
-        """Return an expression as text. ``inner`` adds brackets where neighbouring operators need them."""
+        """Return an expression as query text. ``inner`` adds brackets where neighbouring operators need them."""
         match value:
             case b.Value():
                 return _constant(value, inner=inner)

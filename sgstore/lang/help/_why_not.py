@@ -1,4 +1,4 @@
-"""Explanation of a failed match: the first part of a pattern that a graph does not have.
+"""Explanation of a failed match: the first part of a pattern that a scene graph does not contain.
 
 The parts of a pattern are tested in reading order: its nodes, each edge as soon as both its ends are bound,
 then the conditions. So the result names one part, and the parts before it hold together.
@@ -32,7 +32,7 @@ _WRITTEN_NUMBER: Final = re.compile(
 
 
 def _beyond(sign: str, limit: float, value: float) -> float:
-    """Return a number with few digits for which a comparison with a value is true."""
+    """Return a limit with few digits that makes a comparison (sign, limit) true for a value."""
     if sign == "=":
         return value
     up = sign in {"<", "<="}
@@ -50,7 +50,7 @@ MOST_LOOKED_AT: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class WhyNot:
-    """Longest part of a pattern that holds in a graph.
+    """Explanation of a failed match: the longest part of a pattern that matches in a scene graph.
 
     Attributes
     ----------
@@ -78,7 +78,9 @@ class WhyNot:
     gaps: tuple[tuple[str, float, float], ...] = ()
 
     def relaxed(self, text: str) -> Iterator[tuple[int, int, str]]:
-        """Yield replacements for numbers in a query that could make the failed part true.
+        """Yield replacements for numbers in the query text that could make the failed condition true.
+
+        Each one is (start, end, new text).
 
         Each result is the start, the end and the new text. A number may occur several times in the query, so
         the caller must test each replacement.
@@ -100,7 +102,7 @@ class WhyNot:
                         yield start, found.end(1), f"{new:.12g}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the explanation as plain values."""
+        """Return the explanation as a dictionary of plain values."""
         return {
             "matches": not self.failed,
             "held": list(self.held),
@@ -124,7 +126,9 @@ class WhyNot:
 
 @dataclass(frozen=True, slots=True)
 class WhyNotSteps:
-    """Longest part of each sequence step that holds in one graph. Durations and order are ignored.
+    """Explanation of a failed sequence: for each step, the longest part that matches in one scene graph.
+
+    Durations and order are ignored.
 
     Attributes
     ----------
@@ -138,7 +142,7 @@ class WhyNotSteps:
     steps: tuple[WhyNot, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the explanation as plain values."""
+        """Return the explanation of all steps as a dictionary of plain values."""
         pairs = zip(self.texts, self.steps, strict=True)
         return {"steps": [{"step": text, **step.as_dict()} for text, step in pairs]}
 
@@ -153,7 +157,10 @@ class WhyNotSteps:
 
 
 def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
-    """Explain how far a bound pattern holds in a graph. For a sequence, explain each step."""
+    """Return an explanation of how much of a query's pattern matches in a scene graph.
+
+    For a sequence, it explains each step.
+    """
     if not query.steps:
         return _in_frame(query.first, query, view)
     texts = (" ".join(text[step.span.start : step.span.end].split()) for step in query.steps)
@@ -174,7 +181,7 @@ def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
 
 
 def looked_up(query: b.Query) -> list[b.FrameAttribute]:
-    """Return the frame attributes of a query that only the store has: weather and user tables."""
+    """Return the frame attributes of a query that are not in the scene graph: weather and user tables."""
     found: dict[str, b.FrameAttribute] = {}
 
     def look(scope: b.Scope) -> None:
@@ -191,7 +198,7 @@ def looked_up(query: b.Query) -> list[b.FrameAttribute]:
 
 
 def events_in(query: b.Query, frame_id: int, ask: Ask) -> dict[str, list[NodePair]]:
-    """Return the events of a frame that a query uses, by kind, with the nodes involved.
+    """Return the recorded events of a frame that a query uses: event kind → pairs of involved nodes.
 
     Parameters
     ----------
@@ -216,7 +223,7 @@ def events_in(query: b.Query, frame_id: int, ask: Ask) -> dict[str, list[NodePai
 
 
 def _happened_anywhere(query: b.Query) -> list[b.Happened]:
-    """Return the event tests of a query, one for each kind, with the largest number of nodes."""
+    """Return the tests for recorded events in a query. For each kind of event, keep the test with most nodes."""
     found: dict[str, b.Happened] = {}
 
     def look(scope: b.Scope) -> None:
@@ -255,7 +262,7 @@ def _parts(scope: b.Scope) -> list[_Part]:
 
 
 def _growing(whole: b.Scope, scope: b.Scope, parts: list[_Part]) -> Iterator[tuple[_Part, b.Scope]]:
-    """Yield each part, with the scope of all parts up to it."""
+    """Yield each part of a pattern (node, edge or condition), with the pattern up to and including it."""
     for part in parts:
         if isinstance(part, b.Node):
             scope = replace(scope, nodes={**scope.nodes, part.key: part})
@@ -306,7 +313,7 @@ def _failure(
 
 
 def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str, float, float]]:
-    """Yield the false comparisons with a number in a condition: sign, number and actual value."""
+    """Yield the comparisons with a number that are false in a condition: sign, limit and actual value."""
     for part in b.walk(condition):
         match part:
             case b.Operation(word=word, operands=(left, right)) if word in _COMPARED:
@@ -323,7 +330,7 @@ def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str
 
 
 def _constant_of(value: b.Bound) -> float | None:
-    """Return the number of a constant expression, or None."""
+    """Return the value of a numeric constant in an expression; None for other expressions."""
     match value:
         case b.Value(shown=int() | float() as number) if not isinstance(number, bool):
             return float(number)
@@ -337,7 +344,7 @@ _MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "="}
 
 
 def shortfall(condition: b.Bound, at: Binding, query: b.Query) -> float:
-    """Return the distance of a condition from being true: 0 if it is true, inf if it is unknown."""
+    """Return how far the values in a match are from making a condition true; 0 means true, inf unknown."""
     if _value(condition, at, query) is True:
         return 0.0
     match condition:
@@ -361,20 +368,20 @@ def _value(of: b.Bound, at: Binding, query: b.Query) -> Any:
 
 
 def _apart(edge: b.Edge, at: Binding) -> float:
-    """Return the distance between the ends of an edge, or inf if unknown."""
+    """Return the distance between the two nodes of an edge in m, or inf if unknown."""
     distance = at.view.pair("dist", at.nodes[edge.src], at.nodes[edge.dst])
     return math.inf if distance is None else distance
 
 
 def _text(part: _Part, scope: b.Scope, writer: Writer) -> str:
-    """Return a part as text in the query language, with names for unnamed nodes."""
+    """Return a node, edge or condition of a pattern as query text, with names for unnamed nodes."""
     if isinstance(part, b.Node):
         return writer.node(part.key, part.kinds)
     return writer.edge(part, scope) if isinstance(part, b.Edge) else writer.expression(part)
 
 
 def _named(at: Binding, scope: b.Scope) -> dict[str, str]:
-    """Return the names of the nodes bound to the named variables."""
+    """Return the names of the matched nodes: variable of the pattern → name of the node."""
     return {
         key: _name(at.view, at.nodes[key])
         for key, node in scope.nodes.items()
@@ -393,7 +400,7 @@ def _population(view: FrameView) -> str:
 
 
 def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
-    """Return the relations between the ends of an edge in both directions, as text."""
+    """Return the actual relations between the two nodes of an edge, in both directions, as query text."""
     src, dst = at.nodes[edge.src], at.nodes[edge.dst]
     called = {src: writer.name(edge.src), dst: writer.name(edge.dst)}
     ways = []
@@ -414,7 +421,7 @@ def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
 
 
 def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> str:
-    """Return the values in a condition, as text of the query language."""
+    """Return the actual values in a condition as query text, such as ``e.speed = 5.697``."""
     texts: dict[str, str] = {}
     for leaf in leaves(condition):
         name = writer.expression(leaf)
@@ -426,7 +433,7 @@ def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> 
 
 
 def _shown(name: str, value: Any) -> str:
-    """Return a value as text, such as ``e.speed = 5.697``."""
+    """Return a named value as query text, such as ``e.speed = 5.697``."""
     if value is None:
         return f"{name} IS NULL"
     if isinstance(value, bool):

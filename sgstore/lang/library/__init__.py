@@ -1,4 +1,4 @@
-"""Library of named predicates, concepts, scenarios and properties."""
+"""Library of ready-made patterns in the query language: predicates, concepts, scenarios and properties."""
 
 from sgstore.lang.library._entries import NamedPattern, entries, pattern_named, patterns, predicates
 from sgstore.lang.library._search import search

@@ -1,4 +1,4 @@
-"""Library of named predicates, concepts, scenarios and properties.
+"""Reader of the library of ready-made patterns: predicates, concepts, scenarios and properties.
 
 The files are ``library/*.sgql``. An entry has a head of comments, followed by the query text::
 
@@ -65,7 +65,7 @@ _DRAWING: Final = re.compile(r"^==== (\w+)\n(.*?)(?=^==== |\Z)", re.MULTILINE | 
 
 @dataclass(frozen=True, slots=True)
 class PatternParameter:
-    """Parameter of a named pattern.
+    """Parameter of a pattern in the query library, with its type and default.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class PatternParameter:
     choices: tuple[str, ...] = ()
 
     def written(self, value: object) -> str:
-        """Return a value as query text.
+        """Return a value of the parameter as query text. A value of the wrong type raises an error.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class PatternParameter:
 
 @dataclass(frozen=True, slots=True)
 class NamedPattern:
-    """Entry of the library.
+    """Ready-made pattern of the query library: a predicate, concept, scenario or property.
 
     Attributes
     ----------
@@ -133,21 +133,21 @@ class NamedPattern:
 
     @property
     def text(self) -> str:
-        """Query text with the default values of all parameters."""
+        """Query text of the pattern, with the default values of all parameters."""
         return self.written()
 
     @property
     def example(self) -> str:
-        """Example scene, drawn with letters. Empty for a predicate."""
+        """Example scene of the pattern, drawn with letters. It is empty for a predicate."""
         return _drawings().get(self.name, "")
 
     @property
     def is_check(self) -> bool:
-        """True for a ``CHECK``, which has a verdict. False for a ``MATCH``, which has matches."""
+        """True if the pattern is a ``CHECK`` (with verdicts), False if it is a ``MATCH`` (with matches)."""
         return self.kind == "property"
 
     def written(self, **values: object) -> str:
-        """Return the query text with the given parameter values.
+        """Return the query text of the pattern with the given parameter values.
 
         Parameters
         ----------
@@ -204,7 +204,7 @@ _WRITTEN: Final = {"number": _number, "duration": _duration, "text": _text, "tru
 
 @cache
 def patterns() -> Mapping[str, NamedPattern]:
-    """Return all entries of the library by name, in library order."""
+    """Return all patterns of the query library: name → pattern, in library order."""
     folder = resources.files("sgstore.lang.library")
     found: dict[str, NamedPattern] = {}
     for library in LIBRARY:
@@ -217,7 +217,9 @@ def patterns() -> Mapping[str, NamedPattern]:
 
 
 def pattern_named(name: str) -> NamedPattern:
-    """Return a pattern by name. Case and underscores count only if two names differ in nothing else.
+    """Return the pattern of the query library with a name.
+
+    Case and underscores count only if two names differ in nothing else.
 
     Raises
     ------
@@ -239,7 +241,10 @@ def pattern_named(name: str) -> NamedPattern:
 
 @cache
 def predicates() -> Mapping[str, Define]:
-    """Return the predicates of the library by folded name. Each is parsed on first use."""
+    """Return the predicates of the query library: name in lower case without underscores → definition.
+
+    Each is parsed on first use.
+    """
     return _Predicates(
         {normalize_name(p.name): p for p in patterns().values() if p.kind == "predicate"}
     )
@@ -275,7 +280,7 @@ def _drawings() -> Mapping[str, str]:
 
 @dataclass(slots=True)
 class _LibraryEntry:
-    """Library entry while its file is read."""
+    """Pattern of the query library while its file is read line by line."""
 
     kind: str
     name: str
@@ -285,7 +290,7 @@ class _LibraryEntry:
     last: str = "sentence"
 
     def read(self, line: str) -> bool:
-        """Read one line. Return true if the line is valid at this place."""
+        """Read one line of a library file. Return True if the line is valid at this place."""
         if not line.startswith("--") or self.lines:
             self.lines.append(line)
             return True
@@ -327,7 +332,7 @@ class _LibraryEntry:
 
 
 def entries(text: str, library: str) -> Iterator[NamedPattern]:
-    """Yield the entries of a library file.
+    """Yield the patterns in the text of a library file.
 
     Parameters
     ----------
@@ -359,7 +364,7 @@ def entries(text: str, library: str) -> Iterator[NamedPattern]:
 
 
 def _type_of(default: str) -> str | None:
-    """Return the type of a default value, as written in a query."""
+    """Return the type of a parameter from its default value: text, truth, duration or number."""
     if default.startswith("'"):
         return "text"
     if default in {"TRUE", "FALSE"}:

@@ -1,4 +1,4 @@
-"""Search of library entries by words."""
+"""Search of the query library for patterns by words."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _STEM: Final = 4
 
 
 def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:
-    """Return library entries that match some words, best match first.
+    """Return the patterns of the query library that match some words, best match first.
 
     A word counts most in a name, then in a sentence, then in parameters, source and text. Words of one stem
     match, and so do synonyms of a kind (``pedestrian``, ``person``).
@@ -50,7 +50,7 @@ def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:
 
 @cache
 def _places(name: str) -> tuple[tuple[int, frozenset[str]], ...]:
-    """Return the words of a library entry, grouped by weight."""
+    """Return the words of a library pattern, with weights: words of the name count most."""
     entry = patterns()[name]
     parameters = " ".join(f"{p.name} {p.meaning}" for p in entry.parameters.values())
     rest = f"{parameters} {entry.source} {entry.kind} {entry.query}"
@@ -59,7 +59,7 @@ def _places(name: str) -> tuple[tuple[int, frozenset[str]], ...]:
 
 
 def _words(text: str) -> list[str]:
-    """Split a text into lower-case words, such as ``cut`` and ``in``. Synonyms of a kind are replaced."""
+    """Split a text into lower-case words, such as ``cut`` and ``in``. Synonyms of node kinds are replaced."""
     return [LABEL_ALIASES.get(word, word) for word in map(str.lower, _WORD.findall(text))]
 
 

@@ -1,4 +1,4 @@
-"""Evaluation of patterns and expressions on one graph in memory."""
+"""Search of query patterns in one scene graph in memory, without a database."""
 
 from sgstore.lang.memory._column_evaluation import Columns, column_evaluator
 from sgstore.lang.memory._evaluate import Binding

@@ -1,4 +1,4 @@
-"""Evaluation of expressions in memory, for many bindings or nodes at once.
+"""Evaluation of query expressions in memory, with arrays for many nodes or frames at once.
 
 Numbers of a node, and of its pair with a bound node, are columns over all candidate nodes. A condition on
 them is a few array operations. The results are identical to the last bit. Conditions on texts, blocks and
@@ -37,7 +37,7 @@ Columns = Callable[[T], Column]
 def column_evaluator(
     expression: b.Bound, leaf: Callable[[b.Bound], Columns[T] | None]
 ) -> Columns[T]:
-    """Return the function that evaluates an expression for many bindings or frames at once.
+    """Return a function that evaluates a query expression with arrays, for many nodes or frames at once.
 
     Parameters
     ----------
@@ -77,7 +77,9 @@ class _Alone(Exception):  # noqa: N818 - not an error: the condition is evaluate
 
 
 def crowd_test(condition: b.Bound, key: str) -> Test | None:
-    """Return a function that tests a condition for all candidates of one variable.
+    """Return a function that tests a condition for all candidate nodes of one variable at once.
+
+    ``None`` if the condition has a part without an array form.
 
     Parameters
     ----------
@@ -138,7 +140,7 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
 
 
 def _is_derived(attribute: Attribute) -> bool:
-    """True if an attribute is not stored in the node as a number or a boolean."""
+    """True if a node attribute is computed, and not stored in the node as a number or boolean."""
     return attribute.unit in {
         DisplayUnit.inside,
         DisplayUnit.binding,
@@ -148,7 +150,7 @@ def _is_derived(attribute: Attribute) -> bool:
 
 
 def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:
-    """Return the function for a value of bound nodes, which is the same for all candidates."""
+    """Return a function for a value of nodes that are already chosen. The value is the same for all candidates."""
     told = evaluator(value, _no_blocks)
 
     def same(asked: Asked) -> Column:

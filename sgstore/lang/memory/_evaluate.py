@@ -1,4 +1,4 @@
-"""Evaluation of expressions in memory, for one binding.
+"""Evaluation of query expressions in memory, for one match.
 
 Expressions have the same meaning as in :mod:`sgstore.lang.sql._masks`, which evaluates them in a store:
 ``None`` is NULL, and logic has three values.
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Binding:
-    """Nodes and edges bound to the variables during the search of a graph.
+    """Nodes and edges chosen for the query variables during the search of a scene graph.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ Blocks = Callable[[b.BlockValue], Evaluate]
 
 
 def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, PLR0911, PLR0912 - a case each
-    """Return the function that evaluates an expression for a binding.
+    """Return a function that evaluates a query expression for chosen nodes and edges.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
 
 
 def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a case each
-    """Return the function that evaluates an attribute of a node."""
+    """Return a function that evaluates an attribute of a node in memory."""
     if attribute.unit is DisplayUnit.binding:
         return lambda at: at.nodes[node]
     if attribute.unit is DisplayUnit.role:
@@ -124,19 +124,19 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
 
 
 def _in_junction(at: Binding, node: int) -> bool | None:
-    """True if a part of the map, with a negative id, belongs to a junction. ``None`` for entities."""
+    """True if a map part (negative id) belongs to a junction. ``None`` for entities."""
     return "junction" in at.view.nodes[node] if node < 0 else None
 
 
 def _text_of(value: Any) -> str | None:
-    """Return a JSON value as text, as the database formats it."""
+    """Return a JSON value as text, formatted like the database does; None stays None."""
     if value is None or isinstance(value, str):
         return value
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
 
 
 def _number_of(value: Any) -> Any:
-    """Return a JSON value if it is a number, or None. Other traces may have texts."""
+    """Return a JSON value if it is a number, otherwise None. The same attribute may be a text in other traces."""
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
@@ -149,7 +149,10 @@ _OWN: Final[Mapping[Type, Callable[[Any], Any]]] = {
 
 
 def _lifetime(node: int, attributes: Attributes) -> int | None:
-    """Return the number of an entity among those with the same id. The default is 1."""
+    """Return the lifetime number of an entity: 1 for the first entity with its id, 2 for the second.
+
+    ``None`` for map parts.
+    """
     return None if node < 0 else attributes.get("lifetime", 1)
 
 

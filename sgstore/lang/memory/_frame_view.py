@@ -1,4 +1,4 @@
-"""Graph of one frame, prepared for the search of patterns."""
+"""Scene graph of one frame, indexed for the search of patterns in memory."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ NodePair = tuple["int | None", "int | None"]
 
 @dataclass
 class FrameView:
-    """Scene graph prepared for the search, with attributes of its frame and trace.
+    """Scene graph of one frame, indexed for the search, with attributes of its frame and trace.
 
     Parameters
     ----------
@@ -75,18 +75,21 @@ class FrameView:
     drawn: SceneGraph | None = None
 
     def in_world(self) -> FrameView:
-        """Return the same frame in scope ``world``, with all data beyond its graph."""
+        """Return the same frame for ``USING SCOPE world``: with data of entities outside its scene graph."""
         known = self.graph.known()
         if known is self.graph:
             return self
         return replace(self, graph=known, drawn=self.graph)
 
     def linked(self, edge: b.Edge) -> FrameView:
-        """Return the view in which an edge is searched: the graph, or all data for an edge in braces."""
+        """Return the view in which an edge is searched.
+
+        For an edge in braces it has all data, otherwise the scene graph.
+        """
         return self if self.drawn is None or edge.known else self._drawn
 
     def draws(self, node: int) -> bool:
-        """True if a node is in the graph of the frame, and not beyond it."""
+        """True if a node is in the scene graph of the frame, and not only in other recorded data."""
         return self.drawn is None or node in self.drawn.nodes
 
     @cached_property
@@ -96,12 +99,12 @@ class FrameView:
 
     @cached_property
     def nodes(self) -> Mapping[int, Attributes]:
-        """Attributes of the nodes by id."""
+        """Attributes of the nodes of the frame: node id → attributes."""
         return self.graph.nodes
 
     @cached_property
     def by_kind(self) -> Mapping[str, list[int]]:
-        """Nodes of each kind, including the ego."""
+        """Ids of the nodes of the frame: kind → node ids, including the ego."""
         found: defaultdict[str, list[int]] = defaultdict(list)
         for node, attributes in self.nodes.items():
             found[attributes["kind"]].append(node)
@@ -109,7 +112,7 @@ class FrameView:
 
     @cached_property
     def links(self) -> Mapping[tuple[int, int], dict[str, Attributes]]:
-        """Relations and attributes of the edges between each pair of nodes."""
+        """Edges of the frame: pair of node ids → relation → attributes."""
         found: defaultdict[tuple[int, int], dict[str, Attributes]] = defaultdict(dict)
         for src, relation, dst, attributes in self.graph.edges:
             found[src, dst][relation] = attributes
@@ -117,12 +120,12 @@ class FrameView:
 
     @cached_property
     def ahead(self) -> Mapping[tuple[str, int], list[int]]:
-        """Target nodes of edges, by relation and source node."""
+        """Target nodes of the edges of the frame: (relation, source node) → target nodes."""
         return self._neighbours(0, 2)
 
     @cached_property
     def back(self) -> Mapping[tuple[str, int], list[int]]:
-        """Source nodes of edges, by relation and target node."""
+        """Source nodes of the edges of the frame: (relation, target node) → source nodes."""
         return self._neighbours(2, 0)
 
     def _neighbours(self, at: int, other: int) -> Mapping[tuple[str, int], list[int]]:
@@ -133,11 +136,14 @@ class FrameView:
 
     @cached_property
     def crowds(self) -> dict[b.Kinds, NodeColumns]:
-        """Cache of node columns by kinds, filled by :mod:`sgstore.lang.memory._evaluate`."""
+        """Cache of candidate nodes with their attribute columns, by allowed node kinds.
+
+        :mod:`sgstore.lang.memory._evaluate` fills it.
+        """
         return {}
 
     def class_in(self, abstraction: str) -> str | None:
-        """Return the class of the graph in an abstraction, or None if unknown."""
+        """Return the class of the frame's scene graph in an abstraction, or None if unknown."""
         if abstraction not in self._classes:
             self._classes[abstraction] = self.classes(abstraction) if self.classes else None
         return self._classes[abstraction]
@@ -147,7 +153,7 @@ class FrameView:
         return {}
 
     def role_of(self, node: int) -> str | None:
-        """Return the role of a lane relative to the ego, or None if unknown."""
+        """Return the role of a lane relative to the ego in this frame, or None if unknown."""
         return self._roles.get(node)
 
     @cached_property
@@ -155,7 +161,10 @@ class FrameView:
         return self.roles() if self.roles else {}
 
     def happens(self, asked: b.Happened, nodes: tuple[int, ...]) -> bool | None:
-        """True if an event involves the given nodes. ``None`` if the trace does not record such events."""
+        """True if a recorded event in this frame involves the given nodes.
+
+        ``None`` if the trace does not record such events.
+        """
         told = (self.graph.events if self.events is None else self.events).get(asked.kind)
         if told is None:
             return None
@@ -164,12 +173,12 @@ class FrameView:
         return any(nodes in {pair[: len(nodes)], pair[::-1][: len(nodes)]} for pair in told)
 
     def is_one(self, node: int, kinds: b.Kinds) -> bool:
-        """True if a node has one of the kinds."""
+        """True if a node of the frame has one of the allowed kinds."""
         kind = self.nodes[node]["kind"]
         return kind in (kinds.ego if node == self.graph.ego else kinds.other)
 
     def pair(self, name: str, one: int, other: int) -> float | None:
-        """Return a number of a pair of entities, or None if a needed value is missing."""
+        """Return a number of two entities in this frame, such as ``gap``, or None if a value is missing."""
         if name in WAYS:
             return self._by_lanes(name, one, other)
         if name in RECORDED:
@@ -184,7 +193,7 @@ class FrameView:
         return None if math.isnan(value) else value
 
     def _by_lanes(self, name: str, one: int, other: int) -> float | None:
-        """Return a number derived from lanes, such as a lane distance, or None if unknown."""
+        """Return a number that depends on lanes, such as the lane distance of two nodes, or None if unknown."""
         reach = self.graph.reach
         if reach is None:
             return None
@@ -197,7 +206,9 @@ class FrameView:
         return reach.between(*ends)
 
     def pairs(self, name: str, one: int, *, ahead: bool = True) -> Floats:
-        """Return the numbers (E,) of one entity paired with every entity, ordered as :attr:`rows`.
+        """Return the numbers (E,), such as ``gap``, between one entity and every entity of the frame.
+
+        The order is that of :attr:`rows`.
 
         All pairs are computed at once, because most are needed. NaN means that a needed value is missing.
         Without ``ahead``, the pairs are reversed.
@@ -213,7 +224,7 @@ class FrameView:
         return self._pairs[key][name]
 
     def _on(self, node: int, *, parts: bool = False) -> Sequence[tuple[int, float, float]]:
-        """Return the lane stretches occupied by an entity, or with ``parts`` by a part of the map."""
+        """Return the stretches of lanes that an entity occupies, or with ``parts`` a map part."""
         reach, kind = self.graph.reach, self.nodes[node]["kind"]
         if node >= 0 or reach is None:
             return self._stretches.get(node, ())
@@ -237,13 +248,16 @@ class FrameView:
 
     @cached_property
     def rows(self) -> Mapping[int, int]:
-        """Row of each entity in the result of :meth:`pairs`."""
+        """Index of each entity in the arrays of pair numbers: node id → index."""
         known = (n for n, about in self.nodes.items() if about["kind"] not in MAP_KINDS)
         return {node: row for row, node in enumerate(known)}
 
     @cached_property
     def _boxes(self) -> Floats:
-        """Values (E, 15) from which pair numbers are computed. Static entities have acceleration 0."""
+        """Array (E, 15) of pose, size and motion of each entity, for pair numbers.
+
+        Static entities have acceleration 0.
+        """
         rows: list[list[float]] = []
         heights: list[tuple[float, bool, bool]] = []
         for node in self.rows:
@@ -266,7 +280,7 @@ class FrameView:
 
 
 class NodeColumns:
-    """Candidate nodes of a variable in one graph, with columns of their numbers.
+    """Candidate nodes of a query variable in one frame, with arrays of their attributes.
 
     Parameters
     ----------
@@ -287,7 +301,7 @@ class NodeColumns:
     # The view is not stored, because it holds a reference to this object, and reference cycles are freed late.
 
     def attribute(self, view: FrameView, name: str, *, truth: bool) -> Column:
-        """Return a column (N,) of an attribute: numbers, or booleans if ``truth``."""
+        """Return an attribute of each candidate node (N,): numbers, or booleans if ``truth``."""
         column = self._columns.get(name)
         if column is None:
             nodes = view.nodes
@@ -299,7 +313,10 @@ class NodeColumns:
         return column
 
     def pair(self, view: FrameView, name: str, one: int, *, ahead: bool) -> Column:
-        """Return a column (N,) of a pair number of a node and each candidate. Without ``ahead``, reversed."""
+        """Return a number such as ``gap`` between one node and each candidate node (N,).
+
+        If ``ahead`` is false, the candidate is the first of the pair.
+        """
         key = name, one, ahead
         column = self._columns.get(key)
         if column is None:
@@ -314,7 +331,7 @@ def _known(values: Floats) -> Column:
 
 
 def crowd(view: FrameView, kinds: b.Kinds) -> NodeColumns:
-    """Return the nodes of a graph with some kinds, computed once for each view."""
+    """Return the nodes of a frame with allowed kinds, as columns. The result is cached in the view."""
     found = view.crowds.get(kinds)
     if found is None:
         found = view.crowds[kinds] = NodeColumns(view, kinds)

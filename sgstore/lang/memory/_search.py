@@ -1,4 +1,4 @@
-"""Search of patterns in one graph in memory, with the same results as the SQL of the compiler.
+"""Search of query patterns in one scene graph in memory. The results equal those of the SQL.
 
 The nodes of a pattern are bound one after the other. If an edge leads to a node, its candidates are the
 neighbours of a bound node. Each condition is tested as soon as all its variables are bound.
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class _SearchStep:
-    """Node to bind, the source of its candidates, and the tests after it is bound.
+    """Step of a pattern search: the variable, the source of its candidate nodes, and the tests of a candidate.
 
     The tests in ``crowd`` run before binding, for all candidates at once.
     """
@@ -41,20 +41,20 @@ class _SearchStep:
 
     @property
     def among(self) -> bool:
-        """True if the candidates are all nodes of some kinds, not only neighbours or the ego."""
+        """True if all nodes of some kinds are candidates, not only neighbours of a node or the ego."""
         return bool(self.key) and self.via is None and bool(self.kinds.other)
 
 
 @dataclass(slots=True)
 class _NamedEdge:
-    """Edge to bind, because it has a name or conditions."""
+    """Pattern edge that the search must choose, because it has a name or conditions."""
 
     edge: Edge
     tests: list[Evaluate]
 
 
 class ScopeSearch:
-    """Search plan of one scope: the order in which its nodes are bound."""
+    """Search plan of one graph pattern: the order in which its nodes are chosen."""
 
     def __init__(self, scope: Scope, *, injective: bool) -> None:
         self._scope = scope
@@ -90,7 +90,7 @@ class ScopeSearch:
                 (place.tests if place else step.tests).append(test)
 
     def _order(self) -> list[_SearchStep]:
-        """Return the search steps: nodes reached by edges first, then the ego, then nodes of few kinds."""
+        """Return the search steps: first nodes reached by edges, then the ego, then nodes with few kinds."""
         scope, bound, steps = self._scope, set(self._scope.outer), list[_SearchStep]()
         left = dict.fromkeys(scope.nodes)
         while left:
@@ -109,7 +109,10 @@ class ScopeSearch:
         return steps
 
     def _way(self, key: str, bound: set[str]) -> Edge | None:
-        """Return a single edge from a bound node to the given node, or None."""
+        """Return an edge of the pattern from a node already chosen to the given node, or None.
+
+        Paths of several edges do not count.
+        """
         for edge in self._scope.edges:
             other = edge.dst if edge.src == key else edge.src
             if key in {edge.src, edge.dst} and other in bound and edge.high == 1:
@@ -117,7 +120,7 @@ class ScopeSearch:
         return None
 
     def run(self, at: Binding) -> Iterator[None]:
-        """Yield once for each match of the scope. ``at`` holds the current binding."""
+        """Yield None once for each match of the pattern. Meanwhile ``at`` holds the chosen nodes and edges."""
         if all(at.view.is_one(at.nodes[key], kinds) for key, kinds in self._outer):
             yield from self._bound(at, 0)
 
@@ -139,13 +142,13 @@ class ScopeSearch:
                 yield from self._bound(at, number)
 
     def _bound(self, at: Binding, number: int) -> Iterator[None]:
-        """Continue after a step if all its tests are true."""
+        """Yield once for each match that extends the chosen nodes, if all tests of a search step are true."""
         step = self._steps[number]
         if all(self._linked(at, edge) for edge in step.edges) and _all(step.tests, at):
             yield from self._name(at, number, 0)
 
     def _name(self, at: Binding, number: int, nth: int) -> Iterator[None]:
-        """Bind the edges of a step that have names or conditions, then continue."""
+        """Choose the edges of a search step that have names or conditions. Yield once for each match."""
         step = self._steps[number]
         if nth == len(step.named):
             yield from self._bind(at, number + 1)
@@ -169,7 +172,10 @@ class ScopeSearch:
     def _walks(
         self, view: FrameView, edge: Edge, here: int, dst: int, length: int, seen: tuple[int, ...]
     ) -> bool:
-        """True if a path of the given length connects two nodes. Inner nodes differ if nodes must differ."""
+        """True if a path of ``length`` edges connects two nodes of the frame.
+
+        If nodes must differ, the path visits each node once.
+        """
         if length == 0:
             return here == dst
         for step in _steps(view.linked(edge), edge.relations, here, both=edge.both):
@@ -181,7 +187,7 @@ class ScopeSearch:
 
 
 def expression(of: b.Bound, *, injective: bool) -> Evaluate:
-    """Return the function that evaluates an expression for a binding.
+    """Return a function that evaluates a query expression for chosen nodes and edges.
 
     Parameters
     ----------
@@ -225,12 +231,12 @@ def _all(tests: list[Evaluate], at: Binding) -> bool:
 
 
 def _needs(condition: b.Bound) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the nodes and edges that must be bound before a condition can be tested."""
+    """Return the nodes and edges that must be chosen before a condition can be tested."""
     return b.nodes_of(condition), b.edges_of(condition)
 
 
 def _candidates(at: Binding, step: _SearchStep) -> Iterator[int]:
-    """Yield the candidates of a step: neighbours of a bound node, or all nodes of some kinds."""
+    """Yield the candidate nodes of a search step: neighbours of a chosen node, or all nodes of some kinds."""
     view, edge = at.view, step.via
     if edge is not None:
         forward = edge.dst == step.key
@@ -246,7 +252,7 @@ def _candidates(at: Binding, step: _SearchStep) -> Iterator[int]:
 
 
 def _fitting(at: Binding, step: _SearchStep) -> list[int]:
-    """Return the candidates of a step that pass all tests for many nodes at once."""
+    """Return the candidate nodes of a search step that pass its array tests."""
     among = crowd(at.view, step.kinds)
     fits = step.crowd[0](at, among)
     for test in step.crowd[1:]:
@@ -257,7 +263,7 @@ def _fitting(at: Binding, step: _SearchStep) -> list[int]:
 def _steps(
     view: FrameView, relations: frozenset[str], here: int, *, both: bool, forward: bool = True
 ) -> Iterator[int]:
-    """Yield the neighbours of a node along some relations, without duplicates."""
+    """Yield the neighbours of a node along edges with some relations, without duplicates."""
     sides = (view.ahead, view.back) if both else (view.ahead,) if forward else (view.back,)
     found: dict[int, None] = {}
     for side in sides:
@@ -267,7 +273,10 @@ def _steps(
 
 
 def _between(at: Binding, edge: Edge) -> Iterator[tuple[str, Attributes]]:
-    """Yield relation and attributes of the edges between two bound nodes, each relation once."""
+    """Yield relation and attributes of the edges between the two chosen nodes of a pattern edge.
+
+    Each relation occurs once.
+    """
     src, dst = at.nodes[edge.src], at.nodes[edge.dst]
     links = at.view.linked(edge).links
     found = dict(links.get((src, dst), {}))

@@ -1,4 +1,4 @@
-"""Search of queries with stages in one graph in memory: ``OPTIONAL MATCH``, ``WITH``, named paths.
+"""Search in one scene graph in memory for queries with ``OPTIONAL MATCH``, ``WITH`` or named paths.
 
 Each stage converts the rows of the previous stage. A row holds the bound nodes and edges (``None`` means
 absent), and the values of ``WITH`` and paths. :mod:`sgstore.lang.sql._stages` does the same in a store.
@@ -27,7 +27,7 @@ _Part = Callable[[FrameView, Rows], Rows]
 
 
 class StageSearch:
-    """Search plan of a query with stages.
+    """Search plan for a query with several clauses (``MATCH``, ``OPTIONAL MATCH``, ``WITH``).
 
     Parameters
     ----------
@@ -45,19 +45,19 @@ class StageSearch:
         ]
 
     def rows(self, view: FrameView) -> Rows:
-        """Return the rows of a graph after all stages."""
+        """Return the matches of a query with several clauses in one scene graph."""
         rows = [Binding(view)]
         for part in self._parts:
             rows = part(view, rows)
         return rows
 
     def value(self, of: b.Bound) -> Evaluate:
-        """Return the function that evaluates an expression for a row."""
+        """Return a function that evaluates an expression for one match, whose optional nodes may be absent."""
         return _value(of, injective=self._injective)
 
 
 class _Joining:
-    """Stage that joins the matches of a pattern to the previous rows."""
+    """``MATCH`` or ``OPTIONAL MATCH`` clause: extends each previous match by the matches of a pattern."""
 
     def __init__(self, stage: b.MatchStage, injective: bool) -> None:  # noqa: FBT001
         self._stage = stage
@@ -93,7 +93,7 @@ class _Joining:
         return found
 
     def _beside(self, view: FrameView, row: Binding) -> Iterator[Binding]:
-        """Yield a row extended by each match of the pattern."""
+        """Yield the given match, extended by each match of the next pattern."""
         if _absent(row, self._stage.scope.outer, ()):
             return
         told: set[object] = set()
@@ -120,7 +120,7 @@ def _row(view: FrameView, nodes: Any, edges: Any, passed: Any) -> Binding:
 
 
 class _Passing:
-    """``WITH`` stage: converts the rows of a frame."""
+    """``WITH`` clause: converts the matches in a frame, as by grouping, sorting and limits."""
 
     def __init__(self, stage: b.WithStage, injective: bool) -> None:  # noqa: FBT001
         self._stage, self._injective = stage, injective
@@ -152,7 +152,10 @@ class _Passing:
         return [row for row in found if all(test(row) is True for test in self._where)]
 
     def _passed(self, row: Binding, *, bare: bool = False) -> Binding:
-        """Return a row with the passed names and values. With ``bare``, all others are removed."""
+        """Return a match with the names and values that ``WITH`` passes on.
+
+        With ``bare``, all others are removed.
+        """
         stage = self._stage
         nodes = {new: row.nodes[old] for new, old in stage.nodes}
         edges = {edge.key: row.edges[old] for edge, old in stage.edges}
@@ -163,7 +166,7 @@ class _Passing:
         return Binding(row.view, nodes, edges, passed)
 
     def _groups(self, rows: Rows) -> Rows:
-        """Return one row for each combination of grouping values."""
+        """Return one row for each combination of the grouping values of ``WITH``."""
         members: dict[object, Rows] = {}
         kept: dict[object, Binding] = {}
         for row in rows:
@@ -181,7 +184,7 @@ class _Passing:
         return list(kept.values())
 
     def _counted(self, value: b.Bound, rows: Rows, told: Mapping[str, Any]) -> Any:
-        """Evaluate an aggregating expression over some rows."""
+        """Return the value of an expression with aggregates, over the matches of one group."""
         match value:
             case b.Aggregate():
                 return _aggregate(value, rows, injective=self._injective)
@@ -199,14 +202,17 @@ def _always(value: Any) -> Evaluate:
 
 
 def _place(row: Binding) -> tuple[tuple[bool, Any], ...]:
-    """Return the default sort key of a row."""
+    """Return the default sort key of a match: its node ids, relations and passed values."""
     nodes = [row.nodes[key] for key in sorted(row.nodes)]
     edges = [row.edges[key] and row.edges[key][0] for key in sorted(row.edges)]
     return tuple((one is None, one or 0) for one in (*nodes, *edges, *row.passed.values()))
 
 
 def _aggregate(of: b.Aggregate, rows: Rows, *, injective: bool) -> Any:
-    """Evaluate an aggregate over some rows; see :mod:`sgstore.lang.bind._aggregates`."""
+    """Return the value of an aggregate such as ``COUNT`` over some matches.
+
+    See :mod:`sgstore.lang.bind._aggregates`.
+    """
     if of.operand is None:
         return len(rows)
     value = _value(of.operand, injective=injective)
@@ -244,7 +250,7 @@ _OF_NOTHING: Final = {"EXISTS": False, "COUNT": 0, "SUM": 0.0}
 
 
 def _value(of: b.Bound, *, injective: bool) -> Evaluate:
-    """Return the function that evaluates an expression for a row, whose nodes may be absent."""
+    """Return a function that evaluates an expression for one match, whose optional nodes may be absent."""
     match of:
         case b.Operation(word=word, operands=operands):
             return OPERATORS[word].one([_value(one, injective=injective) for one in operands])

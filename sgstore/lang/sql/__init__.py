@@ -1,4 +1,7 @@
-"""SQL compiler: rewrites bound queries, plans them, and writes the statements of each phase."""
+"""SQL generator of the query compiler.
+
+It has two phases: candidate frames as bit masks, then values of single frames.
+"""
 
 from sgstore.lang.sql._compile import Compiled, compile_checks, compile_query
 from sgstore.lang.sql._display import for_people

@@ -1,4 +1,4 @@
-"""SQL of attributes of nodes, frames and traces."""
+"""SQL expressions for attributes of nodes, frames and traces."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Aliases:
-    """SQL aliases of the tables with a node's attributes. ``None`` means that the table is not joined."""
+    """SQL aliases of the tables that hold the attributes of a node.
+
+    ``None`` means that the table is not joined.
+    """
 
     state: str | None = None
     entity: str | None = None
@@ -45,7 +48,7 @@ _ABSENT: Final = {
 
 
 def attribute_text(attribute: Attribute, at: Aliases) -> str:
-    """Return the SQL of a node attribute, for nodes stored in one of several tables."""
+    """Return the SQL expression of a node attribute. Its value may be in one of several tables."""
     if attribute.unit is DisplayUnit.label:
         return _label(at)
     if attribute.name == "kind" and at.state and not (at.entity or at.map):
@@ -70,7 +73,9 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
 
 
 def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
-    """Return the SQL of a raw column of a node. Positions are relative to the origin of the trace.
+    """Return the SQL expression of a stored number of a node, such as ``x``.
+
+    Positions are relative to the origin of the trace.
 
     Static entities have no states. Their velocity and acceleration are 0.
     """
@@ -101,7 +106,10 @@ def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
 
 
 def _side_text(name: str, at: Aliases, *, upright: bool) -> str:
-    """Return the SQL of the lower or upper height of a body. It is NULL for signals and map parts."""
+    """Return the SQL expression for the height of a body's lower or upper side.
+
+    It is NULL for signals and map parts.
+    """
     parts = [
         low_and_high_sql(
             lambda column, alias=alias: (
@@ -120,7 +128,7 @@ def _side_text(name: str, at: Aliases, *, upright: bool) -> str:
 
 
 def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
-    """Return the SQL of the owner of a node id: the trace of an entity, or the map if negative."""
+    """Return SQL for the owner of a node id: the trace of an entity, or the map of a map part (negative id)."""
     if not profile.mapped:
         return trace
     of_map = f"coalesce({road_map}, -1 - ({trace}))"
@@ -130,14 +138,14 @@ def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
 
 
 def role_text(frame: str, node: str) -> str:
-    """Return the SQL of the role of a lane relative to the ego in a frame."""
+    """Return the SQL expression for the role of a lane relative to the ego in a frame."""
     on = [f'":r"."frame_id" = {frame}', f'":r"."node_id" = {node}']
     role = Select(['any_value(":r"."role")'], ['"roles" AS ":r"'], on)
     return f"({role.text()})"
 
 
 def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = ()) -> str:
-    """Return the SQL of a user-defined attribute in a frame.
+    """Return the SQL expression of a user-defined attribute of a node or edge in a frame.
 
     The attribute belongs to a node, or to the edge from this node with the given relation and other end.
     """
@@ -207,7 +215,7 @@ def _label(at: Aliases) -> str:
 
 
 def as_type(column: str, kind: Type) -> str:
-    """Convert a column of a user table to a value of the query language."""
+    """Return SQL that converts a column of a user table to a value type of the query language."""
     return f"CAST({column} AS {_NATIVE[kind]})"
 
 
@@ -215,7 +223,7 @@ _NATIVE: Final = {Type.number: "DOUBLE", Type.text: "VARCHAR", Type.boolean: "BO
 
 
 def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, map_: str) -> str:
-    """Return the SQL of an attribute of the frame or trace."""
+    """Return the SQL expression of an attribute of the frame or trace."""
     attribute = leaf.attribute
     home, column = next(iter(attribute.columns.items()))
     if attribute.unit in {
@@ -259,7 +267,7 @@ def _class_text(abstraction: str, frame: str) -> str:
 
 
 def _looked_up(attribute: Attribute, frame: str) -> str:
-    """Return the SQL of a frame value that comes from other frames or events."""
+    """Return the SQL expression of a frame attribute that is computed from other frames or from events."""
     column = next(iter(attribute.columns.values()))
     if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
         return _weather_text(column, frame)
@@ -282,7 +290,7 @@ def _looked_up(attribute: Attribute, frame: str) -> str:
 
 
 def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
-    """Return the SQL of a frame value from the class tables of a whole collection."""
+    """Return the SQL expression of a frame attribute that depends on the frame classes of a whole collection."""
     seen = attribute.unit is DisplayUnit.seen
     dataset = attribute.name.removeprefix(f"class_{abstraction} in ") if seen else ""
     on = [f'"k"."abstraction" = {literal(abstraction)}', f'"k"."dataset" = {literal(dataset)}']
@@ -296,7 +304,7 @@ def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
 
 
 def _weather_text(word_: str, frame: str) -> str:
-    """Return the SQL of a weather word from the last weather event up to the frame."""
+    """Return SQL for a weather attribute of a frame, from the last weather event until the frame."""
     told = f'regexp_extract("v"."detail", \'(^|, ){word_}=([^,]*)\', 2)'
     if word_ == "time_of_day":
         parts = [

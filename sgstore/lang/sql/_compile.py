@@ -1,4 +1,4 @@
-"""Compiler: converts query text to SQL statements.
+"""Query compiler: converts query text to SQL statements.
 
 Its stages are parse, bind, rewrite and emit. Each stage is a pure function.
 """
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Compiled:
-    """Compiled query, ready to run on a store.
+    """Compiled query: builds the SQL statements for its results, such as rows, frames or intervals.
 
     Attributes
     ----------
@@ -67,31 +67,31 @@ class Compiled:
 
     @property
     def whole(self) -> Query:
-        """Bound query. For a query that returns graphs: the query of the rows that form the graphs."""
+        """Query before rewriting. For ``RETURN SUBGRAPHS`` it returns the rows that form the subgraphs."""
         return self.bound if self.layout is None else Layout.of(self.bound).query
 
     @property
     def layout(self) -> Layout | None:
-        """Layout of the result graphs. ``None`` if the query does not return graphs."""
+        """Layout of the rows of ``RETURN SUBGRAPHS``. ``None`` if the query returns no subgraphs."""
         return Layout.of(self.bound) if self.bound.result.form == "subgraphs" else None
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the result columns."""
+        """Names of the result columns of the query."""
         if self.layout is not None:
             return self.layout.columns
         return results.names_of(self.query)
 
     @property
     def chosen(self) -> tuple[TraceFacts, ...]:
-        """Traces selected by the query, including traces that cannot answer it."""
+        """Traces that the settings of the query select, even if they lack the needed data."""
         only, ego = self.catalog.only, self.query.ego
         chosen = [t for t in self.catalog.traces if ego in {None, t.ego}]
         return tuple(t for t in chosen if only is None or t.trace_id in only)
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Reason for each selected trace that lacks a relation of the query, by trace name."""
+        """Selected traces that lack a relation of the query: trace name → message."""
         if self.query.unknown_is_false:
             return {}
         wanted = self.query.relations
@@ -104,14 +104,17 @@ class Compiled:
         return tuple(self.reasons)
 
     def rows(self, window: Window | None = None, query: Query | None = None) -> SqlStatement:
-        """Return the SQL for the rows of the query, or of another query with the same pattern."""
+        """Return the SQL for the result rows of the query, or of another query with the same pattern."""
         query, writer, span = self._told(query or self.query, window)
         return results.rows(query, self.catalog, window, writer, span)
 
     def _told(
         self, query: Query, window: Window | None
     ) -> tuple[Query, SqlBuilder | None, results.Span | None]:
-        """Return the query, a builder if its matches are already known, and the span of its matches."""
+        """Return the query, a builder if its matches are computed already, and the time span of a match.
+
+        Builder and span can be None.
+        """
         if query.stages:
             return query, staged_matches(query, self.catalog, window), None
         if not query.steps:
@@ -133,11 +136,13 @@ class Compiled:
         return results.frames(query, self.catalog, window, writer)
 
     def bindings(self, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for frames and bindings. ``RETURN`` is ignored."""
+        """Return the SQL for frames with their matched nodes and edges. ``RETURN`` is ignored."""
         return self.rows(window, replace(self.query, result=Result()))
 
     def intervals(self, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for intervals with constant results. Without ``RETURN``: with constant bindings.
+        """Return the SQL for intervals of frames in which the returned values stay constant.
+
+        Without ``RETURN``, the matched nodes stay constant.
 
         If the query returns rows, its order and its limit are ignored.
         """
@@ -150,7 +155,7 @@ class Compiled:
         return self.rows(window, query)
 
     def bound_intervals(self, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for intervals in which the same nodes are bound. ``RETURN`` is ignored."""
+        """Return the SQL for intervals of frames in which the same nodes match. ``RETURN`` is ignored."""
         return self.rows(window, results.with_bindings(self.query))
 
     def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> SqlStatement:
@@ -168,12 +173,12 @@ class Compiled:
         return self.rows(window, replace(self.query, result=result))
 
     def told_apart(self) -> Compiled:
-        """Return the query with extra columns: the owner of each returned node, if rows have no frame."""
+        """Return a copy that also returns the owner (trace or map) of each node, if rows do not name a frame."""
         result = with_owners(self.query.result)
         return replace(self, query=replace(self.query, result=result))
 
     def limited(self, most: int) -> Compiled:
-        """Return the query with at most ``most`` rows, as with ``LIMIT``."""
+        """Return a copy of the query that returns at most ``most`` rows, as with ``LIMIT``."""
 
         def limit(query: Query) -> Query:
             held = query.result.limit
@@ -184,7 +189,7 @@ class Compiled:
 
     @property
     def in_windows(self) -> bool:
-        """True if the rows can be computed window by window, independently of other windows."""
+        """True if the result can be computed in time windows, each independent of the others."""
         result = self.query.result
         framed = result.whole or result.framed or result.form != "rows"
         across = result.distinct and not framed
@@ -193,7 +198,7 @@ class Compiled:
 
     @property
     def limited_to_frames(self) -> Compiled | None:
-        """Query for the frame and log time of each row. ``None`` if the rows are not limited."""
+        """Return a copy that also returns frame and log time of each row. ``None`` if no limit selects rows."""
         result = self.query.result
         if not result.chooses or result.form != "rows" or result.aggregated:
             return None
@@ -203,7 +208,7 @@ class Compiled:
         return replace(self, query=replace(self.query, result=result))
 
     def stages(self) -> str:
-        """Return the text after each stage of the compiler."""
+        """Return the query as text after each stage of the compiler, from the syntax tree to SQL."""
         statements = parse(self.text)
         statement = self.rows()
         values = "".join(f"\n${i} = {v!r}" for i, v in enumerate(statement.values, start=1))
@@ -224,7 +229,7 @@ class Compiled:
 def compile_query(
     text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
 ) -> Compiled:
-    """Compile a query for a store.
+    """Compile the text of a query for a store.
 
     Parameters
     ----------
@@ -257,7 +262,9 @@ def compile_query(
 def compile_checks(
     text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
 ) -> tuple[CheckInCatalog, ...]:
-    """Bind the checks of a text. Their single-frame parts are compiled when the check runs.
+    """Return the ``CHECK`` statements of a text with resolved names.
+
+    Their SQL is generated when the check runs.
 
     Parameters
     ----------
@@ -277,7 +284,7 @@ def compile_checks(
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
-    """Return the catalog for the abstraction, dataset and scope that the settings of a query select."""
+    """Return the catalog of the abstraction, dataset and scope that the ``USING`` settings select."""
     seen, world = catalog, any(isinstance(one, CheckClause) for one in statements)
     for statement in statements:
         for setting in (

@@ -1,4 +1,4 @@
-"""Rows of results for display."""
+"""Result rows of a query, shortened for display."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def for_people(
     columns: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, graphs: bool
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return shorter columns and rows for display.
+    """Return result columns and rows in a shorter form for display.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def for_people(
 
 
 def _named(name: str) -> str | None:
-    """Return the variable whose name a column holds, or None."""
+    """Return ``v`` for a column ``v.name``, or None for another column."""
     return name.removesuffix(".name") if name.endswith(".name") else None
 
 

@@ -1,4 +1,4 @@
-"""Stages of the compiler as text, for ``--explain``."""
+"""Text of a query after each stage of the compiler, for ``--explain``."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ def _tree(part: Any, indent: str) -> list[str]:
 
 
 def statements_text(statements: tuple[Statement, ...]) -> str:
-    """Return the syntax trees of statements as text."""
+    """Return the syntax trees of query statements as text."""
     return "\n".join(tree_text(statement) for statement in statements)
 
 
 def query_text(query: Query) -> str:
-    """Return a bound query as text: variables, conditions and results."""
+    """Return a compiled query as readable text: variables, conditions and results."""
     lines = [line for stage in query.stages for line in _stage(stage)]
     lines += [] if query.stages else _scope(query.scope, "")
     result = query.result
@@ -89,7 +89,7 @@ def query_text(query: Query) -> str:
 
 
 def _stage(stage: Stage) -> list[str]:
-    """Return the text lines of one stage of a query."""
+    """Return the readable text lines of one clause (``MATCH`` or ``WITH``) of a query."""
     if isinstance(stage, MatchStage):
         return ["optional match" if stage.optional else "match", *_scope(stage.scope, "  ")]
     nodes = [new if new == key else f"{key} AS {new}" for new, key in stage.nodes]
@@ -108,7 +108,7 @@ def _stage(stage: Stage) -> list[str]:
 
 
 def _passed(name: str) -> str:
-    """Return the name in the query of a value that ``WITH`` passes on."""
+    """Return the name that the query text uses for a value passed by ``WITH``."""
     return name.removeprefix(PASSED).rpartition(" ")[0]
 
 
@@ -126,7 +126,7 @@ def _scope(scope: Scope, indent: str) -> list[str]:
 
 
 def edge_text(edge: Edge) -> str:
-    """Return an edge as text, with the keys of its nodes."""
+    """Return a pattern edge as readable text, with the keys of its nodes."""
     some = [relation for relation in RELATIONS if relation in edge.relations]
     label = "" if edge.relations == any_relation() else f":{'|'.join(some)}"
     times = "" if edge.high == 1 else f"*{edge.low}..{edge.high}"
@@ -135,7 +135,7 @@ def edge_text(edge: Edge) -> str:
 
 
 def kinds_text(kinds: Kinds) -> str:
-    """Return the kinds of a node as text."""
+    """Return the allowed kinds of a pattern node as readable text, such as ``the ego``."""
     if kinds == any_kinds():
         return "anything"
     entities = entity_kinds()
@@ -153,7 +153,7 @@ def _kinds(kinds: frozenset[str]) -> str:
 
 
 def unnumbered_text(value: Bound) -> str:
-    """Return an expression as text, as :func:`value_text`, but without the numbers of unnamed nodes."""
+    """Return an expression as readable text, without the numbers of unnamed nodes."""
     return _NUMBERED.sub(lambda found: "#" if found[0][0] == "#" else found[0], value_text(value))
 
 
@@ -162,7 +162,7 @@ _NUMBERED: Final = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|#\d+""")
 
 
 def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case each
-    """Return an expression as text, close to the query language."""
+    """Return an expression as readable text, close to the query language."""
     match value:
         case Value(value=constant):
             return "NULL" if constant is None else repr(constant)

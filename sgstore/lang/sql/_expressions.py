@@ -1,4 +1,4 @@
-"""SQL expressions of values, attributes, conditions and pair numbers."""
+"""SQL of query expressions: values, attributes, conditions and numbers of entity pairs."""
 
 from __future__ import annotations
 
@@ -41,14 +41,17 @@ if TYPE_CHECKING:
 
 
 def pair_column(name: str, a: str, b: str) -> str:
-    """Return the column of a pair number, or of an attribute of one entity (``a_x`` is x of a)."""
+    """Return the SQL column for a number of two entities, or for an attribute of one of them.
+
+    ``a_x`` means x of entity a.
+    """
     if stage_of(name):
         return quoted(f"{name}({a}, {b})")
     return quoted(f"{a if name[0] == 'a' else b}:{name[2:]}")
 
 
 def pair_text(name: str, a: str, b: str, without: frozenset[str] = frozenset()) -> str:
-    """Return the SQL of a pair number, in terms of the columns of earlier layers."""
+    """Return the SQL that computes a number of two entities from columns of inner SELECT statements."""
     return pair_sql(name, lambda part: pair_column(part, a, b), without)
 
 
@@ -68,7 +71,7 @@ Leaf = (
 
 
 def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
-    """Return the SQL of an expression. ``leaf`` returns the SQL of each leaf."""
+    """Return the SQL of a query expression. ``leaf`` returns the SQL of its attributes and other leaves."""
     match expression:
         case Value():
             return _value(expression, values)
@@ -112,7 +115,7 @@ def _operation(operation: Operation, leaf: Callable[[Leaf], str], values: BoundV
 def _compared(
     operand: Bound, operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues
 ) -> str:
-    """Return the SQL of one side of a comparison. A vocabulary column needs no cast."""
+    """Return the SQL of one side of a comparison. Columns with a fixed list of words need no cast."""
     closed = all(
         (isinstance(o, Value) and o.closed) or (isinstance(o, NodeAttribute) and o.attribute.values)
         for o in operation.operands
@@ -138,7 +141,7 @@ def _membership(
 
 
 def leaves(expression: Bound) -> Iterable[Leaf]:
-    """Yield the leaves of an expression that need a column."""
+    """Yield the parts of an expression that are read from a column, such as attributes."""
     match expression:
         case Value() | Choices() | LabelTest() | GroupKey() | Tense() | SignalCall():
             return
@@ -155,14 +158,14 @@ def leaves(expression: Bound) -> Iterable[Leaf]:
 
 
 def columns_of(nodes: frozenset[str], edges: frozenset[str] = frozenset()) -> list[str]:
-    """Return the quoted columns that bind the given nodes and edges."""
+    """Return the quoted names of the SQL columns that hold node ids and edge relations of a match."""
     return [quoted(f"{key}.id") for key in sorted(nodes)] + [
         quoted(f"{key}.type") for key in sorted(edges)
     ]
 
 
 def column_of(leaf: Leaf) -> str:
-    """Return the column name of a leaf."""
+    """Return the SQL column name for a leaf of an expression, such as an attribute."""
     match leaf:
         case NodeValue(node=owner):
             name = "id"
@@ -189,13 +192,16 @@ def column_of(leaf: Leaf) -> str:
 
 
 def _as_column(attribute: Attribute) -> str:
-    """Return the column name of an attribute. Names that differ only in case get distinct columns."""
+    """Return the SQL column name of an attribute.
+
+    User-defined names that differ only in case get distinct columns.
+    """
     own = attribute.unit is DisplayUnit.own and attribute.name != attribute.name.lower()
     return attribute.name.encode().hex() if own else attribute.name
 
 
 def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
-    """Return the table with the attributes of an edge, and the columns of its two ends.
+    """Return the table that holds the attributes of an edge, and its columns for the two nodes.
 
     The ends of an ``isIn`` edge are an entity, with an id of 0 or above, and a lane, with a negative id. A
     gap is stored once, with the follower first.
@@ -208,13 +214,13 @@ def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
 
 
 def lane_text(leaf: Leaf, alias: str) -> str:
-    """Return the SQL of an edge attribute, from a row of :func:`edge_table`."""
+    """Return the SQL expression of an edge attribute, read from a row of :func:`edge_table`."""
     assert isinstance(leaf, EdgeAttribute)  # noqa: S101 - the condition was filed so
     return attribute_text(leaf.attribute, Aliases(state=alias))
 
 
 def is_position(leaf: Leaf) -> bool:
-    """True if a value is a coordinate, stored relative to the origin of the trace."""
+    """True if an expression is a coordinate, which is stored relative to the origin of the trace."""
     return isinstance(leaf, NodeAttribute) and leaf.attribute.unit in {
         DisplayUnit.east,
         DisplayUnit.north,
@@ -223,14 +229,14 @@ def is_position(leaf: Leaf) -> bool:
 
 
 def is_constant(leaf: Leaf) -> bool:
-    """True if the value never changes for an entity."""
+    """True if an expression is a node attribute that never changes during the life of an entity."""
     if not isinstance(leaf, NodeAttribute):
         return False
     return Home.entity in leaf.attribute.columns or leaf.attribute.unit is DisplayUnit.label
 
 
 def node_text(condition: Bound, node: str, at: Aliases, values: BoundValues) -> str:
-    """Return the SQL of a condition on one node, from its id column and table aliases."""
+    """Return the SQL of a condition on one node, from its id column and the aliases of its tables."""
 
     def leaf(found: Leaf) -> str:
         if isinstance(found, NodeAttribute) and found.attribute.unit is not DisplayUnit.binding:
@@ -243,7 +249,7 @@ def node_text(condition: Bound, node: str, at: Aliases, values: BoundValues) -> 
 def bound_text(
     condition: Bound, nodes: Mapping[str, str], edges: Mapping[str, str], values: BoundValues
 ) -> str:
-    """Return the SQL of a condition on node ids and edge relations, from their columns."""
+    """Return the SQL of a condition that uses only node ids and edge relations, from their columns."""
 
     def leaf(found: Leaf) -> str:
         match found:
@@ -258,7 +264,7 @@ def bound_text(
 
 
 def trace_text(condition: Bound, trace: str, values: BoundValues) -> str:
-    """Return the SQL of a condition on the trace, from its id column."""
+    """Return the SQL of a condition on attributes of the trace, from the column of its id."""
     select = Select(['"t"."trace_id"'], ['"trace" AS "t"'])
     select.join('"map" AS "m"', ['"m"."map_id" = "t"."map_id"'], "LEFT JOIN")
 

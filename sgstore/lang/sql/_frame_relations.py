@@ -1,4 +1,4 @@
-"""SQL of relations of frames and bindings.
+"""SQL for sets of matching frames, of entities and of traces.
 
 Conditions over several frames are evaluated on columns read from a store (:func:`relation`). The matches then
 become a relation again (:mod:`sgstore.lang.sql._known_matches`).
@@ -62,7 +62,7 @@ def relation(
     bound: Iterable[str] | None = None,
     most: int | None = None,
 ) -> SqlStatement:
-    """Return the SQL for the frames and bindings in which a pattern holds.
+    """Return the SQL for the frames in which a pattern matches, with the ids of the matched nodes.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ TRACES: Final = 'SELECT "trace_id", "name", "start_ns", coalesce("period_ns", 0)
 
 
 def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -> SqlStatement:
-    """Return the SQL for the entities of a query node that occur in any frame of a trace.
+    """Return the SQL for all entities that can match a node of the pattern in any frame of a trace.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -
 
 
 def traces_with(kinds: Kinds, attribute: Attribute | None, *, moving: bool) -> str:
-    """Return the SQL for traces that have a node of given kinds with a known attribute.
+    """Return the SQL for the traces that have a node of given kinds with a known attribute.
 
     The statement reads tables without a frame join, so it is fast in a large store.
 

@@ -1,4 +1,4 @@
-"""SQL of the second phase: conditions and values of single frames.
+"""SQL of the second phase: values and conditions of single frames, for the candidates of the first phase.
 
 The frames from the first phase are joined with ``state`` (and the tables of constants) for each node whose
 values are needed. Statements around that join compute pair numbers and test conditions.
@@ -86,7 +86,10 @@ MAP: Final = '":map"'
 
 
 def phases(sql: SqlBuilder, scope: Scope) -> Phases:
-    """Return the conditions of a scope by phase. Known matches need no tests."""
+    """Return the conditions of a pattern, grouped by SQL phase.
+
+    Matches that are computed already need no tests.
+    """
     return Phases() if sql.found_in(scope) else phases_of(scope, sql.query, sql.catalog)
 
 
@@ -99,7 +102,7 @@ def masks(
     edges: frozenset[str] = frozenset(),
     kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """Return the relation of the first phase: one row for each bucket and binding.
+    """Return SQL of the first phase: node ids of each match, with its frames as 64-bit masks.
 
     ``kinds`` are nodes whose kind is also a column; they must be in :func:`told_kinds`.
     """
@@ -115,7 +118,7 @@ def masks(
 
 
 def existence(sql: SqlBuilder, scope: Scope, given: SharedRelation | None) -> str:
-    """Return the relation of a block: one row for each bucket and outer binding with a match."""
+    """Return SQL for ``EXISTS {…}``: outer node ids of each match, with its frames as 64-bit masks."""
     keys = frozenset(scope.outer)
     parts = phases(sql, scope)
     if parts.rest or parts.late:
@@ -129,7 +132,7 @@ def existence(sql: SqlBuilder, scope: Scope, given: SharedRelation | None) -> st
 def _block(
     sql: SqlBuilder, condition: Bound, given: SharedRelation
 ) -> tuple[str, frozenset[str], bool]:
-    """Return the relation of a block, its outer nodes, and true if a match is required, not excluded."""
+    """Return SQL for ``EXISTS {…}`` or a count, its outer nodes, and False if a match is excluded (``NOT``)."""
     match condition:
         case BlockValue(scope=scope):
             return existence(sql, scope, given), frozenset(scope.outer), True
@@ -163,13 +166,13 @@ def _block_counted(
 def block_matches(
     sql: SqlBuilder, block: BlockValue, given: SharedRelation | None, columns: Iterable[Leaf] = ()
 ) -> str:
-    """Return the relation of all matches of a block, one row for each match and frame."""
+    """Return SQL for all matches of a pattern in braces: one row for each frame and match."""
     nodes, edges = _told_apart(block.scope)
     return frames(sql, block.scope, given, nodes, edges, columns)
 
 
 def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the nodes and edges that identify the matches of a block, including outer nodes."""
+    """Return the nodes and edges that distinguish two matches of a pattern in braces."""
     nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
     edges = frozenset(edge.key for edge in scope.edges if edge.named)
     return frozenset(nodes) | frozenset(scope.outer), edges
@@ -183,7 +186,7 @@ def frames(
     edges: frozenset[str] = frozenset(),
     columns: Iterable[Leaf] = (),
 ) -> str:
-    """Return the relation of the second phase: one row for each frame and binding.
+    """Return SQL of the second phase: one row for each frame and match.
 
     Parameters
     ----------
@@ -234,7 +237,10 @@ def frames(
 def _needless(
     catalog: Catalog, pairs: Iterable[PairNumber], users: frozenset[str]
 ) -> frozenset[str]:
-    """Return the pair marks that need no computation for the entities in these traces."""
+    """Return the inputs of pair numbers that are unnecessary for the entities in the selected traces.
+
+    An example is the height on flat roads.
+    """
     uneven = 0
     for trace in catalog.traces:
         uneven |= trace.uneven
@@ -254,7 +260,10 @@ _USERS: Final = frozenset({*VEHICLES, "person", "animal"})
 def _kinds_of_edges(
     sql: SqlBuilder, scope: Scope, parts: Phases, needed: list[Leaf]
 ) -> dict[Leaf, str]:
-    """Return kinds to read from edge rows, for nodes that need no other table."""
+    """Return the node kinds that can be read from edge rows, because no other table of the node is needed.
+
+    The result is: expression → node.
+    """
     found = {leaf: leaf.node for leaf in needed if _is(leaf, "kind")}
     more = {key for leaf in needed if leaf not in found for key in _valued(leaf)} | parts.late
     known = told_kinds(sql, scope, parts) - more
@@ -270,7 +279,7 @@ def _by_buckets(
     edges: frozenset[str],
     wanted: list[Leaf],
 ) -> str:
-    """Return one row for each bucket and binding, with its number of frames."""
+    """Return SQL with one row for each match and bucket (64 frames), with the number of matching frames."""
     select, texts = _of_buckets(sql, scope, parts, given, nodes, edges, wanted)
     texts[INVARIANT] = held(PATTERN)
     columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
@@ -288,7 +297,10 @@ def _of_buckets(
     edges: frozenset[str],
     wanted: Sequence[Leaf],
 ) -> tuple[Select, dict[Leaf, str]]:
-    """Return the first phase joined with tables of constant values, and the SQL of these values."""
+    """Return SQL of the first phase (frames as bit masks), joined with constant values of nodes.
+
+    The second result is the SQL of each value.
+    """
     found = sql.found_in(scope)
     known = set[str]() if found else told_kinds(sql, scope, parts)
     kinds = {leaf: leaf.node for leaf in wanted if _is(leaf, "kind") and leaf.node in known}
@@ -313,7 +325,7 @@ def _of_buckets(
 def in_masks(
     sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf], values: Mapping[str, str]
 ) -> str:
-    """Return the relation of frames in which a match has given values, as masks.
+    """Return SQL for the frames in which a match has given values: values, with frames as 64-bit masks.
 
     Parameters
     ----------
@@ -334,7 +346,7 @@ def in_masks(
 
 
 def _lasting(sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
-    """Return one row for each bucket and match if all values are constant in a bucket, or None."""
+    """Return SQL with one row for each match and bucket (64 frames) if all values are constant, or None."""
     parts, wanted = phases(sql, scope), list(dict.fromkeys(wanted))
     known = sql.found_in(scope)
     if (known and not known.runs) or parts.rest or parts.late:
@@ -359,7 +371,7 @@ def _first_phase(
     ties: frozenset[str],
     needed: list[Leaf],
 ) -> tuple[Join, SharedRelation | None]:
-    """Return the first phase joined with its frames, and the relation for blocks of the second phase."""
+    """Return the first phase (frames as bit masks), expanded to single frames, and a shared table for braces."""
     join, nodes = Join(), bound - parts.late
     if parts.empty:
         return join, None
@@ -398,7 +410,7 @@ def _first_phase(
 def _leader(
     sql: SqlBuilder, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
 ) -> str | None:
-    """Return the node whose states are read first, so that masks are not expanded. ``None`` means no node.
+    """Return the pattern node whose states are read first, to avoid expanding bit masks; or None.
 
     The states are then looked up in the few rows of the first phase, and not these rows among the many
     states. If the query selects traces, it is faster to start from the frames.
@@ -432,7 +444,10 @@ def _join_leader(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
 
 
 def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
-    """Return conditions that limit states to the kinds of a node. For the ego, its mark is sufficient."""
+    """Return SQL conditions that limit rows of ``state`` to the allowed kinds of a node.
+
+    For the ego, ``is_ego`` is sufficient.
+    """
     if scope.kinds(key).one_a_frame and key not in phases(sql, scope).late:
         return [f'{state}."is_ego"']
     return kind_conditions(
@@ -443,7 +458,7 @@ def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
 def _tables_of(
     sql: SqlBuilder, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
 ) -> set[Home]:
-    """Return the tables with the needed values of a node. ``stated`` if its state is joined anyway."""
+    """Return the tables that hold the needed attributes of a node. ``stated`` if its state is joined anyway."""
     profile = Profile.of(scope.kinds(key), sql.catalog)
     of_it = [leaf for leaf in needed if key in _valued(leaf)]
     homes = _homes(of_it, profile)
@@ -461,7 +476,7 @@ def _second_phase(
     given: SharedRelation | None,
     needed: list[Leaf],
 ) -> None:
-    """Join all tables with needed values, and set the SQL of each value missing in the first phase."""
+    """Join all tables with needed values to the candidate frames, and set the SQL of each value."""
     needed = [leaf for leaf in needed if leaf not in join.texts]
     for key in sorted(parts.late):
         _bind_late(sql, join, scope, key)
@@ -484,7 +499,7 @@ def _second_phase(
 
 
 def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
-    """Bind a node by its state in the frame."""
+    """Join the states of a node that the first phase (bit masks) left out."""
     alias = quoted(key)
     on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
     on += _of_kinds(sql, scope, key, alias)
@@ -496,7 +511,7 @@ def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
 
 
 def _join_rows(sql: SqlBuilder, join: Join, scope: Scope, needed: list[Leaf]) -> None:
-    """Join the rows of the frame, its trace and the map, where needed."""
+    """Join the table rows of the frame, its trace and its map, if their attributes are needed."""
     kinds = {type(leaf) for leaf in needed}
     about = {key for leaf in needed for key in _valued(leaf)}
     about |= {
@@ -523,7 +538,7 @@ def _join_rows(sql: SqlBuilder, join: Join, scope: Scope, needed: list[Leaf]) ->
 
 
 def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set[Home]) -> None:
-    """Join the tables with the needed values of a node."""
+    """Join the tables that hold the needed attributes of a node."""
     profile = Profile.of(scope.kinds(key), sql.catalog)
     at, node = join.at.get(key, Aliases()), join.nodes[key]
     state, entity, part = at.state, None, None
@@ -552,7 +567,7 @@ def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set
 def _value_text(  # noqa: PLR0911 - a case each
     sql: SqlBuilder, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf
 ) -> str:
-    """Return the SQL of a value, and join the block or edge attributes that it needs."""
+    """Return the SQL of one needed value. Join the table of its edge, or its pattern in braces."""
     match leaf:
         case NodeValue(node=node):
             return join.nodes[node]
@@ -621,7 +636,7 @@ def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str
 
 
 def _of_block(sql: SqlBuilder, join: Join, given: SharedRelation | None, leaf: BlockValue) -> str:
-    """Return the SQL of a block value, joined by frame and outer nodes."""
+    """Return the SQL for the value of ``COUNT {…}`` or similar, joined by frame and outer nodes."""
     keys = frozenset(leaf.scope.outer)
     alias = f":block {leaf.number}"
     if alias not in join.lanes:  # a condition may use a block twice
@@ -667,7 +682,7 @@ _BARE: Final = {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, Displa
 
 
 def _valued(leaf: Leaf) -> frozenset[str]:
-    """Return the nodes whose tables a value needs."""
+    """Return the nodes whose tables must be joined to compute a value."""
     match leaf:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit in _BARE else frozenset({node})
@@ -678,7 +693,7 @@ def _valued(leaf: Leaf) -> frozenset[str]:
 
 
 def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
-    """Return the tables with the needed values of a node, limited to tables that can store the node."""
+    """Return the tables that hold the needed attributes of a node, and can store a node of its kinds."""
     homes: set[Home] = set()
     for leaf in needed:
         if isinstance(leaf, PairNumber):
@@ -689,7 +704,7 @@ def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
 
 
 def _of_kind(leaf: Leaf) -> bool:
-    """True if a value depends only on the kind and id of a node."""
+    """True if a value is the kind of a node, or its name, which follows from kind and id."""
     return _is(leaf, "kind") or _is(leaf, "name")
 
 
@@ -701,7 +716,7 @@ def _join_lasting(
     catalog: Catalog,
     needed: Iterable[Leaf],
 ) -> dict[Leaf, str]:
-    """Join tables of constant values to a relation of buckets. Return the SQL of each value.
+    """Join tables of constant node values to rows of the first phase (bit masks). Return the SQL of each value.
 
     Results with only such values need no single frames. Their count is the number of frames in a mask.
     """

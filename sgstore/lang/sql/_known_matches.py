@@ -1,4 +1,4 @@
-"""SQL of results for matches that are already known, such as those of a sequence."""
+"""SQL of results for matches computed outside the database, such as those of a sequence."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExternalRelation:
-    """Known matches in columns.
+    """Matches computed outside the database, as columns of frames, node ids and values.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class ExternalRelation:
 
 
 def nothing(query: Query, values: int) -> ExternalRelation:
-    """Return an empty relation of matches for a query."""
+    """Return an empty table of matches, with the columns of a query."""
     nodes: dict[str, list[int]] = {key: [] for key in query.scope.nodes}
     edges: dict[str, list[str]] = {edge.key: [] for edge in query.scope.edges}
     return ExternalRelation([], [], nodes, edges, [[] for _ in range(values)])
@@ -73,7 +73,9 @@ def external_matches(
     found: ExternalRelation | Callable[[Window | None], ExternalRelation],
     told: Sequence[FrameAttribute],
 ) -> SqlBuilder:
-    """Return a builder for a query whose matches are known. Other values come from the store.
+    """Return an SQL builder for a query whose matches are computed outside the database.
+
+    Its other values come from the store.
 
     Parameters
     ----------
@@ -109,14 +111,17 @@ def external_matches(
 
 
 def _columns(found: ExternalRelation, shape: ExternalRelation) -> list[list[Any]]:
-    """Return all columns of known matches, with nodes and edges in the order of ``shape``."""
+    """Return all columns of matches computed outside the database. Nodes and edges have the order of ``shape``."""
     nodes = [found.nodes[key] for key in shape.nodes]
     edges = [found.edges[key] for key in shape.edges]
     return [found.first, found.last, *nodes, *edges, *found.values]
 
 
 def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
-    """Replace values over time by placeholders. Return the new query and the placeholder of each value."""
+    """Replace values over several frames in a query's result by placeholders.
+
+    Return the new query and the placeholder of each value.
+    """
     places: dict[Bound, FrameAttribute] = {}
 
     def placed(value: Bound) -> Bound:

@@ -1,4 +1,4 @@
-"""SQL of looked-up numbers: lane distances, lane properties, and measures from later frames.
+"""SQL of numbers that the store looks up: lane distances, lane properties, and measures from later frames.
 
 A node lies on stretches of lanes: an entity at one point of each of its own lanes, a light or a sign at the
 waiting places of the lanes that it controls, a part of the map at its ``map_place``.
@@ -30,14 +30,16 @@ _SIGNALS: Final = frozenset(SIGNALS)
 
 @dataclass(frozen=True, slots=True)
 class WayEnd:
-    """Start or end node of a way: the column of its id, and its possible kinds."""
+    """Start or end node of a route along lanes: the SQL column of its id, and its possible kinds."""
 
     node: str
     kinds: Kinds
 
 
 def way_text(function: str, frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
-    """Return the SQL of a number of :data:`sgstore.model.pair_numbers.WAYS`.
+    """Return the SQL of a number along lanes, such as a lane distance.
+
+    The numbers are :data:`sgstore.model.pair_numbers.WAYS`.
 
     Parameters
     ----------
@@ -63,7 +65,7 @@ _BEHIND: Final = """max(CASE WHEN "way" < 0 THEN "way" END)"""
 
 
 def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
-    """Return the SQL of the lane distance between two entities, which are points on lanes."""
+    """Return the SQL of the lane distance between two entities. Each entity is a point on its lane."""
     conditions = [
         condition
         for alias, end in zip((":a", ":b"), ends, strict=True)
@@ -86,7 +88,10 @@ def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog)
 
 
 def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts: bool) -> str:
-    """Return the SQL of the distance between two stretches of lanes, 0 if they overlap."""
+    """Return the SQL of the lane distance between two nodes that occupy stretches of lanes.
+
+    It is 0 if they overlap.
+    """
     one, other = (_stretches(frame, end, catalog, parts=parts) for end in ends)
     near = '":r"."start" + (":b"."first" - ":a"."last")'
     far = '":r"."start" + (":b"."last" - ":a"."first")'
@@ -102,7 +107,10 @@ def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts
 
 
 def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
-    """Return the SQL of the distance to the next map part of one type, 0 on it."""
+    """Return the SQL of the distance along lanes to the next map part, such as a junction.
+
+    It is 0 inside the part.
+    """
     places = _stretches(frame, end, catalog, parts=False)
     return f"""(
     SELECT min(CASE WHEN "near" < 0 THEN 0 ELSE "near" END)
@@ -118,7 +126,7 @@ def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
 
 
 def _course_text(frame: str, end: WayEnd, column: str, catalog: Catalog) -> str:
-    """Return the SQL of a property of the primary lane at the place of an entity."""
+    """Return the SQL of the curvature or slope of the primary lane at the place of an entity."""
     more = "".join(f" AND {one}" for one in _kinds_of(end, ":s", catalog))
     return f"""(
     SELECT min(":c"."{column}")
@@ -141,7 +149,7 @@ def told_lanes(what: str) -> str:
 
 
 def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str:
-    """Return SQL for the lane stretches on which a node lies, with start and end along the lane."""
+    """Return SQL for the stretches of lanes that a node occupies: lane, start and end; m."""
     kinds, held = end.kinds.every, catalog.moving | catalog.fixed
     found: list[str] = []
     if kinds & entity_kinds() - _SIGNALS:
@@ -168,7 +176,10 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
 
 
 def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str:
-    """Return SQL for the waiting places of a light or sign: from the map, otherwise at a junction."""
+    """Return SQL for the places where traffic waits at a light or sign.
+
+    They come from the map, otherwise from the junction.
+    """
     at = """coalesce(":p"."start", CASE WHEN ":m"."junction" IS NOT NULL THEN 0 ELSE ":m"."length" END)"""
     signals = ", ".join(literal(kind) for kind in SIGNALS if kind in kinds)
     return f"""SELECT ":c"."dst" AS "lane", {at} AS "first", {at} AS "last"
@@ -181,7 +192,7 @@ def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str
 
 
 def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
-    """Return conditions on the ``lane_state`` rows of an entity, to reduce the rows to read."""
+    """Return SQL conditions on the kinds of ``lane_state`` rows, so that fewer rows are read."""
     kinds = end.kinds.only(entity_kinds() - _SIGNALS)
     held = catalog.moving | catalog.fixed
     return kind_conditions(kinds, f'"{alias}"."kind"', f'"{alias}"."is_ego"', held)
@@ -192,12 +203,15 @@ LOOKED_UP: Final = WAYS | RECORDED.keys()
 
 
 def of_later(found: Iterable[Leaf]) -> list[PairNumber]:
-    """Return the measures from later frames. They are expensive, so they are evaluated last."""
+    """Return the numbers of entity pairs that use later frames. They are expensive and evaluated last."""
     return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function in RECORDED]
 
 
 def recorded_text(value: PairNumber, *, world: bool) -> str:
-    """Return the SQL call of a measure from later frames, a function that stores define."""
+    """Return the SQL call for a number of two entities that uses later frames.
+
+    The store defines the SQL function.
+    """
     name = f"{KNOWN if world else ''}{value.function}"
     ends = ", ".join(quoted(f"{key}.id") for key in (value.a, value.b))
     return f'recorded({literal(name)}, "frame_id" >> {TRACE_OF_FRAME}, {ends})'

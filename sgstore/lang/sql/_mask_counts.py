@@ -1,4 +1,4 @@
-"""Counts of rows per frame, computed by adding masks without reading single frames.
+"""Number of SQL rows per frame, computed by adding 64-bit masks of frames.
 
 A mask is spread over twelve numbers, each with every twelfth bit, so that each frame has a field of twelve
 bits. The sums of these numbers over many rows are the counts of all frames of a bucket, five counts in each
@@ -31,14 +31,20 @@ _TOPS: Final = _ONES << (WIDTH - 1)
 
 @dataclass(frozen=True, slots=True)
 class CountRange:
-    """Range of positive counts that a comparison accepts: at least ``least`` and less than ``end``."""
+    """Range of counts that a comparison such as ``COUNT {…} > 2`` accepts.
+
+    Counts are at least ``least`` and less than ``end``.
+    """
 
     least: int
     end: int | None
 
     @classmethod
     def of(cls, sign: str, number: float) -> CountRange:
-        """Return the counts from 1 for which ``count sign number`` is true; it must be false for 0."""
+        """Return the range of counts from 1 for which ``count sign number`` is true.
+
+        The comparison must be false for 0.
+        """
         up, past = math.ceil(number), math.floor(number) + 1
         match sign:
             case "=":
@@ -58,7 +64,7 @@ class CountRange:
 
     @property
     def empty(self) -> bool:
-        """True if the range contains no count."""
+        """True if the range contains no number."""
         return self.end is not None and self.least >= self.end
 
     def condition(self, count: str) -> str:
@@ -68,7 +74,7 @@ class CountRange:
 
 
 def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL for the frames whose number of rows is in a range, as masks.
+    """Return SQL for the frames whose number of rows is in a range, as 64-bit masks of frames.
 
     Parameters
     ----------
@@ -86,7 +92,7 @@ def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
 
 
 def _summed(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL for buckets with few rows, which adds masks."""
+    """Return SQL that counts rows per frame by adding 64-bit masks, for buckets (64 frames) with few rows."""
     sums = [
         f'CAST(sum(("mask" >> {shift}) & {_ONES}) AS BIGINT) AS {_sum(shift)}'
         for shift in range(WIDTH)
@@ -110,7 +116,7 @@ def _sum(shift: int) -> str:
 
 
 def _reached(bound: int) -> str:
-    """Return SQL for the mask of the frames whose counts reach a bound."""
+    """Return SQL for the 64-bit mask of the frames whose row counts reach a bound."""
     less = bound * _ONES
     parts = [
         f"((({_sum(shift)} | {_TOPS}) - {less}) & {_TOPS}) >> {WIDTH - 1 - shift}"
@@ -120,7 +126,7 @@ def _reached(bound: int) -> str:
 
 
 def _one_by_one(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL for buckets with many rows or for large bounds, which counts frame by frame."""
+    """Return SQL that counts rows frame by frame, for buckets (64 frames) with many rows or for large bounds."""
     group = ['"bucket"', *keys]
     crowded = Select(group, [quoted(rows)], group=group)
     if wanted.least <= MOST:

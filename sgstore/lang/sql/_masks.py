@@ -1,4 +1,4 @@
-"""SQL of the first phase: presence of nodes and relations as bit masks.
+"""SQL of the first phase: candidate frames as bit masks. A mask has one bit for each of 64 frames (a bucket).
 
 The mask of a row of ``edge`` or ``node`` marks the frames of a bucket in which the row holds. So edges join
 on bucket and node ids, and the frames of a match are the common bits of all masks. Conditions on attributes
@@ -53,13 +53,13 @@ _BIT: Final = '"bit"'
 
 
 def bit_of(frame: str) -> str:
-    """Return the SQL of the mask of a single frame, from its id or its number in the bucket."""
+    """Return SQL for the 64-bit mask of a single frame, from its id or its number in the bucket (64 frames)."""
     number = frame if frame.endswith(_BIT) else f"{frame} & 63"
     return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
 
 
 def folded(text: str, keys: list[str]) -> str:
-    """Convert a relation of frames and keys to buckets, masks and keys."""
+    """Return SQL that groups rows of single frames into rows of buckets (64 frames) with bit masks."""
     bit = bit_of('"frame_id"')
     select = Select(['"frame_id" >> 6 AS "bucket"', *keys, f'bit_or({bit}) AS "mask"'])
     select.join(nested(text, ":frames"), [])
@@ -68,7 +68,7 @@ def folded(text: str, keys: list[str]) -> str:
 
 
 def merged(text: str, values: Mapping[str, str]) -> str:
-    """Merge the rows of a relation with the same bucket and values, and combine their masks.
+    """Return SQL that merges rows with the same bucket (64 frames) and values, and joins their bit masks by OR.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ _BRANCHES: Final = 8
 
 @dataclass(slots=True)
 class Base:
-    """Join of the first phase during its construction.
+    """Join of tables for the first phase (frames as bit masks), while it is built.
 
     Attributes
     ----------
@@ -137,7 +137,10 @@ class Base:
     def join(
         self, table: str, alias: str, ends: Mapping[str, str], conditions: Iterable[str] = ()
     ) -> None:
-        """Join a table with masks on the bucket and on bound nodes. Its other nodes become bound."""
+        """Join a table of bit masks on the bucket (64 frames) and on nodes that are joined already.
+
+        ``ends`` are its node columns.
+        """
         on = [f'{alias}."bucket" = {self.bucket}'] if self.bucket else []
         self.bucket = self.bucket or f'{alias}."bucket"'
         self.masks.append(f'{alias}."mask"')
@@ -145,7 +148,7 @@ class Base:
         self.tie(table, ends, [*conditions, *on])
 
     def tie(self, table: str, ends: Mapping[str, str], conditions: Iterable[str]) -> None:
-        """Join a table on bound nodes. Its other nodes become bound."""
+        """Join a table on the nodes that are joined already. ``ends`` are its node columns."""
         on = list(conditions)
         for key, column in ends.items():
             if key in self.nodes:
@@ -155,7 +158,7 @@ class Base:
         self.select.join(table, on)
 
     def need_bucket(self) -> None:
-        """Join the row of the bucket, unless it is already joined."""
+        """Join the table ``bucket`` (groups of 64 frames, with their map), unless it is joined already."""
         if not self.knows_map:
             self.knows_map = True
             on = [f'{BUCKET}."bucket" = {self.bucket}'] if self.bucket else []
@@ -165,7 +168,7 @@ class Base:
 
 @dataclass(slots=True)
 class SqlBuilder:
-    """Builder of the SQL of one query: its bound values and its shared relations.
+    """Builder of the SQL of one query, with its bound values and shared subqueries.
 
     Attributes
     ----------
@@ -193,23 +196,25 @@ class SqlBuilder:
 
     @property
     def standing(self) -> frozenset[str]:
-        """Kinds whose presence is stored as masks: static entities and parts of the map."""
+        """Kinds of node whose presence is stored as bit masks: static entities and map parts."""
         return self.catalog.fixed | self.catalog.mapped
 
     def edges_of(self, edge: Edge) -> str:
-        """Return the table in which an edge is searched: all known edges, or edges of graphs."""
+        """Return the table to search for an edge: all known edges, or only edges of scene graphs."""
         return '"known_edge"' if self.catalog.world and edge.known else '"edge"'
 
     def nodes_of(self, edge: Edge) -> str:
-        """Return the table with the presence of static nodes, for the ends of a map edge."""
+        """Return the table with the presence of static nodes, to test the two nodes of a map edge."""
         return '"graph_node"' if self.catalog.world and not edge.known else '"node"'
 
     def found_in(self, scope: Scope) -> SharedRelation | None:
-        """Return the known matches of a scope, or None."""
+        """Return the matches of a pattern that were computed outside the database, or None."""
         return self.found if scope is self.query.scope else None
 
     def within(self, column: str, per: int = 1, *, met: bool = False) -> list[str]:
-        """Return conditions that limit a column of buckets or frames (``per`` 64) to the window.
+        """Return SQL conditions that limit a column to the time window.
+
+        It holds buckets of 64 frames, or frames if ``per`` is 64.
 
         ``met``: the rows are joined with rows of the selected traces. Then the range is sufficient, unless
         matches are known.
@@ -224,13 +229,13 @@ class SqlBuilder:
         return found
 
     def share(self, text: str, name: str) -> str:
-        """Add a shared relation before the statement, and return its name."""
+        """Add a subquery that several parts of the statement use, and return its name."""
         full = f"{name} {len(self.shared) + 1}"
         self.shared.append((full, text))
         return full
 
     def of_traces(self, trace: str, scope: Scope) -> list[str]:
-        """Return conditions that limit the outermost scope to the selected traces."""
+        """Return SQL conditions that limit the main pattern to the selected traces."""
         if scope is not self.query.scope:
             return []
         chosen, left = traces_of(self.query, self.catalog)
@@ -242,12 +247,12 @@ class SqlBuilder:
 
 
 def if_bound(sql: SqlBuilder, node: str, value: str) -> str:
-    """Return the SQL of a value that is NULL for an absent node of an ``OPTIONAL MATCH``."""
+    """Return SQL for a value that is NULL if its node of an ``OPTIONAL MATCH`` is absent."""
     return f"CASE WHEN {node} IS NOT NULL THEN {value} END" if sql.query.stages else value
 
 
 def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: frozenset[str]) -> str:
-    """Convert a relation of the first phase to one row for each frame, with kinds of some nodes."""
+    """Return SQL that expands rows with bit masks to one row for each frame. Kinds of some nodes are included."""
     columns = [*columns_of(nodes, edges), *(quoted(f"{key}.kind") for key in sorted(kinds))]
     keep = [f'":pattern".{column}' for column in columns]
     select = Select(['":pattern"."bucket" * 64 + ":bit"."bit" AS "frame_id"', *keep])
@@ -257,25 +262,28 @@ def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: fro
 
 
 def in_mask(alias: str, frame: str) -> str:
-    """Return the SQL condition that a frame of the same bucket is in the mask of a row."""
+    """Return the SQL condition that the bit of a frame is set in the mask of a row."""
     return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
 
 
 def stands_text(frame: str, node: str) -> str:
-    """Return the SQL condition that a static node is in the graph of a frame, and not beyond it."""
+    """Return the SQL condition that a static node is in the scene graph of a frame."""
     on = [f'":g"."bucket" = {frame} >> 6', f'":g"."node_id" = {node}', in_mask('":g"', frame)]
     rows = Select(["1"], ['"graph_node" AS ":g"'], on)
     return f"EXISTS ({rows.text()})"
 
 
 def number_of_frames(text: str) -> str:
-    """Return SQL for the number of frames of a first-phase relation without bound nodes."""
+    """Return SQL that counts the frames in the bit masks of a subquery without node columns."""
     total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
     return Select([total], [nested(text, ":pattern")]).text()
 
 
 def found_masks(found: SharedRelation) -> str:
-    """Convert runs of known matches, each within a bucket, to rows of the first phase."""
+    """Return SQL that converts runs of frames (first, last) to bit masks.
+
+    Each run is within a bucket of 64 frames.
+    """
     mask = (
         '((1::BIGINT << ("last" - "first" + 1)::INTEGER) - 1) << ("first" & 63)::INTEGER AS "mask"'
     )
@@ -284,12 +292,12 @@ def found_masks(found: SharedRelation) -> str:
 
 
 def in_which(alias: str) -> list[str]:
-    """Return the columns with the frames of a first-phase row: bucket and mask."""
+    """Return the SQL columns that identify the frames of a row: bucket (64 frames) and bit mask."""
     return [f'{alias}."bucket"', f'{alias}."mask"']
 
 
 def held(alias: str) -> str:
-    """Return the SQL of the number of frames of a first-phase row."""
+    """Return the SQL expression that counts the frames in the bit mask of a row."""
     return f'bit_count({alias}."mask")'
 
 
@@ -299,7 +307,7 @@ def with_blocks(
     nodes: frozenset[str],
     edges: frozenset[str],
 ) -> str:
-    """Limit a first-phase relation to the frames in which blocks are true, or not true.
+    """Return SQL that limits rows with bit masks to frames in which ``EXISTS {…}`` conditions are true, or not.
 
     Parameters
     ----------
@@ -335,7 +343,7 @@ def base_rows(  # noqa: C901 - a step each
     edges: frozenset[str],
     kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """Return the join of nodes and edges: one row for each bucket and binding, with some kinds."""
+    """Return SQL that joins the nodes and edges of a pattern: one row for each match and bucket (64 frames)."""
     unfolded = _unfolded(sql, scope, parts, given, nodes, edges)
     if unfolded:
         return unfolded
@@ -373,7 +381,7 @@ def base_rows(  # noqa: C901 - a step each
 
 
 def _join_given(sql: SqlBuilder, base: Base, scope: Scope, given: SharedRelation) -> None:
-    """Join the bindings of the outer nodes of a block."""
+    """Join the rows of the outer pattern, for a pattern in braces."""
     columns = columns_of(frozenset(scope.outer))
     table = f"{quoted(given.name)} AS {OUTSIDE}"
     if given.edges or given.nodes != frozenset(scope.outer):
@@ -423,7 +431,7 @@ def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
 
 
 def _join_graph_nodes(sql: SqlBuilder, base: Base, edge: Edge, ends: Mapping[str, str]) -> None:
-    """Limit the frames to those in which both ends of an edge are in the graph."""
+    """Limit the frames to those in which both nodes of an edge are in the scene graph."""
     if sql.nodes_of(edge) == '"node"':
         return
     for key in ends:
@@ -432,7 +440,7 @@ def _join_graph_nodes(sql: SqlBuilder, base: Base, edge: Edge, ends: Mapping[str
 
 
 def _join_alone(sql: SqlBuilder, base: Base, scope: Scope, block: BlockValue) -> None:
-    """Join a block as its own relation: frames with a match, and the bindings of outer nodes."""
+    """Join an ``EXISTS {…}`` as a separate subquery: frames with a match, and ids of the outer nodes."""
     outer = {key: kinds & scope.kinds(key) for key, kinds in block.scope.outer.items()}
     inner = replace(block.scope, outer=outer)
     keys, alias = frozenset(outer), quoted(f":alone {block.number}")
@@ -446,7 +454,10 @@ def _join_alone(sql: SqlBuilder, base: Base, scope: Scope, block: BlockValue) ->
 
 
 def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -> None:
-    """Join the frames of an event with its nodes. Presence of the nodes is tested separately."""
+    """Join the frames of a recorded event with the ids of its nodes.
+
+    Presence of the nodes is tested separately.
+    """
     keys = [quoted(f":{place}") for place in range(len(happened.nodes))]
     rows, alias = happened_rows(happened), quoted(name)
     inner = Select(['"frame_id"', *keys], [nested(rows, ":events")], sql.within('"frame_id"', 64))
@@ -458,7 +469,7 @@ def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -
 
 
 def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
-    """Return nodes whose kind is in the rows of an edge, so that :func:`base_rows` can return it."""
+    """Return the nodes whose kind can be read from the rows of an edge."""
     if parts.blocks or any(edge.high > 1 for edge in scope.edges):
         return frozenset()
     found = set[str]()
@@ -471,7 +482,7 @@ def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
 
 
 def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
-    """Return the rows of an edge that is undirected, or that is stored for frames and for maps."""
+    """Return SQL for the rows of an edge that is undirected, or stored in the tables of both frames and maps."""
     directions = (False, True) if edge.both else (False,)
     branches: list[str] = []
     for swapped in directions:
@@ -489,7 +500,7 @@ def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: b
 
 
 def _lasting_rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, swapped: bool) -> str:
-    """Return the rows of map edges, with the frames in which both ends are present."""
+    """Return SQL for map edges, with bit masks of the frames in which both nodes are present."""
     mask = '"p"."mask" & "q"."mask"'
     select = Select(_row_columns('"m"', mask, swapped=swapped))
     select.columns[0] = '"p"."bucket" AS "bucket"'
@@ -513,7 +524,7 @@ def _unfolded(
     nodes: frozenset[str],
     edges: frozenset[str],
 ) -> str:
-    """Return the join once for each combination of path lengths, or an empty text if unsuitable.
+    """Return SQL with one join for each combination of path lengths, or an empty text if unsuitable.
 
     Then the search for a path begins at nodes that other edges bind.
     """
@@ -540,7 +551,7 @@ def _unfolded(
 
 
 def _chains(sql: SqlBuilder, scope: Scope, edge: Edge) -> list[Scope]:
-    """Return a path as patterns of single edges, one for each length that the store allows."""
+    """Return a path of variable length as patterns of single edges, one for each possible length."""
     nodes = {key: Node(key, scope.kinds(key), "hidden", edge.span) for key in (edge.src, edge.dst)}
     single = replace(edge, low=1, high=1)
     alone = Scope(nodes, {}, (single,), (), frozenset())
@@ -553,7 +564,7 @@ def _chains(sql: SqlBuilder, scope: Scope, edge: Edge) -> list[Scope]:
 
 
 def _ways(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
-    """Return SQL for the map routes of a path, or an empty text if it can use edges of frames.
+    """Return SQL for the routes of a path along map edges, or an empty text if it can use edges of frames.
 
     Their number does not depend on the number of frames. Other edges are joined to these routes. Then the
     presence of the inner nodes is tested.
@@ -571,7 +582,7 @@ def _ways(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
 
 
 def _ways_along(sql: SqlBuilder, scope: Scope, path: Edge) -> str:
-    """Return SQL for the map routes along a chain of edges."""
+    """Return SQL for the routes along a chain of map edges of fixed length."""
     base, first = Base(), f'{quoted(alias_of(scope.edges[0]))}."map_id"'
     for edge in scope.edges:
         alias = quoted(alias_of(edge))
@@ -591,7 +602,7 @@ def _ways_along(sql: SqlBuilder, scope: Scope, path: Edge) -> str:
 
 
 def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
-    """Return SQL for a path of several edges: its ends and the frames in which it exists."""
+    """Return SQL for a path of several edges: ids of its two end nodes, with its frames as bit masks."""
     ends = ((edge.src, "src"), (edge.dst, "dst"))
     keys = frozenset((edge.src, edge.dst))
     branches: list[str] = []
@@ -609,7 +620,7 @@ def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
 def _join_presence(
     sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
 ) -> None:
-    """Join the frames in which a node is present and meets its conditions."""
+    """Join the bit masks of the frames in which a node is present and meets its conditions."""
     alias = quoted(f"{key}:")
     profile = Profile.of(kinds, sql.catalog)
     if profile.moving or conditions:
@@ -621,7 +632,7 @@ def _join_presence(
 
 
 def _kinds_to_test(scope: Scope, key: str) -> Kinds:
-    """Return the kinds to test in states of a node. An ego with known kind needs no test."""
+    """Return the kinds of a node to test in its states. An ego that is the end of an edge needs no test."""
     kinds = scope.kinds(key)
     said = any(edge.high == 1 and key in {edge.src, edge.dst} for edge in scope.edges)
     return ego_kinds() if said and kinds.one_a_frame else kinds
@@ -630,7 +641,7 @@ def _kinds_to_test(scope: Scope, key: str) -> Kinds:
 def _join_conditions(
     sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
 ) -> None:
-    """Join the frames in which a present node meets its conditions."""
+    """Join the bit masks of the frames in which a present node meets its conditions."""
     profile, alias = Profile.of(kinds, sql.catalog), quoted(f"{key}:")
     constant = all(is_constant(leaf) for c in conditions for leaf in leaves(c))
     if profile.mapped and profile.places == 1:
@@ -649,7 +660,7 @@ def _join_conditions(
 
 
 def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound]) -> None:
-    """Join the frames in which an edge meets conditions on its attributes."""
+    """Join the bit masks of the frames in which an edge meets conditions on its attributes."""
     bucket, bit = '"l"."bucket"', f'"l".{_BIT}'
     table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
     ends = [f'"l".{quoted(column)}' for column in nodes]
@@ -669,7 +680,10 @@ def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound])
 
 
 def _present(sql: SqlBuilder, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
-    """Return SQL for frames in which nodes are present and meet conditions, one part for each table."""
+    """Return SQL for the frames in which nodes are present and meet conditions, as bit masks.
+
+    It has one part for each table.
+    """
     branches: list[str] = []
     if (
         profile.moving
@@ -740,7 +754,7 @@ def _standing(sql: SqlBuilder, kinds: Kinds, conditions: list[Bound], place: str
 
 
 def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bound]) -> str | None:
-    """Join the trace and return its alias if a condition uses a position, otherwise None."""
+    """Join the table ``trace`` if a condition uses a position. Return its alias, or None."""
     if not any(is_position(leaf) for c in conditions for leaf in leaves(c)):
         return None
     select.join('"trace" AS "t"', [f'"t"."trace_id" = {trace}'])
@@ -748,7 +762,7 @@ def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bo
 
 
 def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
-    """Return the join as a relation with the given columns, without duplicates."""
+    """Return SQL that combines the bit masks of a join, with the given columns and without duplicates."""
     select, masks = base.select, base.masks
     mask = " & ".join(masks)
     named = [f"{column} AS {name}" for name, column in keep.items()]
@@ -768,7 +782,7 @@ def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
 def _on_the_way(
     sql: SqlBuilder, join: Select, stops: list[tuple[str, str]], keys: list[str]
 ) -> str:
-    """Limit the rows of a join to frames in which the inner nodes of paths are present."""
+    """Limit the bit masks of a join to frames in which the inner nodes of paths are present."""
     names = [f"stop {number}" for number in range(1, len(stops) + 1)]
     tables = {name: table for name, (_, table) in zip(names, stops, strict=True)}
     join.columns += [

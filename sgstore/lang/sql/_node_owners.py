@@ -1,4 +1,4 @@
-"""Owners of node ids: the trace of an entity, the map of a part of a map.
+"""Owners of node ids: the trace of an entity, or the map of a map part. Ids are unique only for one owner.
 
 A node id is unique within a trace, or, if negative, within a map. So an entity is identified by trace and id,
 a part of a map by map and id. Traces may share a map.
@@ -45,12 +45,12 @@ map part. Traces may share a map. Queries cannot use this attribute."""
 
 
 def owner_of(node: str) -> NodeAttribute:
-    """Return the owner attribute of a node: a trace or a map."""
+    """Return the query expression for the owner (trace or map) of a node."""
     return NodeAttribute(node, OWNER, Type.number)
 
 
 def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[NodeAttribute]:
-    """Return the owners needed to distinguish the nodes in some values.
+    """Return the owner (trace or map) of each returned node, if node ids alone are ambiguous.
 
     Empty if only one trace is searched, or if a value identifies the trace.
     """
@@ -61,7 +61,10 @@ def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[N
 
 
 def with_owners(result: Result) -> Result:
-    """Return a result with extra columns: the owner of each returned node, if rows have no frame."""
+    """Return a result clause with extra columns for the owner (trace or map) of each node.
+
+    Rows with a frame need no such columns.
+    """
     if result.names:
         return result
     owners = (

@@ -1,4 +1,4 @@
-"""Query plan: the phase of each condition.
+"""Query plan: sorts conditions into SQL phases (bit masks first, then single frames).
 
 The first phase works on bit masks, the second on single frames. A node that only the second phase needs is
 bound there.
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Gathered:
-    """Temporary table of a statement, with matches that were computed outside the database.
+    """Temporary table with matches that were computed outside the database.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Gathered:
 
 @dataclass(frozen=True, slots=True)
 class SharedRelation:
-    """Relation shared by parts of a statement: masks of the first phase, or known matches.
+    """Subquery that several parts of an SQL statement use: bit masks of frames, or computed matches.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class SharedRelation:
     runs: bool = False
 
     def frames(self, alias: str) -> str:
-        """Return the relation for ``FROM``, with one row for each frame."""
+        """Return the subquery as text for ``FROM``, with one row for each frame."""
         if not self.runs:
             return f"{quoted(self.name)} AS {quoted(alias)}"
         every = ['unnest(range("first", "last" + 1)) AS "frame_id"', '* EXCLUDE ("first", "last")']
@@ -89,7 +89,7 @@ class SharedRelation:
 
 @dataclass(slots=True)
 class Phases:
-    """Conditions of a scope, grouped by the way they are evaluated.
+    """Conditions of a graph pattern, grouped by the SQL that evaluates them.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Phases:
 
 
 def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
-    """Group the conditions of a scope by the way they are evaluated."""
+    """Group the conditions of a graph pattern by the SQL that evaluates them."""
     parts = Phases()
     for condition in scope.where:
         if stands_alone(condition, catalog):
@@ -176,7 +176,7 @@ def _file(condition: Bound, parts: Phases) -> None:
 
 
 def is_masked(condition: Bound) -> bool:
-    """True if a condition is ``EXISTS`` or ``NOT EXISTS``, or compares a count with a number."""
+    """True if a condition is ``EXISTS {…}``, ``NOT EXISTS {…}`` or ``COUNT {…}`` compared with a number."""
     match condition:
         case BlockValue(word="EXISTS") | Operation("NOT", (BlockValue(word="EXISTS"),)):
             return True
@@ -200,7 +200,7 @@ def _edge_alone(found: set[Leaf]) -> str | None:
 
 
 def _of_null(condition: Bound) -> bool:
-    """True if a condition may be true for a missing row, as of an edge without attributes."""
+    """True if a condition may be true for a missing row, such as ``IS NULL`` for an edge without attributes."""
     return any(
         isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce", "case"}
         for part in walk(condition)
@@ -208,7 +208,7 @@ def _of_null(condition: Bound) -> bool:
 
 
 def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterator[str]:
-    """Yield nodes to bind in the second phase: without edges or blocks, but used in values.
+    """Yield the nodes to join in the second phase (single frames): used in values, but without edges or braces.
 
     Otherwise, all states would be grouped into masks and then expanded again.
     """
@@ -231,7 +231,7 @@ def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterat
 
 
 def blocked(query: Query) -> frozenset[str]:
-    """Return outer nodes that blocks use, anywhere in a query."""
+    """Return the outer nodes that patterns in braces use, anywhere in a query."""
     return frozenset(_blocked((*query.scope.where, *query.result.values)))
 
 
@@ -243,7 +243,7 @@ def _blocked(expressions: tuple[Bound, ...]) -> Iterator[str]:
 
 
 def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]]:
-    """Return ids of the selected traces (None means all), and of traces that cannot answer."""
+    """Return the ids of the selected traces (None means all), and of traces that lack data for the query."""
     chosen = None
     if query.ego is not None:
         chosen = {trace.trace_id for trace in catalog.traces if trace.ego == query.ego}
@@ -257,7 +257,7 @@ def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]
 
 
 def apart(scope: Scope, nodes: set[str], new: set[str]) -> Iterator[tuple[str, str]]:
-    """Yield pairs of bound nodes that must differ, with at least one newly bound node.
+    """Yield the pairs of joined nodes that must differ, if at least one of them is new.
 
     Pairs with disjoint kinds differ anyway and are omitted.
     """

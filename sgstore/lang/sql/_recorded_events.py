@@ -1,4 +1,4 @@
-"""SQL of recorded events: ``HAPPENS name(…)``."""
+"""SQL of the condition ``HAPPENS name(…)``, which tests recorded events."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def happened_rows(happened: Happened) -> str:
-    """Return SQL for the frames of an event, with the nodes involved as ``:0`` and ``:1``."""
+    """Return SQL for the frames of a recorded event. Columns ``:0`` and ``:1`` are the nodes involved."""
     if happened.table:
         return _rows_of_table(happened)
     told, ends = [literal(happened.kind)], ('"node_id"', '"other"')
@@ -44,7 +44,10 @@ def _rows_of_table(happened: Happened) -> str:
 
 
 def happened_text(happened: Happened, frame: str, nodes: Sequence[str]) -> str:
-    """Return SQL that tests an event of some nodes. NULL means that the event is not recorded."""
+    """Return SQL that is true if a recorded event in a frame involves some nodes.
+
+    NULL means that the trace does not record such events.
+    """
     where = [f'":e"."frame_id" = {frame}']
     where += [f'":e".":{place}" = {node}' for place, node in enumerate(nodes)]
     there = Select(["1"], [nested(happened_rows(happened), ":e")], where)
@@ -55,7 +58,7 @@ def happened_text(happened: Happened, frame: str, nodes: Sequence[str]) -> str:
 
 
 def happened_in_frame(happened: Happened) -> str:
-    """Return SQL for the nodes of an event in one frame: two columns, padded with NULL."""
+    """Return SQL for the nodes of a recorded event in one frame: two columns, padded with NULL."""
     told = [f'":{place}"' for place in range(len(happened.nodes))]
     columns = [*told, "NULL", "NULL"][:2]
     rows = nested(happened_rows(happened), ":e")
@@ -70,7 +73,10 @@ EVENT_SCHEMAS: Final = {
 
 
 def told_events(kind: str) -> str:
-    """Return SQL for the traces that record events of a kind: they have an event or a channel."""
+    """Return SQL for the ids of the traces that record events of a kind.
+
+    They have such an event, or a channel for it.
+    """
     events = Select(['"trace_id"'], ['"event"'], [f'"kind" = {literal(kind)}'])
     if kind not in EVENT_SCHEMAS:
         return events.text()
@@ -80,6 +86,6 @@ def told_events(kind: str) -> str:
 
 
 def recorded_events(schemas: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of events recorded by channels with the given schemas."""
+    """Return the kinds of event that channels with the given message schemas record."""
     names = tuple(schemas)
     return frozenset(k for k, end in EVENT_SCHEMAS.items() if any(n.endswith(end) for n in names))

@@ -1,4 +1,4 @@
-"""SQL of results: rows, frames, intervals, clips and counts.
+"""SQL of query results: rows, frames, intervals, clips and counts.
 
 Rows are sorted by trace, frame and binding, unless the query has an order. An *interval* is a longest run
 of consecutive frames of one trace with the same binding. A gap of more than 2.5 median periods ends it.
@@ -75,7 +75,7 @@ _T: Final = seconds_text('{0} - ":trace"."start_ns"')
 
 @dataclass(frozen=True, slots=True)
 class SqlStatement:
-    """SQL with its bound values, column names and temporary tables.
+    """SQL statement with its bound values, column names and temporary tables.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class SqlStatement:
     last: str = ""
 
     def steps(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return separate statements with their values: a temporary table for each stage, then the last.
+        """Return separate SQL statements with their values: one for each temporary table, then the last.
 
         The result is the same as that of ``sql``. But the database plans each step with the exact number of
         rows of earlier steps. In one statement, it estimated 40 million rows for a pattern with 180, and
@@ -105,7 +105,7 @@ class SqlStatement:
         return [(text, self._bound(text)) for text in (*made, self.last or self.sql)]
 
     def _bound(self, text: str) -> dict[str, Any]:
-        """Return the values bound by a part of the statement."""
+        """Return the values of the numbered parameters in a part of the SQL: number → value."""
         numbers = {found[1] for found in _BOUND.finditer(text) if found[1]}
         return {number: self.values[int(number) - 1] for number in sorted(numbers)}
 
@@ -136,7 +136,7 @@ def rows(
     writer: SqlBuilder | None = None,
     span: Span | None = None,
 ) -> SqlStatement:
-    """Return the SQL for the results of a query, in any form.
+    """Return the SQL for the results of a query, in the form of its ``RETURN`` clause.
 
     Parameters
     ----------
