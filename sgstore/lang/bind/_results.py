@@ -25,6 +25,7 @@ _FORMS: Final[dict[str, b.Form]] = {
 
 
 def bind_result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
+    """Bind the clauses after ``RETURN``. ``None`` means no ``RETURN``."""
     if returns is None:
         return b.Result()
     inner = replace(names, aggregates=True, over=True)
@@ -91,6 +92,7 @@ def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
 
 
 def bind_column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
+    """Bind one value to return. Lists are refused, except those of aggregates."""
     assert item.value is not None  # noqa: S101 - the form of the item guarantees it
     value = settled(names.bind(item.value), names.session)
     if value.type is Type.list and not (isinstance(value, b.Aggregate) or b.is_passed_on(value)):
