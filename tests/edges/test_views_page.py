@@ -15,6 +15,11 @@ import sgstore
 from sgstore.store import StoreFile
 
 SCHEMA = Path(sgstore.__file__).with_name("schema.sql")
+ELSEWHERE = {
+    "pairs": ("distance: ", "[The language](language.md#functions) explains the numbers."),
+    "criticality": ("dce: ", "[Criticality](criticality.md) explains the measures."),
+}
+"""View → the first number that its comment explains, and the sentence in place of all of them."""
 PAGE = Path(__file__).parents[2] / "docs" / "views.md"
 
 
@@ -33,12 +38,22 @@ def page(now: str, store: Path) -> str:
     assert comments == {}
     intro, *sections = re.split(r"^## ", now, flags=re.MULTILINE)
     examples = {section.split("\n")[0]: example_of(section) for section in sections}
-    parts = [intro]
+    parts, places = [intro], dict[str, str]()
     for name, comment in views:
         described = connection.execute(f"DESCRIBE {name}").fetchall()
         columns = ", ".join(f"`{column}` {short(kind)}" for column, kind, *_ in described)
-        parts.append(f"## {name}\n\n{comment}\n\n{columns}\n\n{examples.get(name, '')}")
+        same = places.setdefault(columns, name)
+        if same != name:
+            columns = f"Columns as in [{same}](#{same})."
+        meaning = shortened(name, comment)
+        parts.append(f"## {name}\n\n{meaning}\n\n{columns}\n\n{examples.get(name, '')}")
     return "".join(parts).rstrip("\n") + "\n"
+
+
+def shortened(name: str, comment: str) -> str:
+    """The comment of a view, with a link in place of the meanings of numbers of pairs."""
+    first, page = ELSEWHERE.get(name, ("", ""))
+    return f"{comment.partition(first)[0]}{page}" if first else comment
 
 
 def example_of(section: str) -> str:
