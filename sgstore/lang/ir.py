@@ -62,12 +62,15 @@ class Kinds:
 
 
 def any_kinds() -> Kinds:
-    """Return all known kinds of node, for the ego and for others. Readers, settings and stores may add kinds."""
+    """Return all known kinds of node, for the ego and for others.
+
+    Readers, settings and stores may add kinds.
+    """
     return Kinds(entity_kinds(), frozenset(KINDS))
 
 
 def ego_kinds() -> Kinds:
-    """Return the allowed kinds of a node that must be the ego: all entity kinds for the ego, none for others."""
+    """Return the kinds of a node that must be the ego: all entity kinds for the ego, none for others."""
     return Kinds(entity_kinds(), frozenset())
 
 
@@ -277,9 +280,9 @@ class Operation:
 
 @dataclass(frozen=True, slots=True)
 class BlockValue:
-    """Pattern in braces:
+    """Pattern in braces, as in ``EXISTS {…}``, ``COUNT {…}`` or ``MIN {… | value}``.
 
-    ``EXISTS {…}``, ``COUNT {…}`` or ``MIN {… | value}``. ``number`` is unique in the query.
+    ``number`` is unique in the query.
     """
 
     word: str

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CheckInCatalog:
-    """Bound ``CHECK`` statement, with the catalog that resolved its names: of the store, or of an abstraction."""
+    """Bound ``CHECK`` statement, with the catalog (of a store or an abstraction) that resolved its names."""
 
     check: b.BoundCheck
     catalog: Catalog

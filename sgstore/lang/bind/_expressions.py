@@ -484,7 +484,7 @@ def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttri
 
 
 def _case(e: s.Case, names: SymbolTable) -> b.Operation:
-    """Return the bound form of ``CASE``: condition and value of each branch, then the ``ELSE`` value or NULL."""
+    """Return the bound form of ``CASE``: condition and value of each branch, then the ``ELSE`` value."""
     operands: list[b.Bound] = []
     written = [branch.value for branch in e.branches]
     written += [e.otherwise] if e.otherwise is not None else []

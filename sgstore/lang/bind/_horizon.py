@@ -282,7 +282,7 @@ class _Looking:
         return found.both(self._measured(_MIRRORED[word], other, one, key))
 
     def _measured(self, word: str, one: Bound, other: Bound, key: str) -> _Place:
-        """Return bounds on the distance between ego and entity from a comparison such as ``dist(e, v) < 20``."""
+        """Return bounds on the distance of an entity from the ego, from a comparison: ``dist(e, v) < 20``."""
         whole = isinstance(one, b.Operation) and one.word == "abs"
         pair = one.operands[0] if isinstance(one, b.Operation) and whole else one
         if not isinstance(pair, b.PairNumber) or key not in {pair.a, pair.b}:

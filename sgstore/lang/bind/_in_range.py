@@ -59,7 +59,7 @@ def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
 
 
 def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
-    """Group traces by relation scope (settings that select pairs of entities): each scope with its trace ids."""
+    """Group traces by relation scope (setting of entity pairs): each scope with the ids of its traces."""
     of: dict[RelationScope | None, list[int]] = {}
     for trace in traces:
         of.setdefault(trace.reach, []).append(trace.trace_id)
@@ -67,7 +67,7 @@ def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
 
 
 def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Bound]) -> Bound:
-    """Return one condition for all traces, from a condition for each relation scope (setting of entity pairs)."""
+    """Return one condition for all traces, from one for each relation scope (setting of entity pairs)."""
     if len(scopes) < 2:
         return condition(next(reach for reach, _ in scopes))
     number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
@@ -157,7 +157,10 @@ def _labelled(label: str) -> Kinds:
 
 
 def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
-    """Return the condition that the distance of two nodes has an upper bound. Without a position it is false."""
+    """Return the condition that the distance of two nodes has an upper bound.
+
+    Without a position it is false.
+    """
     limit = Value(bound, Type.number)
     if reach.between == "origins":
         return any_of(

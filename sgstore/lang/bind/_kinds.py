@@ -105,7 +105,10 @@ def _among(kinds: frozenset[str], column: str, held: frozenset[str]) -> list[str
 
 
 def _one_of(column: str, words: list[str], others: Sequence[str] = ()) -> str:
-    """Return the SQL condition that a column equals one of some words. ``others`` are the other possible words."""
+    """Return the SQL condition that a column equals one of some words.
+
+    ``others`` are the other possible words.
+    """
     if len(words) > _FEW >= len(others) > 0:
         return " AND ".join(f"{column} <> {literal(word)}" for word in others)
     if len(words) == 1:

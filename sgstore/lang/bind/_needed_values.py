@@ -91,7 +91,10 @@ class Need:
 
 
 def of_check(check: BoundCheck) -> tuple[Need, ...]:
-    """Return the data that a trace must contain for a check. The result is empty with ``USING UNKNOWN false``."""
+    """Return the data that a trace must contain for a check.
+
+    The result is empty with ``USING UNKNOWN false``.
+    """
     if check.unknown_is_false:
         return ()
     nodes = check.scope.nodes

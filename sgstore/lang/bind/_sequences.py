@@ -158,7 +158,10 @@ class _WrittenSteps:
         )
 
     def given(self, values: Mapping[str, Any]) -> _WrittenSteps:
-        """Return a copy of the sequence with parameter values added to steps and links. Existing values stay."""
+        """Return a copy of the sequence with parameter values added to steps and links.
+
+        Existing values stay.
+        """
         links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = [
             (link, {**values, **(more or {})}) for link, more in self.links
         ]
@@ -300,7 +303,10 @@ def _bind_group(
     *,
     again: bool,
 ) -> None:
-    """Bind the alternatives of a group of steps. Later steps can use only names that all alternatives define."""
+    """Bind the alternatives of a group of steps.
+
+    Later steps can use only names that all alternatives define.
+    """
     session = found.session
     known, meanings, keys = dict(found.known), dict(found.meanings), set(session.keys)
     edges, ends, partial = list(found.edges), dict(found.ends), set(found.partial)

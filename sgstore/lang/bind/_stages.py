@@ -246,7 +246,7 @@ class StageBinder:
     def _named(
         self, item: s.Item, names: SymbolTable, written: list[s.Item]
     ) -> Mapping[str, Symbol]:
-        """Return the name that an item of ``WITH`` passes on: of a variable, or of a value that is bound later."""
+        """Return the name that an item of ``WITH`` passes on, for a variable or a value bound later."""
         value = item.value
         if isinstance(value, s.Variable):
             symbol = names.meaning(value.name)

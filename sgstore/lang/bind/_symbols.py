@@ -135,7 +135,7 @@ class Session:
             self.beyond = scopes_of(self.traces)
 
     def key(self, name: str | None) -> str:
-        """Return an unused key for a node or edge: its name if possible, or ``#1``, ``#2``, … without a name."""
+        """Return an unused key for a node or edge: its name if possible, or ``#1``, ``#2``, … if unnamed."""
         self.numbers += name is None
         wanted = name or f"#{self.numbers}"
         key, copy = wanted, 2
@@ -210,7 +210,7 @@ class ScopeBuilder:
         return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
 
     def distinct(self) -> frozenset[tuple[str, str]]:
-        """Return the pairs of pattern nodes that must differ: own nodes from each other and from outer nodes."""
+        """Return the pairs of nodes that must differ: nodes of the pattern, also from nodes of outer ones."""
         if not self.session.injective:
             return frozenset()
         pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
@@ -269,7 +269,10 @@ class SymbolTable:
         return SymbolTable(self.session, self.scope, meanings)
 
     def meaning(self, name: str) -> Symbol | None:
-        """Return the meaning of a name in a query, or None if unknown. The name ``ego`` is not resolved here."""
+        """Return the meaning of a name in a query, or None if unknown.
+
+        The name ``ego`` is not resolved here.
+        """
         names: SymbolTable | None = self
         while names is not None:
             if name in names.meanings:
@@ -361,7 +364,7 @@ class SymbolTable:
         return found
 
     def visible(self) -> set[str]:
-        """Return all variable names usable at this place of a query, except ``frame``, ``trace`` and ``env``."""
+        """Return all variable names usable at this place of a query, without ``frame``, ``trace``, ``env``."""
         outside = self.parent.visible() if self.parent else {THE_EGO}
         return outside | set(self.meanings) | set(self.aliases)
 

@@ -84,7 +84,7 @@ def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
 
 
 def bounded_in(scopes: b.Scopes) -> frozenset[str]:
-    """Return the names of the relations that have a distance limit, according to the settings of some traces."""
+    """Return the names of relations that have a distance limit, from the settings of some traces."""
     rungs = (name for reach, _ in scopes if reach is not None for name, _ in reach.rungs)
     return frozenset({"overlaps", *PROXIMITY, *rungs}) - frozenset(DIRECTIONS)
 
@@ -134,7 +134,7 @@ def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
 
 
 def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
-    """Return a copy of an expression whose patterns in braces match only entities within a distance of the ego."""
+    """Return an expression whose patterns in braces match only entities within a distance of the ego."""
     again = partial(_limited, ego=ego, limit=limit)
     if not isinstance(value, b.BlockValue):
         return b.with_operands(value, again)

@@ -197,7 +197,7 @@ def _groups(
 
 
 def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
-    """Return the free variables of an atom (node, edge or condition): nodes without fixed id, and named edges."""
+    """Return the free variables of an atom (node, edge or condition): nodes not fixed, and named edges."""
     ties = {f"node {key}" for key in _nodes(atom) if key not in pins}
     if isinstance(atom, b.Edge):
         return ties | ({f"edge {atom.key}"} if atom.named or atom.key in asked else set())

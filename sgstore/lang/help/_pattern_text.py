@@ -27,7 +27,10 @@ def text_written(text: str) -> str:
 
 
 def label_written(kinds: b.Kinds) -> str:
-    """Return the label, such as ``Car|Truck``, for a set of node kinds. It is empty if all kinds are allowed."""
+    """Return the label, such as ``Car|Truck``, for a set of node kinds.
+
+    It is empty if all kinds are allowed.
+    """
     if kinds == b.any_kinds():
         return ""
     if not kinds.other:
@@ -144,7 +147,10 @@ class Writer:
     # Expressions
 
     def expression(self, value: b.Bound, *, inner: bool = False) -> str:
-        """Return an expression as query text. ``inner`` adds brackets where neighbouring operators need them."""
+        """Return an expression as query text.
+
+        ``inner`` adds brackets where neighbouring operators need them.
+        """
         match value:
             case b.Value():
                 return _constant(value, inner=inner)

@@ -223,7 +223,10 @@ def events_in(query: b.Query, frame_id: int, ask: Ask) -> dict[str, list[NodePai
 
 
 def _happened_anywhere(query: b.Query) -> list[b.Happened]:
-    """Return the tests for recorded events in a query. For each kind of event, keep the test with most nodes."""
+    """Return the tests for recorded events in a query.
+
+    For each kind of event, keep the test with most nodes.
+    """
     found: dict[str, b.Happened] = {}
 
     def look(scope: b.Scope) -> None:

@@ -150,7 +150,10 @@ def _is_derived(attribute: Attribute) -> bool:
 
 
 def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:
-    """Return a function for a value of nodes that are already chosen. The value is the same for all candidates."""
+    """Return a function for a value of nodes that are already chosen.
+
+    The value is the same for all candidates.
+    """
     told = evaluator(value, _no_blocks)
 
     def same(asked: Asked) -> Column:

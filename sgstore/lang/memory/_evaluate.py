@@ -136,7 +136,10 @@ def _text_of(value: Any) -> str | None:
 
 
 def _number_of(value: Any) -> Any:
-    """Return a JSON value if it is a number, otherwise None. The same attribute may be a text in other traces."""
+    """Return a JSON value if it is a number, otherwise None.
+
+    The same attribute may be a text in other traces.
+    """
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 

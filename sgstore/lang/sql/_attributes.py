@@ -290,7 +290,7 @@ def _looked_up(attribute: Attribute, frame: str) -> str:
 
 
 def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
-    """Return the SQL expression of a frame attribute that depends on the frame classes of a whole collection."""
+    """Return the SQL of a frame attribute that depends on the frame classes of a whole collection."""
     seen = attribute.unit is DisplayUnit.seen
     dataset = attribute.name.removeprefix(f"class_{abstraction} in ") if seen else ""
     on = [f'"k"."abstraction" = {literal(abstraction)}', f'"k"."dataset" = {literal(dataset)}']

@@ -173,7 +173,7 @@ class Compiled:
         return self.rows(window, replace(self.query, result=result))
 
     def told_apart(self) -> Compiled:
-        """Return a copy that also returns the owner (trace or map) of each node, if rows do not name a frame."""
+        """Return a copy that also returns the owner (trace or map) of each node, if rows have no frame."""
         result = with_owners(self.query.result)
         return replace(self, query=replace(self.query, result=result))
 

@@ -371,7 +371,7 @@ def _first_phase(
     ties: frozenset[str],
     needed: list[Leaf],
 ) -> tuple[Join, SharedRelation | None]:
-    """Return the first phase (frames as bit masks), expanded to single frames, and a shared table for braces."""
+    """Return the first phase (bit masks), expanded to single frames, and a shared table for braces."""
     join, nodes = Join(), bound - parts.late
     if parts.empty:
         return join, None

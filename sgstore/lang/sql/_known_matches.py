@@ -111,7 +111,10 @@ def external_matches(
 
 
 def _columns(found: ExternalRelation, shape: ExternalRelation) -> list[list[Any]]:
-    """Return all columns of matches computed outside the database. Nodes and edges have the order of ``shape``."""
+    """Return all columns of matches computed outside the database.
+
+    Nodes and edges have the order of ``shape``.
+    """
     nodes = [found.nodes[key] for key in shape.nodes]
     edges = [found.edges[key] for key in shape.edges]
     return [found.first, found.last, *nodes, *edges, *found.values]

@@ -126,7 +126,7 @@ def _reached(bound: int) -> str:
 
 
 def _one_by_one(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL that counts rows frame by frame, for buckets (64 frames) with many rows or for large bounds."""
+    """Return SQL that counts rows frame by frame, for buckets (64 frames) with many rows."""
     group = ['"bucket"', *keys]
     crowded = Select(group, [quoted(rows)], group=group)
     if wanted.least <= MOST:

@@ -252,7 +252,10 @@ def if_bound(sql: SqlBuilder, node: str, value: str) -> str:
 
 
 def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: frozenset[str]) -> str:
-    """Return SQL that expands rows with bit masks to one row for each frame. Kinds of some nodes are included."""
+    """Return SQL that expands rows with bit masks to one row for each frame.
+
+    It includes the kinds of some nodes.
+    """
     columns = [*columns_of(nodes, edges), *(quoted(f"{key}.kind") for key in sorted(kinds))]
     keep = [f'":pattern".{column}' for column in columns]
     select = Select(['":pattern"."bucket" * 64 + ":bit"."bit" AS "frame_id"', *keep])
@@ -482,7 +485,7 @@ def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
 
 
 def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
-    """Return SQL for the rows of an edge that is undirected, or stored in the tables of both frames and maps."""
+    """Return SQL for the rows of an edge that is undirected, or stored in tables of both frames and maps."""
     directions = (False, True) if edge.both else (False,)
     branches: list[str] = []
     for swapped in directions:

@@ -189,13 +189,13 @@ def intervals(
     writer: SqlBuilder | None = None,
     span: Span | None = None,
 ) -> SqlStatement:
-    """Return the SQL for intervals in which the returned values stay the same."""
+    """Return the SQL for intervals of frames in which the returned values stay the same."""
     query = _spelled(query, catalog)
     return _IntervalStatement(query, writer or SqlBuilder(query, catalog, window), span).statement()
 
 
 def about_frame(attributes: Sequence[FrameAttribute]) -> str:
-    """Return SQL for attributes of one frame, selected by its id: one row."""
+    """Return SQL for the attributes of one frame, given its id: one row."""
     texts = [frame_text(one, _FRAME, _TRACE, '":map"') for one in attributes]
     select = Select(
         [f"{text} AS {quoted(column_of(a))}" for text, a in zip(texts, attributes, strict=True)]
@@ -206,7 +206,12 @@ def about_frame(attributes: Sequence[FrameAttribute]) -> str:
 
 
 def with_bindings(query: Query) -> Query:
-    """Return a query for intervals with the bindings and the names of bound nodes as columns."""
+    """Return a query for intervals of frames in which the same nodes match.
+
+    The columns are the nodes and their names.
+
+    The columns are the nodes and their names.
+    """
     columns: list[ReturnColumn] = []
     for node in query.scope.nodes.values():
         if node.role == "named":
@@ -219,7 +224,7 @@ def with_bindings(query: Query) -> Query:
 
 
 def told_apart_by(query: Query) -> list[FrameAttribute]:
-    """Return values passed by ``WITH`` that distinguish the rows of a query."""
+    """Return the values passed by ``WITH`` that distinguish two result rows with the same nodes."""
     result = query.result
     if result.whole:
         return [one.value for one in result.columns if is_passed_on(one.value)]
@@ -227,7 +232,7 @@ def told_apart_by(query: Query) -> list[FrameAttribute]:
 
 
 class _RowStatement:
-    """Builder of the SQL for results in rows."""
+    """Builder of the SQL for results in rows (not intervals or clips)."""
 
     def __init__(self, query: Query, writer: SqlBuilder) -> None:
         self.query, self.result = query, query.result
@@ -301,14 +306,14 @@ class _RowStatement:
         return finished(self.writer, text, tuple(names))
 
     def _tops(self) -> dict[str, str]:
-        """Return the extra columns for ``LIMIT … PER``."""
+        """Return the extra columns that ``LIMIT n PER value`` needs: column name → SQL."""
         top = self.result.top
         per = [] if top is None or top.per is None or isinstance(top.per, str) else [top.per]
         values = [*per, *self.top_owners]
         return {f":top {number}": self._text(value) for number, value in enumerate(values)}
 
     def _placed(self, relation: str) -> str:
-        """Return SQL for matches with their position in the default order."""
+        """Return SQL for matches with an extra column: their number in the default order."""
         select = Select([f"{_ROWS}.*"])
         select.join(nested(relation, ":rows"), [])
         frame, writer = f'{_ROWS}."frame_id"', self.writer
@@ -319,7 +324,7 @@ class _RowStatement:
         return select.text()
 
     def _outputs(self) -> list[tuple[str, str]]:
-        """Return the names and SQL texts of the columns."""
+        """Return the names and SQL texts of the result columns."""
         texts: list[str] = []
         if self.result.whole or self.result.framed:
             texts += [text for _, text in _frame_columns()]
@@ -350,14 +355,14 @@ class _RowStatement:
         return self._of_group(leaf.name) if isinstance(leaf, GroupKey) else _column(leaf)
 
     def _of_group(self, name: str) -> str:
-        """Return the SQL of a grouping value. It is the same at each use, with the same bound values."""
+        """Return the SQL of a value by which the query groups. Each use gets the same text."""
         if name not in self.texts:
             value = next(c.value for c in self.result.columns if c.name == name)
             self.texts[name] = self._text(value)
         return self.texts[name]
 
     def _ordered(self, select: Select, names: list[str], tops: list[str]) -> str:
-        """Return SQL for the sorted and limited rows: in query order, then in default order."""
+        """Return SQL for the sorted and limited result rows. The default order follows ``ORDER BY``."""
         keys = [directed(self._key(k.value), k.descending) for k in self.result.order]
         frame, own, writer = f'{_ROWS}."frame_id"', len(keys), self.writer
         grouped = self.grouped
@@ -395,7 +400,7 @@ class _RowStatement:
         return select.text()
 
     def _named_traces(self, keys: list[str], own: int) -> list[int]:
-        """Return the sort keys with trace names whose alphabetical order differs from the trace order."""
+        """Return the positions of sort keys that are trace names, if names are not in alphabetical order."""
         known = [trace.name for trace in self.writer.catalog.traces]
         if known == sorted(known):
             return []
@@ -407,7 +412,7 @@ class _RowStatement:
 
 
 class _IntervalStatement:
-    """Builder of the SQL for results in intervals or clips.
+    """Builder of the SQL for results in intervals of frames or in clips.
 
     The *keys* of an interval stay the same: the returned values, or the parts of a composed name.
     """
@@ -458,7 +463,7 @@ class _IntervalStatement:
         return finished(self.writer, select.text(), names)
 
     def _hidden(self, told: dict[str, str]) -> dict[str, str]:
-        """Return extra columns that order intervals of several stores: first frames and owners of nodes."""
+        """Return extra columns for sorting intervals of several stores: first frame, and owners of nodes."""
         hidden = {FIRST: '":runs"."first"'}
         for name, chosen in ((OWNER_KEY, self.result.sample), (TOP_OWNER, self.result.top)):
             for owner in self._per(chosen, told)[1:]:
@@ -466,7 +471,7 @@ class _IntervalStatement:
         return hidden
 
     def _having(self, condition: Bound, columns: dict[str, str]) -> str:
-        """Return the SQL of the condition on an interval, from its columns."""
+        """Return the SQL of the ``HAVING`` condition on an interval, from its columns."""
 
         def leaf(found: Leaf) -> str:
             assert isinstance(found, GroupKey)  # noqa: S101 - guaranteed by the binder
@@ -475,7 +480,10 @@ class _IntervalStatement:
         return expression_text(condition, leaf, self.writer.values)
 
     def _per(self, chosen: Sampling | None, told: dict[str, str]) -> list[str]:
-        """Return the SQL texts of the sampling key and of the owner of its node."""
+        """Return the SQL of the value in ``SAMPLE n PER value``.
+
+        If it is a node, the SQL of its owner follows.
+        """
         if chosen is None or chosen.per is None:
             return []
         assert isinstance(chosen.per, str)  # noqa: S101 - the binder knows the names of intervals only
@@ -489,7 +497,7 @@ class _IntervalStatement:
         return per
 
     def _told(self, value: Bound) -> str:
-        """Return the SQL of a returned value, in terms of the keys."""
+        """Return the SQL of a returned value, from the columns that are constant in each interval."""
         if value in self.keys and not isinstance(value, NodeAttribute):
             return self.keys[value]
         return expression_text(value, self.keys.__getitem__, self.writer.values)
@@ -499,7 +507,7 @@ class _IntervalStatement:
         return shortest_text(text) if column.single else text
 
     def _keys(self) -> dict[str, str]:
-        """Return the SQL of the constant value of each key column."""
+        """Return the columns that are constant in each interval: SQL of the value by column."""
         # A word of the vocabulary stays an internal number until it is returned.
         texts = [
             _column(value)
@@ -510,7 +518,7 @@ class _IntervalStatement:
         return dict(zip(self.keys.values(), texts, strict=True))
 
     def _spans(self, wanted: list[Leaf]) -> str:
-        """Return SQL for the first and last frame of each interval, with the keys."""
+        """Return SQL for the first and last frame of each interval, with its constant columns."""
         scope = self.query.scope
         if self.span is not None:
             wanted = [*wanted, *self.span]
@@ -525,7 +533,7 @@ class _IntervalStatement:
         return runs(in_masks(self.writer, scope, wanted, self._keys()), keys, self.apart)
 
     def _between(self, spans: str) -> str:
-        """Return SQL for columns of the first and last frame of each interval."""
+        """Return SQL for the number, times and log times of the first and last frame of each interval."""
         select = Select(['":from"."trace_id" AS "trace_id"', *self.keys.values()])
         select.columns += ['":from"."frame_id" AS "first"']
         select.columns += ['":to"."seq" - ":from"."seq" + 1 AS "frames"']
@@ -553,14 +561,19 @@ def _column(leaf: Leaf) -> str:
 
 
 def _kept(value: Bound) -> tuple[Bound, ...]:
-    """Return the columns that determine a value."""
+    """Return the expressions whose columns determine a value. A node's name needs its kind and id."""
     return (
         tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
     )
 
 
 def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
-    """Return the name of a node. The name of an entity is composed late, from its kind and id."""
+    """Return the query expression for the name of a node.
+
+    For an entity, the last SELECT composes it from kind and id.
+
+    For an entity, the last SELECT composes it from kind and id.
+    """
     name = NodeAttribute(node, _NAME, Type.text)
     profile = Profile.of(query.scope.kinds(node), catalog)
     if query.steps or query.stages or profile.mapped or profile.places != 1:
@@ -572,7 +585,7 @@ def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
 
 
 def _spelled(query: Query, catalog: Catalog) -> Query:
-    """Return a query that composes node names as late as possible."""
+    """Return a query in which the outermost SELECT composes the names of nodes, which is faster."""
 
     def spelled(value: Bound) -> Bound:
         match value:
@@ -601,7 +614,7 @@ def _from_frames(select: Select, relation: str) -> None:
 
 
 def shortest_text(text: str) -> str:
-    """Return the SQL that converts a 32-bit number to a 64-bit number with the same shortest text."""
+    """Return SQL that converts a 32-bit number to the 64-bit number with the same shortest text."""
     return f"CAST(CAST(CAST({text} AS FLOAT) AS VARCHAR) AS DOUBLE)"
 
 
@@ -619,7 +632,7 @@ def directed(text: str, descending: bool) -> str:  # noqa: FBT001
 
 
 def _per(result: Result, chosen: Sampling | None) -> Bound | None:
-    """Return the value of a sampling key, or None."""
+    """Return the value in ``SAMPLE n PER value`` or ``LIMIT n PER value``, or None."""
     per = chosen and chosen.per
     if isinstance(per, str):
         return next((column.value for column in result.columns if column.name == per), None)
@@ -627,14 +640,14 @@ def _per(result: Result, chosen: Sampling | None) -> Bound | None:
 
 
 def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) -> Select:
-    """Return a statement with distinct rows, where nodes of different owners count as different."""
+    """Return SQL for distinct rows, in which equal node ids of two traces or maps count as different."""
     select.columns += [f'{_column(one)} AS ":owner {i}"' for i, one in enumerate(apart)]
     return Select([quoted(name) for name in names], [nested(select.text(), ":distinct")])
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Selection of a number of rows for each combination of some values.
+    """Selection of a number of rows for each combination of some values, as for ``SAMPLE n PER value``.
 
     Without a frame, or with ``first`` sort keys, the first rows are selected. Otherwise, rows are selected by
     a pseudo-random number computed from the frame.
@@ -649,7 +662,7 @@ class Chosen:
 def sampled(
     select: Select, columns: list[str], names: list[str], keys: list[str], chosen: Chosen
 ) -> tuple[Select, list[str]]:
-    """Return the statement for the selected rows, and its sort keys."""
+    """Return the SELECT statement for some rows of each group, and its sort keys."""
     partition = [f'":per {place}"' for place in range(len(chosen.per))]
     if chosen.frame is not None:
         select.columns.append(f'{chosen.frame} % 1000003 * 48271 % 2147483647 AS ":mixed"')
@@ -668,7 +681,7 @@ def sampled(
 
 
 def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
-    """Add sort keys to a statement as columns. Return the keys for an outer statement."""
+    """Add sort keys to a SELECT statement as columns. Return the sort keys for the statement around it."""
     ordered = [key.removesuffix(" NULLS LAST") for key in keys]
     plain = [key.removesuffix(" ASC").removesuffix(" DESC") for key in ordered]
     inner = [key if key in names else f'":key {i}"' for i, key in enumerate(plain)]
@@ -680,12 +693,12 @@ def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
 
 
 def in_order(part: Bound) -> bool:
-    """True if an expression depends on the order of matches, as ``collect`` does."""
+    """True if the value of an expression depends on the order of matches, as for ``collect``."""
     return isinstance(part, Aggregate) and part.word == "collect" and not part.distinct
 
 
 def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatement:
-    """Return the final statement, with the shared relations before it."""
+    """Return the final SQL statement, with the shared subqueries in a ``WITH`` clause before it."""
     shadows = [
         (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows
     ]
@@ -697,7 +710,7 @@ def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatem
 
 
 def _preceded(relations: Iterable[tuple[str, str]], text: str) -> str:
-    """Return a statement with its relations before it in a ``WITH`` clause."""
+    """Return an SQL statement with named subqueries before it, in a ``WITH`` clause."""
     before = ",\n".join(
         f"{head} (\n" + "\n".join(f"  {line}" for line in body.splitlines()) + "\n)"
         for head, body in relations

@@ -1,4 +1,4 @@
-"""Rewriting rules that make a bound query faster without changing its meaning.
+"""Rules that rewrite a query into a faster query with the same meaning.
 
 Each rule converts a scope to a scope. Its docstring explains the change and why the meaning stays the same.
 No rule can fail.
@@ -74,7 +74,7 @@ _MIRRORED: Final = {"=": "=", "<>": "<>", "<": ">", ">=": "<=", ">": "<", "<=": 
 
 
 def rewritten(query: Query, catalog: Catalog) -> Query:
-    """Return the query after all rewriting rules."""
+    """Return an equivalent query that is faster to evaluate, after all rewriting rules."""
     if query.stages:
         return _staged(query, catalog)
     query = _ruled(query, catalog)
@@ -103,7 +103,11 @@ def _ruled(query: Query, catalog: Catalog) -> Query:
 
 
 def _staged(query: Query, catalog: Catalog) -> Query:
-    """Return a query with stages after all rules, applied to each stage.
+    """Return an equivalent, faster query with several clauses (``MATCH``, ``WITH``).
+
+    The rules apply to each clause.
+
+    The rules apply to each clause.
 
     Nodes are limited to the kinds that the patterns allow. A node that may be absent is looked up by its id.
     This includes the ego: even if the frame has an ego, the pattern may not bind it.
@@ -152,7 +156,7 @@ def _staged(query: Query, catalog: Catalog) -> Query:
 
 
 def path_ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
-    """Yield the pattern of a stage once for each combination of lengths of its named paths."""
+    """Yield the pattern of a ``MATCH`` clause once for each combination of lengths of its named paths."""
     edges = {edge.key: edge for edge in stage.scope.edges}
     repeated = [edges[key] for path in stage.paths for key, _ in path.edges if edges[key].high > 1]
     for lengths in product(*(range(edge.low, edge.high + 1) for edge in repeated)):
@@ -171,7 +175,7 @@ def path_ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
 
 
 def _kinds_in(scopes: Iterable[Scope]) -> dict[str, Kinds]:
-    """Return the kinds that nodes can have in any of the patterns that can match."""
+    """Return the node kinds that are possible in at least one of several patterns: node → kinds."""
     every = list(scopes)
     found: dict[str, Kinds] = {}
     for scope in [one for one in every if one.where != (FALSE,)] or every:
@@ -181,7 +185,7 @@ def _kinds_in(scopes: Iterable[Scope]) -> dict[str, Kinds]:
 
 
 def _expression(value: Any, values: Callable[[Result], Result]) -> Any:
-    """Return a value after all rules for results."""
+    """Return one expression after the rewriting rules for result columns."""
     return values(Result(columns=(ReturnColumn("", value),))).columns[0].value
 
 
@@ -189,7 +193,7 @@ _Rule = Callable[[Scope, Catalog], Scope]
 
 
 def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
-    """Apply a rule to every scope of a query, inner scopes first."""
+    """Apply a rewriting rule to every graph pattern of a query, patterns in braces first."""
 
     def inside(expression: Bound) -> Bound:
         if isinstance(expression, BlockValue):
@@ -204,7 +208,7 @@ def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
 
 
 def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
-    """Replace ``in_graph`` by true unless the store has data beyond the graphs in scope ``world``."""
+    """Replace the attribute ``in_graph`` by true, unless the query may match entities outside scene graphs."""
 
     def known(value: Bound) -> Bound:
         if isinstance(value, NodeAttribute) and value.attribute.unit is DisplayUnit.inside:
@@ -215,7 +219,12 @@ def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
-    """Replace ``computed``: true for traces with settings, whose relations were computed."""
+    """Replace the trace attribute ``computed`` by a test of trace ids.
+
+    It is true if sgstore computed the trace's relations.
+
+    It is true if sgstore computed the trace's relations.
+    """
     ids = [trace.trace_id for trace in catalog.traces if trace.reach is not None]
     told: Bound = Value(value=bool(ids), type=Type.boolean)
     if 0 < len(ids) < len(catalog.traces):
@@ -230,7 +239,7 @@ def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def push_negations(scope: Scope, _: Catalog) -> Scope:
-    """Move ``NOT`` inwards, so that more conditions can be evaluated separately.
+    """Move ``NOT`` inwards in the conditions of a pattern, so that more conditions can be tested separately.
 
     De Morgan's laws and ``NOT a < b`` = ``a >= b`` hold in three-valued logic too.
     """
@@ -278,7 +287,7 @@ def _negated_operation(word: str, operands: tuple[Bound, ...]) -> Bound:
 
 
 def counts_to_existence(scope: Scope, _: Catalog) -> Scope:
-    """Replace ``COUNT {…} > 0`` by ``EXISTS {…}``, and ``COUNT {…} = 0`` by its negation."""
+    """Replace ``COUNT {…} > 0`` by ``EXISTS {…}``, and ``COUNT {…} = 0`` by ``NOT EXISTS {…}``."""
     return replace(scope, where=tuple(map(_existence, scope.where)))
 
 
@@ -298,7 +307,7 @@ def _existence(condition: Bound) -> Bound:
 
 
 def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
-    """Return block, sign and number of ``COUNT {…} sign number``, or None for other conditions."""
+    """Return pattern, sign and number of a condition ``COUNT {…} sign number``; None for others."""
     match condition:
         case Operation(
             word, (BlockValue(word="COUNT") as block, Value(value=int() | float() as n))
@@ -313,12 +322,12 @@ def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
 
 
 def complement(sign: str) -> str:
-    """Return the opposite comparison, such as ``>=`` for ``<``."""
+    """Return the negated comparison sign, such as ``>=`` for ``<``."""
     return _OPPOSITE[sign]
 
 
 def unfold_paths(scope: Scope, _: Catalog, *, injective: bool) -> Scope:
-    """Replace a path of exactly n edges by n edges with hidden nodes between them.
+    """Replace each path of exactly n edges by n single edges, with hidden nodes between them.
 
     If nodes must differ, the hidden nodes differ from each other and from both ends. They may coincide with
     other nodes of the pattern. The same holds for a path of m to n edges.
@@ -330,7 +339,7 @@ def unfold_paths(scope: Scope, _: Catalog, *, injective: bool) -> Scope:
 
 
 def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
-    """Replace a path by ``length`` edges with hidden nodes between them."""
+    """Return a pattern in which a path becomes ``length`` single edges, with hidden nodes between them."""
     between = [f"#{edge.key}.{number}" for number in range(1, length)]
     stops = [edge.src, *between, edge.dst]
     hidden = {key: Node(key, any_kinds(), "hidden", edge.span) for key in between}
@@ -348,7 +357,7 @@ def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
 
 
 def labels_from_conditions(scope: Scope, _: Catalog) -> Scope:
-    """Convert conditions such as ``v.kind = 'car'`` or ``v.is_ego`` to labels, which edges can use."""
+    """Replace conditions such as ``v.kind = 'car'`` or ``v.is_ego`` by labels, which are faster to test."""
     nodes, rest = dict(scope.nodes), list[Bound]()
     for condition in scope.where:
         key, kinds = _label(condition)
@@ -378,7 +387,7 @@ def _label(condition: Bound) -> tuple[str, Kinds]:
 
 
 def open_exists(scope: Scope, catalog: Catalog) -> Scope:
-    """Merge a required ``EXISTS {…}`` into the pattern around it, with hidden nodes.
+    """Merge the pattern of a required ``EXISTS {…}`` into the pattern around it. Its nodes become hidden.
 
     This needs a free node: one that the block binds, but no edge of the pattern. Otherwise, such a node would
     be tried with every entity of the frame. If several blocks are separate relations (:func:`stands_alone`),
@@ -408,7 +417,12 @@ LONG_WAY: Final = 3
 
 
 def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
-    """True if a block in scope ``world`` becomes its own relation, because its edges bind all its nodes."""
+    """True if an ``EXISTS {…}`` with a long path is evaluated as a separate subquery.
+
+    This occurs only in scope ``world``.
+
+    This occurs only in scope ``world``.
+    """
     if not catalog.around or not isinstance(condition, BlockValue) or condition.word != "EXISTS":
         return False
     scope = condition.scope
@@ -420,7 +434,7 @@ def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
 
 
 def _of_table(leaf: NodeAttribute) -> bool:
-    """True if an attribute is stored in the table of its node."""
+    """True if an attribute of a node is stored in the table of the node."""
     bare = {DisplayUnit.role, DisplayUnit.own, DisplayUnit.owner, DisplayUnit.inside}
     return leaf.attribute.unit not in bare
 
@@ -444,7 +458,7 @@ def _merged(scope: Scope, block: BlockValue) -> Scope:
 
 
 def narrowed(scope: Scope, catalog: Catalog) -> Scope:
-    """Limit nodes to the kinds that occur at the ends of such edges in the store.
+    """Limit the nodes of a pattern to the kinds for which the store has the required edges.
 
     If the edges of a pattern do not occur in the store, its condition becomes false.
     """
@@ -459,7 +473,12 @@ def narrowed(scope: Scope, catalog: Catalog) -> Scope:
 def kinds_left(
     scope: Scope, triples: Collection[Triple], held: frozenset[str]
 ) -> dict[str, Kinds] | None:
-    """Return possible kinds of each node, for the given triples and kinds. ``None`` means no match."""
+    """Return the possible kinds of each pattern node, given the triples (relation, kind, kind) in a store.
+
+    ``None`` means no match.
+
+    ``None`` means no match.
+    """
     kinds = {key: scope.kinds(key).only(held) for key in (*scope.nodes, *scope.outer)}
     single = [edge for edge in scope.edges if edge.high == 1]
     ways = [[*possible(e, kinds[e.src], kinds[e.dst], triples)] for e in single]
@@ -469,7 +488,12 @@ def kinds_left(
 
 
 def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) -> bool:
-    """Narrow both ends and the triples of each edge once. Return true if something changed."""
+    """Remove node kinds and triples that the edges of a pattern exclude, once.
+
+    Return True if something changed.
+
+    Return True if something changed.
+    """
     changed = False
     for place, edge in enumerate(edges):
         starts, ends = kinds[edge.src].every, kinds[edge.dst].every
@@ -484,7 +508,12 @@ def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) 
 
 
 def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> Iterator[Triple]:
-    """Yield the triples that an edge can have. The second item is the kind of ``src``."""
+    """Yield the triples (relation, kind, kind) that a pattern edge can match.
+
+    The second item is the kind of ``src``.
+
+    The second item is the kind of ``src``.
+    """
     relations, starts, ends, both = edge.relations, src.every, dst.every, edge.both
     for triple in triples:
         relation, one, other = triple
@@ -497,7 +526,7 @@ def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> I
 
 
 def ordered(scope: Scope, catalog: Catalog) -> Scope:
-    """Sort edges by frequency, rarest first, so that each is connected to an earlier edge if possible."""
+    """Sort the edges of a pattern, rarest first. Each is connected to an earlier edge if possible."""
     counts = {**catalog.map_edges, **catalog.edges}
 
     def rows(edge: Edge) -> int:
@@ -516,12 +545,12 @@ def ordered(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def labels_to_conditions(scope: Scope, _: Catalog) -> Scope:
-    """Convert labels that a block requires of outer nodes to conditions on their attributes."""
+    """Replace labels that a pattern in braces requires of outer nodes by conditions on attributes."""
     return replace(scope, where=tuple(map(_attributes, scope.where)))
 
 
 def _attributes(condition: Bound) -> Bound:
-    """Convert label tests in an expression to conditions on attributes."""
+    """Return an expression in which conditions on the kind replace label tests."""
     if not isinstance(condition, LabelTest):
         return with_operands(condition, _attributes)
     kind = NodeAttribute(condition.node, NODE_ATTRIBUTES["kind"], Type.text)
@@ -545,7 +574,7 @@ INVARIANT: Final = FrameAttribute(
 
 
 def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
-    """True if a value is the same in all frames of a bucket in which its binding holds."""
+    """True if a value is the same in all 64 frames of a bucket, for the same matched nodes."""
     match leaf:
         case NodeValue() | EdgeRelation() | TraceAttribute():
             return True
@@ -561,7 +590,7 @@ def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
 
 
 def count_by_buckets(query: Query, catalog: Catalog) -> Query:
-    """Replace ``COUNT(*)`` by the sum of the frames per row, if no value needs single frames.
+    """Replace ``COUNT(*)`` by a sum of frame counts of SQL rows, if no value needs single frames.
 
     All values must be constant within a bucket. Other aggregates must not depend on how often a value occurs.
     """
@@ -600,7 +629,10 @@ _MORE: Final = {">", ">=", "="}
 
 
 def bounds(conditions: list[Bound]) -> list[Bound]:
-    """Return cheaper conditions that follow from others, such as a lower bound for ``gap < t``."""
+    """Return cheaper conditions that follow from others.
+
+    Example: ``gap < t`` implies that a lower bound of ``gap`` is at most t.
+    """
     found: list[Bound] = []
     for condition in conditions:
         match condition:
@@ -624,7 +656,7 @@ def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
 
 
 def is_dear(leaf: Leaf) -> bool:
-    """True if a pair number is expensive to compute."""
+    """True if a number of two entities is expensive to compute."""
     return (
         isinstance(leaf, PairNumber)
         and leaf.function in PAIR_FUNCTIONS

@@ -1,4 +1,4 @@
-"""Builder of ``SELECT`` statements, with bound values.
+"""Builder of SQL ``SELECT`` statements, with parameter values.
 
 The text is portable SQL. It runs on DuckDB and can be adapted to other engines. Every identifier is quoted
 and every value of the user is bound. Words of the vocabulary are literals.
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class BoundValues:
-    """User values bound by a statement, in order."""
+    """Parameter values of an SQL statement, in the order of ``$1``, ``$2``, …."""
 
     items: list[Any] = field(default_factory=list[Any])
 
     def add(self, value: object) -> str:
-        """Add a value and return its placeholder."""
+        """Add a parameter value of the SQL statement and return its placeholder, such as ``$3``."""
         self.items.append(value)
         return f"${len(self.items)}"
 
 
 @dataclass(slots=True)
 class Select:
-    """Builder of a ``SELECT`` statement: one line for each column, table and condition.
+    """Builder of an SQL ``SELECT`` statement: one line for each column, table and condition.
 
     If ``lenient``, tables are joined by ``LEFT JOIN``, so rows without a partner are kept.
     """
@@ -46,7 +46,7 @@ class Select:
     lenient: bool = False
 
     def text(self) -> str:
-        """Return the SQL text."""
+        """Return the text of the ``SELECT`` statement."""
         head = "SELECT DISTINCT " if self.distinct else "SELECT "
         lines = [head + ",\n  ".join(self.columns)]
         lines += ["FROM " + "\n  ".join(self.tables)] if self.tables else []
@@ -59,7 +59,7 @@ class Select:
         return "\n".join(lines)
 
     def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
-        """Join a table. Without conditions, it is a cross join."""
+        """Add a table to the ``SELECT`` statement. Without conditions it is a cross join."""
         if not self.tables:
             self.tables.append(table)
             self.where += conditions
@@ -71,10 +71,10 @@ class Select:
 
 
 def indented(text: str) -> str:
-    """Indent a statement for use in another statement."""
+    """Return SQL text, indented for use in another statement."""
     return "\n".join(f"    {line}" for line in text.splitlines())
 
 
 def nested(text: str, name: str) -> str:
-    """Return a statement as a derived table."""
+    """Return SQL text in brackets with a name, for use in ``FROM`` of another statement."""
     return f"(\n{indented(text)}\n  ) AS {quoted(name)}"

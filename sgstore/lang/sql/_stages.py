@@ -1,4 +1,4 @@
-"""SQL of queries with stages: ``OPTIONAL MATCH``, ``WITH``, and later ``MATCH`` clauses.
+"""SQL of queries with several clauses: ``OPTIONAL MATCH``, ``WITH``, and later ``MATCH`` clauses.
 
 Each stage converts the relation of the previous stage: one row for each frame and match, with the bound nodes
 and edges, and the values passed by ``WITH``. The results are computed from the last relation as from known
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def staged_matches(query: Query, catalog: Catalog, window: Window | None) -> SqlBuilder:
-    """Return a builder for a query with stages, with its matches as a shared relation.
+    """Return an SQL builder for a query with several clauses. Its matches are a shared subquery.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def _first(sql: SqlBuilder, query: Query, stage: MatchStage) -> SharedRelation:
 
 
 def _late(stage: MatchStage) -> tuple[list[Bound], list[Leaf]]:
-    """Return conditions on passed values and paths, and the pattern values that they need."""
+    """Return the conditions of a ``MATCH`` on ``WITH`` values and paths, and the values that they need."""
     late = [one for one in stage.scope.where if _speaks_of_passed(one)]
     wanted = [leaf for one in late for leaf in leaves(one) if not is_passed_on(leaf)]
     return late, list(dict.fromkeys(wanted))
@@ -90,7 +90,7 @@ def _pattern(
     rows: SharedRelation | None,
     wanted: list[Leaf],
 ) -> str:
-    """Return SQL for the matches of a stage, with its paths as lists and the wanted values."""
+    """Return SQL for the matches of one ``MATCH`` clause, with named paths as lists and the wanted values."""
     nodes, edges = _bound(stage.scope)
     outer = frozenset(stage.scope.outer)
     texts: list[str] = []
@@ -127,7 +127,7 @@ def _with_paths(
 def _joined(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: MatchStage
 ) -> SharedRelation:
-    """Join the matches of another pattern to the previous rows."""
+    """Join the matches of a later ``MATCH`` clause to the rows of the previous clauses."""
     outer = frozenset(stage.scope.outer)
     nodes, edges = _bound(stage.scope)
     late, wanted = _late(stage)
@@ -151,13 +151,18 @@ def _joined(
 
 
 def _bound(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the nodes and edges that distinguish the matches of a pattern."""
+    """Return the keys of the nodes and edges that distinguish two matches of a pattern."""
     nodes = frozenset(key for key, node in scope.nodes.items() if node.role != "hidden")
     return nodes, frozenset(edge.key for edge in scope.edges if edge.named)
 
 
 def _given(sql: SqlBuilder, rows: SharedRelation, outer: frozenset[str]) -> SharedRelation:
-    """Return masks of the outer nodes of a pattern. Rows with NULL have no match."""
+    """Return a subquery with the outer nodes of a pattern and bit masks of their frames.
+
+    Rows with NULL are excluded.
+
+    Rows with NULL are excluded.
+    """
     keys = columns_of(outer)
     known = [f"{key} IS NOT NULL" for key in keys]
     each = Select(['"frame_id"', *keys], [quoted(rows.name)], known, distinct=True)
@@ -171,7 +176,7 @@ def _speaks_of_passed(condition: Bound) -> bool:
 def _passed(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: WithStage
 ) -> SharedRelation:
-    """Return the rows that ``WITH`` passes on."""
+    """Return the subquery of the rows that a ``WITH`` clause passes on."""
     values = [column.value for column in stage.values]
     collected = any(in_order(part) for value in values for part in walk(value))
     text = _of_rows(sql, query, rows, stage.before, values)
@@ -220,7 +225,7 @@ def _told(rows: SharedRelation) -> list[str]:
 def _of_rows(
     sql: SqlBuilder, query: Query, rows: SharedRelation, scope: Scope, values: Iterable[Bound]
 ) -> str:
-    """Return SQL for the previous rows, with the leaves of some values."""
+    """Return SQL for the rows of the previous clauses, with extra columns for some values."""
     asked = replace(query, scope=scope, result=Result(), stages=())
     sql.query, sql.found = asked, rows
     wanted: list[Leaf] = [leaf for value in values for leaf in leaves(value)]
@@ -239,7 +244,7 @@ def _leaf_of(texts: dict[str, str]) -> Callable[[Leaf], str]:
 def _chosen(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: WithStage
 ) -> SharedRelation:
-    """Return the first rows of each frame that meet the condition."""
+    """Return a subquery for ``LIMIT`` and ``WHERE`` of a ``WITH`` clause: the selected rows of each frame."""
     columns = ['"frame_id"', *columns_of(rows.nodes, rows.edges), *_told(rows)]
     if stage.skip or stage.limit is not None:
         keys = [

@@ -1,4 +1,4 @@
-"""Subgraphs of matches, for ``RETURN SUBGRAPHS``.
+"""Results of ``RETURN SUBGRAPHS``: each match as a graph of nodes and edges.
 
 Each match is a small graph, built from the columns of one statement. It contains the nodes bound by the
 pattern, named or not, with all known attributes, and the edges of the pattern. A path of exactly n edges is
@@ -44,21 +44,21 @@ _TWICE: Final = frozenset({"id", "type"})
 
 @dataclass(frozen=True, slots=True)
 class _ValuePlace:
-    """Node or edge of the pattern, with the columns of its values in a row."""
+    """Node or edge of a pattern, with the positions of its values in an SQL row."""
 
     part: Node | Edge
     first: int
     names: tuple[str, ...]
 
     def known(self, row: Sequence[Any]) -> Record:
-        """Return the known values of the node or edge in a row."""
+        """Return the values of the pattern node or edge in an SQL row, without NULL."""
         values = zip(self.names, row[self.first :], strict=False)
         return {name: value for name, value in values if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Query whose rows contain all values of the match graphs.
+    """Query for ``RETURN SUBGRAPHS``, with the positions of all graph values in its rows.
 
     Attributes
     ----------
@@ -77,7 +77,10 @@ class Layout:
 
     @classmethod
     def of(cls, query: Query) -> Layout:
-        """Return the layout of the match graphs of a query. Its own result columns are kept."""
+        """Return the layout of the subgraph values in the rows of a query.
+
+        The query's own columns stay first.
+        """
         scope = _bound_variables(query)
         result = query.result
         kept = result.form == "subgraphs" or result.whole
@@ -103,14 +106,14 @@ class Layout:
         return cls(replace(query, scope=scope, result=framed), names, tuple(places), width)
 
     def row(self, row: Sequence[Any]) -> tuple[Any, ...]:
-        """Convert a row of the query to a row with a graph."""
+        """Convert an SQL row to a result row: own columns, then nodes and edges of the subgraph."""
         bound = {place.part.key: place.known(row) for place in self.places}
         parts = [(place.part, bound[place.part.key]) for place in self.places]
         return (*row[: self._width], *graph_of(parts))
 
 
 def _bound_variables(query: Query) -> Scope:
-    """Return the pattern with all nodes and single edges bound. Paths of fixed length are expanded."""
+    """Return a pattern that reports all nodes and single edges. Paths of fixed length become single edges."""
     scope = unfold_paths(query.scope, Catalog(), injective=query.injective)
     nodes = {
         key: replace(node, role="unnamed") if node.role == "hidden" else node
@@ -121,7 +124,7 @@ def _bound_variables(query: Query) -> Scope:
 
 
 def graph_of(parts: Sequence[tuple[Node | Edge, Record]]) -> tuple[list[Record], list[Record]]:
-    """Return the nodes and edges of a match, in the order of the pattern.
+    """Return the nodes and edges of a match as records, in the order of the pattern.
 
     Parameters
     ----------
@@ -165,7 +168,7 @@ def path_text(edge: Edge) -> str:
 
 
 def _of_node(node: Node) -> list[tuple[str, NodeValue | NodeAttribute]]:
-    """Return the id and the possible attributes of a node, by name."""
+    """Return the id and the possible attributes of a pattern node: pairs of name and expression."""
     known: list[tuple[str, NodeValue | NodeAttribute]] = [("id", NodeValue(node.key))]
     return known + [
         (attribute.name, NodeAttribute(node.key, attribute, attribute.type))
@@ -183,7 +186,7 @@ def _of_edge(edge: Edge) -> list[tuple[str, EdgeRelation | EdgeAttribute]]:
 
 
 def edge_attributes(edge: Edge) -> Iterator[Attribute]:
-    """Yield the attributes that an edge of a pattern can have."""
+    """Yield the attributes that an edge of a query pattern can have."""
     if edge.high > 1 or len(edge.relations) > 1:
         return
     for attribute in EDGE_ATTRIBUTES.values():

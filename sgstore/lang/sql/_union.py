@@ -1,4 +1,4 @@
-"""Splitting of a ``UNION`` into its queries, and joining of their rows.
+"""Splitting of a ``UNION`` query into its single queries, and SQL that joins their rows.
 
 Each part is a separate query with its own settings, order and limits. :class:`sgstore.matches.UnionMatches`
 joins their answers.
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class UnionPart:
-    """Query that is part of a ``UNION``.
+    """Single query of a ``UNION``, with its parameter values.
 
     Attributes
     ----------
@@ -48,13 +48,13 @@ class UnionPart:
 
 @dataclass(frozen=True, slots=True)
 class UnionParts:
-    """Parts of a ``UNION``. ``distinct`` is false for ``UNION ALL``."""
+    """Single queries of a ``UNION``. ``distinct`` is false for ``UNION ALL``."""
 
     parts: tuple[UnionPart, ...]
     distinct: bool
 
     def each(self, find: Callable[[str, Mapping[str, Any]], T], text: str) -> list[T]:
-        """Run all parts with a function and return their answers.
+        """Run every query of the union with a function, and return the list of results.
 
         Raises
         ------
@@ -73,7 +73,7 @@ _LETTER: Final = re.compile(r"[^\n]")
 
 
 def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
-    """Return the parts of a ``UNION`` text, or None for other texts.
+    """Return the single queries of a ``UNION`` text, or None for a text without ``UNION``.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
 
 
 def _parameters_of(part: s.MatchClause, defined: Iterable[s.Define]) -> set[str]:
-    """Return the names of the parameters of a part and of the definitions that it uses."""
+    """Return the names of the parameters that one query of a union uses, also through definitions."""
     found, waiting = set(parameters_in(part)), {*_called(part)}
     by_name = {normalize_name(one.name): one for one in defined}
     while used := waiting & by_name.keys():
@@ -139,7 +139,7 @@ def _alone(text: str, union: TextSpan, part: TextSpan) -> str:
 def joined_rows(
     columns: Sequence[str], tables: Sequence[str], result: Sequence[Result], *, distinct: bool
 ) -> tuple[Select, bool]:
-    """Return the statement that joins the rows of several tables.
+    """Return SQL that joins the rows of several result tables of a ``UNION``.
 
     Parameters
     ----------
@@ -184,13 +184,13 @@ _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 
 
 def each_match(statements: Iterable[s.Statement]) -> Iterator[s.Statement]:
-    """Yield statements, with a union replaced by its parts."""
+    """Yield query statements, with each ``UNION`` replaced by its single queries."""
     for statement in statements:
         yield from statement.parts if isinstance(statement, s.UnionClause) else (statement,)
 
 
 def parameters_in(part: object) -> Iterator[str]:
-    """Yield the names of the parameters in a part of a text."""
+    """Yield the names of the query parameters (``$name``) in a part of a syntax tree."""
     return (one.name for one in _walk(part) if isinstance(one, s.Parameter))
 
 

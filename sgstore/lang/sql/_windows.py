@@ -1,4 +1,4 @@
-"""Windows of frames, and the default order of traces: by name, ``run2`` before ``run10``.
+"""Windows of frames for processing in portions, and the order of traces by name (``run2`` before ``run10``).
 
 Trace ids are digests, so their order has no meaning. A catalog has its traces in order (see
 :attr:`sgstore.lang.catalog.Catalog.traces`). Rows are sorted by the index of their trace in the catalog,
@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Range of buckets from ``low`` up to, not including, ``high``. ``traces`` limits it to some traces."""
+    """Range of frame buckets (64 frames each): from ``low`` to before ``high``.
+
+    ``traces`` limits it to some traces.
+
+    ``traces`` limits it to some traces.
+    """
 
     low: int
     high: int
@@ -29,13 +34,16 @@ class Window:
 
     @classmethod
     def of(cls, extents: Sequence[tuple[int, int]]) -> Window:
-        """Return the window of whole traces, or of a part of one trace."""
+        """Return the smallest window that contains some ranges of buckets (64 frames each).
+
+        The ranges are whole traces, or a part of one trace.
+        """
         low, high = min(first for first, _ in extents), max(first + many for first, many in extents)
         traces = tuple(first >> TRACE_OF_BUCKET for first, _ in extents)
         return cls(low, high, traces if len(traces) > 1 else None)
 
     def whole(self, extents: Iterable[tuple[int, int]]) -> Window:
-        """Return the window as a plain range if no other trace begins inside it."""
+        """Return the window without its list of traces, if no other trace begins inside it."""
         if self.traces is None:
             return self
         many = sum(self.low <= first < self.high for first, _ in extents)
@@ -54,14 +62,14 @@ TRACE_OF_FRAME: Final = 24
 
 
 def extents(catalog: Catalog) -> list[tuple[int, int]]:
-    """Return the first bucket and number of buckets of each trace, in trace order."""
+    """Return the first bucket (of 64 frames) and the number of buckets of each trace, in trace order."""
     return [trace.extent for trace in catalog.traces]
 
 
 def frame_key(
     select: Select, frame: str, catalog: Catalog, window: Window | None, values: BoundValues
 ) -> str:
-    """Return the sort key for frames: by trace order, then by frame order.
+    """Return an SQL sort key for frames: by the order of traces, then by frame.
 
     The key is one number, which sorts fastest: the frame id, with the index of the trace instead of its id.
     If the ids are already in trace order, the key is the frame id.
@@ -93,7 +101,7 @@ def frame_key(
 def name_key(
     select: Select, number: int, column: str, catalog: Catalog, values: BoundValues
 ) -> str:
-    """Return the sort key that replaces a column with trace names.
+    """Return an SQL sort key that sorts trace names in natural order: ``run2`` before ``run10``.
 
     Parameters
     ----------
@@ -119,7 +127,7 @@ def _join(
     column: str,
     values: BoundValues,
 ) -> None:
-    """Join a number to each row, by the value of a column."""
+    """Join a list of numbers to the ``SELECT`` statement: one number for each value of a column."""
     kind, keys = known
     text = (
         f'SELECT unnest(CAST({values.add(list(keys))} AS {kind}[])) AS ":trace",'

@@ -1,4 +1,4 @@
-"""Queries for the parts of a collection, and SQL that merges their answers.
+"""Queries for the stores of a collection, and SQL that merges their results.
 
 A trace is in one part. So the rows, intervals and clips of the collection are those of its parts. Only their
 order and their number must be adjusted. Each row has *hidden* columns, named ``:0``, ``:1``, …, which hold
@@ -73,7 +73,7 @@ Terms = list[str]
 
 @dataclass(frozen=True, slots=True)
 class Parted:
-    """Queries sent to each part, and the merging of their answers.
+    """Queries for each store of a collection, with the rule that merges their results.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Parted:
     merge: Callable[[Catalog, BoundValues], str]
 
     def compiled(self, whole: Compiled) -> tuple[Compiled, ...]:
-        """Return the queries, compiled against the catalog of a compiled query."""
+        """Return the compiled queries for each store of the collection."""
         found: list[Compiled] = []
         for query in self.queries:
             ready = query if query.steps else rewritten(query, whole.catalog)
@@ -99,14 +99,14 @@ class Parted:
         return tuple(found)
 
     def statement(self, catalog: Catalog) -> tuple[str, tuple[Any, ...]]:
-        """Return the merging SQL statement and the values that it binds."""
+        """Return the SQL that merges the results of all stores, and its parameter values."""
         values = BoundValues()
         text = self.merge(catalog, values)
         return text, tuple(values.items)
 
 
 def parted(compiled: Compiled, form: str = "rows", before: int = 0, after: int = 0) -> Parted:
-    """Return the queries for the parts of a collection, and the merging of their answers.
+    """Return the queries for each store of a collection, with the rule that merges their results.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ LISTED: Final = frozenset({"stddev", "median", "percentile", "collect"})
 
 
 def _refuse_strange(result: Result) -> None:
-    """Reject a result with a field that has no merging rule, to avoid wrong answers."""
+    """Raise an error if the result clause has a setting without a rule for merging stores."""
     for one in fields(result):
         if one.name not in MERGED and getattr(result, one.name) != one.default:
             raise QueryError(
@@ -178,7 +178,10 @@ def _refuse_strange(result: Result) -> None:
 
 
 def _frames(query: Query) -> Query:
-    """Return a query for the matching frames with log times. With ``LIMIT``: the frame of each row."""
+    """Return a query for the matching frames with log times.
+
+    With ``LIMIT``, it returns the frame of each row.
+    """
     result, time = query.result, ReturnColumn(LOG_TIME_COLUMN, _LOG_TIME)
     if not result.chooses or result.form != "rows" or result.aggregated:
         return replace(query, result=Result(whole=False, framed=True, columns=(time,)))
@@ -223,7 +226,7 @@ Placed = tuple[Terms, Terms, str]
 
 
 def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, Terms]) -> str:
-    """Return the SQL for the sorted, sampled and limited rows of a statement.
+    """Return SQL that sorts, samples and limits the merged rows.
 
     ``pers``: the ``PER`` columns of ``SAMPLE`` and those of ``LIMIT … PER``.
     """
@@ -244,7 +247,7 @@ def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, T
 
 
 def _of_part(result: Result) -> Result:
-    """Return the result clause for a part, with enough rows for the final selection.
+    """Return the result clause for one store of a collection, with enough rows for the final selection.
 
     A sample of one part can differ from the sample of the collection, so a limited number of its rows is not
     enough.
@@ -259,7 +262,7 @@ def _of_part(result: Result) -> Result:
 
 
 def _bindings(query: Query, hidden: _Hidden) -> Terms:
-    """Return sort keys for the rows of one frame: the nodes and edges that identify a match.
+    """Return sort keys for the result rows of one frame: the nodes and edges that identify a match.
 
     A store sorts relations by their enumeration, but returns them as texts.
     """
@@ -274,7 +277,12 @@ def _bindings(query: Query, hidden: _Hidden) -> Terms:
 
 
 def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
-    """Return the columns that group the rows for ``SAMPLE`` or ``LIMIT … PER``."""
+    """Return the columns of the value in ``SAMPLE n PER value`` or ``LIMIT n PER value``.
+
+    For a node, the owner is included.
+
+    For a node, the owner is included.
+    """
     if chosen is None or chosen.per is None:
         return []
     value = _value_of(result, chosen.per)
@@ -285,27 +293,27 @@ def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
 
 
 def _value_of(result: Result, per: Bound | str) -> Bound | str:
-    """Return the value of a named result column. Other values are returned unchanged."""
+    """Return the expression of a result column, given its name. Expressions are returned unchanged."""
     if not isinstance(per, str):
         return per
     return next((column.value for column in result.columns if column.name == per), per)
 
 
 class _Hidden:
-    """Hidden columns of rows, in addition to the shown columns."""
+    """Columns that the stores of a collection return only for sorting and grouping."""
 
     def __init__(self, first: int = 0) -> None:
         self.columns: list[ReturnColumn] = []
         self._numbers = count(first)
 
     def add(self, value: Bound) -> str:
-        """Add a hidden column with a value, and return its quoted name."""
+        """Add a column that users do not see, and return its quoted name."""
         column = ReturnColumn(f":{next(self._numbers)}", value)
         self.columns.append(column)
         return quoted(column.name)
 
     def key(self, value: Bound | str) -> str:
-        """Return the quoted column of a sort key: a result column, or a new hidden column."""
+        """Return the quoted column of a sort key: a result column, or a new column that users do not see."""
         return quoted(value) if isinstance(value, str) else self.add(value)
 
 
@@ -371,7 +379,7 @@ def _in_names(
     bound: tuple[Catalog, BoundValues],
     owners: Mapping[str, str],
 ) -> str:
-    """Return SQL for rows in query order, then sorted by columns, with ``run2`` before ``run10``.
+    """Return SQL for merged rows in query order, then sorted by column, with ``run2`` before ``run10``.
 
     ``owners``: the columns with the owners of the nodes in a column.
     """
@@ -390,7 +398,7 @@ def _in_names(
 
 
 class _Grouping:
-    """Split of an aggregating query into queries for the parts of a collection.
+    """Split of a query with aggregates into queries for the stores of a collection, and their merging.
 
     The first query for a part has a column for each grouping value, and one or two summable columns for each
     aggregate. An aggregate over *distinct* values needs its own query, which returns the set of values for
@@ -447,7 +455,7 @@ class _Grouping:
         return self._text(column.value)
 
     def _text(self, value: Bound) -> Bound:
-        """Replace aggregates and grouping values by columns of the merged parts."""
+        """Return an expression with columns of merged results in place of aggregates and grouping values."""
         match value:
             case GroupKey(name=name):
                 return EdgeRelation(self._keys[name])
@@ -457,7 +465,7 @@ class _Grouping:
                 return with_operands(value, self._text)
 
     def _number(self, number: Aggregate) -> str:
-        """Return the SQL of an aggregate, computed from columns of the parts."""
+        """Return the SQL of an aggregate over a collection, computed from results of the stores."""
         if number not in self._known:
             self._known[number] = self._merged(number)
         return self._known[number]
@@ -490,7 +498,7 @@ class _Grouping:
         return name
 
     def _each(self, number: Aggregate) -> str:
-        """Return the column of an aggregate that needs all values, or all distinct values."""
+        """Return the SQL column of an aggregate that needs all values of the stores, or all distinct values."""
         assert number.operand is not None  # noqa: S101 - COUNT(*) alone has none
         hidden = _Hidden(2_000)
         value = hidden.add(number.operand)
@@ -523,7 +531,7 @@ class _Grouping:
         return name
 
     def _every(self, catalog: Catalog, values: BoundValues) -> str:
-        """Return the SQL of the rows of all parts: partial aggregates, and aggregates over all values."""
+        """Return SQL for the result rows of all stores: partial aggregates, and aggregates over all values."""
         rows = [Select(["*"], [quoted(PARTS)]).text()]
         rows += [text(catalog, values) for _, text in self._more]
         return "\nUNION ALL BY NAME\n".join(f"({text})" for text in rows)
@@ -533,7 +541,7 @@ _PLACE: Final = '":place"'
 
 
 def _sql(value: Bound, values: BoundValues) -> str:
-    """Return the SQL of an expression whose leaves are already columns."""
+    """Return the SQL of an expression whose leaves are SQL columns already."""
 
     def leaf(found: Any) -> str:
         return found.edge

@@ -1,4 +1,4 @@
-"""Parts of a collection that may answer a query, by their triples, kinds and classes."""
+"""Selection of the stores of a collection that may have matches, by their triples, kinds and classes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,11 @@ _WITNESSES: Final = 32
 
 
 class Pruning:
-    """Filter of the parts of a collection that may answer a query, by their triples and kinds.
+    """Filter for the stores of a collection that may have matches, by their triples and node kinds.
+
+    A triple is relation, kind and kind.
+
+    A triple is relation, kind and kind.
 
     The filter uses the narrowing of the compiler: a pattern that becomes false for the content of a part has
     no match there.
@@ -63,11 +67,11 @@ class Pruning:
         ]
 
     def matters(self, triple: Triple) -> bool:
-        """True if an edge of the pattern can have this triple."""
+        """True if an edge of the query pattern can match a triple (relation, kind, kind)."""
         return any(True for of in self._edges for _ in possible(*of, (triple,)))
 
     def may_answer(self, held: frozenset[Triple], kinds: Sequence[frozenset[str]]) -> bool:
-        """True if a part may have a match.
+        """True if a store may have a match, according to its triples and node kinds.
 
         Parameters
         ----------
@@ -88,7 +92,7 @@ class Pruning:
         return known
 
     def _possible(self, every: frozenset[Any]) -> bool:
-        """True if a match is possible with these triples and kinds."""
+        """True if the query can match in a store with these triples (relation, kind, kind) and node kinds."""
         triples = [one for one in every if isinstance(one, tuple)]
         return any(
             all(s.where != (FALSE,) and kinds_left(s, triples, every) is not None for s in scopes)
@@ -96,7 +100,7 @@ class Pruning:
         )
 
     def _least(self, every: frozenset[Any]) -> frozenset[Any]:
-        """Return a minimal set of triples and kinds with which a match is still possible."""
+        """Return a minimal subset of triples and node kinds with which the query can still match."""
         for one in every:
             if self._possible(every - {one}):
                 every -= {one}
@@ -105,7 +109,7 @@ class Pruning:
 
 @dataclass(frozen=True, slots=True)
 class ClassQuestion:
-    """Frame classes used by a query, which must be collected from all parts.
+    """Use of frame classes in a query. These classes must be collected from all stores of a collection.
 
     Attributes
     ----------
@@ -125,7 +129,7 @@ class ClassQuestion:
 
 
 def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
-    """Return the frame classes that a query or a check uses, without duplicates."""
+    """Return the uses of frame classes in a query or a check, without duplicates."""
     if isinstance(asked, BoundCheck):
         values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
         values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]

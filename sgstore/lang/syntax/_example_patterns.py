@@ -1,4 +1,4 @@
-"""Patterns from an example frame: they describe the surroundings of its ego, and match that frame.
+"""Query patterns generated from an example frame: they describe the surroundings of the ego.
 
 The pattern describes the place of the ego and the traffic related to it: the minimum number of entities of
 each kind at each place. The place is relative to the ego and to its lane, the neighbouring lanes and the
@@ -40,7 +40,9 @@ _PLACES: Final = ("crosswalk", "off_road")
 
 
 def pattern_of(graph: SceneGraph, ignored: Sequence[str] = ()) -> str:
-    """Return a pattern that describes a scene graph around its ego, and matches it.
+    """Return a query pattern that describes the surroundings of the ego in a scene graph.
+
+    It matches that graph.
 
     Parameters
     ----------
@@ -65,7 +67,7 @@ def pattern_of(graph: SceneGraph, ignored: Sequence[str] = ()) -> str:
 
 
 def _left(ignored: Sequence[str]) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the relations and kinds that are not ignored."""
+    """Return all relations and node kinds, except the ignored ones."""
     relations, kinds = set(RELATIONS), {*ENTITY_KINDS, "lane", *_PLACES} - _SCENERY
     for name in ignored:
         relation, several = relation_named(name), kinds_labelled(name)
@@ -79,7 +81,7 @@ def _left(ignored: Sequence[str]) -> tuple[frozenset[str], frozenset[str]]:
 
 
 class _Around:
-    """Neighbourhood of the ego of a graph."""
+    """Surroundings of the ego in an example scene graph."""
 
     def __init__(
         self, graph: SceneGraph, ego: int, relations: frozenset[str], kinds: frozenset[str]
@@ -100,16 +102,16 @@ class _Around:
                 self._in.setdefault(src, set()).add(dst)
 
     def of_ego(self) -> Iterator[str]:
-        """Yield conditions on the place of the ego."""
+        """Yield conditions, as query text, on the place of the ego."""
         yield from self._places("ego", self._ego)
 
     def others(self) -> list[int]:
-        """Return the traffic with a relation to the ego."""
+        """Return the ids of the entities that have a relation to the ego."""
         ends = {src for src, _, dst in self._edges if dst == self._ego and src >= 0}
         return [n for n in self._graph.nodes if n in ends and self._kind(n) in self._kinds]
 
     def block(self, node: int) -> str:
-        """Return a block for an entity: its kind, its relations to the ego, its lanes and places."""
+        """Return a pattern in braces for an entity: its kind, relations to the ego, lanes and places."""
         relations = [r for r in RELATIONS if (node, r, self._ego) in self._edges]
         first, *more = relations
         paths = [f"{node_of_kind(self._kind(node), 'x')}-[:{first}]->(ego)"]
@@ -140,7 +142,11 @@ class _Around:
 
 
 def node_of_kind(kind: str, name: str = "", mark: str = "!Ego") -> str:
-    """Return a node pattern for one kind, with a mark for the ego or for other nodes.
+    """Return the query text of a node of one kind, such as ``(x:Car&!Ego)``.
+
+    ``mark`` includes or excludes the ego.
+
+    ``mark`` includes or excludes the ego.
 
     A label for several kinds, such as ``Vehicle``, also needs the kind as a property.
     """

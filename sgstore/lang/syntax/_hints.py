@@ -1,4 +1,4 @@
-"""Hints for syntax from other languages and for unknown names. The texts are in ``hints.toml``."""
+"""Hints for error messages: syntax of other languages, and unknown names. The texts are in ``hints.toml``."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def _tables() -> dict[str, Any]:
 
 @cache
 def _words(table: str, of: str) -> Mapping[str, str]:
-    """Return the entries of a hint table by folded word."""
+    """Return the entries of a table in ``hints.toml``, by word in lower case without underscores."""
     told = _tables()[table][of].items()
     return {normalize_name(w.replace(" ", "_")): meant for meant, words in told for w in words}
 
 
 def said_of(of: str, word: str) -> str | None:
-    """Return the hint for a word from another language, or None.
+    """Return the hint for a word from another query language, or None.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def said_of(of: str, word: str) -> str | None:
 
 
 def places(names: Container[str]) -> frozenset[str]:
-    """Return the kinds of a place in a query, derived from the terminals allowed there.
+    """Return types of a place in a query, such as ``label`` or ``comma``, from the terminals allowed there.
 
     The kinds are ``edge`` (or the end of a pattern), ``value`` (or a condition), ``operator`` (after a
     value), ``time`` (a duration), ``number``, ``label``, ``name``, ``within`` (inside an edge), ``start`` (of
@@ -107,7 +107,7 @@ _ODD: Final = {
 def slip_hint(
     text: str, start: int, end: int, at: frozenset[str], words: Iterable[str]
 ) -> str | None:
-    """Return a hint for an unexpected part of a query, or None.
+    """Return a hint for an unexpected part of a query text, or None.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def slip_hint(
 
 
 def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) -> str | None:
-    """Return the hint of the first table row that matches the text before and after a position."""
+    """Return the hint of the first table row that fits the query text around a position, or None."""
     flags = re.IGNORECASE | re.DOTALL
     for looks, hint, *where in _tables()[table]:
         place, then = (*where, "", "")[:2]
@@ -148,7 +148,7 @@ def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) ->
 
 
 def _character(found: str, at: frozenset[str]) -> str | None:
-    """Return a hint for a character that is not allowed, or not allowed here."""
+    """Return a hint for a character of the query that is not allowed, or not allowed at this place; or None."""
     if found in {"'", '"'}:
         return "the text in quotes has no end"
     if found[:1] in {"'", '"'}:
@@ -171,7 +171,7 @@ def _unknown_letter(found: str, at: frozenset[str]) -> str | None:
 
 
 def _like(word: str, keywords: Iterable[str]) -> str | None:
-    """Return the keyword most similar to a word, if both start with the same letter."""
+    """Return the keyword most similar to a word, if both start with the same letter; otherwise None."""
     like = (
         suggestion(word.upper(), [w for w in keywords if w.isalpha()]) if word.isalpha() else None
     )
@@ -179,7 +179,7 @@ def _like(word: str, keywords: Iterable[str]) -> str | None:
 
 
 def _joined(found: str, before: str, at: frozenset[str]) -> str | None:
-    """Return a hint for a word directly after a value: a misspelt or a missing word."""
+    """Return a hint for a word directly after a value: a misspelt keyword, or a missing comma or ``AND``."""
     last = re.search(r"(\w+)\s*$", before)
     if last and (like := _like(last[1], _PREFIXES)):
         return f"did you mean {like}?"
@@ -196,7 +196,7 @@ _WORDS: Final = frozenset(
 
 
 def hint_at(name: str, known: Iterable[str]) -> str | None:
-    """Return a hint for an unknown name: the most similar name, or all known names.
+    """Return a hint for an unknown name: the most similar known name, or a list of known names.
 
     A list keeps its order, so that common names can come first. A set is sorted.
     """
@@ -214,14 +214,14 @@ def hint_at(name: str, known: Iterable[str]) -> str | None:
 
 
 def _short_for(name: str, names: list[str]) -> str | None:
-    """Return the longest known name that the given name starts with."""
+    """Return the longest known name that is the beginning of the given name, or None."""
     whole = normalize_name(name)
     found = [n for n in names if len(n) >= 3 and whole.startswith(normalize_name(n))]
     return max(found, key=len, default=None)
 
 
 def bracket_hint(text: str, position: int, found: str) -> str | None:
-    """Return a hint for an unmatched bracket, with the place where it was opened.
+    """Return a hint for an unmatched bracket in a query, with the place of the opening bracket, or None.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ _EXCERPT: Final = 24
 
 
 def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | None:  # noqa: FBT001
-    """Return a hint for an unknown variable, such as an attribute or a text without quotes, or None.
+    """Return a hint for an unknown variable, which may be an attribute or a text without quotes; or None.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | N
 
 
 def condition_hint(found: Type, written: str) -> str | None:
-    """Return a hint for a value in place of a condition, or None.
+    """Return a hint for a query that has a plain value in place of a condition, or None.
 
     Parameters
     ----------
@@ -327,7 +327,7 @@ def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | N
 
 
 def _number_hint(value: object) -> str | None:
-    """Return a hint for a text in place of a number, or a number in place of a text."""
+    """Return a hint for a quoted number, a number with a unit, or a text without quotes; otherwise None."""
     if isinstance(value, int | float):
         return f"a text stands in quotes: '{value}'"
     found = re.fullmatch(r"\s*([-+]?\d+(?:\.\d+)?)\s*([a-z°/²%]*)\s*", str(value), re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""Parser of the query language: an LALR(1) parser that runs the tables of the grammar.
+"""LALR(1) parser of the query language. It uses precomputed tables of the grammar.
 
 The parser guides the lexer: the lexer takes the longest of the terminals allowed at a place. So a word is a
 keyword only where a keyword is allowed. Error messages list the same allowed terminals.
@@ -38,7 +38,7 @@ _NEXT: Final = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """Token read from the text."""
+    """Token of a query text, such as a keyword, a name or a number."""
 
     name: str
     text: str
@@ -47,7 +47,7 @@ class Token:
 
 @dataclass(slots=True)
 class _StackEntry:
-    """Entry of the parser's stack: the state after a symbol, its result, and its place in the text."""
+    """Entry of the parser stack: the parser state after a symbol, its result, and its place in the text."""
 
     state: int
     value: Any
@@ -55,7 +55,7 @@ class _StackEntry:
 
 
 def parse(text: str) -> tuple[Statement, ...]:
-    """Return the statements of a text. The results for recent short texts are cached.
+    """Return the syntax trees of the statements in a query text. Results for short texts are cached.
 
     Raises
     ------
@@ -88,7 +88,7 @@ _parsed_once = lru_cache(maxsize=64)(_parsed)
 
 
 def joined(texts: Sequence[str]) -> str:
-    """Join the statements of several texts into one text. A single text is returned unchanged.
+    """Return the statements of several query texts as one text. A single text is unchanged.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def joined(texts: Sequence[str]) -> str:
 
 
 def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -> Token:
-    """Return the next token that is allowed after the stack."""
+    """Return the next token of the query text that the current parser state allows."""
     actions = machine.states[stack[-1].state]
     allowed = [machine.terminals[name] for name in actions if name in machine.terminals]
     while True:
@@ -125,7 +125,7 @@ def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -
 
 
 def _reads_as_edge(text: str, position: int, actions: Mapping[str, int]) -> bool:
-    """True if two dashes at this place are an edge, and not the start of a comment."""
+    """True if two dashes at this place of the query are an edge, and not the start of a comment."""
     if text.startswith("-->", position):
         return True
     behind = text[position - 1 : position] == ")" or text.startswith("--[", position)
@@ -140,7 +140,7 @@ _CLOSING: Final = "RPAR"
 
 
 def _take(machine: Tables, stack: list[_StackEntry], token: Token, text: str) -> None:
-    """Reduce all rules that end before the token, then push the token."""
+    """Process one token in the parser: reduce all finished grammar rules, then push the token."""
     before = [*stack]
     while True:
         action = machine.states[stack[-1].state].get(token.name)
@@ -171,7 +171,7 @@ def _reduce(machine: Tables, stack: list[_StackEntry], rule: Rule, text: str) ->
 
 
 def _children(rule: Rule, parts: list[_StackEntry]) -> list[Any]:
-    """Return the children of a rule: no signs, flattened repetitions, ``None`` for absent parts."""
+    """Return the values of a grammar rule's parts: no signs, flat lists, ``None`` for absent parts."""
     children: list[Any] = []
     for index, part in enumerate(parts):
         if rule.absent:
@@ -262,7 +262,7 @@ def _unexpected(
 
 
 def _shown(found: str) -> str:
-    """Return a part of the text for a message, shortened and with all characters visible."""
+    """Return a part of the query text for an error message: shortened, with all characters visible."""
     if not found.isprintable():
         return " ".join(f"U+{ord(character):04X}" for character in found[:8])
     short = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}…"
@@ -270,7 +270,7 @@ def _shown(found: str) -> str:
 
 
 def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
-    """True if the parser would accept the terminal after all pending reductions."""
+    """True if the parser would accept a terminal next, after all pending reductions."""
     states = [entry.state for entry in stack]
     while (action := machine.states[states[-1]].get(name)) is not None:
         if action >= 0:
@@ -284,7 +284,12 @@ def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
 
 
 def _listed(machine: Tables, names: list[str]) -> str:
-    """Return the expected terminals in words. Operators are grouped, and so are starts of values."""
+    """Return the expected terminals as words for an error message.
+
+    Operators form a group, as do starts of values.
+
+    Operators form a group, as do starts of values.
+    """
     left = set(names) - _LATER or set(names)
     said: list[str] = []
     if "RETURN" in left:  # a second MATCH is allowed wherever RETURN is

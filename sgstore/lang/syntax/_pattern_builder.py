@@ -1,4 +1,4 @@
-"""Patterns built in Python, step by step or from networkx.
+"""Query patterns built in Python, step by step or from a networkx graph.
 
 Each pattern is converted to query text and parameter values, so it has the meaning of that text.
 """
@@ -56,7 +56,7 @@ class Pattern:
     parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
     def node(self, name: str, label: str = "", /, **properties: Any) -> Pattern:
-        """Add a node.
+        """Return a new pattern with an additional node.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class Pattern:
         times: str = "",
         name: str = "",
     ) -> Pattern:
-        """Add an edge between two nodes.
+        """Return a new pattern with an additional edge between two nodes.
 
         Parameters
         ----------
@@ -114,18 +114,18 @@ class Pattern:
         return self._with(part=f"({ends[0]})-[{inside}]-{'' if both else '>'}({ends[1]})")
 
     def where(self, condition: str, /, **parameters: Any) -> Pattern:
-        """Add a condition, as written after ``WHERE``, with the values of its parameters."""
+        """Return a new pattern with an additional condition, written as after ``WHERE``."""
         return self._with(condition=f"({condition})", values=parameters)
 
     def returns(self, what: str, /) -> Pattern:
-        """Set the values to return, as written after ``RETURN``."""
+        """Return a new pattern with values to return, written as after ``RETURN``."""
         return Pattern(self.parts, self.conditions, what, self.parameters)
 
     def __repr__(self) -> str:
         return f"<Pattern {str(self) if self.parts else 'without nodes'!r}>"
 
     def __str__(self) -> str:
-        """Text of the pattern."""
+        """Return the pattern as query text."""
         if not self.parts:
             raise QueryError("the pattern is empty", hint="add a node")
         text = f"MATCH {', '.join(self.parts)}"
@@ -134,7 +134,7 @@ class Pattern:
 
     @classmethod
     def of(cls, graph: nx.Graph[Any]) -> Pattern:
-        """Return the pattern that a networkx graph represents.
+        """Return the query pattern that a networkx graph describes.
 
         Parameters
         ----------
@@ -206,7 +206,7 @@ def _label(label: str) -> str:
 
 
 def _name_of(node: object, number: int) -> str:
-    """Return the name of a node if it is a valid variable name, otherwise ``n`` and a number."""
+    """Return the variable name for a node: its own name if valid, otherwise ``n`` and a number."""
     text = str(node)
     return text if _NAME.fullmatch(text) else f"n{number}"
 

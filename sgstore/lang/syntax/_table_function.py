@@ -1,4 +1,4 @@
-"""SQL table function ``sgql('MATCH …')``: patterns as tables of a statement.
+"""Calls of ``sgql('MATCH …')`` in SQL, which use the matches of a query as a table.
 
 The SQL statement is not parsed. Texts, quoted names and comments are skipped, so only real calls are found.
 """
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PatternTable:
-    """Call of ``sgql`` in an SQL statement.
+    """Call of ``sgql`` in an SQL statement: the query text and its parameter values.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ _EXAMPLE: Final = "SELECT * FROM sgql('MATCH (e:Ego) RETURN FRAMES')"
 
 
 def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[PatternTable, ...]]:
-    """Replace the calls of ``sgql`` in a statement by tables. Return the SQL and these tables.
+    """Return an SQL statement in which table names replace the ``sgql('MATCH …')`` calls, and the calls.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[Pa
 
 
 def _free(taken: Collection[str], number: int) -> str:
-    """Return an unused table name. The first table has the name of the function, as in SQL."""
+    """Return an unused table name for a call of ``sgql`` in SQL. The first table is named ``sgql``."""
     name = f"sgql {number + 1}" if number else "sgql"
     while name in taken:
         name += "_"
@@ -91,7 +91,7 @@ def _free(taken: Collection[str], number: int) -> str:
 
 
 class _Arguments:
-    """Reader of the arguments of a call. It stops after the closing bracket.
+    """Reader of the arguments of a ``sgql(…)`` call in SQL. It stops after the closing bracket.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class _Arguments:
         self.sql, self.start, self.at = sql, start, at
 
     def read(self) -> tuple[str, tuple[tuple[str, Any], ...]]:
-        """Return the query and the values of its parameters."""
+        """Return the query text and the parameter values of a ``sgql(…)`` call."""
         first = self._next()
         text = self._value()
         if not isinstance(text, str):
@@ -159,7 +159,7 @@ class _Arguments:
         return tuple(items)
 
     def _value(self) -> Any:
-        """Read a constant. ``None`` means that the next argument is not a constant."""
+        """Return the next argument of a ``sgql(…)`` call if it is a constant, otherwise None."""
         found = _VALUE.match(self.sql, self._next())
         if found is None:
             return None

@@ -1,4 +1,4 @@
-"""LALR(1) tables of the grammar, computed once and stored.
+"""LALR(1) parser tables of the query grammar, computed once and stored in a file.
 
 Lark needs about 200 ms to compute the tables of ``grammar.lark``. They are stored in ``grammar.json``, with
 the digest of the grammar, and load in 6 ms. If the file is missing or outdated, the tables are computed again
@@ -25,7 +25,7 @@ _WORD: Final = re.compile(r"\w")
 
 @dataclass(frozen=True, slots=True)
 class Terminal:
-    """Terminal symbol of the grammar, with its literal or pattern.
+    """Terminal symbol of the query grammar, with its literal or pattern.
 
     Attributes
     ----------
@@ -43,7 +43,10 @@ class Terminal:
     priority: int
 
     def length_at(self, text: str, start: int) -> int:
-        """Return the length of the match at ``start``, or 0 without a match. Words must match as a whole."""
+        """Return the length of the terminal's match at ``start`` of a text, or 0.
+
+        Words must match as a whole.
+        """
         if self.pattern is None:
             end = start + len(self.literal)
             length = len(self.literal) if text[start:end].upper() == self.literal else 0
@@ -57,7 +60,7 @@ class Terminal:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Grammar rule, as the parser reduces it.
+    """Rule of the query grammar, in the form that the parser needs to reduce it.
 
     Attributes
     ----------
@@ -83,7 +86,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """Tables of an LALR(1) parser.
+    """Tables of an LALR(1) parser: terminals, rules and states.
 
     Attributes
     ----------
@@ -104,7 +107,7 @@ class Tables:
 
 @cache
 def tables() -> Tables:
-    """Return the tables of the bundled grammar."""
+    """Return the parser tables of the query grammar, from a file or newly computed."""
     folder = resources.files("sgstore.lang.syntax")
     grammar = folder.joinpath(GRAMMAR).read_text(encoding="utf-8")
     kept = folder.joinpath(TABLES)
@@ -115,14 +118,14 @@ def tables() -> Tables:
 
 
 def keywords() -> list[str]:
-    """Return the keywords of the language in alphabetical order."""
+    """Return the keywords of the query language in alphabetical order."""
     terminals = tables().terminals.values()
     written = [one.pattern.pattern if one.pattern else one.literal for one in terminals]
     return sorted({word for text in written for word in re.findall("[A-Z]{2,}", text)})
 
 
 def made_from(grammar: str) -> dict[str, Any]:
-    """Return the tables of a grammar as JSON data. The same grammar always gives the same tables."""
+    """Return the parser tables of a grammar as JSON data. The same grammar always gives the same tables."""
     from lark import Lark
     from lark.grammar import Rule as LarkRule
     from lark.lexer import TerminalDef
@@ -160,7 +163,12 @@ def made_from(grammar: str) -> dict[str, Any]:
 
 
 def _walk(states: dict[int, dict[str, int]], start: int) -> dict[int, int]:
-    """Return new state numbers that depend only on the grammar. The numbers of lark change from run to run."""
+    """Return new numbers for parser states that depend only on the grammar: old → new.
+
+    The old numbers change from run to run.
+
+    The old numbers change from run to run.
+    """
     order = {start: 0}
     waiting = [start]
     while waiting:
@@ -224,7 +232,7 @@ def _digest(grammar: str) -> str:
 
 
 def text_of(plain: dict[str, Any]) -> str:
-    """Return the tables as JSON text, with one state on each line."""
+    """Return parser tables as JSON text, with one state on each line."""
     states = ",\n".join(json.dumps(state, separators=(",", ":")) for state in plain["states"])
     rest = {key: value for key, value in plain.items() if key != "states"}
     return f'{json.dumps(rest, separators=(",", ":"))[:-1]},\n"states":[\n{states}\n]}}\n'

@@ -1,4 +1,4 @@
-"""Builders of the syntax tree: one function for each grammar rule.
+"""Builders of the syntax tree of a query: one function for each grammar rule.
 
 A builder has the name of its rule, or of the alias of an alternative. It takes the span and the children and
 returns a part of the syntax tree. Signs and keywords are not passed as children. An absent optional part is
@@ -29,7 +29,7 @@ _DURATION: Final = re.compile(r"([\d.]+)\s*(\w+)")
 
 
 class BuildError(Exception):
-    """Text that matches the grammar, but is not valid in the language."""
+    """Error for a query text that matches the grammar, but is not valid."""
 
     def __init__(self, reason: str, span: TextSpan | None = None, hint: str | None = None) -> None:
         self.reason = reason
@@ -61,7 +61,7 @@ def _string(span: TextSpan, children: Children) -> s.Constant:
 
 
 def _unquoted(text: str) -> str:
-    r"""Return the text between the quotes. Unknown escapes such as ``\d`` keep their backslash."""
+    r"""Return the text between two quotes, with escapes replaced. Unknown escapes such as ``\d`` stay."""
     return _ESCAPED.sub(lambda found: _ESCAPES.get(found[1], found[0]), text[1:-1])
 
 
@@ -106,7 +106,7 @@ def _attribute(span: TextSpan, children: Children) -> s.AttributeOf:
 
 
 def _attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
-    """Build ``frame.class('E')``, which means ``frame.class_E``."""
+    """Return the syntax tree of ``frame.class('E')``, which means ``frame.class_E``."""
     owner, name, value = children
     if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
         hint = said_of("methods", name.text) or f"what is called stands first: {name.text}(x)"
@@ -199,7 +199,7 @@ def _when(span: TextSpan, children: Children) -> s.When:
 
 
 def _case(span: TextSpan, children: Children) -> s.Case:
-    """Build a ``CASE``. With ``CASE x WHEN y``, each branch has the condition ``x = y``."""
+    """Return the syntax tree of a ``CASE``. With ``CASE x WHEN y``, each branch has the condition ``x = y``."""
     subject, *branches, otherwise = children
     if subject is not None:
         branches = [
@@ -222,7 +222,7 @@ def _temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
 
 
 def _bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
-    """Build a time bound: ``[0s, 2s]``, or ``WITHIN 2s``, which starts at 0."""
+    """Return start and end of a time bound: ``[0s, 2s]``, or ``WITHIN 2s``, which starts at 0."""
     (found,) = children
     if isinstance(found, s.Duration | s.Parameter):
         return s.Duration(0, "s", span), found
@@ -357,7 +357,7 @@ def _match_step(span: TextSpan, children: Children) -> s.StepClause:
 
 
 def _further(_: TextSpan, children: Children) -> tuple[Any, Any]:
-    """Build a second ``MATCH`` for the same frame: its paths and its condition."""
+    """Return the paths and the condition of a second ``MATCH`` for the same frame."""
     paths, where = children
     return paths, where
 

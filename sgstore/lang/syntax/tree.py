@@ -1,4 +1,4 @@
-"""Syntax tree of a query as written. Each part has its position in the text.
+"""Classes for the syntax tree of a query. Each part has its position in the text.
 
 Words are not checked against a vocabulary here; the binder does that. :mod:`sgstore.lang.syntax._parse` makes
 these trees from text.
@@ -29,7 +29,7 @@ TOO_LONG: Final = "no length of time that a trace may have"
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """Duration: ``amount`` in ``ms``, ``s``, ``min`` or ``frames``."""
+    """Duration in a query: ``amount`` in ``ms``, ``s``, ``min`` or ``frames``."""
 
     amount: float
     unit: str
@@ -51,7 +51,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """Name bound by a pattern, or ``ego``, ``frame`` or ``trace``."""
+    """Variable in a query: a name from a pattern, or ``ego``, ``frame`` or ``trace``."""
 
     name: str
     span: TextSpan
@@ -59,7 +59,7 @@ class Variable:
 
 @dataclass(frozen=True, slots=True)
 class AttributeOf:
-    """Attribute access: ``owner.name``."""
+    """Attribute access in a query: ``owner.name``."""
 
     owner: Variable
     name: str
@@ -68,7 +68,7 @@ class AttributeOf:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """Function call: ``name(arguments)``. ``COUNT(DISTINCT x)`` is also a call."""
+    """Function call in a query: ``name(arguments)``. ``COUNT(DISTINCT x)`` is also a call."""
 
     name: str
     arguments: tuple[Expression, ...]
@@ -79,14 +79,14 @@ class Call:
 
 @dataclass(frozen=True, slots=True)
 class CountAll:
-    """The expression ``COUNT(*)``."""
+    """Query expression ``COUNT(*)``."""
 
     span: TextSpan
 
 
 @dataclass(frozen=True, slots=True)
 class ListOf:
-    """List: ``[a, b, …]``."""
+    """List in a query: ``[a, b, …]``."""
 
     items: tuple[Expression, ...]
     span: TextSpan
@@ -132,7 +132,7 @@ class Membership:
 
 @dataclass(frozen=True, slots=True)
 class Arithmetic:
-    """Chain of operators of equal precedence, evaluated from left to right: ``a + b - c``."""
+    """Chain of arithmetic operators of equal precedence, evaluated from left to right: ``a + b - c``."""
 
     first: Expression
     rest: tuple[tuple[str, Expression], ...]
@@ -149,7 +149,7 @@ class Negative:
 
 @dataclass(frozen=True, slots=True)
 class BlockExpression:
-    """Block with braces: ``EXISTS {…}``, ``COUNT {…}``, or ``MIN``, ``MAX``, ``AVG``, ``SUM {… | value}``."""
+    """Pattern in braces: ``EXISTS {…}``, ``COUNT {…}``, or ``MIN``, ``MAX``, ``AVG``, ``SUM {… | value}``."""
 
     word: str
     block: Block
@@ -168,7 +168,7 @@ class When:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Expression ``CASE WHEN condition THEN value … ELSE value END``.
+    """Query expression ``CASE WHEN condition THEN value … ELSE value END``.
 
     ``CASE x WHEN y`` is read as ``CASE WHEN x = y``.
     """
@@ -180,7 +180,9 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Temporal:
-    """Temporal operator with its operands and its time bound. ``None`` means unbounded.
+    """Temporal operator such as ``EVENTUALLY``, with its operands and time bound.
+
+    A bound of ``None`` means unbounded.
 
     The upper end of a bound is ``None`` for ``INF``.
     """
@@ -193,7 +195,7 @@ class Temporal:
 
 @dataclass(frozen=True, slots=True)
 class OverExpression:
-    """Function over a match or over its steps: ``call OVER match``, ``call OVER start..end``."""
+    """Aggregate over a match or some of its steps: ``call OVER match``, ``call OVER start..end``."""
 
     call: Expression
     start: Variable | None
@@ -240,7 +242,7 @@ Given = Constant | Duration | Parameter | Variable
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """Label in a pattern. The name ``%`` means any label."""
+    """Label of a node or edge in a pattern. The name ``%`` means any label."""
 
     name: str
     span: TextSpan
@@ -260,7 +262,7 @@ LabelExpression = Label | LabelLogic
 
 @dataclass(frozen=True, slots=True)
 class Property:
-    """Property in braces of a pattern: ``name: value``."""
+    """Property of a node or edge in a pattern, in braces: ``name: value``."""
 
     name: str
     value: Expression
@@ -295,7 +297,7 @@ class EdgePattern:
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Path: nodes with edges between them, such as ``name = (a)-->(b)``. The name is optional."""
+    """Path of a pattern: nodes with edges between them, such as ``name = (a)-->(b)``. The name is optional."""
 
     nodes: tuple[NodePattern, ...]
     edges: tuple[EdgePattern, ...]
@@ -305,7 +307,7 @@ class Path:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """Paths and a condition: the content of a ``MATCH`` or of braces."""
+    """Graph pattern: paths and a condition, after ``MATCH`` or in braces."""
 
     paths: tuple[Path, ...]
     where: Expression | None
@@ -323,7 +325,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Item to return: a named value, ``*``, ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``.
+    """Item of ``RETURN``: a named value, ``*``, ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``.
 
     ``before`` and ``after`` are the two offsets of ``CLIPS``; ns, negative is earlier.
     """
@@ -338,7 +340,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Sort:
-    """Sort key: ``value ASC`` or ``value DESC``."""
+    """Sort key of ``ORDER BY``: ``value ASC`` or ``value DESC``."""
 
     value: Expression
     descending: bool
@@ -373,7 +375,7 @@ class Returns:
 
 @dataclass(frozen=True, slots=True)
 class HoldClause:
-    """Minimum or maximum duration of a step: ``FOR >= duration INCLUSIVE``."""
+    """Minimum or maximum duration of a sequence step: ``FOR >= duration INCLUSIVE``."""
 
     comparison: str
     duration: Duration | Parameter
@@ -383,7 +385,7 @@ class HoldClause:
 
 @dataclass(frozen=True, slots=True)
 class StepClause:
-    """Step of a sequence.
+    """Step of a sequence: a graph pattern, optionally with a name and a duration.
 
     Attributes
     ----------
@@ -406,7 +408,7 @@ class StepClause:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioStep:
-    """Call of a named scenario as a step: ``MATCH name(parameter = value, …)``."""
+    """Call of a named scenario as a sequence step: ``MATCH name(parameter = value, …)``."""
 
     name: str
     given: tuple[Argument, ...]
@@ -416,7 +418,7 @@ class ScenarioStep:
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """Argument of a scenario, ``name = value``: a parameter value, or a new name for a variable."""
+    """Argument of a scenario call, ``name = value``: a parameter value, or a new name for a variable."""
 
     name: str
     value: Given
@@ -425,7 +427,7 @@ class Argument:
 
 @dataclass(frozen=True, slots=True)
 class LinkClause:
-    """Time relation between two steps of a sequence.
+    """Time relation between two steps of a sequence, such as ``THEN WITHIN 5s``.
 
     Attributes
     ----------
@@ -444,7 +446,7 @@ class LinkClause:
 
 @dataclass(frozen=True, slots=True)
 class GroupStep:
-    """Group of alternative sequences with a repeat count: ``(A | B THEN C){2,3}``.
+    """Group of alternative step sequences with a repeat count: ``(A | B THEN C){2,3}``.
 
     Attributes
     ----------
@@ -462,7 +464,7 @@ class GroupStep:
 
 @dataclass(frozen=True, slots=True)
 class SequenceClause:
-    """Steps with links between them. There is one step more than links."""
+    """Sequence of steps with a time relation between neighbouring steps."""
 
     steps: tuple[StepClause | ScenarioStep | GroupStep, ...]
     links: tuple[LinkClause, ...]
@@ -471,7 +473,7 @@ class SequenceClause:
 
 @dataclass(frozen=True, slots=True)
 class LaterMatch:
-    """``OPTIONAL MATCH …``, or a ``MATCH …`` after an ``OPTIONAL MATCH`` or a ``WITH``."""
+    """Later clause of a query: ``OPTIONAL MATCH …``, or ``MATCH …`` after ``OPTIONAL MATCH`` or ``WITH``."""
 
     block: Block
     optional: bool
@@ -503,7 +505,7 @@ class MatchClause:
 
     @property
     def block(self) -> Block:
-        """Pattern of the first step. If the step is a scenario, the pattern is empty."""
+        """Graph pattern of the first sequence step. If the step is a scenario, the pattern is empty."""
         first = self.sequence.steps[0]
         return first.block if isinstance(first, StepClause) else Block((), None, first.span)
 
@@ -519,7 +521,10 @@ class UnionClause:
 
 @dataclass(frozen=True, slots=True)
 class Formal:
-    """Formal parameter of a definition. A parameter of a scenario may have a default value."""
+    """Formal parameter of a predicate or scenario definition.
+
+    A parameter of a scenario may have a default value.
+    """
 
     name: str
     default: Constant | Duration | None
@@ -539,7 +544,7 @@ class Define:
 
 @dataclass(frozen=True, slots=True)
 class QuantifiedNode:
-    """Quantified variable ``name:label`` after ``FORALL`` or ``FORSOME``."""
+    """Quantified variable ``name:label`` of a check, after ``FORALL`` or ``FORSOME``."""
 
     name: str
     label: LabelExpression
@@ -548,7 +553,7 @@ class QuantifiedNode:
 
 @dataclass(frozen=True, slots=True)
 class QuantifierClause:
-    """Quantifier: ``FORALL (a:Label, b:Label WHERE condition ABSENT AS TRUE)``, or ``FORSOME``."""
+    """Quantifier of a check: ``FORALL (a:Label, b:Label WHERE condition ABSENT AS TRUE)``, or ``FORSOME``."""
 
     word: str
     nodes: tuple[QuantifiedNode, ...]
@@ -559,7 +564,10 @@ class QuantifierClause:
 
 @dataclass(frozen=True, slots=True)
 class CheckClause:
-    """Check: ``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items``."""
+    """Check statement, a rule for whole traces.
+
+    ``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items``.
+    """
 
     settings: tuple[Setting, ...]
     name: str | None
