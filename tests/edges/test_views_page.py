@@ -16,8 +16,15 @@ from sgstore.store import StoreFile
 
 SCHEMA = Path(sgstore.__file__).with_name("schema.sql")
 ELSEWHERE = {
-    "pairs": ("distance: ", "[The language](language.md#functions) explains the numbers."),
-    "criticality": ("dce: ", "[Criticality](criticality.md) explains the measures."),
+    "pairs": (
+        "distance: ",
+        "[The language](language.md#functions) explains the numbers."
+        " For distances along lanes LEFT JOIN lane_dists USING (frame_id, src, dst).",
+    ),
+    "criticality": (
+        "dce: ",
+        "[Criticality](criticality.md) explains the measures. They are NULL if an input is unknown.",
+    ),
 }
 """View → the first number that its comment explains, and the sentence in place of all of them."""
 PAGE = Path(__file__).parents[2] / "docs" / "views.md"
