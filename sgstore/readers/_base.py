@@ -23,6 +23,7 @@ from sgstore.readers._blocks import (
     FrameRows,
     LossTally,
     MessageDecoder,
+    Raw,
     assemble,
     counted,
 )
@@ -30,7 +31,7 @@ from sgstore.readers._roles import channel_rank
 from sgstore.readers._stamps import Stamps
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -40,6 +41,9 @@ if TYPE_CHECKING:
 
 
 Key = TypeVar("Key")
+
+LISTED: Final = 20
+"""Maximum number of names in an error."""
 
 Ref = tuple[int, int, int, int, int]
 """Channel id, log time, chunk offset, offset, length."""
@@ -123,6 +127,12 @@ def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int =
     before, first = told.get(key, (0, ref))
     told[key] = before + times, first
     return before
+
+
+def listing(things: Sequence[str]) -> str:
+    """Return a list of possible egos for an error message."""
+    more = f" and {len(things) - LISTED} more" if len(things) > LISTED else ""
+    return f"there are: {', '.join(things[:LISTED]) or 'none'}{more}"
 
 
 @dataclass(slots=True)
@@ -303,7 +313,8 @@ class Survey(Generic[AnyLead]):
 
     def no_frames(self) -> str:
         """Return the reason for a recording without a leading channel."""
-        raise NotImplementedError
+        lost = self.lost.losses()
+        return lost[0].reason if lost else "no list of objects can be read"
 
     def ego_named(self, name: str) -> str | None:
         """Return the id of the ego for a name. ``None`` means that a new reading may find it.
@@ -521,6 +532,24 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
             **more,
         )
 
+    @classmethod
+    def recognises(cls, recording: Recording) -> bool:
+        """True if a channel of the recording contains frames of this flavour."""
+        return any(cls.has_frames(recording, channel) for channel in recording.channels)
+
+    @staticmethod
+    def has_frames(recording: Recording, channel: int) -> bool:
+        """True if a channel contains frames of this flavour, by its schema."""
+        raise NotImplementedError
+
+    def decoder(self, report: TraceReport) -> MessageDecoder[Any]:
+        """Return a new decoder, and add the findings of the first reading to the report."""
+        self._survey.tell(report)
+        return self._decoder(report)
+
+    def _decoder(self, report: TraceReport) -> MessageDecoder[Any]:
+        raise NotImplementedError
+
     def _first_steps(self) -> list[int]:
         stamps = self._survey.leads[self._survey.leading].stamps
         return stamps.steps[:FIRST_STEPS] or super()._first_steps()
@@ -528,6 +557,29 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
     def ego_named(self, name: str) -> str | None:
         """Return the id of the ego for a name, from the results of the first reading."""
         return self._survey.ego_named(name)
+
+
+class SurveyedDecoder(MessageDecoder[Raw], Generic[Raw, AnySurvey]):
+    """Converter of messages into frames, after a first reading.
+
+    Parameters
+    ----------
+    survey : Survey
+        Result of the first reading.
+    report : TraceReport
+        Receives losses and warnings.
+    """
+
+    def __init__(self, survey: AnySurvey, report: TraceReport) -> None:
+        self._survey = survey
+        self._leading = frozenset(survey.alike(survey.leading))
+        self._stamps = survey.leads[survey.leading].stamps.reading()
+        super().__init__(self._leading, survey.recording.window, report)
+
+    def settle(self) -> None:
+        """Report the losses, after all frames are read."""
+        self._untimed = self._stamps.untimed
+        super().settle()
 
 
 # Readers with complete frames in messages: messages → frames → blocks of frames.

@@ -25,6 +25,9 @@ from sgstore.errors import TraceError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from mcap.records import Schema
+
+    from sgstore.mcap import Recording
     from sgstore.model.world import Floats
 
 
@@ -170,6 +173,20 @@ def short_name(name: str) -> str:
     """Return ``package/Type`` for ``package/msg/Type``."""
     package, _, rest = name.partition("/")
     return f"{package}/{rest.removeprefix('msg/')}" if rest else name
+
+
+def ros_schema(recording: Recording, channel: int) -> Schema | None:
+    """Return the schema of a ROS 2 channel; ``None`` for other channels."""
+    record = recording.channels[channel]
+    schema = recording.schemas.get(record.schema_id)
+    is_ros = schema and record.message_encoding == "cdr" and schema.encoding == "ros2msg"
+    return schema if is_ros else None
+
+
+def ros_name(recording: Recording, channel: int) -> str:
+    """Return the short name of a ROS 2 channel's schema; empty for other channels."""
+    schema = ros_schema(recording, channel)
+    return "" if schema is None else short_name(schema.name)
 
 
 def _texts(name: str, text: str) -> dict[str, list[str]]:

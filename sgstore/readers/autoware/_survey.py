@@ -23,14 +23,13 @@ from sgstore.readers._ros2 import (
     number,
     parse_definition,
     records,
+    ros_name,
     short_name,
     text,
 )
 from sgstore.readers._stamps import Stamps
 
 if TYPE_CHECKING:
-    from mcap.records import Channel, Schema
-
     from sgstore.mcap import Messages, Recording
     from sgstore.model.world import Floats
     from sgstore.readers._base import Ref
@@ -100,15 +99,7 @@ class ObjectLead(Lead):
 
 def content_of(recording: Recording, channel: int) -> str:
     """Return the content type of a channel's messages; empty if the reader does not support them."""
-    record = recording.channels[channel]
-    schema = recording.schemas.get(record.schema_id)
-    if schema is None or not _is_ros(record, schema):
-        return ""
-    return CONTENTS.get(short_name(schema.name), "")
-
-
-def _is_ros(channel: Channel, schema: Schema) -> bool:
-    return channel.message_encoding == "cdr" and schema.encoding == "ros2msg"
+    return CONTENTS.get(ros_name(recording, channel), "")
 
 
 def idents_of(table: Floats) -> list[str]:
@@ -174,11 +165,6 @@ class AutowareSurvey(Survey[ObjectLead]):
         """Return the most frequent class of an object; ``first`` if it is unknown."""
         counts = self._classes.get(ident)
         return max(counts, key=counts.__getitem__) if counts else first
-
-    def no_frames(self) -> str:
-        """Return the reason for a recording without a leading channel."""
-        lost = self.lost.losses()
-        return lost[0].reason if lost else "no list of objects can be read"
 
     def find_ego(self) -> str:
         """Find the channel of the ego's pose and the axes, and return the ego's id."""

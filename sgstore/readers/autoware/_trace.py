@@ -30,8 +30,8 @@ import numpy as np
 from sgstore.errors import TraceError
 from sgstore.model.vocabulary import KINDS, LIGHT_STATE_CODE, VEHICLE_LIGHTS, TypeMeaning
 from sgstore.model.world import POSE
-from sgstore.readers._base import SurveyedTrace
-from sgstore.readers._blocks import FAR, NAN, FrameRows, MessageDecoder
+from sgstore.readers._base import SurveyedDecoder, SurveyedTrace
+from sgstore.readers._blocks import FAR, NAN, FrameRows
 from sgstore.readers._ros2 import ColumnReader, decode, ident_of, number, records, text
 from sgstore.readers._stamps import NO_TIME
 from sgstore.readers.autoware._survey import (
@@ -163,7 +163,7 @@ class _Detection:
     velocity: Floats
 
 
-class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
+class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
     """Converter of Autoware messages into frames.
 
     The class of an object is a guess of the perception. The most frequent class is used.
@@ -191,14 +191,13 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
         places: Mapping[str, tuple[float, float, float]],
         report: TraceReport,
     ) -> None:
-        self._survey, self._box, self._types, self._places = survey, ego, types, places
+        super().__init__(survey, report)
+        self._box, self._types, self._places = ego, types, places
         self._table = ColumnReader(
             survey.structures[survey.leading], _columns(self._is_predicted()), "objects"
         )
-        self._stamps = survey.leads[survey.leading].stamps.reading()
-        self._leading = frozenset(survey.alike(survey.leading))
-        super().__init__({*self._leading, *self._takers()}, survey.recording.window, report)
         self._take = self._takers()
+        self.channels = self._leading | {*self._take}
         self._axes = Axes()
         self._motions: tuple[list[int], list[Floats]] = ([], [])
         self._nodes: dict[str, int] = {}
@@ -235,7 +234,6 @@ class AutowareDecoder(MessageDecoder[AutowareRawFrame]):
 
     def settle(self) -> None:
         """Report the losses, after all frames are read."""
-        self._untimed = self._stamps.untimed
         super().settle()
         warn = self._report.warnings.append
         if self._unplaced:
@@ -660,10 +658,10 @@ class AutowareTrace(SurveyedTrace[AutowareSurvey]):
         known_by = sha256(repr(told).encode("utf-8", "replace")).hexdigest() if told else ""
         super().__init__(lambda: AutowareSurvey(recording, ego), digest, mapping=known_by)
 
-    @classmethod
-    def recognises(cls, recording: Recording) -> bool:
+    @staticmethod
+    def has_frames(recording: Recording, channel: int) -> bool:
         """True if a channel contains lists of objects."""
-        return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
+        return content_of(recording, channel) == OBJECTS
 
     def on_map(self, road_map: RoadMap | None) -> None:
         """Find the positions of traffic lights in the road map of the ingest."""
@@ -677,9 +675,7 @@ class AutowareTrace(SurveyedTrace[AutowareSurvey]):
             if KINDS[kind] == "traffic_light"
         }
 
-    def decoder(self, report: TraceReport) -> AutowareDecoder:
-        """Return a new decoder."""
-        self._survey.tell(report)
+    def _decoder(self, report: TraceReport) -> AutowareDecoder:
         if self._box is SAMPLE_VEHICLE and self.info.ego == EGO:
             report.warnings.append(
                 "how large the vehicle is, is not recorded: that of Autoware's sample vehicle is taken unless a"

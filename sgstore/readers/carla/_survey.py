@@ -17,7 +17,7 @@ import numpy as np
 from sgstore.errors import TraceError
 from sgstore.model.vocabulary import TypeMeaning, type_meanings, vague_kind
 from sgstore.model.world import Event
-from sgstore.readers._base import Lead, Survey, ref_of
+from sgstore.readers._base import LISTED, Lead, Survey, listing, ref_of
 from sgstore.readers._ros2 import (
     MAX_IDENT,
     ColumnReader,
@@ -26,7 +26,8 @@ from sgstore.readers._ros2 import (
     number,
     parse_definition,
     records,
-    short_name,
+    ros_name,
+    ros_schema,
     text,
 )
 from sgstore.readers._stamps import Stamps
@@ -34,8 +35,6 @@ from sgstore.readers.carla._signals import read_places
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
-
-    from mcap.records import Channel, Schema
 
     from sgstore.mcap import Messages, Recording
     from sgstore.model.world import Floats
@@ -46,9 +45,6 @@ if TYPE_CHECKING:
 
 EGO_ROLES: Final = ("hero", "ego_vehicle", *(f"hero{i}" for i in range(10)))
 """Role names of the bridge for a vehicle under test, in the order of their priority."""
-
-LISTED: Final = 20
-"""Maximum number of actors listed in an error."""
 
 _CLASSES: Final = {
     4: "person",
@@ -182,13 +178,12 @@ class Egos:
 
 
 def _listing(egos: Egos) -> str:
-    """Return a text with the possible actors, for an error message."""
+    """Return a list of the possible actors for an error message."""
     things = [
         f"{ident} ({actor.role or actor.type_name})"
         for ident, actor in _vehicles(egos.actors).items()
-    ] or [str(ident) for ident in sorted(egos.seen)]
-    more = f" and {len(things) - LISTED} more" if len(things) > LISTED else ""
-    return f"there are: {', '.join(things[:LISTED]) or 'none'}{more}"
+    ]
+    return listing(things or [str(ident) for ident in sorted(egos.seen)])
 
 
 def _vehicles(actors: Mapping[int, Actor]) -> dict[int, Actor]:
@@ -270,11 +265,9 @@ def content_of(recording: Recording, channel: int) -> str:
     """
     record = recording.channels[channel]
     schema = recording.schemas.get(record.schema_id)
-    if schema is None:
-        return ""
-    if record.message_encoding == "json" and schema.name.endswith("VehicleLights"):
+    if schema and record.message_encoding == "json" and schema.name.endswith("VehicleLights"):
         return VEHICLE_LIGHTS
-    return CONTENTS.get(short_name(schema.name), "") if _is_ros(record, schema) else ""
+    return CONTENTS.get(ros_name(recording, channel), "")
 
 
 def structure(recording: Recording, channel: int) -> Struct | None:
@@ -285,15 +278,8 @@ def structure(recording: Recording, channel: int) -> Struct | None:
     TraceError
         The definition is missing or malformed.
     """
-    record = recording.channels[channel]
-    schema = recording.schemas.get(record.schema_id)
-    if schema is None or not _is_ros(record, schema):
-        return None
-    return parse_definition(schema.name, schema.data)
-
-
-def _is_ros(channel: Channel, schema: Schema) -> bool:
-    return channel.message_encoding == "cdr" and schema.encoding == "ros2msg"
+    schema = ros_schema(recording, channel)
+    return None if schema is None else parse_definition(schema.name, schema.data)
 
 
 def role_in(topic: str) -> str:
@@ -404,11 +390,6 @@ class CarlaSurvey(Survey[Lead]):
             for channel, content in self.contents.items()
             if content in OF_ONE_VEHICLE
         }
-
-    def no_frames(self) -> str:
-        """Return the reason for a recording without a leading channel."""
-        lost = self.lost.losses()
-        return lost[0].reason if lost else "no list of objects can be read"
 
     def ego_named(self, name: str) -> str | None:
         """Return the id of the ego for a name. ``None`` means that a new reading may find it."""

@@ -33,8 +33,8 @@ from sgstore.errors import MapError, TraceError
 from sgstore.maps.opendrive import read_map
 from sgstore.model.vocabulary import KINDS
 from sgstore.model.world import LARGEST, POSE
-from sgstore.readers._base import SurveyedTrace
-from sgstore.readers._blocks import FAR, NAN, NO_INPUTS, UPRIGHT, FrameRows, MessageDecoder
+from sgstore.readers._base import SurveyedDecoder, SurveyedTrace
+from sgstore.readers._blocks import FAR, NAN, NO_INPUTS, UPRIGHT, FrameRows
 from sgstore.readers._ros2 import MAX_IDENT, ColumnReader, decode
 from sgstore.readers._stamps import NO_TIME
 from sgstore.readers.carla._signals import Lights, signals_of
@@ -137,7 +137,7 @@ class CarlaRawFrame:
     kinds: dict[int, Called] = field(default_factory=dict[int, "Called"])
 
 
-class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
+class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
     """Converter of messages of the CARLA bridge into frames.
 
     Parameters
@@ -158,8 +158,8 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         road_map: RoadMap | None,
         report: TraceReport,
     ) -> None:
-        self._survey = survey
-        self._leading, self._ego = frozenset(survey.alike(survey.leading)), survey.ego
+        super().__init__(survey, report)
+        self._ego = survey.ego
         self._table = ColumnReader(survey.structures[survey.leading], COLUMNS, "objects")
         self._nodes: dict[int, int] = {}
         self._idents: dict[int, int] = {}
@@ -174,8 +174,7 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
         self._driven = survey.driven
         self._drivers: dict[int, int] = {}
         self._take = self._takers()
-        self._stamps = survey.leads[survey.leading].stamps.reading()
-        super().__init__({*self._leading, *self._take}, survey.recording.window, report)
+        self.channels = self._leading | {*self._take}
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
@@ -197,7 +196,6 @@ class CarlaDecoder(MessageDecoder[CarlaRawFrame]):
 
     def settle(self) -> None:
         """Report the losses, after all frames are read."""
-        self._untimed = self._stamps.untimed
         warn = self._report.warnings.append
         if self._lights.unplaced:
             warn(
@@ -563,14 +561,12 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
         self._road_map: RoadMap | None = None
         self.on_map(self._own_map())
 
-    @classmethod
-    def recognises(cls, recording: Recording) -> bool:
+    @staticmethod
+    def has_frames(recording: Recording, channel: int) -> bool:
         """True if a channel contains lists of objects."""
-        return any(content_of(recording, channel) == OBJECTS for channel in recording.channels)
+        return content_of(recording, channel) == OBJECTS
 
-    def decoder(self, report: TraceReport) -> CarlaDecoder:
-        """Return a new decoder."""
-        self._survey.tell(report)
+    def _decoder(self, report: TraceReport) -> CarlaDecoder:
         return CarlaDecoder(self._survey, self._signals, self._road_map, report)
 
     def on_map(self, road_map: RoadMap | None) -> None:

@@ -27,8 +27,17 @@ import numpy as np
 from sgstore.errors import TraceError
 from sgstore.model.vocabulary import KINDS, LIGHT_STATE_CODE, normalize_name
 from sgstore.model.world import POSE
-from sgstore.readers._base import Lead, Ref, Survey, SurveyedTrace, count_ref, ref_of
-from sgstore.readers._blocks import FAR, NAN, FrameRows, LossTally, MessageDecoder
+from sgstore.readers._base import (
+    LISTED,
+    Lead,
+    Ref,
+    Survey,
+    SurveyedDecoder,
+    SurveyedTrace,
+    count_ref,
+    ref_of,
+)
+from sgstore.readers._blocks import FAR, NAN, FrameRows, LossTally
 from sgstore.readers._stamps import NO_TIME, Stamps
 from sgstore.readers.foxglove._mapping import Mapping, mapping_for
 from sgstore.readers.foxglove._messages import (
@@ -60,7 +69,6 @@ REMEMBERED: Final = 10_000_000_000
 """Time span of stored transforms; ns."""
 NO_EGO: Final = "no entity is the ego: none is named, and the mapping names none that is there"
 
-LISTED: Final = 20
 """Maximum number of entities listed in an error."""
 EGO_NAMES: Final = frozenset({"ego", "hero", "host", "ego_vehicle", "ego-vehicle", "vehicle.ego"})
 """Ids and types of the ego in lower case, without a mapping."""
@@ -218,7 +226,7 @@ class FoxgloveRawFrame:
     kinds: dict[int, Called] = field(default_factory=dict[int, "Called"])
 
 
-class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
+class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
     """Converter of Foxglove messages into frames.
 
     Parameters
@@ -228,9 +236,9 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
     """
 
     def __init__(self, survey: FoxgloveSurvey, report: TraceReport) -> None:
-        super().__init__(survey.readers, survey.recording.window, report)
+        super().__init__(survey, report)
         self._readers = survey.readers
-        self._leading = frozenset(survey.alike(survey.leading))
+        self.channels = frozenset(survey.readers)
         self._sources = {channel: survey.alike(channel)[0] for channel in survey.leads}
         self._mapping, self._root = survey.mapping, survey.root()
         self._ego_entity, self._ego_axes = survey.ego
@@ -245,7 +253,6 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
         self._told_by = -1
         self._left_out = LossTally()
         self._bodiless = self._odd_axes = 0
-        self._stamps = survey.leads[survey.leading].stamps.reading()
 
     def decode(self, run: Messages, row: int) -> FoxgloveRawFrame | None:
         """Return the frame of a message in the leading scene; ``None`` for other messages."""
@@ -313,7 +320,6 @@ class FoxgloveDecoder(MessageDecoder[FoxgloveRawFrame]):
 
     def settle(self) -> None:
         """Report the losses, after all frames are read."""
-        self._untimed = self._stamps.untimed
         super().settle()
         self._report.losses += self._left_out.losses()
         warn = self._report.warnings.append
@@ -518,16 +524,12 @@ class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):
         known_by = sha256(repr(found).encode("utf-8", "replace")).hexdigest()
         super().__init__(lambda: FoxgloveSurvey(recording, ego, found), digest, mapping=known_by)
 
-    @classmethod
-    def recognises(cls, recording: Recording) -> bool:
+    @staticmethod
+    def has_frames(recording: Recording, channel: int) -> bool:
         """True if a channel contains Foxglove scenes."""
-        for number, record in recording.channels.items():
-            schema = recording.schemas.get(record.schema_id)
-            if schema is not None and schema.name == SCENE and encoding_of(recording, number):
-                return True
-        return False
+        schema = recording.schemas.get(recording.channels[channel].schema_id)
+        is_scene = schema is not None and schema.name == SCENE
+        return is_scene and bool(encoding_of(recording, channel))
 
-    def decoder(self, report: TraceReport) -> FoxgloveDecoder:
-        """Return a new decoder."""
-        self._survey.tell(report)
+    def _decoder(self, report: TraceReport) -> FoxgloveDecoder:
         return FoxgloveDecoder(self._survey, report)

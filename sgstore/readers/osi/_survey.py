@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from sgstore.errors import MapError, TraceError
 from sgstore.maps.roads import OF_LANES
 from sgstore.model.world import TraceReport
-from sgstore.readers._base import Lead, Ref, Survey, ref_of
+from sgstore.readers._base import LISTED, Lead, Ref, Survey, listing, ref_of
 from sgstore.readers._blocks import EntityTable
 from sgstore.readers._stamps import Stamps
 from sgstore.readers.osi._lanes import FIELDS as LANE_FIELDS
@@ -47,9 +47,6 @@ if TYPE_CHECKING:
 
     from sgstore.mcap import Messages, Recording
 
-
-LISTED: Final = 20
-"""Maximum number of objects listed in an error."""
 
 EGO_NAMES: Final = frozenset({"ego", "hero", "host", "ego_vehicle", "host_vehicle"})
 """Usual names of the ego in lower case, for recordings without a host vehicle id."""
@@ -223,13 +220,9 @@ class Cast:
             return named[0]
         things = [
             f"{number} ({', '.join(names)})" if names else str(number)
-            for number, names in list(self.names.items())[:LISTED]
+            for number, names in self.names.items()
         ]
-        more = f" and {len(self.names) - LISTED} more" if len(self.names) > LISTED else ""
-        raise TraceError(
-            f"no moving object has the id or name {wanted!r}; there are: "
-            f"{', '.join(things) or 'none'}{more}"
-        )
+        raise TraceError(f"no moving object has the id or name {wanted!r}; {listing(things)}")
 
 
 # First reading of an OSI recording, which collects the facts needed for its frames. The map may come after the

@@ -22,8 +22,8 @@ from google.protobuf import message_factory
 from sgstore.mcap import Loss
 from sgstore.model.vocabulary import KINDS, TypeMeaning, type_meanings
 from sgstore.model.world import POSE, Event
-from sgstore.readers._base import SurveyedTrace
-from sgstore.readers._blocks import NAN, NO_INPUTS, FrameRows, LossTally, MessageDecoder
+from sgstore.readers._base import SurveyedDecoder, SurveyedTrace
+from sgstore.readers._blocks import NAN, NO_INPUTS, FrameRows, LossTally
 from sgstore.readers._stamps import NO_TIME
 from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights, code_of
 from sgstore.readers.osi._schema import (
@@ -186,7 +186,7 @@ class OsiRawFrame:
     objects: list[bytes] = field(default_factory=list[bytes])
 
 
-class OsiDecoder(MessageDecoder[OsiRawFrame]):
+class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     """Converter of ground truth messages into frames.
 
     Parameters
@@ -198,9 +198,9 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
     """
 
     def __init__(self, survey: OsiSurvey, report: TraceReport) -> None:
-        super().__init__({*survey.leads, *survey.hosts}, survey.recording.window, report)
-        self._survey = survey
-        self._leading, self._ego = frozenset(survey.alike(survey.leading)), survey.ego
+        super().__init__(survey, report)
+        self.channels = frozenset({*survey.leads, *survey.hosts})
+        self._ego = survey.ego
         self._idents = survey.cast.idents()
         self._nodes: dict[int, int] = {}
         self._keys: dict[bytes, int] = {}
@@ -223,7 +223,6 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
             has_field(one.message, "host_vehicle_data") for one in survey.leads.values()
         )
         self._frames = 0
-        self._stamps = lead.stamps.reading()
 
     def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
         """Return the frame that a message starts, or ``None``. Other contents of the message are stored."""
@@ -255,7 +254,6 @@ class OsiDecoder(MessageDecoder[OsiRawFrame]):
 
     def settle(self) -> None:
         """Report the losses, after all frames are read."""
-        self._untimed = self._stamps.untimed
         self._environment.settle()
         warn = self._report.warnings.append
         if self._lights.unplaced:
@@ -575,13 +573,10 @@ class OsiTrace(SurveyedTrace[OsiSurvey]):
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
         super().__init__(lambda: OsiSurvey(recording, ego), digest)
 
-    @classmethod
-    def recognises(cls, recording: Recording) -> bool:
+    @staticmethod
+    def has_frames(recording: Recording, channel: int) -> bool:
         """True if a channel contains OSI ground truth."""
-        names = {schema_name(recording, channel) for channel in recording.channels}
-        return bool(names & {GROUND_TRUTH, SENSOR_VIEW})
+        return schema_name(recording, channel) in {GROUND_TRUTH, SENSOR_VIEW}
 
-    def decoder(self, report: TraceReport) -> OsiDecoder:
-        """Return a new decoder."""
-        self._survey.tell(report)
+    def _decoder(self, report: TraceReport) -> OsiDecoder:
         return OsiDecoder(self._survey, report)
