@@ -5,8 +5,11 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Self
 
+from mcap.records import Channel, Schema
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
 
     from mcap.records import Metadata
 
@@ -16,8 +19,13 @@ if TYPE_CHECKING:
 class MessageFile:
     """File with messages only, without the other record types of MCAP.
 
+    Parameters
+    ----------
+    path : Path
+
     Attributes
     ----------
+    schemas, channels : dict
     has_log_times : bool
         ``False``: the log time of a message is the time in its data.
     window : tuple of int
@@ -32,6 +40,24 @@ class MessageFile:
     profile, compression = "", "zstd"
     metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
     attachments: tuple[RecordPlace, ...] = ()
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+
+    def add_channel(
+        self, topic: str, schema: Schema, encoding: str, about: dict[str, str] | None = None
+    ) -> None:
+        """Add a channel with the id of its schema. ``about``: its metadata."""
+        self.schemas[schema.id] = schema
+        self.channels[schema.id] = Channel(
+            id=schema.id,
+            topic=topic,
+            message_encoding=encoding,
+            metadata=about or {},
+            schema_id=schema.id,
+        )
 
     def __enter__(self) -> Self:
         return self

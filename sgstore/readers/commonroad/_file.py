@@ -14,7 +14,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from mcap.records import Channel, Schema
+from mcap.records import Schema
 
 from sgstore.errors import MapError, TraceError
 from sgstore.mcap import MESSAGE_HEAD, Findings, Loss, Messages, mark_of_open, open_regular
@@ -80,7 +80,7 @@ class CommonRoadFile(MessageFile):
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         with open_regular(path) as file:
             self.size, self.mtime_ns = mark_of_open(file)
             if self.size > MAX_BYTES:
@@ -96,20 +96,14 @@ class CommonRoadFile(MessageFile):
         self._steps = _steps(self._scenario)
         self._standing = [one for one in self._scenario.obstacles.values() if one.static]
         about = {NAME: self._scenario.name or path.stem}
-        self.schemas = {
-            number: Schema(id=number, data=_schema(name), encoding="jsonschema", name=name)
-            for number, name in ((_MAP_CHANNEL, MAP), (_STEP_CHANNEL, STEP))
-        }
-        self.channels = {
-            number: Channel(
-                id=number, topic=topic, message_encoding="json", metadata=about, schema_id=number
-            )
-            for number, topic in (
-                (_MAP_CHANNEL, "/commonroad/map"),
-                (_STEP_CHANNEL, "/commonroad/steps"),
-            )
-            if self._map or number != _MAP_CHANNEL
-        }
+        for number, name, topic in (
+            (_MAP_CHANNEL, MAP, "/commonroad/map"),
+            (_STEP_CHANNEL, STEP, "/commonroad/steps"),
+        ):
+            schema = Schema(id=number, data=_schema(name), encoding="jsonschema", name=name)
+            self.schemas[number] = schema
+            if self._map or number != _MAP_CHANNEL:
+                self.add_channel(topic, schema, "json", about)
         self.counts = {_STEP_CHANNEL: len(self._steps)}
         if self._map:
             self.counts[_MAP_CHANNEL] = 1

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import zstandard
-from mcap.records import Channel, Schema
+from mcap.records import Schema
 
 from sgstore.errors import TraceError
 from sgstore.mcap import (
@@ -241,7 +241,7 @@ class OsiFile(MessageFile):
     counts = None
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         self._mark = b""
         self._file = open_regular(path)
         try:
@@ -251,12 +251,8 @@ class OsiFile(MessageFile):
             self._file.close()
             raise
         topic = "sensor_view" if name == SENSOR_VIEW else "ground_truth"
-        self.schemas = {1: Schema(id=1, data=descriptors(), encoding="protobuf", name=name)}
-        self.channels = {
-            CHANNEL: Channel(
-                id=CHANNEL, topic=topic, message_encoding="protobuf", metadata={}, schema_id=1
-            )
-        }
+        schema = Schema(id=CHANNEL, data=descriptors(), encoding="protobuf", name=name)
+        self.add_channel(topic, schema, "protobuf")
 
     def close(self) -> None:
         """Close the file."""

@@ -14,7 +14,7 @@ import zlib
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from mcap.records import Channel, Schema
+from mcap.records import Schema
 
 from sgstore.errors import TraceError
 from sgstore.mcap import (
@@ -132,20 +132,12 @@ class SumoFile(MessageFile):
     counts = None
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         with open_regular(path) as file:
             self.size, self.mtime_ns = mark_of_open(file)
         self._file = opened(path)
-        self.schemas = {_CHANNEL: Schema(id=_CHANNEL, data=b"", encoding="", name=STEP)}
-        self.channels = {
-            _CHANNEL: Channel(
-                id=_CHANNEL,
-                topic="/sumo/fcd",
-                message_encoding="xml",
-                metadata={},
-                schema_id=_CHANNEL,
-            )
-        }
+        schema = Schema(id=_CHANNEL, data=b"", encoding="", name=STEP)
+        self.add_channel("/sumo/fcd", schema, "xml")
 
     def close(self) -> None:
         """Close the file."""
