@@ -35,9 +35,9 @@ from sgstore.draw import draw_curve
 from sgstore.pipeline.importing import import_graphs
 from sgstore.temporal._verdicts import PRESUMABLY_TRUE, Settled
 from sgstore.testsets.coverage import (
+    Specification,
     classed,
     classes,
-    read_specifications,
     selection_of,
     slot_coverage,
     specification,
@@ -83,9 +83,7 @@ def s3c(folder: Path) -> Iterator[str]:
     import_graphs(store, [DATA / READ[0]], "s3c")
     chosen = selection_of(str(store))
     found: dict[str, tuple[int, int]] = defaultdict(lambda: (0, 0))
-    for name, part, of, *_ in slot_coverage(chosen, read_specifications(PRECONDITIONS))[0].rows[
-        :-1
-    ]:
+    for name, part, of, *_ in slot_coverage(chosen, Specification.read(PRECONDITIONS))[0].rows[:-1]:
         found[name[0]] = found[name[0]][0] + part, found[name[0]][1] + of
     found["4"] = specification(chosen, VEHICLES, 22)[0].rows[0][1:3]
     many = len(classes(classed(chosen)).rows)

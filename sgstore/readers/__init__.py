@@ -15,7 +15,6 @@ from sgstore.readers._registry import (
     open_trace,
     read_message,
     read_messages,
-    readers,
 )
 from sgstore.readers._roles import channel_rank
 from sgstore.readers._ros2 import decode, parse_definition
@@ -37,32 +36,22 @@ from sgstore.readers.osi._schema import add_fields, descriptors, message_class
 __all__ = [
     "DERIVED",
     "ENDINGS",
-    "NAN",
-    "POSE",
     "READERS",
     "Cameras",
     "CommonRoadFile",
-    "EntityTable",
-    "FrameRows",
-    "FramesTrace",
     "LiveCameras",
     "LiveWorld",
     "Media",
-    "MessageDecoder",
-    "MessageTrace",
     "OsiFile",
     "RecordedCameras",
     "RecordingFile",
-    "RecordingReader",
     "Sensor",
     "SensorCloud",
     "SensorPicture",
     "SensorReading",
     "Sensors",
-    "TraceMessage",
     "add_fields",
     "channel_rank",
-    "channels_of",
     "connect",
     "decode",
     "descriptors",
@@ -78,6 +67,19 @@ __all__ = [
     "read_carried",
     "read_message",
     "read_messages",
-    "readers",
     "record_reader",
+]
+
+# For authors of readers; see docs/flavours.md.
+__all__ += [
+    "NAN",
+    "POSE",
+    "EntityTable",
+    "FrameRows",
+    "FramesTrace",
+    "MessageDecoder",
+    "MessageTrace",
+    "RecordingReader",
+    "TraceMessage",
+    "channels_of",
 ]

@@ -24,7 +24,7 @@ from sgstore.ingest import ingest
 from sgstore.pipeline.importing import import_graphs
 from sgstore.testsets.coverage import (
     Classed,
-    Missing,
+    Specification,
     classed,
     classes,
     combos,
@@ -37,13 +37,12 @@ from sgstore.testsets.coverage import (
     novel_clips,
     novel_frames,
     read_outcomes,
-    read_specifications,
     selection_of,
     slot_coverage,
-    slot_matrix,
     specification,
     venn,
 )
+from sgstore.testsets.coverage._classes import Missing
 from sgstore.testsets.coverage._compare import estimate, expected_classes
 from sgstore.testsets.coverage._features import tree
 from sgstore.testsets.coverage._frames import block_of, query_of_features
@@ -505,7 +504,7 @@ def test_values_of_slots_are_combined_as_loops_combine_them(
     a, _, of_a, _ = worlds
     file = tmp_path / "slots.toml"
     file.write_text(SLOTS)
-    shares, there, missing = slot_coverage(selection_of(a), read_specifications(file), k)
+    shares, there, missing = slot_coverage(selection_of(a), Specification.read(file), k)
     domains = {
         "person": ["none", "near", "seen"],
         "truck": ["none", "near", "ahead"],
@@ -533,8 +532,8 @@ def test_the_matrix_of_slots_is_that_of_loops(worlds: Worlds, tmp_path: Path) ->
     a, _, of_a, _ = worlds
     file = tmp_path / "slots.toml"
     file.write_text(f"{SLOTS}[[impossible]]\ncar = 'none'\n")
-    (declared,) = read_specifications(file)
-    items, frames, wanted = slot_matrix(selection_of(a), declared)
+    (declared,) = Specification.read(file)
+    items, frames, wanted = declared.matrix(selection_of(a))
     there = [slots_of(scene) for trace in of_a for scene in trace]
 
     assert items[:4] == [(s, v) for s in ("person",) for v in ("none", "near", "seen")] + [
@@ -558,7 +557,7 @@ def test_slots_ask_tables_of_tags_beside_their_file(worlds: Worlds, tmp_path: Pa
         "tables = {tags = 'tags.csv'}\n[[slot]]\nname = 'road'\n"
         "values = {city = \"MATCH () WHERE tags.road = 'city'\"}\n"
     )
-    (declared,) = read_specifications(tmp_path / "slots.toml")
+    (declared,) = Specification.read(tmp_path / "slots.toml")
     _, there, _ = slot_coverage(selection_of(a), [declared])
     frames = {one.name: one.frames for one in store.info()}
 
@@ -571,8 +570,8 @@ def test_slots_ask_tables_of_tags_beside_their_file(worlds: Worlds, tmp_path: Pa
 
 
 def test_attributes_of_the_operational_design_domain_come_along(town_store: Path) -> None:
-    (odd,) = read_specifications("iso34503")
-    items, frames, wanted = slot_matrix(selection_of(str(town_store)), odd)
+    (odd,) = Specification.read("iso34503")
+    items, frames, wanted = odd.matrix(selection_of(str(town_store)))
     counted = {item: int(frames[i, i]) for i, item in enumerate(items)}
     by_hand = {
         ("speed of the ego", "stands"): "is_ego AND speed < 0.1",
@@ -597,7 +596,7 @@ def test_slots_are_classes_too(worlds: Worlds, tmp_path: Path, width: int) -> No
     a, b, of_a, of_b = worlds
     file = tmp_path / "slots.toml"
     file.write_text(SLOTS)
-    (slots,) = read_specifications(file)
+    (slots,) = Specification.read(file)
     one, other = (classed(selection_of(text), "RSV", width, slots=slots) for text in (a, b))
 
     def counted(traces: list[list[Scene]]) -> Counter[Any]:
@@ -650,7 +649,7 @@ def test_a_file_of_slots_that_is_none_is_told(tmp_path: Path, text: str, said: s
     (tmp_path / "slots.toml").write_text(text)
 
     with pytest.raises(ConfigError, match=said):
-        read_specifications(tmp_path / "slots.toml")
+        Specification.read(tmp_path / "slots.toml")
 
 
 def test_a_pattern_is_a_block_and_whatever_is_more_is_not() -> None:
@@ -707,7 +706,7 @@ def town02(
 def test_the_preconditions_of_s3c_are_covered_in_town02_as_published(town02: str) -> None:
     """5 of 242, 0 of 31, 0 of 24, 4 of 22, 3 of 426. (Woodlief et al., ICSE 2024, table 2.)"""
     chosen = selection_of(town02)
-    rows = slot_coverage(chosen, read_specifications(PRECONDITIONS))[0].rows
+    rows = slot_coverage(chosen, Specification.read(PRECONDITIONS))[0].rows
     found: dict[str, tuple[int, int]] = defaultdict(lambda: (0, 0))
     for name, part, of, *_ in rows[:-1]:
         so_far = found[name[0]]

@@ -465,22 +465,21 @@ def _fraction(text: str) -> float:
 def _slot_table(
     text: str, slots: Path, k: int, ask: FrameAskOptions, *, covered: bool, missing: bool
 ) -> ReportTable:
-    from sgstore.testsets.coverage import read_specifications, slot_coverage
+    from sgstore.testsets.coverage import Specification, slot_coverage
 
     (chosen,) = ask.frames(text)
     say_scope(chosen.scope(world=False), ask.chosen)
-    tables = slot_coverage(chosen, read_specifications(slots), k)
+    tables = slot_coverage(chosen, Specification.read(slots), k)
     return tables[1 if covered else 2 if missing else 0]
 
 
 def _slot_picture(text: str, slots: Path, ask: FrameAskOptions, to: Path) -> None:
     """Draw the pairs of slot values of a file, with gaps."""
     from sgstore.draw import draw_matrix
-    from sgstore.testsets.coverage import slot_matrix
 
     (chosen,) = ask.frames(text)
     declared = _one_specification(slots)
-    items, frames, wanted = slot_matrix(chosen, declared)
+    items, frames, wanted = declared.matrix(chosen)
     names = [f"{slot}: {value}" for slot, value in items]
     title = f"Pairs of {declared.name} in {_short(text)}"
     draw_matrix(names, frames, wanted, to, title=title, groups=[slot for slot, _ in items])
@@ -489,9 +488,9 @@ def _slot_picture(text: str, slots: Path, ask: FrameAskOptions, to: Path) -> Non
 
 def _one_specification(slots: Path) -> Specification:
     """Return the only specification in a file."""
-    from sgstore.testsets.coverage import read_specifications
+    from sgstore.testsets.coverage import Specification
 
-    declared, *more = read_specifications(slots)
+    declared, *more = Specification.read(slots)
     if more:
         raise typer.BadParameter(f"--slots {slots}: several specifications; expected one here")
     return declared

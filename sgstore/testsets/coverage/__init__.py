@@ -8,14 +8,7 @@ estimates the number of unseen classes, and evaluates failures of a system. ``_f
 Every result is a table that names the denominators of its shares.
 """
 
-from sgstore.testsets.coverage._classes import (
-    UNKNOWN,
-    Classed,
-    CountedUnit,
-    Missing,
-    classed,
-    shared,
-)
+from sgstore.testsets.coverage._classes import UNKNOWN, Classed, classed, shared
 from sgstore.testsets.coverage._compare import (
     S3C_THRESHOLD,
     classes,
@@ -31,14 +24,7 @@ from sgstore.testsets.coverage._compare import (
     told_outcomes,
     venn,
 )
-from sgstore.testsets.coverage._features import (
-    Combinations,
-    Combos,
-    combined,
-    combos,
-    explain,
-    features,
-)
+from sgstore.testsets.coverage._features import Combinations, combos, explain, features
 from sgstore.testsets.coverage._frames import (
     ChosenFrames,
     ReportTable,
@@ -53,21 +39,13 @@ from sgstore.testsets.coverage._frames import (
 )
 from sgstore.testsets.coverage._sequences import (
     WITHIN_S,
-    ManoeuvreEvents,
-    SequenceCoverage,
     check_sequences,
     happenings,
     manoeuvres_named,
     sequences,
     sequences_in,
 )
-from sgstore.testsets.coverage._slots import (
-    Specification,
-    read_specifications,
-    slot_coverage,
-    slot_matrix,
-    specification,
-)
+from sgstore.testsets.coverage._slots import Specification, slot_coverage, specification
 
 __all__ = [
     "S3C_THRESHOLD",
@@ -76,17 +54,11 @@ __all__ = [
     "ChosenFrames",
     "Classed",
     "Combinations",
-    "Combos",
-    "CountedUnit",
-    "ManoeuvreEvents",
-    "Missing",
     "ReportTable",
-    "SequenceCoverage",
     "Specification",
     "check_sequences",
     "classed",
     "classes",
-    "combined",
     "combos",
     "covered",
     "expected_classes",
@@ -105,7 +77,6 @@ __all__ = [
     "periods_of",
     "rank_sizes",
     "read_outcomes",
-    "read_specifications",
     "recordings_of",
     "run_begins",
     "selection_of",
@@ -113,7 +84,6 @@ __all__ = [
     "sequences_in",
     "shared",
     "slot_coverage",
-    "slot_matrix",
     "specification",
     "told_outcomes",
     "traces_of",

@@ -163,29 +163,30 @@ class Combinations:
         names = [" ".join(name) for name in self.features.names]
         return [" & ".join(names[i] for i in one) for one in self.members[rows].tolist()]
 
+    @staticmethod
+    def of(found: ClassFeatures, k: int) -> Combinations:
+        """Return all combinations of k features, with the number of frames of each.
 
-def combined(found: ClassFeatures, k: int) -> Combinations:
-    """Return all combinations of k features, with the number of frames of each.
-
-    Raises
-    ------
-    ConfigError
-        k is not positive, or there are too many combinations.
-    """
-    many = len(found.names)
-    if k < 1 or comb(many, k) > MOST:
-        raise ConfigError(
-            f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features; {MOST:,} can be gone through:"
-            " ask for a smaller k, or for an abstraction with fewer labels"
-        )
-    size = min(k, many + 1)  # larger sizes have no combinations either
-    listed = chain.from_iterable(combinations(range(many), size))
-    members = np.fromiter(listed, np.int64, comb(many, size) * size).reshape(-1, size)
-    if k == 2:
-        frames = _together(found)[members[:, 0], members[:, 1]]
-    else:
-        frames = np.fromiter(_counted(found, members), np.int64, len(members))
-    return Combinations(found, k, members, frames)
+        Raises
+        ------
+        ConfigError
+            k is not positive, or there are too many combinations.
+        """
+        many = len(found.names)
+        if k < 1 or comb(many, k) > MOST:
+            raise ConfigError(
+                f"{comb(many, max(k, 0)):,} combinations of {k} of {many} features;"
+                f" {MOST:,} can be gone through: ask for a smaller k, or for an abstraction"
+                " with fewer labels"
+            )
+        size = min(k, many + 1)  # larger sizes have no combinations either
+        listed = chain.from_iterable(combinations(range(many), size))
+        members = np.fromiter(listed, np.int64, comb(many, size) * size).reshape(-1, size)
+        if k == 2:
+            frames = _together(found)[members[:, 0], members[:, 1]]
+        else:
+            frames = np.fromiter(_counted(found, members), np.int64, len(members))
+        return Combinations(found, k, members, frames)
 
 
 def _counted(found: ClassFeatures, members: Ints) -> Iterator[int]:
@@ -280,7 +281,7 @@ def combos(
     other = None if reference is None else features(reference, abstraction, of_ego=of_ego)
     names = tuple(sorted({*own.names, *(other.names if other else ())}))
     other = None if other is None else over(other, names)
-    found = combined(over(own, names), k)
+    found = Combinations.of(over(own, names), k)
     name, kinds = (
         a.chosen.text,
         f"combinations of {k} of the {len(names)} features{' of the ego' if of_ego else ''}",
@@ -289,7 +290,7 @@ def combos(
         wanted, there = np.ones(len(found.frames), np.bool_), None
         denominator = f"all {kinds} of {name}, whether they can be or not (product)"
     else:
-        theirs = combined(other, k)
+        theirs = Combinations.of(other, k)
         there = theirs.frames
         wanted = there > 0
         denominator = f"{kinds} that occur in {reference.chosen.text} (observed)"

@@ -220,42 +220,86 @@ class Specification:
     impossible: tuple[Mapping[str, str], ...]
     tables: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
+    def matrix(
+        self, chosen: ChosenFrames
+    ) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
+        """Return pairs of slot values: their common frames, and the wanted pairs.
+
+        Returns
+        -------
+        items : list of (str, str)
+            Slot and value, slot by slot, ``none`` first.
+        frames : (F, F) int64
+            Frames with both, symmetric; on the diagonal, with the value.
+        wanted : (F, F) bool
+            Mask of possible pairs of values of two slots.
+
+        Raises
+        ------
+        QueryError
+            A pattern is invalid.
+        ConfigError
+            There are too many pairs.
+        """
+        items = [(slot.name, value) for slot in self.slots for value in slot.domain]
+        if len(items) ** 2 > MOST:
+            raise ConfigError(
+                f"{self.name}: {len(items) ** 2:,} pairs; {MOST:,} can be gone through"
+            )
+        with chosen.snapshot():
+            there = _Held(chosen, self.tables).values(self)
+        bits = np.stack([there[item] for item in items])
+        frames = np.stack(
+            [np.bitwise_count(bits & own).sum(axis=1, dtype=np.int64) for own in bits]
+        )
+        names = np.array([name for name, _ in items])
+        wanted = names[:, None] != names[None, :]
+        for one in self.impossible:
+            if len(one) <= 2:  # with three values, each pair can be possible
+                ends = [items.index(item) for item in one.items()]
+                wanted[ends[0], ends[-1]] = wanted[ends[-1], ends[0]] = False
+                if len(ends) == 1:
+                    wanted[ends[0]] = wanted[:, ends[0]] = False
+        return items, frames, wanted
+
+    @staticmethod
+    def read(path: str | Path) -> list[Specification]:
+        """Read the specifications in a file.
+
+        Parameters
+        ----------
+        path : str or Path
+            A file, or the name of an included one: ``iso34503``, attributes of an operational design
+            domain that recordings contain.
+
+        Raises
+        ------
+        ConfigError
+            The file is not TOML, or has an invalid value.
+        """
+        path = Path(path)
+        if str(path) in DECLARED and not path.exists():
+            path = Path(__file__).with_name(f"{path}.toml")
+        try:
+            if path.stat().st_size > _MAX_FILE:
+                raise ConfigError(f"{path}: larger than {_MAX_FILE >> 20} MiB")
+            document = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(f"{path}: {error.strerror}") from error
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(f"{path}: no TOML: {error}") from error
+        several = document.pop("specification", None)
+        if several is None:
+            return [_specification(path, document, path.stem)]
+        if document or not isinstance(several, list) or not several:
+            raise ConfigError(f"{path}: expected tables [[specification]] and nothing beside them")
+        return [
+            _specification(path, one, f"{path.stem} {i}") for i, one in enumerate(several, start=1)
+        ]
+
 
 DECLARED: Final = ("iso34503",)
 """Included slot files, by name."""
-
-
-def read_specifications(path: str | Path) -> list[Specification]:
-    """Read the specifications in a file.
-
-    Parameters
-    ----------
-    path : str or Path
-        A file, or the name of an included one: ``iso34503``, attributes of an operational design
-        domain that recordings contain.
-
-    Raises
-    ------
-    ConfigError
-        The file is not TOML, or has an invalid value.
-    """
-    path = Path(path)
-    if str(path) in DECLARED and not path.exists():
-        path = Path(__file__).with_name(f"{path}.toml")
-    try:
-        if path.stat().st_size > _MAX_FILE:
-            raise ConfigError(f"{path}: larger than {_MAX_FILE >> 20} MiB")
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: no TOML: {error}") from error
-    several = document.pop("specification", None)
-    if several is None:
-        return [_specification(path, document, path.stem)]
-    if document or not isinstance(several, list) or not several:
-        raise ConfigError(f"{path}: expected tables [[specification]] and nothing beside them")
-    return [_specification(path, one, f"{path.stem} {i}") for i, one in enumerate(several, start=1)]
 
 
 def _specification(path: Path, given: Any, name: str) -> Specification:
@@ -463,47 +507,6 @@ def slot_coverage(
         ReportTable(("specification", "combination", "frames"), covered),
         ReportTable(("specification", "combination", "query"), missing),
     )
-
-
-def slot_matrix(
-    chosen: ChosenFrames, specification: Specification
-) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
-    """Return pairs of slot values: their common frames, and the wanted pairs.
-
-    Returns
-    -------
-    items : list of (str, str)
-        Slot and value, slot by slot, ``none`` first.
-    frames : (F, F) int64
-        Frames with both, symmetric; on the diagonal, with the value.
-    wanted : (F, F) bool
-        Mask of possible pairs of values of two slots.
-
-    Raises
-    ------
-    QueryError
-        A pattern is invalid.
-    ConfigError
-        There are too many pairs.
-    """
-    items = [(slot.name, value) for slot in specification.slots for value in slot.domain]
-    if len(items) ** 2 > MOST:
-        raise ConfigError(
-            f"{specification.name}: {len(items) ** 2:,} pairs; {MOST:,} can be gone through"
-        )
-    with chosen.snapshot():
-        there = _Held(chosen, specification.tables).values(specification)
-    bits = np.stack([there[item] for item in items])
-    frames = np.stack([np.bitwise_count(bits & own).sum(axis=1, dtype=np.int64) for own in bits])
-    names = np.array([name for name, _ in items])
-    wanted = names[:, None] != names[None, :]
-    for one in specification.impossible:
-        if len(one) <= 2:  # with three values, each pair can be possible
-            ends = [items.index(item) for item in one.items()]
-            wanted[ends[0], ends[-1]] = wanted[ends[-1], ends[0]] = False
-            if len(ends) == 1:
-                wanted[ends[0]] = wanted[:, ends[0]] = False
-    return items, frames, wanted
 
 
 def _query(one: Specification, slots: Sequence[Slot], values: Sequence[str]) -> str:

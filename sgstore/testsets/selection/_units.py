@@ -16,9 +16,9 @@ from sgstore.model.frame_ids import trace_of
 from sgstore.store import lengths_of_messages
 from sgstore.testsets.coverage import (
     UNKNOWN,
+    Combinations,
     check_sequences,
     classed,
-    combined,
     features,
     happenings,
     manoeuvres_named,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from sgstore.model.world import Bools, Floats, Ints
-    from sgstore.testsets.coverage import ChosenFrames, Classed, Combinations
+    from sgstore.testsets.coverage import ChosenFrames, Classed
     from sgstore.testsets.locks import CasePart
 
 
@@ -412,7 +412,7 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
     if not combos:
         sizes = of.sizes()[of.present()]
         return Holdings(of, pairs, np.ones_like(sizes), sizes, kind_of(abstraction))
-    found = combined(features(of, abstraction, of_ego=of_ego), combos)
+    found = Combinations.of(features(of, abstraction, of_ego=of_ego), combos)
     inside, weight, frames = _distinct_combinations(found)
     kind = f"combinations of {combos} features{' of the ego' if of_ego else ''} in {abstraction}"
     return Holdings(of, _of_units(pairs, inside), weight, frames, kind, inside)
