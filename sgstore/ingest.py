@@ -29,7 +29,7 @@ from sgstore.model.trace_sampling import TracePart
 from sgstore.model.world import BUCKET_FRAMES
 from sgstore.pipeline.recording_ingest import Job, Progress, SegmentReader, TraceOutcome
 from sgstore.readers import ENDINGS, is_recording
-from sgstore.store import Folder, PresentError, Sealed, StoreFile, refuse_name
+from sgstore.store import Folder, PresentError, Sealed, StoreFile
 
 _log = logger("ingest")
 
@@ -370,7 +370,7 @@ def ingest(  # noqa: PLR0913  one option per way to read
         block_frames=BLOCK_FRAMES,
     )
     paths = [Path(path) for path in traces]
-    refuse_name(job.store)
+    Folder.refuse_name(job.store)
     file = StoreFile(job.store) if job.store.exists() else None
     if file is not None and not dry_run:
         file.settle()

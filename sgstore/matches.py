@@ -18,6 +18,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from sgstore.base.display import IN_NOTEBOOK
 from sgstore.base.quoting import quoted
 from sgstore.errors import QueryError, SgstoreError
 from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
@@ -32,17 +33,15 @@ from sgstore.lang.sql import (
     rewritten,
 )
 from sgstore.model.frame_ids import SEQ_BITS
+from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import natural
 from sgstore.model.world import Clip, tolerance_ns
 from sgstore.store import (
-    IN_NOTEBOOK,
     FrameRef,
     GivenTable,
+    ParquetTable,
     Tabular,
     as_told,
-    as_told_batches,
-    scope_of,
-    write_batches,
 )
 
 if TYPE_CHECKING:
@@ -267,7 +266,7 @@ class Matches(Tabular):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Data that the settings excluded from the searched traces; see :func:`sgstore.store.scope_of`."""
+        """Data that settings exclude from the searched traces; see :func:`sgstore.model.scope.scope_of`."""
         with self._compiled() as compiled:
             chosen = {trace.trace_id for trace in compiled.chosen}
             traces = (one for one in self._file.traces() if one.trace_id in chosen)
@@ -452,7 +451,7 @@ class Matches(Tabular):
             columns = next(found, None)
             if columns is None:
                 return super().parquet(path)
-            return write_batches(as_told_batches(self.columns, (columns, found)), Path(path))
+            return ParquetTable.write_batches((columns, found), Path(path), self.columns)
 
     def _record_batches(self) -> Generator[Any]:
         """Yield the columns, then the rows in Arrow batches.

@@ -8,12 +8,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
+from sgstore.base.display import IN_NOTEBOOK
 from sgstore.errors import StoreError, place_named, url_named
 from sgstore.lang.sql import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.model.criticality import KNOWN
 from sgstore.model.vocabulary import normalize_name
-from sgstore.store import IN_NOTEBOOK, FrameRef, StoreFile, UserTables, measured
+from sgstore.store import FrameRef, StoreFile, UserTables, measured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -469,10 +470,10 @@ class Store:
         AbstractionError
             The abstraction does not exist, or no name matches ``ignore``.
         """
-        from sgstore.store import example_of, frames_like
+        from sgstore.store import Example
 
-        example = example_of(self.file, _ref(frame), abstraction, ignore)
-        return frames_like(self.file, example, limit, each_trace=each_trace)
+        example = Example.of(self.file, _ref(frame), abstraction, ignore)
+        return Example.find(self.file, example, limit, each_trace=each_trace)
 
     def pattern(self, frame: int | str | FrameRef, *, ignore: Sequence[str] = ()) -> str:
         """Return a pattern text that describes a frame around its ego and matches this frame.
@@ -641,7 +642,7 @@ class Store:
     def _range_of(self, clip: str | Clip | Interval) -> tuple[str, str]:
         """Return the names of the first and the last frame of a clip."""
         from sgstore.matches import Interval
-        from sgstore.store import range_of
+        from sgstore.model.frame_ids import range_of
 
         if isinstance(clip, str):
             if (frames := range_of(clip)) is None:

@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+IN_NOTEBOOK: Final = 20
+"""Number of result rows shown in a notebook."""
+
 LONGEST: Final = 200
 """Longest value in a table cell; characters."""
 

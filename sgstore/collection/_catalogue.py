@@ -18,17 +18,22 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection._storage import ABOUT, MissingObjectError, digest_of_file
 from sgstore.errors import ExportError, StoreError
-from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts, Type, own_type
+from sgstore.lang.catalog import (
+    Catalog,
+    RelationScope,
+    TraceFacts,
+    Type,
+    own_type,
+    relations_of_set,
+)
+from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import NAMES, natural
 from sgstore.store import (
     CATALOGUE,
     SCHEMA_VERSION,
-    answers_of,
+    ParquetTable,
     parquet_rows,
-    relations_of_set,
-    scope_of,
     subset_catalogs,
-    write_parquet,
 )
 
 if TYPE_CHECKING:
@@ -143,7 +148,7 @@ class Snapshot:
         return tuple(sorted(found, key=lambda row: natural(row["name"])))
 
     def scope(self, *, world: bool, traces: Iterable[int] | None = None) -> dict[str, Any]:
-        """Return the omissions by settings in some traces, or in all; see :func:`sgstore.store.scope_of`."""
+        """Return the omissions by settings in some or all traces; see :func:`sgstore.model.scope.scope_of`."""
         chosen = None if traces is None else frozenset(traces)
         told = (row["scope"] for row in self.traces if chosen is None or row["trace_id"] in chosen)
         return scope_of(({"scope": json.loads(one)} for one in told if one), world=world)
@@ -283,7 +288,7 @@ class Snapshot:
         answers: dict[str, frozenset[str]] = {}
         for row in self.traces:
             if row["answers"] not in answers:
-                answers[row["answers"]] = frozenset(answers_of(row["answers"]))
+                answers[row["answers"]] = frozenset(_answers_of(row["answers"]))
         return tuple(
             TraceFacts(
                 row["trace_id"],
@@ -314,7 +319,7 @@ class Snapshot:
                 one.trace_id,
                 one.name,
                 one.ego,
-                frozenset(answers_of(own[one.trace_id][5])),
+                frozenset(_answers_of(own[one.trace_id][5])),
                 RelationScope.of(json.loads(own[one.trace_id][4])),
                 one.period_ns,
                 one.extent,
@@ -339,9 +344,9 @@ class Snapshot:
         numbers = {row[2] for row in rows}
         if any("abstraction" in json.loads(row[4]) for row in rows):
             return None
-        answered = frozenset(one for row in rows for one in answers_of(row[5]))
+        answered = frozenset(one for row in rows for one in _answers_of(row[5]))
         of = [row for row in self.traces if row["trace_id"] in numbers]
-        known = frozenset(one for row in of for one in answers_of(row["answers"]))
+        known = frozenset(one for row in of for one in _answers_of(row["answers"]))
         mapped = any(row["map_digest"] for row in of)
         return relations_of_set(answered, known, mapped=mapped)
 
@@ -422,7 +427,7 @@ def write(place: Place, number: int, facts: Facts) -> bool:
         for table, columns in CATALOGUE.items():
             path = held / f"{table}.parquet"
             try:
-                write_parquet([*columns], facts[table], path, [*columns.values()])
+                ParquetTable.write_rows([*columns], facts[table], path, [*columns.values()])
             except ExportError as error:
                 raise StoreError(str(error)) from error
             digests[table] = digest_of_file(path)
@@ -472,3 +477,8 @@ def files(place: Place, known: Iterable[int]) -> set[str]:
         found.add(f"{_name(number)}.json")
         found |= {f"{told['folder']}/{table}.parquet" for table in told["tables"]}
     return found
+
+
+def _answers_of(text: str) -> tuple[str, ...]:
+    """Return the relations that a trace in a catalogue can answer."""
+    return tuple(map(str, json.loads(text)))

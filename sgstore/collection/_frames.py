@@ -17,7 +17,7 @@ from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _worker as worker
 from sgstore.lang.sql.collection_parts import PARTS
 from sgstore.model.frame_ids import trace_of
-from sgstore.store import PartFile, Rows, Triples, merged_arrays, merged_classes, merged_parts
+from sgstore.store import PartFile, Rows, Triples
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator
@@ -88,7 +88,7 @@ class CollectionFrames:
             skipped.
         """
         with self._told(sql, parameters) as parts:
-            return merged_arrays({PARTS: parts}, self._words, _ALL, ())
+            return PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
 
     def rows(self, sql: str, parameters: Parameters = ()) -> Rows:
         """Return all rows of such a statement; see :meth:`arrays`."""
@@ -118,7 +118,7 @@ class CollectionFrames:
     def coded(self, name: str) -> CodedClasses:
         """Return the class of each frame as a number; computed in bundles without stored classes."""
         with self._parts({"kind": "coded", "abstraction": name}) as parts:
-            return merged_classes(parts)
+            return PartFile.merged_classes(parts)
 
     def times(self) -> tuple[Ints, Ints]:
         """Return the ids of all frames, ascending, and their simulation times; ns."""
@@ -151,7 +151,7 @@ class CollectionFrames:
     def margins(self, question: dict[str, Any]) -> Iterator[tuple[Ints, Floats]]:
         """Yield the margins of a check, as :meth:`sgstore.temporal.CheckRun.margins`."""
         with self._parts({"kind": "margins"} | question) as parts:
-            found = merged_arrays({PARTS: parts}, self._words, _ALL, ())
+            found = PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
         yield (
             found["frame_id"].astype(np.int64),
             np.ma.filled(found["margin"].astype(np.float64), np.nan),
@@ -181,6 +181,6 @@ def _parts_of(answer: Mapping[str, Any]) -> list[PartFile]:
 
 
 def _rows(parts: list[PartFile], words: Words) -> Iterator[tuple[Any, ...]]:
-    with merged_parts({PARTS: parts}, words, _ALL, ()) as batches:
+    with PartFile.merged_rows({PARTS: parts}, words, _ALL, ()) as batches:
         for batch in batches:
             yield from batch.values

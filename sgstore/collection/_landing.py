@@ -28,10 +28,10 @@ from sgstore.model.trace_sampling import TracePart
 from sgstore.model.vocabulary import natural
 from sgstore.pipeline.recording_ingest import Job, SegmentReader, TraceOutcome
 from sgstore.store import (
+    BundleSource,
+    Identity,
     Sealed,
     StoreFile,
-    free_name,
-    maps_of_traces,
     split_segment,
     whole_segment,
 )
@@ -376,7 +376,7 @@ def _names(waiting: Sequence[_Landed], before: Snapshot, done: Commit) -> dict[i
     taken = {row["name"] for row in before.traces}
     names: dict[int, str] = {}
     for one in waiting:
-        names[one.trace_id] = free_name(one.stem, taken)
+        names[one.trace_id] = Identity.free_name(one.stem, taken)
         taken.add(names[one.trace_id])
     done.added = sorted(names.values(), key=natural)
     return names
@@ -406,7 +406,7 @@ def _bundled(
         shutil.rmtree(to)
         shutil.rmtree(segment)
     file.close()
-    known = maps_of_traces(path, names)
+    known = BundleSource(path).maps(names)
     segments = {one.trace_id: one.segment for one in waiting}
     chosen = {digest: maps[digest] for digest in known}
     facts = put_bundle(place, path, folder / "bundle.sgstore", names, chosen, segments)

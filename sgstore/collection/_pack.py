@@ -20,14 +20,11 @@ from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.vocabulary import natural
 from sgstore.store import (
     CATALOGUE,
+    BundleSource,
+    Identity,
     StoreFile,
     facts_of,
-    free_name,
-    join_bundles,
-    maps_of_traces,
-    names_of_traces,
     verify_file,
-    write_bundle,
 )
 
 if TYPE_CHECKING:
@@ -135,7 +132,7 @@ class _Source:
         names = self._named(before, done, place)
         if not names:
             return done
-        maps = map_names(before, maps_of_traces(self.path, names))
+        maps = map_names(before, BundleSource(self.path).maps(names))
         parts = self._groups(names)
         with working_folder("bundles") as folder:
             facts: list[Facts] = []
@@ -160,7 +157,7 @@ class _Source:
         """
         there = {row["trace_id"]: row for row in before.traces}
         new: list[tuple[str, str, str, int]] = []
-        for trace_id, (name, digest, ego) in names_of_traces(self.path).items():
+        for trace_id, (name, digest, ego) in BundleSource(self.path).names().items():
             row = there.get(trace_id)
             if row is None:
                 new.append((digest, ego, name, trace_id))
@@ -176,7 +173,7 @@ class _Source:
         taken = {row["name"] for row in before.traces}
         names: dict[int, str] = {}
         for _, _, name, trace_id in sorted(new):
-            names[trace_id] = free_name(name, taken)
+            names[trace_id] = Identity.free_name(name, taken)
             taken.add(names[trace_id])
             done.added.append(names[trace_id])
             if names[trace_id] != name:
@@ -186,7 +183,7 @@ class _Source:
 
     def _groups(self, names: Mapping[int, str]) -> list[dict[int, str]]:
         """Return the traces of each bundle."""
-        each = max(self.path.stat().st_size // max(len(names_of_traces(self.path)), 1), 1)
+        each = max(self.path.stat().st_size // max(len(BundleSource(self.path).names()), 1), 1)
         return groups(names, max(min(self.limit, self.about.bundle_bytes // each), 1))
 
 
@@ -220,11 +217,11 @@ def put_bundle(
     path : Path
         Temporary path of the bundle; removed afterwards.
     names, maps : mapping
-        As in :func:`sgstore.store.write_bundle`.
+        As in :meth:`sgstore.store.BundleSource.write`.
     segments : mapping of int to str, optional
         Trace → its landed segment.
     """
-    write_bundle(source, path, names, maps)
+    BundleSource(source).write(path, names, maps)
     sha = digest_of_file(path)
     file = StoreFile(path)
     facts = facts_of(file, sha, path.stat().st_size)
@@ -243,7 +240,7 @@ def map_names(before: Snapshot, found: Mapping[str, str]) -> dict[str, str]:
     taken = set(names.values())
     for digest, name in sorted(found.items()):
         if digest not in names:
-            names[digest] = free_name(name, taken)
+            names[digest] = Identity.free_name(name, taken)
             taken.add(names[digest])
     return {digest: names[digest] for digest in found}
 
@@ -277,7 +274,7 @@ def unpack(url: str | Path, store: str | Path) -> list[str]:
         fresh = beside.path / "store"
         paths = [bundle_path(place, one["bundle"]) for one in snapshot.bundles]
         if paths:
-            join_bundles(paths, fresh, names, maps)
+            BundleSource.join(paths, fresh, names, maps)
         else:
             StoreFile.create(fresh).close()
         fresh.rename(to)

@@ -48,18 +48,15 @@ from sgstore.model.vocabulary import natural
 from sgstore.model.world import Clip, tolerance_ns
 from sgstore.query import Store
 from sgstore.store import (
+    Example,
     FrameRef,
+    Identity,
+    ParquetTable,
     PartFile,
     SimilarFrames,
     StoreFile,
     Tabular,
     UserTables,
-    merged_arrays,
-    merged_file,
-    merged_parts,
-    most_like,
-    trace_among,
-    write_parquet,
 )
 from sgstore.temporal import TemporalMatches, kept_throughout
 
@@ -288,7 +285,7 @@ class Collection:
         found: list[SimilarFrames] = []
         for _, some in self.each(worker.like_in, dict.fromkeys(self.bundles(), how)):
             found += map(_similar, some)
-        return most_like(found, limit)
+        return Example.best(found, limit)
 
     def pattern(self, frame: str, *, ignore: Sequence[str] = ()) -> str:
         """Return a pattern that describes a frame around its ego; see :meth:`sgstore.Store.pattern`."""
@@ -318,7 +315,7 @@ class Collection:
             if (home := self.snapshot.homes.get(int(frame) >> SEQ_BITS)) is None:
                 raise StoreError(f"no frame {frame} in the collection")
             return home
-        return self.snapshot.homes[trace_among(known, name.strip())[0]]
+        return self.snapshot.homes[Identity.among(known, name.strip())[0]]
 
     # How a question is asked ----------------------------------------------------------------------
 
@@ -443,14 +440,14 @@ class Collection:
             found = set[str]()
             for result in self.ask({"kind": "classes"} | about, bundles):
                 parts = [PartFile.from_dict(part) for part in result["parts"]]
-                with merged_parts({PARTS: parts}, {}, _ALL, ()) as batches:
+                with PartFile.merged_rows({PARTS: parts}, {}, _ALL, ()) as batches:
                     found |= {row[0] for batch in batches for row in batch.values}
             rows += [(one.dataset, one.abstraction, name, 0) for name in sorted(found)]
         if not asked:
             return {}
         path = Path(folder) / "classes.parquet"
         types = ("VARCHAR", "VARCHAR", "VARCHAR", "BIGINT")
-        write_parquet(("dataset", "abstraction", "class", "frames"), rows, path, types)
+        ParquetTable.write_rows(("dataset", "abstraction", "class", "frames"), rows, path, types)
         return {CLASSES_GIVEN: path}
 
     def _counted(self, abstraction: str) -> list[tuple[str, str, str, int]]:
@@ -575,7 +572,7 @@ class PartedMatches(Tabular):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the omissions by settings in the queried traces; see :func:`sgstore.store.scope_of`."""
+        """Return the omissions by settings in the queried traces; see :func:`sgstore.model.scope.scope_of`."""
         chosen = (trace.trace_id for trace in self._ready.chosen)
         return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
 
@@ -596,7 +593,7 @@ class PartedMatches(Tabular):
         """Return all columns as arrays, masked for NULL."""
         with self._tables("rows", (0, 0)) as tables:
             text, values = parted(self._ready).statement(self._ready.catalog)
-            return merged_arrays(tables, self.snapshot.words, text, values)
+            return PartFile.merged_arrays(tables, self.snapshot.words, text, values)
 
     def count(self) -> int:
         """Return the number of distinct frames."""
@@ -608,7 +605,7 @@ class PartedMatches(Tabular):
             for result in self._whole.ask(self._question("count", folder), bundles):
                 self._reasons |= result["reasons"]
                 parts = [PartFile.from_dict(part) for part in result["parts"]]
-                with merged_parts({PARTS: parts}, {}, _ALL, ()) as batches:
+                with PartFile.merged_rows({PARTS: parts}, {}, _ALL, ()) as batches:
                     total += sum(row[0] for batch in batches for row in batch.values)
             return total
 
@@ -693,7 +690,7 @@ class PartedMatches(Tabular):
         with self._tables(form, offsets) as tables:
             text, values = asked.statement(self._ready.catalog)
             words = self.snapshot.words
-            with merged_parts(tables, words, text, values) as batches:
+            with PartFile.merged_rows(tables, words, text, values) as batches:
                 for batch in batches:
                     yield from batch.values
 
@@ -703,7 +700,7 @@ class PartedMatches(Tabular):
         with self._tables("apart", (0, 0)) as tables:
             statement = asked.statement(self._ready.catalog)
             words = self.snapshot.words
-            return merged_file(tables, words, statement, asked.columns, to)
+            return PartFile.merged(tables, words, statement, asked.columns, to)
 
     @contextmanager
     def _tables(self, form: str, offsets: tuple[int, int]) -> Generator[dict[str, list[PartFile]]]:
@@ -746,7 +743,7 @@ class PartedUnion(UnionMatches):
             yield from super()._rows(whole=whole)
             return
         row = row_type(self.columns)
-        with self._tables() as asked, merged_parts(*asked) as batches:
+        with self._tables() as asked, PartFile.merged_rows(*asked) as batches:
             for batch in batches:
                 yield from map(row._make, batch.values)
 
@@ -755,7 +752,7 @@ class PartedUnion(UnionMatches):
         if self.graphs:
             raise QueryError("a table has values, and SUBGRAPHS are graphs")
         with self._tables() as asked:
-            return merged_arrays(*asked)
+            return PartFile.merged_arrays(*asked)
 
     @contextmanager
     def _tables(self) -> Generator[tuple[Any, Any, str, list[Any]]]:
@@ -829,7 +826,7 @@ class PartedChecks:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the omissions by settings in the traces; see :func:`sgstore.store.scope_of`."""
+        """Return the omissions by settings in the traces; see :func:`sgstore.model.scope.scope_of`."""
         world = any(one.check.world for one in self._checks)
         return self._whole.snapshot.scope(world=world)
 

@@ -12,7 +12,7 @@ from sgstore.collection._pack import ATTEMPTS, put_bundle
 from sgstore.collection._storage import place_at
 from sgstore.errors import StoreError
 from sgstore.pipeline.rebuild import rebuild as rebuild_store
-from sgstore.store import maps_of_traces, names_of_traces
+from sgstore.store import BundleSource
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -78,13 +78,13 @@ def _remade(place: Place, bundle: str, look_in: Sequence[str | Path], jobs: int)
         path = folder / "bundle.sgstore"
         shutil.copyfile(bundle_path(place, bundle), path)
         rebuild_store(path, look_in=look_in, jobs=jobs)
-        names = {number: name for number, (name, _, _) in names_of_traces(path).items()}
+        names = {number: name for number, (name, _, _) in BundleSource(path).names().items()}
         segments = {
             row["trace_id"]: row["segment"]
             for row in catalogue.latest(place).traces
             if row["bundle"] == bundle
         }
-        maps = maps_of_traces(path, names)
+        maps = BundleSource(path).maps(names)
         return put_bundle(place, path, folder / "fresh.sgstore", names, maps, segments)
 
 

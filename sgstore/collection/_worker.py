@@ -26,18 +26,7 @@ from sgstore.lang.sql import Compiled
 from sgstore.lang.sql.collection_parts import parted
 from sgstore.matches import Interval
 from sgstore.query import Store, UserStatement, matches_of
-from sgstore.store import (
-    Example,
-    PartFile,
-    StoreFile,
-    UserTables,
-    example_of,
-    frames_like,
-    write_classes,
-    write_coded,
-    write_part,
-    write_rows,
-)
+from sgstore.store import Example, PartFile, StoreFile, UserTables
 from sgstore.temporal import CheckRun, Robustness, TemporalMatches, Verdict, Witness
 
 if TYPE_CHECKING:
@@ -120,7 +109,7 @@ class PartMatches(TemporalMatches):
         to = folder / f"{secrets.token_hex(8)}.parquet"
         asked = self._asked(statement)
         sql = asked["sql"], asked["parameters"]
-        return write_part(self._file, sql, statement.columns, asked["given"], to)
+        return PartFile.of_statement(self._file, sql, statement.columns, asked["given"], to)
 
 
 def answer(task: dict[str, Any]) -> dict[str, Any]:
@@ -287,7 +276,7 @@ def _classes(
 ) -> dict[str, Any]:
     """Write the classes of the frames of some traces, or of a table of single frames."""
     path = to / f"{secrets.token_hex(8)}.parquet"
-    part = write_classes(file, task["abstraction"], task["traces"], task["table"], path)
+    part = PartFile.of_classes(file, task["abstraction"], task["traces"], task["table"], path)
     return {"parts": [part.as_dict()], "reasons": {}}
 
 
@@ -315,7 +304,7 @@ def _sql(
 def _coded(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    part = write_coded(file, task["abstraction"], to / f"{secrets.token_hex(8)}.parquet")
+    part = PartFile.of_coded(file, task["abstraction"], to / f"{secrets.token_hex(8)}.parquet")
     return {"parts": [part.as_dict()], "reasons": {}}
 
 
@@ -335,7 +324,7 @@ def _features(
             )
 
     columns = {"frame": "BIGINT", "feature": "VARCHAR", "often": "BIGINT"}
-    part = write_rows(columns, rows(), to / f"{secrets.token_hex(8)}.parquet")
+    part = PartFile.of_rows(columns, rows(), to / f"{secrets.token_hex(8)}.parquet")
     return {"parts": [part.as_dict()], "reasons": {}}
 
 
@@ -349,7 +338,7 @@ def _margins(
     found = ((ids, np.broadcast_to(margins, len(ids))) for ids, margins in run.margins())
     rows = (row for one in found for row in zip(*(of.tolist() for of in one), strict=True))
     columns = {"frame_id": "BIGINT", "margin": "DOUBLE"}
-    part = write_rows(columns, rows, to / f"{secrets.token_hex(8)}.parquet")
+    part = PartFile.of_rows(columns, rows, to / f"{secrets.token_hex(8)}.parquet")
     return {"parts": [part.as_dict()], "reasons": {}}
 
 
@@ -358,7 +347,9 @@ def _rows(
 ) -> dict[str, Any]:
     statement = task["sql"], task["values"]
     columns = [row[0] for row in file.rows(f"DESCRIBE {task['sql']}", task["values"]).values]
-    part = write_part(file, statement, columns, (), to / f"{secrets.token_hex(8)}.parquet")
+    part = PartFile.of_statement(
+        file, statement, columns, (), to / f"{secrets.token_hex(8)}.parquet"
+    )
     return {"parts": [part.as_dict()], "reasons": {}}
 
 
@@ -389,12 +380,12 @@ def _tables(
 
 def example_in(store: Store, **asked: Any) -> dict[str, Any]:
     """Return a frame of a bundle as an example for others."""
-    return asdict(example_of(store.file, **asked))
+    return asdict(Example.of(store.file, **asked))
 
 
 def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str, Any]]:
     """Return the frames of a bundle that are most similar to an example."""
-    return [asdict(one) for one in frames_like(store.file, Example(**example), **how)]
+    return [asdict(one) for one in Example.find(store.file, Example(**example), **how)]
 
 
 _KINDS: Final[dict[str, Any]] = {

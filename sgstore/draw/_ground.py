@@ -14,7 +14,7 @@ from matplotlib.path import Path as Outline
 import sgstore.draw._page as layers
 import sgstore.draw._palette as palette
 from sgstore.draw._view import SCENERY
-from sgstore.maps.roads import within
+from sgstore.maps.roads import RoadMap
 from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from sgstore.draw._page import Rect, Stage
     from sgstore.draw._view import MapWindow
-    from sgstore.maps.roads import MapNodes, RoadMap
+    from sgstore.maps.roads import MapNodes
     from sgstore.model.world import Floats
 
 
@@ -98,7 +98,7 @@ class GroundView:
         for row in self.of_kind("lane"):
             if not 1 <= row < len(ribbons.offsets):
                 continue
-            inside = np.flatnonzero(within(self.outlines[row], places))
+            inside = np.flatnonzero(RoadMap.within(self.outlines[row], places))
             if not len(inside):
                 continue
             part = slice(*ribbons.offsets[row - 1 : row + 1].tolist())

@@ -31,7 +31,7 @@ from sgstore.exporters._labels import FEW
 from sgstore.exporters._nx import graphs_of
 from sgstore.exporters._transforms import EGO, FrameTransforms
 from sgstore.maps.opendrive import read_map
-from sgstore.maps.roads import drawn_outlines
+from sgstore.maps.roads import DrawnOutlines
 from sgstore.mcap import Loss
 from sgstore.readers import record_reader
 
@@ -162,7 +162,7 @@ class RerunClip:
         if told is None:
             return
         name, text = told
-        lines = drawn_outlines(read_map(text, name))
+        lines = DrawnOutlines.of(read_map(text, name))
         points = np.column_stack(
             [lines.x + lines.origin[0], lines.y + lines.origin[1], 0 * lines.x]
         )

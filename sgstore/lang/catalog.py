@@ -25,6 +25,7 @@ from sgstore.model.vocabulary import (
     MAP_KINDS,
     OWN_ENTITY_KINDS,
     OWN_KINDS,
+    RELATIONS,
     SIGNALS,
     SPECIALS,
     VEHICLE_LIGHTS,
@@ -893,3 +894,20 @@ def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:
         "env": [*ENV_ATTRIBUTES.values()],
         "trace": [*TRACE_ATTRIBUTES.values()],
     }
+
+
+def relations_of_set(
+    answered: frozenset[str], known: frozenset[str], *, mapped: bool
+) -> frozenset[str]:
+    """Return the relations of a derived set according to its settings.
+
+    Parameters
+    ----------
+    answered : frozenset of str
+        Relations that its traces answer in the set.
+    known : frozenset of str
+        Relations that its traces answer in the store.
+    mapped : bool
+        True if one of its traces has a road map.
+    """
+    return answered if mapped else frozenset(RELATIONS) - (known - answered)

@@ -22,18 +22,16 @@ import numpy as np
 from sgstore.base.markup import MarkupError, MarkupParser
 from sgstore.errors import MapError
 from sgstore.maps.roads import (
-    END,
     MAX_LANES,
     MAX_NAME,
     MAX_POINTS,
-    START,
     Border,
     Joint,
     LaneLine,
     PlainCrosswalk,
     PlainSignal,
+    Sections,
     about_lanes,
-    cross_sections,
     lane_text,
     plain_lanes,
     run_of,
@@ -41,7 +39,6 @@ from sgstore.maps.roads import (
 )
 
 if TYPE_CHECKING:
-    from sgstore.maps.roads import Sections
     from sgstore.model.world import Floats
 
 MAX_ELEMENTS: Final = 8_000_000
@@ -167,7 +164,7 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
             if not ident or len(ident) > MAX_NAME or len(centre) < 2 or not 0 < width < 1000:
                 broken.append(ident or edge.ident)
                 continue
-            sections, _ = cross_sections(centre, [], [], width / 2)
+            sections, _ = Sections.across(centre, [], [], width / 2)
             if crossing:
                 crosswalks.append(_crosswalk(ident, sections))
                 continue
@@ -258,8 +255,8 @@ def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
         via, end = told.get("via", ""), f"{told.get('to')}_{told.get('toLane')}"
         dst = via if via in lines else end
         if src in lines and dst in lines:
-            after[src].append(Joint(dst, START))
-            before[dst].append(Joint(src, END))
+            after[src].append(Joint(dst, Joint.START))
+            before[dst].append(Joint(src, Joint.END))
     return [
         replace(line, before=tuple(before[ident]), after=tuple(after[ident]))
         for ident, line in lines.items()

@@ -1,7 +1,11 @@
-"""Ids of frames: the trace id, the bucket number and the frame number in the bucket, as bits of one number."""
+"""Ids of frames: trace id, bucket number and frame number in the bucket, as bits of one number.
+
+Also the text form of a range of frames.
+"""
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -63,3 +67,23 @@ def begins(frame_id: Ints) -> Bools:
     found = np.ones(len(frame_id), np.bool_)
     found[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
     return found
+
+
+_RANGE: Final = re.compile(r"(.+)([@#])(\d+(?:\.\d+)?s?)\.\.(\d+(?:\.\d+)?s?)")
+
+
+def range_of(text: str) -> tuple[str, str] | None:
+    """Parse a frame range such as ``TRACE@12s..18s`` or ``TRACE#120..180``; ``None`` for a single frame.
+
+    >>> range_of("town@12.5s..18s")
+    ('town@12.5s', 'town@18s')
+    >>> range_of("town#120..180"), range_of("town#120")
+    (('town#120', 'town#180'), None)
+    """
+    found = _RANGE.fullmatch(text.strip())
+    if found is None:
+        return None
+    trace, mark, first, last = found.groups()
+    unit = "s" if mark == "@" else ""
+    first, last = (f"{trace}{mark}{end.removesuffix('s')}{unit}" for end in (first, last))
+    return first, last

@@ -368,7 +368,7 @@ class Entities:
         True if the entity never moves. Its only pose is in :attr:`FrameBlock.scenery`.
     map_ref : tuple of str
         Id of the matching OpenDRIVE signal or object, or an empty string. For a signal that the map lacks: its
-        lanes, in the format of :func:`sgstore.maps.roads.lanes_ref`.
+        lanes, in the format of :meth:`sgstore.maps.roads.RoadMap.lanes_ref`.
     lifetime : tuple of int
         1 for the first entity with an id, 2 for the next one with the same id, and so on. Empty means 1 for
         all.

@@ -22,13 +22,13 @@ from sgstore.model.config import Config, from_dict
 from sgstore.pipeline.derive import derive, keep_abstraction
 from sgstore.pipeline.importing import Words, import_graphs
 from sgstore.readers import open_trace
-from sgstore.store import StoreFile, named_as, remains_of, take_place
+from sgstore.store import Remains, StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
 
     from sgstore.pipeline.recording_ingest import Progress
-    from sgstore.store import OldMap, OldTrace, Remains
+    from sgstore.store import OldMap, OldTrace
 
 
 try:
@@ -110,7 +110,7 @@ def rebuild(
         tables. The old store is then unchanged.
     """
     path = Path(store)
-    whole = remains_of(path)
+    whole = Remains.of(path)
     old = _without(path, whole, leave_out)
     _check_settings(path, old.traces)
     if old.others:
@@ -131,9 +131,9 @@ def rebuild(
             else:
                 _import(fresh, step, places[step.trace_id], old.maps)
         _complete(path, fresh, old)
-        named_as(fresh, old)
+        old.give_names(fresh)
         made = {one.trace_id: one for one in StoreFile(fresh).traces()}
-        take_place(fresh, path, whole)
+        whole.replace(fresh, path)
     return [
         Rebuilt(
             one.name,
@@ -360,7 +360,7 @@ def _import(fresh: Path, trace: OldTrace, path: Path, maps: dict[int, OldMap]) -
     if reason and "words" not in (trace.imported or {}):
         reason += f" (an older version did not keep how it was imported: {unknown})"
     if not reason and trace.map_id is not None:
-        now = {one.digest for one in remains_of(fresh).maps.values()}
+        now = {one.digest for one in Remains.of(fresh).maps.values()}
         if maps[trace.map_id].digest not in now:
             StoreFile(fresh).remove(trace.trace_id)
             reason = f"{path}: the store does not know how it was imported (--kind, --relation, …): {unknown}"

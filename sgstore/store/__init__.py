@@ -18,77 +18,36 @@ Collections: ``_bundles`` copies traces into new stores, and ``_bundle_catalogue
 ``_inbox_segments`` keeps segments before that, and ``_merge`` merges the results of several bundles.
 """
 
-from sgstore.store._arrow import arrow_file, as_told, as_told_batches
-from sgstore.store._bundle_catalogue import (
-    CATALOGUE,
-    Facts,
-    answers_of,
-    facts_of,
-    maps_of_traces,
-    names_of_traces,
-    parquet_rows,
-)
-from sgstore.store._bundles import join_bundles, write_bundle
-from sgstore.store._catalog import relations_of_set, subset_catalogs
+from sgstore.store._arrow import as_told
+from sgstore.store._bundle_catalogue import CATALOGUE, Facts, facts_of, parquet_rows
+from sgstore.store._bundles import BundleSource
+from sgstore.store._catalog import subset_catalogs
 from sgstore.store._classes import Abstracted
-from sgstore.store._clients import duckdb
 from sgstore.store._coded_classes import CodedClasses, Triples
-from sgstore.store._contents import (
-    DIGEST_BYTES,
-    WINDOW,
-    Mark,
-    MessagePlaces,
-    graph_digests,
-    lengths_of_messages,
-    marks,
-    messages_of,
-)
+from sgstore.store._contents import Mark, MessagePlaces, graph_digests
 from sgstore.store._encounters import measured
 from sgstore.store._file import StoreFile
 from sgstore.store._inbox_segments import split_segment, whole_segment
 from sgstore.store._joins import UserTables
-from sgstore.store._merge import (
-    PartFile,
-    merged_arrays,
-    merged_classes,
-    merged_file,
-    merged_parts,
-    write_classes,
-    write_coded,
-    write_part,
-    write_rows,
-)
+from sgstore.store._merge import PartFile
 from sgstore.store._publish import PresentError
-from sgstore.store._rebuild import OldMap, OldTrace, Remains, named_as, remains_of, take_place
-from sgstore.store._rows import IN_NOTEBOOK, Batches, Rows, Tabular, count_parquet
+from sgstore.store._rebuild import OldMap, OldTrace, Remains
+from sgstore.store._rows import Rows, Tabular, count_parquet
 from sgstore.store._schema import SCHEMA_VERSION
-from sgstore.store._similarity import Example, SimilarFrames, example_of, frames_like, most_like
+from sgstore.store._similarity import Example, SimilarFrames
 from sgstore.store._staging import Sealed
-from sgstore.store._store_paths import Folder, refuse_name
-from sgstore.store._table_files import ParquetTable, write_batches, write_csv, write_parquet
+from sgstore.store._store_paths import Folder
+from sgstore.store._table_files import ParquetTable
 from sgstore.store._temporary_tables import Given, GivenTable
-from sgstore.store._traces import (
-    FrameRef,
-    Identity,
-    StoredTrace,
-    free_name,
-    range_of,
-    scope_of,
-    scope_text,
-    trace_among,
-    trace_id_of,
-)
+from sgstore.store._traces import FrameRef, Identity, StoredTrace
 from sgstore.store._verify import verify_file
 from sgstore.store._write import OnMap, Segment
 
 __all__ = [
     "CATALOGUE",
-    "DIGEST_BYTES",
-    "IN_NOTEBOOK",
     "SCHEMA_VERSION",
-    "WINDOW",
     "Abstracted",
-    "Batches",
+    "BundleSource",
     "CodedClasses",
     "Example",
     "Facts",
@@ -115,50 +74,14 @@ __all__ = [
     "Tabular",
     "Triples",
     "UserTables",
-    "answers_of",
-    "arrow_file",
     "as_told",
-    "as_told_batches",
     "count_parquet",
-    "duckdb",
-    "example_of",
     "facts_of",
-    "frames_like",
-    "free_name",
     "graph_digests",
-    "join_bundles",
-    "lengths_of_messages",
-    "maps_of_traces",
-    "marks",
     "measured",
-    "merged_arrays",
-    "merged_classes",
-    "merged_file",
-    "merged_parts",
-    "messages_of",
-    "most_like",
-    "named_as",
-    "names_of_traces",
     "parquet_rows",
-    "range_of",
-    "refuse_name",
-    "relations_of_set",
-    "remains_of",
-    "scope_of",
-    "scope_text",
     "split_segment",
     "subset_catalogs",
-    "take_place",
-    "trace_among",
-    "trace_id_of",
     "verify_file",
     "whole_segment",
-    "write_batches",
-    "write_bundle",
-    "write_classes",
-    "write_coded",
-    "write_csv",
-    "write_parquet",
-    "write_part",
-    "write_rows",
 ]

@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
 
-from sgstore.base.output_files import written_at
 from sgstore.errors import MissingExtraError
 from sgstore.store._interrupts import interruptible
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-    from pathlib import Path
 
     from duckdb import DuckDBPyConnection
 
@@ -108,28 +106,6 @@ def package(name: str) -> Any:
         return import_module(name)
     except ImportError as error:
         raise MissingExtraError(*_EXTRAS[name]) from error
-
-
-def arrow_file(source: Path, to: Path) -> None:
-    """Convert a Parquet file to an Arrow file (IPC, Feather 2), batch by batch.
-
-    Raises
-    ------
-    ExportError
-        The file is not writable.
-    MissingExtraError
-        pyarrow is not installed.
-    """
-    arrow = package("pyarrow")
-    parquet = import_module("pyarrow.parquet")
-    with (
-        written_at(to) as place,
-        parquet.ParquetFile(source) as file,
-        arrow.OSFile(str(place), "wb") as sink,
-        arrow.ipc.new_file(sink, file.schema_arrow) as writer,
-    ):
-        for batch in file.iter_batches():
-            writer.write_batch(batch)
 
 
 ROWS_AT_ONCE: Final = 50_000

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
 
 from sgstore.base.quoting import quoted
 from sgstore.errors import StoreError
-from sgstore.store._locking import Access
 from sgstore.store._rows import Rows, run
-from sgstore.store._traces import stored_traces
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -191,28 +188,6 @@ def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
             yield bundle, what, name, kind.value, 0
     for name in catalog.classed:
         yield bundle, "classed", name, "", 0
-
-
-def answers_of(text: str) -> tuple[str, ...]:
-    """Return the relations that a trace in a catalogue can answer."""
-    return tuple(map(str, json.loads(text)))
-
-
-def names_of_traces(path: Path) -> dict[int, tuple[str, str, str]]:
-    """Return trace id → (name, recording digest, ego) of a store, sorted by name in natural order."""
-    with Access(path).reading() as connection:
-        found = stored_traces(connection)
-    return {one.trace_id: (one.name, one.digest, one.ego) for one in found}
-
-
-def maps_of_traces(path: Path, traces: Iterable[int]) -> dict[str, str]:
-    """Return the road maps of some traces: map digest → map name."""
-    sql = (
-        "SELECT DISTINCT m.digest, m.name FROM trace t JOIN map m ON m.map_id = t.map_id"
-        " WHERE t.trace_id IN (SELECT unnest(CAST($1 AS BIGINT[])))"
-    )
-    with Access(path).reading() as connection:
-        return dict(run(connection, sql, [[*traces]]).values)
 
 
 def parquet_rows(path: Path, columns: Iterable[str]) -> list[tuple[Any, ...]]:

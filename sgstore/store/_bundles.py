@@ -1,14 +1,14 @@
 """Bundles: new stores with sorted, renamed traces of one or several stores.
 
 Ids of traces, maps, recordings and settings come from digests. They are equal in every store, so rows are
-copied unchanged. This module also computes the catalogue rows of a bundle, and reads and writes the Parquet
-tables of a catalogue.
+copied unchanged.
 """
 
 from __future__ import annotations
 
 import os
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import sgstore.store._schema as shape
@@ -21,10 +21,12 @@ from sgstore.store._creation import attach_empty
 from sgstore.store._engine_errors import translated
 from sgstore.store._locking import Access, default_memory, spill_folder
 from sgstore.store._publish import SHARED
+from sgstore.store._rows import run
 from sgstore.store._staging import scratch
+from sgstore.store._traces import stored_traces
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -47,65 +49,89 @@ _SORTED: Final = frozenset({*STATES, *REPEATED, *REPEATED.values(), "frame", *MA
 """Large tables, sorted in a bundle."""
 
 
-def write_bundle(
-    source: Path, to: Path, traces: Mapping[int, str], maps: Mapping[str, str] | None = None
-) -> None:
-    """Copy traces of a store into a new store, sorted across all traces.
+@dataclass(frozen=True, slots=True)
+class BundleSource:
+    """Store with traces for a bundle. It does not change.
 
-    Parameters
+    Attributes
     ----------
-    source : Path
-        Source store; it does not change.
-    to : Path
-        Path of the new store, in a folder that no other process uses. The file must not exist.
-    traces : mapping of int to str
-        Trace id → name in the new store.
-    maps : mapping of str to str, optional
-        Digest of a road map → name in the new store.
-
-    Raises
-    ------
-    StoreError
-        The store lacks one of the traces, or a file is not readable or writable.
+    path : Path
     """
-    access = Access(source)
-    threads = os.cpu_count() or 1
-    with (
-        scratch(spill_folder(), memory=default_memory(), threads=threads) as connection,
-        access.attached(connection, to.parent),
-    ):
-        _copied(connection, ["store"], to, traces, maps or {})
 
+    path: Path
 
-def join_bundles(
-    sources: Sequence[Path], to: Path, traces: Mapping[int, str], maps: Mapping[str, str]
-) -> None:
-    """Copy traces of several stores into a new store. No process may write to the sources.
+    def names(self) -> dict[int, tuple[str, str, str]]:
+        """Return trace id → (name, recording digest, ego), sorted by name in natural order."""
+        with Access(self.path).reading() as connection:
+            found = stored_traces(connection)
+        return {one.trace_id: (one.name, one.digest, one.ego) for one in found}
 
-    Parameters
-    ----------
-    sources : sequence of Path
-        Stores of this version. Each trace is in one of them.
-    to, traces, maps
-        See :func:`write_bundle`.
+    def maps(self, traces: Iterable[int]) -> dict[str, str]:
+        """Return the road maps of some traces: map digest → map name."""
+        sql = (
+            "SELECT DISTINCT m.digest, m.name FROM trace t JOIN map m ON m.map_id = t.map_id"
+            " WHERE t.trace_id IN (SELECT unnest(CAST($1 AS BIGINT[])))"
+        )
+        with Access(self.path).reading() as connection:
+            return dict(run(connection, sql, [[*traces]]).values)
 
-    Raises
-    ------
-    StoreError
-        A trace is missing from all stores, or a file is not readable or writable.
-    """
-    sources = list(sources)
-    with ExitStack() as made:
-        while len(sources) > TOGETHER:
-            parts: list[Path] = []
-            for first in range(0, len(sources), TOGETHER):
-                some = sources[first : first + TOGETHER]
-                part = to.with_name(f"{to.name}.part-{len(sources)}-{first}")
-                made.callback(part.unlink, missing_ok=True)
-                _join(some, part, traces, maps, whole=False)
-                parts.append(part)
-            sources = parts
-        _join(sources, to, traces, maps, whole=True)
+    def write(
+        self, to: Path, traces: Mapping[int, str], maps: Mapping[str, str] | None = None
+    ) -> None:
+        """Copy traces into a new store, sorted across all traces.
+
+        Parameters
+        ----------
+        to : Path
+            Path of the new store, in a folder that no other process uses. The file must not exist.
+        traces : mapping of int to str
+            Trace id → name in the new store.
+        maps : mapping of str to str, optional
+            Digest of a road map → name in the new store.
+
+        Raises
+        ------
+        StoreError
+            The store lacks one of the traces, or a file is not readable or writable.
+        """
+        access = Access(self.path)
+        threads = os.cpu_count() or 1
+        with (
+            scratch(spill_folder(), memory=default_memory(), threads=threads) as connection,
+            access.attached(connection, to.parent),
+        ):
+            _copied(connection, ["store"], to, traces, maps or {})
+
+    @staticmethod
+    def join(
+        sources: Sequence[Path], to: Path, traces: Mapping[int, str], maps: Mapping[str, str]
+    ) -> None:
+        """Copy traces of several stores into a new store. No process may write to the sources.
+
+        Parameters
+        ----------
+        sources : sequence of Path
+            Stores of this version. Each trace is in one of them.
+        to, traces, maps
+            See :meth:`write`.
+
+        Raises
+        ------
+        StoreError
+            A trace is missing from all stores, or a file is not readable or writable.
+        """
+        sources = list(sources)
+        with ExitStack() as made:
+            while len(sources) > TOGETHER:
+                parts: list[Path] = []
+                for first in range(0, len(sources), TOGETHER):
+                    some = sources[first : first + TOGETHER]
+                    part = to.with_name(f"{to.name}.part-{len(sources)}-{first}")
+                    made.callback(part.unlink, missing_ok=True)
+                    _join(some, part, traces, maps, whole=False)
+                    parts.append(part)
+                sources = parts
+            _join(sources, to, traces, maps, whole=True)
 
 
 def _join(

@@ -12,8 +12,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.quoting import literal
 from sgstore.graphs.abstractions import SUBSETS
-from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts, Type, excluded_kinds, own_type
-from sgstore.model.vocabulary import BEYOND, NAMES, RELATIONS
+from sgstore.lang.catalog import (
+    Catalog,
+    RelationScope,
+    TraceFacts,
+    Type,
+    excluded_kinds,
+    own_type,
+    relations_of_set,
+)
+from sgstore.model.vocabulary import BEYOND, NAMES
 from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
 
@@ -291,23 +299,6 @@ def _relations(
     known = (t.answers for t in whole.traces if t.trace_id in numbers)
     mapped = bool(numbers & {number for (number,) in told})
     return relations_of_set(answered, frozenset[str]().union(*known), mapped=mapped)
-
-
-def relations_of_set(
-    answered: frozenset[str], known: frozenset[str], *, mapped: bool
-) -> frozenset[str]:
-    """Return the relations of a derived set according to its settings.
-
-    Parameters
-    ----------
-    answered : frozenset of str
-        Relations that its traces answer in the set.
-    known : frozenset of str
-        Relations that its traces answer in the store.
-    mapped : bool
-        True if one of its traces has a road map.
-    """
-    return answered if mapped else frozenset(RELATIONS) - (known - answered)
 
 
 def _words(names: Iterable[str]) -> str:

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     Words = NDArray[np.uint64]
 
 
-WINDOW: Final = 4_000
-"""Frames to read messages of at once."""
-
 GRAPHS: Final = 500
 """Frames to read graphs of at once. A frame usually has a thousand edges, and 45 values per node."""
 
@@ -96,10 +93,10 @@ class Mark:
     config: str
     map: str
 
-
-def marks(file: StoreFile) -> dict[int, Mark]:
-    """Return the settings and maps of the traces of a store by trace id."""
-    return {row[0]: Mark(*row[1:]) for row in file.rows(_MARKS).values}
+    @staticmethod
+    def of_traces(file: StoreFile) -> dict[int, Mark]:
+        """Return the settings and maps of the traces of a store by trace id."""
+        return {row[0]: Mark(*row[1:]) for row in file.rows(_MARKS).values}
 
 
 def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
@@ -251,30 +248,30 @@ class MessagePlaces:
     offset: Ints
     length: Ints
 
+    @staticmethod
+    def of(file: StoreFile, frame_id: Ints) -> MessagePlaces:
+        """Return the messages of frames of one trace, one row per frame and message."""
+        found = file.arrays(_MESSAGES, {"frames": frame_id.tolist()})
+        frame, channel, *numbers = found.values()
+        return MessagePlaces(
+            frame.astype(np.int64),
+            np.asarray(channel, object),
+            *(column.astype(np.int64) for column in numbers),
+        )
 
-def messages_of(file: StoreFile, frame_id: Ints) -> MessagePlaces:
-    """Return the messages of frames of one trace, one row per frame and message."""
-    found = file.arrays(_MESSAGES, {"frames": frame_id.tolist()})
-    frame, channel, *numbers = found.values()
-    return MessagePlaces(
-        frame.astype(np.int64),
-        np.asarray(channel, object),
-        *(column.astype(np.int64) for column in numbers),
-    )
+    @staticmethod
+    def lengths(file: FileOfFrames, frame_id: Ints) -> Iterator[tuple[Ints, Ints]]:
+        """Yield message sizes for ascending frame ids; bytes. Each message counts once, for its first frame."""
+        ends = np.append(np.flatnonzero(np.diff(trace_of(frame_id))) + 1, len(frame_id))
+        low = 0
+        while low < len(frame_id):
+            high = int(ends[np.searchsorted(ends, min(low + TOGETHER, len(frame_id)))])
+            found = file.arrays(_LENGTHS, {"frames": frame_id[low:high].tolist()})
+            yield found["frame_id"].astype(np.int64), found["length"].astype(np.int64)
+            low = high
 
 
 class FileOfFrames(Protocol):
     """Interface of a store file, or of the bundles of a collection."""
 
     def arrays(self, sql: str, parameters: Any) -> dict[str, NDArray[Any]]: ...
-
-
-def lengths_of_messages(file: FileOfFrames, frame_id: Ints) -> Iterator[tuple[Ints, Ints]]:
-    """Yield message sizes for ascending frame ids; bytes. Each message counts once, for its first frame."""
-    ends = np.append(np.flatnonzero(np.diff(trace_of(frame_id))) + 1, len(frame_id))
-    low = 0
-    while low < len(frame_id):
-        high = int(ends[np.searchsorted(ends, min(low + TOGETHER, len(frame_id)))])
-        found = file.arrays(_LENGTHS, {"frames": frame_id[low:high].tolist()})
-        yield found["frame_id"].astype(np.int64), found["length"].astype(np.int64)
-        low = high

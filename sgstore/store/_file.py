@@ -22,7 +22,7 @@ from sgstore.store._encounters import recorded_measures
 from sgstore.store._engine_errors import EngineError, translated
 from sgstore.store._locking import WAIT_S, Access, default_memory, spill_folder, stamp_of
 from sgstore.store._rows import BATCH, Batches, Rows
-from sgstore.store._table_files import write_batches, write_parquet
+from sgstore.store._table_files import ParquetTable
 from sgstore.store._temporary_tables import Given, give
 from sgstore.store._traces import (
     FrameRef,
@@ -335,14 +335,14 @@ class StoreFile:
 
         def step(connection: DuckDBPyConnection) -> int | None:
             stream = record_batches(connection, sql)
-            return None if stream is None else write_batches(stream, to)
+            return None if stream is None else ParquetTable.write_batches(stream, to)
 
         number = self._user_step(sql, timeout_s, step, given)
         if number is not None:
             return number
         with self.user_batches(sql, timeout_s=timeout_s, given=given) as batches:
             values = chain.from_iterable(batch.values for batch in batches)
-            return write_parquet(batches.columns, values, to, batches.types)
+            return ParquetTable.write_rows(batches.columns, values, to, batches.types)
 
     def _user_step(
         self,

@@ -26,7 +26,7 @@ from sgstore.store._lease import shared_instance
 from sgstore.store._locking import default_memory, spill_folder
 from sgstore.store._rows import Batches, arrays
 from sgstore.store._staging import scratch
-from sgstore.store._table_files import write_parquet
+from sgstore.store._table_files import ParquetTable
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Mapping, Sequence
@@ -101,37 +101,142 @@ class PartFile:
             return self
         return replace(self, path=self.path.replace(folder / self.path.name))
 
+    @staticmethod
+    def of_statement(
+        file: StoreFile,
+        statement: tuple[str, Parameters],
+        columns: Sequence[str],
+        given: Iterable[Given],
+        to: Path,
+    ) -> PartFile:
+        """Run a trusted SQL statement on a store, and let DuckDB write the rows to a Parquet file.
 
-_PART: Final = quoted(":part")
+        Parameters
+        ----------
+        file : StoreFile
+        statement : (str, values)
+            SQL statement and its parameter values.
+        columns : sequence of str
+            Column names of the result.
+        given : iterable
+            Temporary tables, as for :meth:`StoreFile.batches`.
+        to : Path
+        """
+        sql, values = statement
+        made = _making(sql, len(columns))
+        table: Any = made, values
+        with file.asked(_written, [*given, table]) as (place, kinds, rows, few):
+            if place is not None:
+                shutil.move(place, to)
+        return PartFile(to, tuple(columns), kinds, rows, few)
 
+    @staticmethod
+    def of_classes(
+        file: StoreFile, abstraction: str, traces: Sequence[int], table: str, to: Path
+    ) -> PartFile:
+        """Write the frame classes of an abstraction for some traces, or for a user table.
 
-def write_part(
-    file: StoreFile,
-    statement: tuple[str, Parameters],
-    columns: Sequence[str],
-    given: Iterable[Given],
-    to: Path,
-) -> PartFile:
-    """Run a trusted SQL statement on a store, and let DuckDB write the rows to a Parquet file.
+        Parameters
+        ----------
+        file : StoreFile
+        abstraction : str
+        traces : sequence of int
+            Trace ids; ids outside this store are ignored.
+        table : str
+            Name of the user table; empty: use ``traces``.
+        to : Path
+        """
+        of = "SELECT DISTINCT c.class FROM classes c"
+        known = "c.abstraction = $1 AND c.class IS NOT NULL"
+        if table:
+            sql = f"{of} JOIN {quoted(table)} u ON u.frame_id = c.frame_id WHERE {known}"
+            return PartFile.of_statement(file, (sql, [abstraction]), ["class"], (), to)
+        sql = f"{of} WHERE {known} AND c.frame_id >> {SEQ_BITS} IN (SELECT unnest(CAST($2 AS BIGINT[])))"
+        return PartFile.of_statement(file, (sql, [abstraction, [*traces]]), ["class"], (), to)
 
-    Parameters
-    ----------
-    file : StoreFile
-    statement : (str, values)
-        SQL statement and its parameter values.
-    columns : sequence of str
-        Column names of the result.
-    given : iterable
-        Temporary tables, as for :meth:`StoreFile.batches`.
-    to : Path
-    """
-    sql, values = statement
-    made = _making(sql, len(columns))
-    table: Any = made, values
-    with file.asked(_written, [*given, table]) as (place, kinds, rows, few):
+    @staticmethod
+    def of_coded(file: StoreFile, abstraction: str, to: Path) -> PartFile:
+        """Write the class of each frame in an abstraction, for :meth:`merged_classes`."""
+        columns = {"class": "VARCHAR", "bucket": "BIGINT", "mask": "BIGINT"}
+        return PartFile.of_rows(columns, file.abstracted.masks(abstraction), to)
+
+    @staticmethod
+    def of_rows(columns: Mapping[str, str], rows: Iterable[Sequence[Any]], to: Path) -> PartFile:
+        """Write rows from Python in the format of :meth:`of_statement`. ``columns`` maps names to types."""
+        names, types = [f"c{number}" for number in range(len(columns))], (*columns.values(),)
+        return PartFile(to, tuple(columns), types, ParquetTable.write_rows(names, rows, to, types))
+
+    @staticmethod
+    def merged_classes(parts: Sequence[PartFile]) -> CodedClasses:
+        """Return the frame classes of partial results with columns ``class``, ``bucket``, ``mask``."""
+        from sgstore.store._coded_classes import classes_coded
+
+        with _tables({"parts": [*parts]}, {}) as connection:
+            return classes_coded(connection, "SELECT class, bucket, mask FROM parts")
+
+    @staticmethod
+    def merged_arrays(
+        parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
+    ) -> dict[str, NDArray[np.generic]]:
+        """Return the columns of a statement over partial results as arrays. NULL values are masked."""
+        with _tables(parts, words) as connection:
+            return arrays(connection, sql, _numbered(values))
+
+    @staticmethod
+    @contextmanager
+    def merged_rows(
+        parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
+    ) -> Generator[Batches]:
+        """Stream the rows of a statement over partial results.
+
+        Parameters
+        ----------
+        parts : mapping of str to sequence of PartFile
+            See :data:`Parts`.
+        words : mapping of str to sequence of str
+            Enumeration → values in the collection that ``schema.sql`` lacks.
+        sql : str
+        values : sequence
+            Parameter values.
+        """
+        with _tables(parts, words) as connection:
+            yield Batches(connection, sql, _numbered(values))
+
+    @staticmethod
+    def merged(
+        parts: Parts,
+        words: Mapping[str, Sequence[str]],
+        statement: tuple[str, Sequence[Any]],
+        columns: Sequence[str],
+        to: Path,
+    ) -> PartFile:
+        """Write the rows of a statement over partial results as a new partial result.
+
+        Parameters
+        ----------
+        parts, words
+            See :meth:`merged_rows`.
+        statement : (str, values)
+            SQL statement and its parameter values.
+        columns : sequence of str
+            Column names of the result.
+        to : Path
+        """
+        sql, values = statement
+        with _tables(parts, words) as connection:
+            made = _making(sql, len(columns))
+
+            def step() -> Written:
+                connection.execute(made, _numbered(values) or None)
+                return _written(connection)
+
+            place, kinds, rows, few = interruptible(connection, step)
         if place is not None:
             shutil.move(place, to)
-    return PartFile(to, tuple(columns), kinds, rows, few)
+        return PartFile(to, tuple(columns), kinds, rows, few)
+
+
+_PART: Final = quoted(":part")
 
 
 def _making(sql: str, columns: int) -> str:
@@ -169,115 +274,8 @@ def _is_plain(kind: str) -> bool:
     return kind in _PLAIN or kind == _NOTHING or kind.startswith("ENUM")
 
 
-def write_classes(
-    file: StoreFile, abstraction: str, traces: Sequence[int], table: str, to: Path
-) -> PartFile:
-    """Write the frame classes of an abstraction for some traces, or for a user table.
-
-    Parameters
-    ----------
-    file : StoreFile
-    abstraction : str
-    traces : sequence of int
-        Trace ids; ids outside this store are ignored.
-    table : str
-        Name of the user table; empty: use ``traces``.
-    to : Path
-    """
-    of = "SELECT DISTINCT c.class FROM classes c"
-    known = "c.abstraction = $1 AND c.class IS NOT NULL"
-    if table:
-        sql = f"{of} JOIN {quoted(table)} u ON u.frame_id = c.frame_id WHERE {known}"
-        return write_part(file, (sql, [abstraction]), ["class"], (), to)
-    sql = (
-        f"{of} WHERE {known} AND c.frame_id >> {SEQ_BITS} IN (SELECT unnest(CAST($2 AS BIGINT[])))"
-    )
-    return write_part(file, (sql, [abstraction, [*traces]]), ["class"], (), to)
-
-
-def write_rows(columns: Mapping[str, str], rows: Iterable[Sequence[Any]], to: Path) -> PartFile:
-    """Write rows from Python in the format of :func:`write_part`. ``columns`` maps names to types."""
-    names, types = [f"c{number}" for number in range(len(columns))], (*columns.values(),)
-    return PartFile(to, tuple(columns), types, write_parquet(names, rows, to, types))
-
-
-def write_coded(file: StoreFile, abstraction: str, to: Path) -> PartFile:
-    """Write the class of each frame in an abstraction, for :func:`merged_classes`."""
-    columns = {"class": "VARCHAR", "bucket": "BIGINT", "mask": "BIGINT"}
-    return write_rows(columns, file.abstracted.masks(abstraction), to)
-
-
 Parts = dict[str, list[PartFile]]
 """Table of a statement → files of its rows, with the same columns."""
-
-
-@contextmanager
-def merged_parts(
-    parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
-) -> Generator[Batches]:
-    """Stream the rows of a statement over partial results.
-
-    Parameters
-    ----------
-    parts : mapping of str to sequence of PartFile
-        See :data:`Parts`.
-    words : mapping of str to sequence of str
-        Enumeration → values in the collection that ``schema.sql`` lacks.
-    sql : str
-    values : sequence
-        Parameter values.
-    """
-    with _tables(parts, words) as connection:
-        yield Batches(connection, sql, _numbered(values))
-
-
-def merged_file(
-    parts: Parts,
-    words: Mapping[str, Sequence[str]],
-    statement: tuple[str, Sequence[Any]],
-    columns: Sequence[str],
-    to: Path,
-) -> PartFile:
-    """Write the rows of a statement over partial results as a new partial result.
-
-    Parameters
-    ----------
-    parts, words
-        See :func:`merged_parts`.
-    statement : (str, values)
-        SQL statement and its parameter values.
-    columns : sequence of str
-        Column names of the result.
-    to : Path
-    """
-    sql, values = statement
-    with _tables(parts, words) as connection:
-        made = _making(sql, len(columns))
-
-        def step() -> Written:
-            connection.execute(made, _numbered(values) or None)
-            return _written(connection)
-
-        place, kinds, rows, few = interruptible(connection, step)
-    if place is not None:
-        shutil.move(place, to)
-    return PartFile(to, tuple(columns), kinds, rows, few)
-
-
-def merged_arrays(
-    parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
-) -> dict[str, NDArray[np.generic]]:
-    """Return the columns of a statement over partial results as arrays. NULL values are masked."""
-    with _tables(parts, words) as connection:
-        return arrays(connection, sql, _numbered(values))
-
-
-def merged_classes(parts: Sequence[PartFile]) -> CodedClasses:
-    """Return the frame classes of partial results with columns ``class``, ``bucket``, ``mask``."""
-    from sgstore.store._coded_classes import classes_coded
-
-    with _tables({"parts": [*parts]}, {}) as connection:
-        return classes_coded(connection, "SELECT class, bucket, mask FROM parts")
 
 
 def _numbered(values: Sequence[Any]) -> dict[str, Any]:

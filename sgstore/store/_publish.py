@@ -34,7 +34,13 @@ from sgstore.store._locking import spill_folder, transaction
 from sgstore.store._packing import MISSING, plain
 from sgstore.store._staging import PIECE_ROWS, Staging, scratch
 from sgstore.store._table_stream import FILE, TableFile
-from sgstore.store._traces import already_stored, free_name, id_of, place_below, stored_name
+from sgstore.store._traces import (
+    Identity,
+    already_stored,
+    id_of,
+    place_below,
+    stored_name,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
@@ -111,7 +117,7 @@ def _put(
     name = stored_name(connection, identity, catalog="store.inside.")
     known = name is not None
     if name is None:
-        name = free_name(plain(sealed.path.stem), {name for (name,) in taken})
+        name = Identity.free_name(plain(sealed.path.stem), {name for (name,) in taken})
     else:
         _delete(connection, identity.trace_id)
     widen(connection, sealed.words)
@@ -177,7 +183,7 @@ def _publish_shared(
     elif owner == "map":
         taken = connection.execute("SELECT name FROM store.inside.map").fetchall()
         wanted = plain(sealed.identity.map_name) or "map"
-        given = {"name": free_name(wanted, {name for (name,) in taken})}
+        given = {"name": Identity.free_name(wanted, {name for (name,) in taken})}
     noted = {table: sealed.checksums[table] for table in SHARED[owner] if table in sealed.checksums}
     for table in noted:
         insert(connection, tables, table, given if table == owner else {})

@@ -101,18 +101,63 @@ class Remains:
     abstractions: tuple[str, ...]
     others: tuple[str, ...]
 
+    @staticmethod
+    def of(path: Path) -> Remains:
+        """Return the content of an old store that a rebuild needs.
 
-def remains_of(path: Path) -> Remains:
-    """Return the content of an old store that a rebuild needs.
+        Raises
+        ------
+        StoreError
+            The file is not a store, or the needed tables are not readable.
+        """
+        access = Access(path, checked=False)
+        with access.reading() as connection:
+            return remains_in(connection, shape.database_of(connection), path)
 
-    Raises
-    ------
-    StoreError
-        The file is not a store, or the needed tables are not readable.
-    """
-    access = Access(path, checked=False)
-    with access.reading() as connection:
-        return remains_in(connection, shape.database_of(connection), path)
+    def give_names(
+        self,
+        path: Path,
+    ) -> None:
+        """Rename traces and maps of a store to their names in an old store."""
+        access = Access(path)
+        with scratch(spill_folder()) as connection, access.writing(connection):
+            for trace in self.traces:
+                connection.execute(
+                    "UPDATE store.inside.trace SET name = ? WHERE trace_id = ?",
+                    [trace.name, trace.trace_id],
+                )
+            named = {one.digest: one.name for one in self.maps.values()}
+            if len(set(named.values())) == len(named):
+                held = connection.execute(
+                    "SELECT map_id, digest, name FROM store.inside.map"
+                ).fetchall()
+                others = {name for _, digest, name in held if digest not in named}
+                for map_id, digest, _ in held:
+                    if digest in named and named[digest] not in others:
+                        connection.execute(
+                            "UPDATE store.inside.map SET name = ? WHERE map_id = ?",
+                            [named[digest], map_id],
+                        )
+
+    def replace(
+        self,
+        fresh: Path,
+        path: Path,
+    ) -> None:
+        """Replace an old store by a new one, with exclusive access to the old store.
+
+        Raises
+        ------
+        StoreError
+            The traces of the old store have changed in the meantime.
+        """
+        access = Access(path, checked=False)
+        with scratch(spill_folder()) as connection, access.attached(connection):
+            if remains_in(connection, "store", path) != self:
+                raise StoreError(f"{path}: has changed while it was made anew; do it again")
+            connection.execute("FORCE CHECKPOINT store")
+            connection.execute("DETACH store")
+            _replace(path, fresh)
 
 
 def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Remains:
@@ -308,46 +353,6 @@ def refuse_others(path: Path, access: Access) -> None:
             f"{path}: cannot be written anew: what is none of sgstore's would be lost:"
             f" {', '.join(others)}; move them to a file of their own first"
         )
-
-
-def named_as(path: Path, old: Remains) -> None:
-    """Rename traces and maps of a store to their names in an old store."""
-    access = Access(path)
-    with scratch(spill_folder()) as connection, access.writing(connection):
-        for trace in old.traces:
-            connection.execute(
-                "UPDATE store.inside.trace SET name = ? WHERE trace_id = ?",
-                [trace.name, trace.trace_id],
-            )
-        named = {one.digest: one.name for one in old.maps.values()}
-        if len(set(named.values())) == len(named):
-            held = connection.execute(
-                "SELECT map_id, digest, name FROM store.inside.map"
-            ).fetchall()
-            others = {name for _, digest, name in held if digest not in named}
-            for map_id, digest, _ in held:
-                if digest in named and named[digest] not in others:
-                    connection.execute(
-                        "UPDATE store.inside.map SET name = ? WHERE map_id = ?",
-                        [named[digest], map_id],
-                    )
-
-
-def take_place(fresh: Path, path: Path, old: Remains) -> None:
-    """Replace an old store by a new one, with exclusive access to the old store.
-
-    Raises
-    ------
-    StoreError
-        The traces of the old store have changed in the meantime.
-    """
-    access = Access(path, checked=False)
-    with scratch(spill_folder()) as connection, access.attached(connection):
-        if remains_in(connection, "store", path) != old:
-            raise StoreError(f"{path}: has changed while it was made anew; do it again")
-        connection.execute("FORCE CHECKPOINT store")
-        connection.execute("DETACH store")
-        _replace(path, fresh)
 
 
 def _replace(path: Path, fresh: Path) -> None:

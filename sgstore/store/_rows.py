@@ -20,7 +20,7 @@ from sgstore.store._engine_errors import EngineError, engine_fault, spill_fault
 from sgstore.store._interrupts import interrupt, interruptible
 from sgstore.store._schema import expected
 from sgstore.store._schema_text import INSIDE
-from sgstore.store._table_files import relation_of, write_csv, write_parquet
+from sgstore.store._table_files import ParquetTable, relation_of, write_csv
 from sgstore.store._temporary_tables import Given, give
 
 if TYPE_CHECKING:
@@ -37,9 +37,6 @@ T = TypeVar("T")
 
 BATCH: Final = 10_000
 """Rows of a batch."""
-
-IN_NOTEBOOK: Final = 20
-"""Number of result rows shown in a notebook."""
 
 MAX_SQL: Final = 1 << 20
 """Longest statement of a user; characters."""
@@ -130,7 +127,7 @@ class Tabular:
             The file is not writable.
         """
         names, types = self._described()
-        return write_parquet(names, self, Path(path), types)
+        return ParquetTable.write_rows(names, self, Path(path), types)
 
     def csv(self, path: str | Path) -> int:
         """Stream all rows to a CSV file, and return their number.
@@ -199,7 +196,7 @@ class Rows(Tabular):
 
     def _repr_html_(self) -> str:
         """Return the first rows as an HTML table, for notebooks."""
-        from sgstore.base.display import html_table
+        from sgstore.base.display import IN_NOTEBOOK, html_table
 
         some = self._values[:IN_NOTEBOOK]
         more = self.truncated or len(self._values) > len(some)

@@ -110,83 +110,83 @@ class Example:
     abstraction: str
     ignored: list[str]
 
+    @staticmethod
+    def of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str]) -> Example:
+        """Return a frame as a search example.
+
+        Parameters
+        ----------
+        file : StoreFile
+        ref : int or str
+            Frame, as for :meth:`sgstore.store.StoreFile.frame`.
+        name : str
+            Abstraction of the compared graphs.
+        ignored : sequence of str
+            Labels and relations to ignore; see :func:`sgstore.graphs.abstractions._features.without`.
+
+        Raises
+        ------
+        StoreError
+            The frame does not exist.
+        AbstractionError
+            The abstraction does not exist, or no name matches ``ignored``.
+        """
+        abstraction = abstraction_named(name)
+        with translated(file.path), file.access.reading() as connection:
+            frame = frame_named(connection, ref)
+            _, seen = Graphs().of_frames(connection, frame.frame_id, frame.frame_id)
+            beside = _beside(connection, frame)
+        whole = abstraction.function(seen)
+        _check(ignored, whole)
+        example = without(whole, ignored)
+        (own,) = Classes().of(example)
+        features = dict(GraphFeatures.of(example).counts(0))
+        return Example(features, own, frame.trace_id, beside, name, [*ignored])
+
+    @staticmethod
+    def find(
+        file: StoreFile, example: Example, limit: int, *, each_trace: bool = False
+    ) -> list[SimilarFrames]:
+        """Return runs of similar frames, most similar first, then by trace name and time.
+
+        Memory does not grow with the store: graphs are read window by window.
+
+        Parameters
+        ----------
+        file : StoreFile
+        example : Example
+            Frame of this or another store.
+        limit : int
+            Largest number of runs.
+        each_trace : bool
+            True for only the best run of each trace, without frames near the example.
+        """
+        abstraction, graphs = abstraction_named(example.abstraction), Graphs()
+        search = _RunSearch(example, max(limit, 0), each_trace=each_trace)
+        first, last = example.beside
+        beside = range(first, last + 1) if each_trace else range(0)
+        with translated(file.path), file.access.reading() as connection:
+            traces = stored_traces(connection)
+            for number, trace in enumerate(traces):
+                left_out = beside if trace.trace_id == example.trace_id else range(0)
+                for seq, block in _blocks(connection, graphs, trace, abstraction):
+                    search.look(number, seq, without(block, example.ignored), left_out)
+            search.close()
+            return [_like(connection, run, traces, search.example) for run in search.best()]
+
+    @staticmethod
+    def best(found: Iterable[SimilarFrames], limit: int) -> list[SimilarFrames]:
+        """Return the best results of several stores, in the order of a single combined store."""
+
+        def place(one: SimilarFrames) -> tuple[Any, ...]:
+            likeness = one.similarity + (one.same is True)
+            return -likeness, natural(one.frame.trace), one.frame.seq
+
+        return sorted(found, key=place)[:limit]
+
 
 BESIDE_S: Final = 5.0
 """Frames of the same trace within this time are near the example, and similar for that reason; s."""
-
-
-def example_of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str]) -> Example:
-    """Return a frame as a search example.
-
-    Parameters
-    ----------
-    file : StoreFile
-    ref : int or str
-        Frame, as for :meth:`sgstore.store.StoreFile.frame`.
-    name : str
-        Abstraction of the compared graphs.
-    ignored : sequence of str
-        Labels and relations to ignore; see :func:`sgstore.graphs.abstractions._features.without`.
-
-    Raises
-    ------
-    StoreError
-        The frame does not exist.
-    AbstractionError
-        The abstraction does not exist, or no name matches ``ignored``.
-    """
-    abstraction = abstraction_named(name)
-    with translated(file.path), file.access.reading() as connection:
-        frame = frame_named(connection, ref)
-        _, seen = Graphs().of_frames(connection, frame.frame_id, frame.frame_id)
-        beside = _beside(connection, frame)
-    whole = abstraction.function(seen)
-    _check(ignored, whole)
-    example = without(whole, ignored)
-    (own,) = Classes().of(example)
-    features = dict(GraphFeatures.of(example).counts(0))
-    return Example(features, own, frame.trace_id, beside, name, [*ignored])
-
-
-def frames_like(
-    file: StoreFile, example: Example, limit: int, *, each_trace: bool = False
-) -> list[SimilarFrames]:
-    """Return runs of similar frames, most similar first, then by trace name and time.
-
-    Memory does not grow with the store: graphs are read window by window.
-
-    Parameters
-    ----------
-    file : StoreFile
-    example : Example
-        Frame of this or another store.
-    limit : int
-        Largest number of runs.
-    each_trace : bool
-        True for only the best run of each trace, without frames near the example.
-    """
-    abstraction, graphs = abstraction_named(example.abstraction), Graphs()
-    search = _RunSearch(example, max(limit, 0), each_trace=each_trace)
-    first, last = example.beside
-    beside = range(first, last + 1) if each_trace else range(0)
-    with translated(file.path), file.access.reading() as connection:
-        traces = stored_traces(connection)
-        for number, trace in enumerate(traces):
-            left_out = beside if trace.trace_id == example.trace_id else range(0)
-            for seq, block in _blocks(connection, graphs, trace, abstraction):
-                search.look(number, seq, without(block, example.ignored), left_out)
-        search.close()
-        return [_like(connection, run, traces, search.example) for run in search.best()]
-
-
-def most_like(found: Iterable[SimilarFrames], limit: int) -> list[SimilarFrames]:
-    """Return the best results of several stores, in the order of a single combined store."""
-
-    def place(one: SimilarFrames) -> tuple[Any, ...]:
-        likeness = one.similarity + (one.same is True)
-        return -likeness, natural(one.frame.trace), one.frame.seq
-
-    return sorted(found, key=place)[:limit]
 
 
 def _blocks(

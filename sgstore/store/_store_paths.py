@@ -25,20 +25,6 @@ _NO_NAME: Final = frozenset("?\\")
 """Characters that DuckDB treats as the end of a path, or as a slash."""
 
 
-def refuse_name(path: Path) -> None:
-    """Reject a path with characters that DuckDB misinterprets.
-
-    Raises
-    ------
-    StoreError
-    """
-    found = sorted(_NO_NAME & set(str(path.absolute())))
-    if found and os.name == "posix" and url_named(path) is None:
-        raise StoreError(
-            f"{path}: DuckDB cannot open a path with {found[0]!r}; rename the store, or its folder"
-        )
-
-
 def refuse_special(path: Path) -> None:
     """Reject pipes and devices, which would block on open.
 
@@ -48,7 +34,7 @@ def refuse_special(path: Path) -> None:
     """
     if url_named(path) is not None:
         raise one_store_needed(path)
-    refuse_name(path)
+    Folder.refuse_name(path)
     for file in (path.with_name(f"{path.name}.wal"), path):
         try:
             mode = file.stat().st_mode
@@ -95,6 +81,20 @@ class Folder(HeldFolder):
             super().__init__(store.parent, f"{store.name}{_NAME}")
         except OSError as error:
             raise StoreError(f"{store.parent}: cannot be written: {error.strerror}") from error
+
+    @staticmethod
+    def refuse_name(path: Path) -> None:
+        """Reject a path with characters that DuckDB misinterprets.
+
+        Raises
+        ------
+        StoreError
+        """
+        found = sorted(_NO_NAME & set(str(path.absolute())))
+        if found and os.name == "posix" and url_named(path) is None:
+            raise StoreError(
+                f"{path}: DuckDB cannot open a path with {found[0]!r}; rename the store, or its folder"
+            )
 
 
 def remove_left_behind(store: Path) -> None:

@@ -19,7 +19,7 @@ from sgstore.base.output_files import without_controls, written_at, written_text
 from sgstore.base.quoting import literal, quoted
 from sgstore.base.temporary_folders import temporary_folder, working_folder
 from sgstore.errors import ExportError
-from sgstore.store._arrow import ROWS_AT_ONCE, package
+from sgstore.store._arrow import ROWS_AT_ONCE, as_told_batches, package
 from sgstore.store._locking import default_memory
 
 if TYPE_CHECKING:
@@ -182,65 +182,94 @@ class ParquetTable:
         except duckdb.Error as error:
             raise ExportError(f"{self._called}: {str(error).strip()}") from error
 
+    @staticmethod
+    def write_rows(
+        columns: Sequence[str],
+        rows: Iterable[Sequence[Any]],
+        to: Path,
+        types: Sequence[str] | None = None,
+    ) -> int:
+        """Write rows to a Parquet file. An existing file is replaced.
 
-def write_parquet(
-    columns: Sequence[str],
-    rows: Iterable[Sequence[Any]],
-    to: Path,
-    types: Sequence[str] | None = None,
-) -> int:
-    """Write rows to a Parquet file. An existing file is replaced.
+        Parameters
+        ----------
+        columns : sequence of str
+            Distinct names.
+        rows : iterable of sequences
+            Plain Python values; ``None`` means missing.
+        to : Path
+        types : sequence of str, optional
+            DuckDB's types of the columns. Default: the narrowest type of the first 50,000 rows: truth value,
+            integer, number, else text.
 
-    Parameters
-    ----------
-    columns : sequence of str
-        Distinct names.
-    rows : iterable of sequences
-        Plain Python values; ``None`` means missing.
-    to : Path
-    types : sequence of str, optional
-        DuckDB's types of the columns. Default: the narrowest type of the first 50,000 rows: truth value,
-        integer, number, else text.
+        Returns
+        -------
+        int
+            Number of rows written.
 
-    Returns
-    -------
-    int
-        Number of rows written.
+        Raises
+        ------
+        ExportError
+            The file is not writable, or a later row does not fit the type of its column.
+        """
+        rows = iter(rows)
+        if types is None:
+            first = list(islice(rows, ROWS_AT_ONCE))
+            types = [_type_of([row[i] for row in first]) for i in range(len(columns))]
+            rows = chain(first, rows)
+        with (
+            written_at(to) as place,
+            ParquetTable(place, zip(columns, types, strict=True), enums=True, called=to) as table,
+        ):
+            table.add_rows(rows)
+        return table.rows
 
-    Raises
-    ------
-    ExportError
-        The file is not writable, or a later row does not fit the type of its column.
-    """
-    rows = iter(rows)
-    if types is None:
-        first = list(islice(rows, ROWS_AT_ONCE))
-        types = [_type_of([row[i] for row in first]) for i in range(len(columns))]
-        rows = chain(first, rows)
-    with (
-        written_at(to) as place,
-        ParquetTable(place, zip(columns, types, strict=True), enums=True, called=to) as table,
-    ):
-        table.add_rows(rows)
-    return table.rows
+    @staticmethod
+    def write_batches(stream: ArrowStream, to: Path, names: Sequence[str] | None = None) -> int:
+        """Write Arrow batches to a Parquet file like :meth:`write_rows`, and return the number of rows.
 
+        Parameters
+        ----------
+        stream : (columns, batches)
+        to : Path
+        names : sequence of str, optional
+            New column names. The columns then get the types that Python values would have.
 
-def write_batches(stream: ArrowStream, to: Path) -> int:
-    """Write Arrow batches to a Parquet file like :func:`write_parquet`, and return the number of rows.
+        Raises
+        ------
+        ExportError
+            The file is not writable.
+        """
+        columns, batches = stream if names is None else as_told_batches(names, stream)
+        arrow = package("pyarrow")
+        places = [f"c{i}" for i in range(len(columns))]
+        with written_at(to) as place, ParquetTable(place, columns, enums=True, called=to) as table:
+            for batch in batches:
+                arrays = [_without_nan(column) for column in batch.columns]
+                table.add_arrow(arrow.Table.from_arrays(arrays, names=places))
+        return table.rows
 
-    Raises
-    ------
-    ExportError
-        The file is not writable.
-    """
-    columns, batches = stream
-    arrow = package("pyarrow")
-    names = [f"c{i}" for i in range(len(columns))]
-    with written_at(to) as place, ParquetTable(place, columns, enums=True, called=to) as table:
-        for batch in batches:
-            arrays = [_without_nan(column) for column in batch.columns]
-            table.add_arrow(arrow.Table.from_arrays(arrays, names=names))
-    return table.rows
+    @staticmethod
+    def to_arrow(source: Path, to: Path) -> None:
+        """Convert a Parquet file to an Arrow file (IPC, Feather 2), batch by batch.
+
+        Raises
+        ------
+        ExportError
+            The file is not writable.
+        MissingExtraError
+            pyarrow is not installed.
+        """
+        arrow = package("pyarrow")
+        parquet = import_module("pyarrow.parquet")
+        with (
+            written_at(to) as place,
+            parquet.ParquetFile(source) as file,
+            arrow.OSFile(str(place), "wb") as sink,
+            arrow.ipc.new_file(sink, file.schema_arrow) as writer,
+        ):
+            for batch in file.iter_batches():
+                writer.write_batch(batch)
 
 
 def _without_nan(column: Any) -> Any:

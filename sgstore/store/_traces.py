@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import re
-from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from sgstore.store._packing import as_json, plain
 from sgstore.store._rows import run
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from datetime import datetime
 
     from duckdb import DuckDBPyConnection
@@ -77,7 +76,7 @@ class Identity:
         """Return the identity of a recording, or a part of it, for a config and a map."""
         settings = as_json(replace(config, ego="", egos=()).as_dict())
         return cls(
-            trace_id=trace_id_of(info.digest, info.ego),
+            trace_id=Identity.id_of(info.digest, info.ego),
             digest=info.digest,
             ego=plain(info.ego),
             settings=settings,
@@ -108,16 +107,40 @@ class Identity:
         payloads: Any = Payloads(**values["payloads"])
         return cls(**(values | {"payloads": payloads}))
 
+    @staticmethod
+    def id_of(digest: str, ego: str) -> int:
+        """Return the trace id: 39 bits of a hash of recording digest and ego id. It is equal in every store."""
+        both = f"{digest}\0{ego}".encode("utf-8", "surrogatepass")
+        return int.from_bytes(hashlib.sha256(both).digest()[:8], "big") >> (64 - _TRACE_BITS)
+
+    @staticmethod
+    def among(known: Mapping[str, int], ref: str) -> tuple[int, str]:
+        """Find a trace like :func:`trace_named`, among known names and ids, sorted by name."""
+        if ref in known:
+            return known[ref], ref
+        found = [name for name, trace_id in known.items() if str(trace_id) == ref]
+        found = found or [name for name in known if ref and name.startswith(ref)]
+        if len(found) == 1:
+            return known[found[0]], found[0]
+        if found:
+            raise StoreError(f"several traces begin with {ref!r}: {_listed(found)}")
+        like = suggestion(ref, known)
+        hint = f"did you mean {like!r}?" if like else f"there are: {_listed(list(known))}"
+        raise StoreError(f"no trace {ref!r}; {hint if known else 'the store is empty'}")
+
+    @staticmethod
+    def free_name(stem: str, taken: set[str]) -> str:
+        """Return an unused name: the stem, or the stem with a suffix ``~2``, ``~3`` and so on."""
+        name, count = stem, 1
+        while name in taken:
+            count += 1
+            name = f"{stem}~{count}"
+        return name
+
 
 def id_of(digest: str) -> int:
     """Return the first 60 bits of a hexadecimal digest: the id of a recording, map or config."""
     return int(digest[:15], 16)
-
-
-def trace_id_of(digest: str, ego: str) -> int:
-    """Return the trace id: 39 bits of a hash of recording digest and ego id. It is equal in every store."""
-    both = f"{digest}\0{ego}".encode("utf-8", "surrogatepass")
-    return int.from_bytes(hashlib.sha256(both).digest()[:8], "big") >> (64 - _TRACE_BITS)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -283,54 +306,6 @@ def located(
     return path
 
 
-def scope_of(reports: Iterable[Mapping[str, Any]], *, world: bool | None) -> dict[str, Any]:
-    """Return counts of the data that settings exclude from a query, or an empty dict.
-
-    Parameters
-    ----------
-    reports : iterable of mapping
-        Reports of the queried traces.
-    world : bool or None
-        True for a query on all known data, False for a query on graphs. ``None`` means no query.
-
-    Returns
-    -------
-    dict
-        ``scope`` (``graph`` or ``world``; only with a query), ``radius`` and ``world`` (m; ``None`` if traces
-        differ), ``states``, ``beyond_radius``, ``beyond_world`` and ``excluded`` (kind → states), ``rate``
-        (Hz).
-    """
-    told = [one["scope"] for one in reports if "scope" in one]
-    found: dict[str, Any] = {} if world is None else {"scope": "world" if world else "graph"}
-    for name in ("radius", "world", "rate"):
-        values = {one[name] for one in told}
-        found[name] = values.pop() if len(values) == 1 else None
-    for name in ("states", "beyond_radius", "beyond_world"):
-        found[name] = sum(one[name] for one in told)
-    excluded: Counter[str] = Counter()
-    for one in told:
-        excluded.update(one["excluded"])
-    found["excluded"] = dict(sorted(excluded.items()))
-    beyond = found["beyond_world" if world else "beyond_radius"]
-    return found if beyond or excluded or found["rate"] else {}
-
-
-def scope_text(found: Mapping[str, Any]) -> str:
-    """Format the result of :func:`scope_of` as one line."""
-    if not found:
-        return ""
-    scope, states = found.get("scope", ""), f"of {found['states']:,} states"
-    parts: list[str] = []
-    for of, what, reach in (("graph", "the graphs", "radius"), ("world", "the world", "world")):
-        beyond, far = found[f"beyond_{reach}"], found[reach]
-        if beyond and scope in {of, ""}:
-            range_text = "" if far is None else f" ({far:g} m)"
-            parts.append(f"{beyond:,} {states} lie beyond {what}{range_text}")
-    parts += [f"{many:,} of {kind} are excluded" for kind, many in found["excluded"].items()]
-    parts += [f"frames are kept at {found['rate']:g} Hz"] if found["rate"] else []
-    return f"{f'scope {scope}'.rstrip()}: {', '.join(parts)}"
-
-
 def stored_traces(
     connection: DuckDBPyConnection, store: Path | None = None, root: str | Path | None = None
 ) -> tuple[StoredTrace, ...]:
@@ -418,15 +393,6 @@ def already_stored(
     return name
 
 
-def free_name(stem: str, taken: set[str]) -> str:
-    """Return an unused name: the stem, or the stem with a suffix ``~2``, ``~3`` and so on."""
-    name, count = stem, 1
-    while name in taken:
-        count += 1
-        name = f"{stem}~{count}"
-    return name
-
-
 _OF_TRACE: Final = re.compile(r"(?P<trace>.+)(?P<mark>[#@])(?P<where>[^#@]*)", re.DOTALL)
 _SECONDS: Final = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*s?\s*")
 
@@ -440,22 +406,7 @@ def trace_named(connection: DuckDBPyConnection, ref: str) -> tuple[int, str]:
         No trace or several traces match.
     """
     found = connection.execute("SELECT name, trace_id FROM trace ORDER BY name").fetchall()
-    return trace_among(dict(found), ref)
-
-
-def trace_among(known: Mapping[str, int], ref: str) -> tuple[int, str]:
-    """Find a trace like :func:`trace_named`, among known names and ids, sorted by name."""
-    if ref in known:
-        return known[ref], ref
-    found = [name for name, trace_id in known.items() if str(trace_id) == ref]
-    found = found or [name for name in known if ref and name.startswith(ref)]
-    if len(found) == 1:
-        return known[found[0]], found[0]
-    if found:
-        raise StoreError(f"several traces begin with {ref!r}: {_listed(found)}")
-    like = suggestion(ref, known)
-    hint = f"did you mean {like!r}?" if like else f"there are: {_listed(list(known))}"
-    raise StoreError(f"no trace {ref!r}; {hint if known else 'the store is empty'}")
+    return Identity.among(dict(found), ref)
 
 
 def frame_named(connection: DuckDBPyConnection, ref: int | str) -> FrameRef:
@@ -548,23 +499,3 @@ def _range(connection: DuckDBPyConnection, trace_id: int) -> str:
 def _listed(names: list[str]) -> str:
     shown = ", ".join(repr(name) for name in names[:8])
     return shown if len(names) <= 8 else f"{shown}, … ({len(names)} in all)"
-
-
-_RANGE: Final = re.compile(r"(.+)([@#])(\d+(?:\.\d+)?s?)\.\.(\d+(?:\.\d+)?s?)")
-
-
-def range_of(text: str) -> tuple[str, str] | None:
-    """Parse a frame range such as ``TRACE@12s..18s`` or ``TRACE#120..180``; ``None`` for a single frame.
-
-    >>> range_of("town@12.5s..18s")
-    ('town@12.5s', 'town@18s')
-    >>> range_of("town#120..180"), range_of("town#120")
-    (('town#120', 'town#180'), None)
-    """
-    found = _RANGE.fullmatch(text.strip())
-    if found is None:
-        return None
-    trace, mark, first, last = found.groups()
-    unit = "s" if mark == "@" else ""
-    first, last = (f"{trace}{mark}{end.removesuffix('s')}{unit}" for end in (first, last))
-    return first, last

@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.display import IN_NOTEBOOK
 from sgstore.lang.bind import not_computed, of_check
 from sgstore.lang.help import compared_in_check
 from sgstore.lang.sql import compile_checks, entities, relation, traces_of, value_text
 from sgstore.matches import Interval, notes_in
 from sgstore.model.frame_ids import trace_of
+from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import natural
-from sgstore.store import IN_NOTEBOOK, scope_of
 from sgstore.temporal._check_plan import (
     FAVOURABLE,
     SIGNS,
@@ -598,7 +599,7 @@ class CheckRun:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Data that the settings excluded from the checked traces; see :func:`sgstore.store.scope_of`."""
+        """Data that the settings excluded from the checked traces; see :func:`sgstore.model.scope.scope_of`."""
         world = any(one.check.world for one in self._checks)
         with self._file.snapshot():
             return scope_of((one.report for one in self._file.traces()), world=world)

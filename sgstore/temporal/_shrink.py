@@ -20,8 +20,8 @@ from sgstore.lang.ir import Tense, walk
 from sgstore.lang.sql import CLOCK, Window, compile_checks, extents, union_parts
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import CheckClause
+from sgstore.model.frame_ids import range_of
 from sgstore.model.world import Clip
-from sgstore.store import range_of
 from sgstore.temporal._checks import StoreCheck
 from sgstore.temporal._matches import TemporalMatches
 from sgstore.temporal._sequences import Finder

@@ -26,7 +26,7 @@ from opendrive_maps import a_map, a_road, element, lane, line, link, section
 import sgstore
 from sgstore.ingest import ingest
 from sgstore.maps.opendrive import read_map
-from sgstore.maps.roads import lanes_ref
+from sgstore.maps.roads import RoadMap
 from sgstore.model.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.model.world import Clip, Event
 from sgstore.pipeline.doctor import examine
@@ -37,7 +37,6 @@ from sgstore.store import StoreFile
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.maps.roads import RoadMap
     from sgstore.query import Store
 
 
@@ -400,10 +399,10 @@ def test_a_light_that_the_map_does_not_have_applies_to_the_lanes_of_its_box() ->
 
     found = signals_of(lights, road_map)
 
-    assert found == {1: lanes_ref(["1/0/-1"])}
+    assert found == {1: RoadMap.lanes_ref(["1/0/-1"])}
     (lane,) = road_map.lanes_of_signal(found[1]).tolist()
     assert road_map.nodes.name[-1 - lane] == "1/0/-1"
-    assert road_map.lanes_of_signal(lanes_ref(["9/0/-1"])).tolist() == []
+    assert road_map.lanes_of_signal(RoadMap.lanes_ref(["9/0/-1"])).tolist() == []
     assert road_map.lanes_of_signal("lanes:{").tolist() == []
 
 

@@ -21,7 +21,7 @@ from sgstore.model.config import Config, RangeSettings, preset
 from sgstore.pipeline.derive import derive, keep_abstraction
 from sgstore.pipeline.importing import Words, import_graphs
 from sgstore.pipeline.rebuild import rebuild
-from sgstore.store import StoreFile, remains_of
+from sgstore.store import Remains, StoreFile
 from sgstore.store._classes import Abstracted
 from sgstore.store._schema_text import schema_sql
 
@@ -218,12 +218,12 @@ def test_a_store_that_was_made_before_says_what_it_was_made_of(
     how: str, few: Made, small: Path
 ) -> None:
     """A rebuild asks no more of the old store: from equal remains it makes equal stores."""
-    before = remains_of(small)
+    before = Remains.of(small)
     change(small, *MADE_BEFORE[how])
 
     with pytest.raises(StoreError, match="'sgstore rebuild' makes it anew"):
         StoreFile(small).traces()
-    assert remains_of(small) == before
+    assert Remains.of(small) == before
     assert {one.name for one in before.traces} == set(few.content["order"])
     assert before.maps
     assert before.sets

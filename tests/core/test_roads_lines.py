@@ -14,8 +14,6 @@ import sgstore.maps.roads._lane_lines as lanelines
 from sgstore.errors import MapError
 from sgstore.maps.opendrive import parse_map
 from sgstore.maps.roads import (
-    END,
-    START,
     Area,
     Border,
     Joint,
@@ -456,7 +454,7 @@ def test_every_point_of_a_centre_line_is_in_its_lane() -> None:
 
 def test_a_joint_may_say_which_end_it_touches() -> None:
     road_map = made(
-        a_line("1", after=(Joint("2", START), Joint("3", END))),
+        a_line("1", after=(Joint("2", Joint.START), Joint("3", Joint.END))),
         a_line("2", x=100),
         a_line("3", x=100, centre=path((200, 0), (100, 0)), forward=False, lefts=(), rights=()),
     )

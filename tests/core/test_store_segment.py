@@ -20,7 +20,7 @@ import sgstore.store._table_stream as table_stream
 from sgstore.errors import StoreError
 from sgstore.model.config import Config, RangeSettings
 from sgstore.model.world import TraceReport
-from sgstore.store import StoreFile, trace_id_of
+from sgstore.store import Identity, StoreFile
 from sgstore.store._columns import REPEATED
 
 if TYPE_CHECKING:
@@ -349,7 +349,7 @@ def test_two_traces_with_one_id_are_not_mixed(store: Any) -> None:
 
     store.close()
     with duckdb.connect(str(store.path)) as connection:
-        taken = trace_id_of(other.digest, other.ego)
+        taken = Identity.id_of(other.digest, other.ego)
         connection.execute(f"UPDATE inside.trace SET trace_id = {taken}")
 
     with pytest.raises(StoreError, match="is taken by another trace, 'drive', by chance"):
@@ -361,7 +361,7 @@ def test_the_id_of_a_trace_is_39_bits_of_a_digest_of_recording_and_ego() -> None
 
     number = int(hashlib.sha256(b"abc\x0042").hexdigest(), 16)
 
-    assert trace_id_of("abc", "42") == number >> (256 - 39)
+    assert Identity.id_of("abc", "42") == number >> (256 - 39)
 
 
 def test_frames_out_of_order_are_a_defect_of_the_caller(store: Any) -> None:

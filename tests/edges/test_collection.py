@@ -29,7 +29,7 @@ from sgstore.lang.sql import collection_parts as parts
 from sgstore.lang.sql import compile_query
 from sgstore.lang.syntax import tree as syntax
 from sgstore.query import Store
-from sgstore.store import CATALOGUE, StoreFile, _bundle_catalogue, _bundles, write_parquet
+from sgstore.store import CATALOGUE, ParquetTable, StoreFile, _bundle_catalogue, _bundles
 from sgstore.testsets import coverage
 
 if TYPE_CHECKING:
@@ -707,7 +707,7 @@ def test_what_is_wrong_with_a_question_is_no_fault_of_a_bundle(
 def test_a_catalogue_of_before_knows_no_scopes(tmp_path: Path) -> None:
     columns = {"bundle": "VARCHAR", "trace_id": "BIGINT"}
     path = tmp_path / "trace.parquet"
-    write_parquet([*columns], [("b", 7)], path, [*columns.values()])
+    ParquetTable.write_rows([*columns], [("b", 7)], path, [*columns.values()])
 
     assert _bundle_catalogue.parquet_rows(path, [*columns, "scope"]) == [("b", 7, None)]
     snapshot = catalogue.Snapshot()

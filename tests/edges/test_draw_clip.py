@@ -24,8 +24,9 @@ from sgstore.draw._scene import DrawnFrame
 from sgstore.draw._stored import Shot, filmed, scale_of
 from sgstore.draw._view import view_of
 from sgstore.errors import ExportError, MissingExtraError, StoreError
+from sgstore.model.frame_ids import range_of
 from sgstore.query import Store
-from sgstore.store import StoreFile, range_of
+from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -20,7 +20,6 @@ import shapely.affinity
 from sgstore.base.geometry import wrapped
 from sgstore.graphs.online import Frame
 from sgstore.maps.roads import (
-    STOREY,
     LaneCourses,
     LaneHits,
     MapEdges,
@@ -29,6 +28,7 @@ from sgstore.maps.roads import (
     Ribbons,
     RoadMap,
 )
+from sgstore.maps.roads._map import STOREY
 from sgstore.model.config import Config
 from sgstore.model.vocabulary import KIND_CODE, RELATION_CODE, RELATIONS
 from sgstore.model.world import Entities, Floats, FrameBlock, Ints, MessageRefs, States

@@ -372,7 +372,7 @@ def show(
 ) -> int:
     """Draw a frame from above, or a clip as an animation; with a QUERY, what it matches is marked."""
     from sgstore.draw import draw_clip, draw_stored
-    from sgstore.store import range_of
+    from sgstore.model.frame_ids import range_of
 
     opened = bounds.opened(store)
     text, values = question.asked() if question else ("", {})

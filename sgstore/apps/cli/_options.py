@@ -735,14 +735,12 @@ def say_left_out(
 
 def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
     """Report in one line what settings omitted; as JSON if the results are JSON."""
-    from sgstore.store import scope_text
-
     if not found:
         return
     if chosen in {Format.json, Format.ndjson}:
         say_json({"scope": found})
     else:
-        say(scope_text(found))
+        say(_scope_text(found))
 
 
 def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
@@ -757,3 +755,19 @@ def say_notes(notes: Iterable[str]) -> None:
     """Report likely mistakes in a query."""
     for note in notes:
         say(f"note: {note}")
+
+
+def _scope_text(found: Mapping[str, Any]) -> str:
+    """Format the result of :func:`sgstore.model.scope.scope_of` as one line."""
+    if not found:
+        return ""
+    scope, states = found.get("scope", ""), f"of {found['states']:,} states"
+    parts: list[str] = []
+    for of, what, reach in (("graph", "the graphs", "radius"), ("world", "the world", "world")):
+        beyond, far = found[f"beyond_{reach}"], found[reach]
+        if beyond and scope in {of, ""}:
+            range_text = "" if far is None else f" ({far:g} m)"
+            parts.append(f"{beyond:,} {states} lie beyond {what}{range_text}")
+    parts += [f"{many:,} of {kind} are excluded" for kind, many in found["excluded"].items()]
+    parts += [f"frames are kept at {found['rate']:g} Hz"] if found["rate"] else []
+    return f"{f'scope {scope}'.rstrip()}: {', '.join(parts)}"

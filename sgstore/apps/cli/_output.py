@@ -156,9 +156,11 @@ def write_rows(
     if form in _WITHOUT_NESTING and not types:
         rows = ([_flat(value) for value in row] for row in rows)
     if form in BINARY:
-        from sgstore.store import write_parquet
+        from sgstore.store import ParquetTable
 
-        return write_binary(lambda to: write_parquet(columns, rows, to, types), form, output)
+        return write_binary(
+            lambda to: ParquetTable.write_rows(columns, rows, to, types), form, output
+        )
     if output is None:
         return _write_text(columns, rows, form, sys.stdout)
     with written_text(output) as stream:
@@ -357,14 +359,14 @@ def write_binary(write: Callable[[Path], int], form: Format, output: Path | None
         raise ExportError(
             f"{form.capitalize()} is not for a terminal: name a file with -o FILE, or redirect stdout"
         )
-    from sgstore.store import arrow_file
+    from sgstore.store import ParquetTable
 
     with working_folder("rows") as folder:
         file = folder / "rows.parquet"
         number = write(file)
         if form is Format.arrow:
             ready = output or folder / "rows.arrow"
-            arrow_file(file, ready)
+            ParquetTable.to_arrow(file, ready)
             file = ready
         if output is None:
             with file.open("rb") as source:

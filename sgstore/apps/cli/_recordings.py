@@ -121,7 +121,7 @@ def ingest(
 
 def _told(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     """Print the status of recordings; return the exit code."""
-    from sgstore.store import scope_of
+    from sgstore.model.scope import scope_of
 
     for outcome in outcomes:
         _say_what_was_odd(outcome)
@@ -218,10 +218,12 @@ def info(
     out: PrintedRows,
 ) -> int:
     """List the traces of a store, or describe one in full; of a collection, list them."""
+    from sgstore.model.scope import scope_of
+
     if (url := url_of(store)) is not None:
         _tell_of_collection(url, traces or [], out)
         return 0
-    from sgstore.store import StoreFile, scope_of
+    from sgstore.store import StoreFile
 
     file = StoreFile(store)
     if traces:

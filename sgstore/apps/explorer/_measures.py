@@ -17,7 +17,7 @@ from sgstore.exporters import Export, write_export
 from sgstore.model.frame_ids import frame_ids
 from sgstore.model.world import Clip
 from sgstore.query import Store
-from sgstore.store import lengths_of_messages
+from sgstore.store import MessagePlaces
 from sgstore.testsets.coverage import ChosenFrames, classed, classes, combos, covered, growth
 from sgstore.testsets.diff import by_frame, scenes
 from sgstore.testsets.locks import lock_of
@@ -65,7 +65,7 @@ def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
     with store.file.snapshot():
         parts = list(_frames(store, clips))
         frame_id = np.sort(np.concatenate([np.zeros(0, np.int64), *(ids for _, ids, _ in parts)]))
-        sizes = (lengths for _, lengths in lengths_of_messages(store.file, frame_id))
+        sizes = (lengths for _, lengths in MessagePlaces.lengths(store.file, frame_id))
         size = sum(int(lengths.sum()) for lengths in sizes) if len(frame_id) else 0
         whole = classed(ChosenFrames("the store", store), abstraction)
         some = classed(ChosenFrames("the selection", store, frame_id), abstraction)

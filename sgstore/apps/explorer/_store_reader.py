@@ -18,7 +18,7 @@ from sgstore.errors import ExportError, SgstoreError, StoreError
 from sgstore.lang.help import words
 from sgstore.lang.library import patterns
 from sgstore.maps.opendrive import read_map
-from sgstore.maps.roads import drawn_outlines
+from sgstore.maps.roads import DrawnOutlines
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -202,7 +202,7 @@ def drawn_map(road_map: RoadMap | None) -> bytes:
     """Return the outlines of a map; empty without a map."""
     if road_map is None:
         return packed({"origin": [0, 0], "words": []}, {})
-    drawn = drawn_outlines(road_map)
+    drawn = DrawnOutlines.of(road_map)
     names = ("x", "y", "start", "node", "word", "closed")
     columns = {name: getattr(drawn, name) for name in names}
     return packed({"origin": drawn.origin, "words": drawn.words}, columns)

@@ -10,7 +10,6 @@ import numpy as np
 from sgstore.base.tables import taken
 from sgstore.graphs.relations._registry import relations
 from sgstore.graphs.relations._scene import Relation, kinds_mask
-from sgstore.maps.roads import first_sections
 from sgstore.model.vocabulary import (
     KIND_CODE,
     KINDS,
@@ -69,7 +68,7 @@ class Keeping:
         if road_map is not None:
             self.parts = self._kept_parts(road_map, config.lanes.types)
             if not config.lanes.sections:
-                self._same = first_sections(road_map.nodes)
+                self._same = road_map.nodes.first_sections()
         self._everything = bool(not dropped and self.parts.all() and self._same is None)
 
     def _kept_parts(self, road_map: RoadMap, lane_types: tuple[str, ...]) -> Bools:

@@ -47,7 +47,7 @@ class SignalReach:
         Parameters
         ----------
         signal : str
-            Its id in the map, or the result of :func:`sgstore.maps.roads.lanes_ref`.
+            Its id in the map, or the result of :meth:`sgstore.maps.roads.RoadMap.lanes_ref`.
         place : (float, float)
             Its position, if the map does not have the signal; m, NaN if unknown.
         """

@@ -11,7 +11,7 @@ import numpy as np
 from sgstore.base.tables import chained, taken
 from sgstore.errors import ConfigError
 from sgstore.graphs.relations._scene import Bodies, spread
-from sgstore.maps.roads import LaneHits, MapEdges, MapNodes, RoadMap, point_shapes
+from sgstore.maps.roads import LaneHits, MapEdges, MapNodes, RoadMap
 from sgstore.model.vocabulary import DRIVING, KIND_CODE, RELATION_CODE
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Waypoints:
         ):
             code = np.full(len(src), RELATION_CODE[name], np.int8)
             parts.append((code, -1 - src, -1 - dst))
-        shapes = point_shapes(points.x, points.y)
+        shapes = RoadMap.point_shapes(points.x, points.y)
         return RoadMap(
             name=road_map.name,
             text=road_map.text,

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from sgstore.maps.roads import (
-    END,
     MAX_NAME,
-    START,
     Border,
     Joint,
     LaneLine,
+    Sections,
     about_lanes,
     run_of,
-    sections_between,
     thinned,
 )
 from sgstore.model.vocabulary import DRIVING
@@ -158,7 +156,7 @@ def line_of(
     document: OsmDocument, ident: str, lanelet: LaneletShape, kind: str, limit: float
 ) -> LaneLine:
     element = lanelet.element
-    sections = sections_between(lanelet.left, lanelet.right)
+    sections = Sections.between(lanelet.left, lanelet.right)
     one_way = element.tags.get("one_way", "").lower()
     both = one_way not in _YES if one_way else element.tags.get("subtype", "") in _BOTH_WAYS
     own = speed_of(element.tags.get("speed_limit", ""))
@@ -235,8 +233,8 @@ def with_joints(
     at: dict[tuple[str, str], list[Joint]] = defaultdict(list)
     for line in lines:
         lanelet = lanelets[line.ident]
-        at[lanelet.starts].append(Joint(line.ident, START))
-        at[_reversed(lanelet.ends)].append(Joint(line.ident, END))
+        at[lanelet.starts].append(Joint(line.ident, Joint.START))
+        at[_reversed(lanelet.ends)].append(Joint(line.ident, Joint.END))
     for gate, joints in at.items():
         if len(joints) > _MOST_BESIDE:
             what = f"more than {_MOST_BESIDE} lanelets meet between nodes {' and '.join(gate)}"

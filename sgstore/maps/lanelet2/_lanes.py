@@ -24,11 +24,11 @@ from sgstore.maps.lanelet2._projection import Projection
 from sgstore.maps.lanelet2._signals import Rules, plain_signals
 from sgstore.maps.roads import (
     MAX_NAME,
+    LaneLine,
     PlainCrosswalk,
     PlainObject,
     lane_text,
     plain_lanes,
-    with_junctions,
 )
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def lanelet2_text(text: str, projection: Projection | None = None) -> str:
         if type_of(lanelet.element) != CROSSWALK
     ]
     lines = with_joints(document, with_neighbours(document, lines, lanelets), lanelets)
-    lanes, warnings = plain_lanes(with_junctions(lines))
+    lanes, warnings = plain_lanes(LaneLine.with_junctions(lines))
     row_of = {lane.name: row for row, lane in enumerate(lanes)}
     signals = plain_signals(document, rules, lanes, row_of)
     crosswalks = [

@@ -11,7 +11,7 @@ import numpy as np
 from sgstore.maps.lanelet2._document import OsmDocument, OsmElement
 from sgstore.maps.lanelet2._lanelets import COUNTRY, SHORTEST, LaneletShape, speed_of
 from sgstore.maps.opendrive import kind_of_signal
-from sgstore.maps.roads import MAX_NAME, PlainLane, PlainSignal, painted_across, run_of
+from sgstore.maps.roads import MAX_NAME, PlainLane, PlainSignal, run_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -92,7 +92,7 @@ def plain_signals(
     def rows(lanelets: Iterable[str]) -> tuple[int, ...]:
         return tuple(sorted({row_of[one] for one in lanelets if one in row_of}))
 
-    lying = painted_across(lanes, [document.lines[way] for way in rules.stop_lines])
+    lying = PlainLane.painted_across(lanes, [document.lines[way] for way in rules.stop_lines])
     stops = dict(zip(rules.stop_lines, lying, strict=True))
     found: list[PlainSignal] = []
     for element, users in rules.elements:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.maps.opendrive._nodes import wide_pairs
-from sgstore.maps.roads import LaneChanges, broad_lines
+from sgstore.maps.roads import LaneChanges, MapPlaces
 from sgstore.model.vocabulary import DRIVING
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from sgstore.maps.opendrive._document import Document
     from sgstore.maps.opendrive._lanes import LaneTable
-    from sgstore.maps.roads import MapPlaces, Ribbons
+    from sgstore.maps.roads import Ribbons
     from sgstore.model.world import Floats, Ints
 
 
@@ -149,7 +149,7 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
         [ribbons.along_at(lane, np.array([row[i] for row in rows], np.float64)) for i in (2, 3)],
         axis=0,
     )
-    return broad_lines(
+    return MapPlaces.of_lines(
         [(row[0], row[1], *along) for row, along in zip(rows, ends.T.tolist(), strict=True)]
     )
 

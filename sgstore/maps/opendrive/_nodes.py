@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.maps.opendrive._piecewise import last_before
-from sgstore.maps.roads import STOREY, MapNodes, conflicts, mean_widths, turn_words, turned
+from sgstore.maps.roads import MapNodes, conflicts, turn_words
 from sgstore.model.vocabulary import DRIVING, TRAFFIC
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def lane_nodes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapNod
         section=number,
         lane=lanes.ident,
         length=length,
-        width=mean_widths(ribbons),
+        width=ribbons.mean_widths(),
         speed_limit=_speed_limits(document, lanes),
     )
 
@@ -70,7 +70,7 @@ def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str,
     sign = np.where(lanes.forward, 1.0, -1.0)
     _, one = np.unique(lanes.section, return_index=True)
     of_road = np.zeros(len(document["road"]))
-    np.add.at(of_road, lanes.road[one], (turned(ribbons) * sign)[one])
+    np.add.at(of_road, lanes.road[one], (ribbons.turned() * sign)[one])
     turn = of_road[lanes.road] * sign
     return tuple(
         word if junction_of(document, road) else ""
@@ -117,7 +117,7 @@ def speed(value: str, unit: str) -> float:
 
 def wide_pairs(lanes: LaneTable, ribbons: Ribbons) -> Ints:
     """Return pairs of lanes that share a border, the left one first, (2, n)."""
-    return _pairs(lanes, np.flatnonzero(mean_widths(ribbons) > NARROW))
+    return _pairs(lanes, np.flatnonzero(ribbons.mean_widths() > NARROW))
 
 
 def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
@@ -126,7 +126,7 @@ def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
     Neighbours share a border. Lanes of traffic with only lanes without traffic between them (a
     median, a strip of grass) are also neighbours, because drivers look across it.
     """
-    wide = np.flatnonzero(mean_widths(ribbons) > NARROW)
+    wide = np.flatnonzero(ribbons.mean_widths() > NARROW)
     traffic = _pairs(lanes, wide[[lanes.type[lane] in TRAFFIC for lane in wide.tolist()]])
     forward, both = lanes.forward, lanes.both
     left, right = np.concatenate((wide_pairs(lanes, ribbons), traffic), axis=1)
@@ -158,7 +158,7 @@ def flow_edges(
         for lane, (kind, junction) in enumerate(zip(lanes.type, nodes.junction, strict=True))
         if junction and kind in DRIVING
     ]
-    one, other = conflicts(ribbons, np.array(crossing, np.int64), nodes.junction, flow, STOREY)
+    one, other = conflicts(ribbons, np.array(crossing, np.int64), nodes.junction, flow)
     both = np.concatenate((one, other)), np.concatenate((other, one))
     return [
         ("travelsTo", flow[0] + FIRST_LANE, flow[1] + FIRST_LANE),

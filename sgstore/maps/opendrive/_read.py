@@ -32,11 +32,11 @@ from sgstore.maps.opendrive._objects import read_objects
 from sgstore.maps.opendrive._plan_view import read_plan_view
 from sgstore.maps.opendrive._signals import read_controllers, read_signals
 from sgstore.maps.roads import (
+    LaneCourses,
     MapNodes,
     RoadMap,
     edges_of,
     is_lane_text,
-    lane_courses,
     plain_nodes,
     read_lane_text,
     ribbons_of,
@@ -172,7 +172,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         warnings=[*odd_sections(document), *network.warnings],
         stops=(signal, lane, ribbons.along_at(lane, s)),
         stop_lines=signals.stop_lines(first_signal),
-        courses=lane_courses(every, heights(document, lanes, every)),
+        courses=LaneCourses.of(every, heights(document, lanes, every)),
         broad_lines=read_broad_lines(document, lanes, ribbons),
         variant=signals.told,
     )

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 
 from sgstore.errors import MapError
+from sgstore.maps.roads._map import STOREY
 from sgstore.maps.roads._ribbons import Ribbons, centre_lines, wrapped
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ MOST_PAIRS: Final = 2_000_000
 
 
 def conflicts(
-    ribbons: Ribbons, lanes: Ints, junction: Sequence[str], flow: tuple[Ints, Ints], storey: float
+    ribbons: Ribbons, lanes: Ints, junction: Sequence[str], flow: tuple[Ints, Ints]
 ) -> tuple[Ints, Ints]:
     """Return pairs of lanes of a junction that cross or merge, each once, the lower lane first.
 
@@ -41,8 +42,6 @@ def conflicts(
         The junction of every lane of the map.
     flow : (m,) int64 twice
         Pairs of lanes (from, to) of the traffic flow.
-    storey : float
-        Least difference of height between lanes on different storeys; m.
 
     Raises
     ------
@@ -56,7 +55,7 @@ def conflicts(
     cross: Any = shapely.crosses(lines[one], lines[other])
     rows = np.flatnonzero(merge | (cross & ~part))
     one, other = one[rows], other[rows]
-    level = np.abs(_heights(ribbons, lines, one, other)) <= storey
+    level = np.abs(_heights(ribbons, lines, one, other)) <= STOREY
     return one[level], other[level]
 
 

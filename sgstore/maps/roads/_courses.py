@@ -71,40 +71,40 @@ class LaneCourses:
         columns = (self.start, self.curvature, self.slope)
         return zip((-2 - self.lane).tolist(), *(one.tolist() for one in columns), strict=True)
 
+    @staticmethod
+    def of(ribbons: Ribbons, heights: Heights | None) -> LaneCourses:
+        """Compute curvature and slope along lanes.
 
-def lane_courses(ribbons: Ribbons, heights: Heights | None) -> LaneCourses:
-    """Compute curvature and slope along lanes.
-
-    Parameters
-    ----------
-    ribbons : Ribbons
-    heights : callable or None
-        Function from lanes and places along them (m) to heights (m). ``None`` means unknown
-        heights.
-    """
-    lengths = ribbons.lengths
-    wanted = np.clip(np.rint(lengths / STRETCH), 1, _MOST)
-    wanted = np.maximum(wanted // max(wanted.sum() / _MOST_IN_ALL, 1), 1)
-    counts = np.where(lengths > 0, wanted, 0).astype(np.int64)
-    lane = np.repeat(np.arange(len(ribbons)), counts)
-    number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
-    step = lengths[lane] / counts[lane]
-    start, end = number * step, (number + 1) * step
-    # A stretch ends where the next one begins: the places are all starts, and the end of each lane.
-    last = np.flatnonzero(number == counts[lane] - 1)
-    at_lane = np.insert(lane, last + 1, lane[last])
-    at = np.insert(start, last + 1, end[last])
-    row = np.arange(len(lane)) + np.searchsorted(last, np.arange(len(lane)))
-    turn = np.cumsum(ribbons.bends)
-    turned = ribbons.between(at_lane, at, np.concatenate((np.zeros(1), turn[:-1])))
-    curvature = np.round((turned[row + 1] - turned[row]) / step, _DIGITS) + 0.0
-    slope = np.full(len(lane), np.nan)
-    if heights is not None:
-        height = heights(at_lane, at)
-        slope = np.round((height[row + 1] - height[row]) / step, _DIGITS) + 0.0
-    end[last] = np.inf
-    every = LaneCourses(lane, start, end, curvature, slope)
-    return _joined(every)
+        Parameters
+        ----------
+        ribbons : Ribbons
+        heights : callable or None
+            Function from lanes and places along them (m) to heights (m). ``None`` means unknown
+            heights.
+        """
+        lengths = ribbons.lengths
+        wanted = np.clip(np.rint(lengths / STRETCH), 1, _MOST)
+        wanted = np.maximum(wanted // max(wanted.sum() / _MOST_IN_ALL, 1), 1)
+        counts = np.where(lengths > 0, wanted, 0).astype(np.int64)
+        lane = np.repeat(np.arange(len(ribbons)), counts)
+        number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
+        step = lengths[lane] / counts[lane]
+        start, end = number * step, (number + 1) * step
+        # A stretch ends where the next one begins: the places are all starts, and the end of each lane.
+        last = np.flatnonzero(number == counts[lane] - 1)
+        at_lane = np.insert(lane, last + 1, lane[last])
+        at = np.insert(start, last + 1, end[last])
+        row = np.arange(len(lane)) + np.searchsorted(last, np.arange(len(lane)))
+        turn = np.cumsum(ribbons.bends)
+        turned = ribbons.between(at_lane, at, np.concatenate((np.zeros(1), turn[:-1])))
+        curvature = np.round((turned[row + 1] - turned[row]) / step, _DIGITS) + 0.0
+        slope = np.full(len(lane), np.nan)
+        if heights is not None:
+            height = heights(at_lane, at)
+            slope = np.round((height[row + 1] - height[row]) / step, _DIGITS) + 0.0
+        end[last] = np.inf
+        every = LaneCourses(lane, start, end, curvature, slope)
+        return _joined(every)
 
 
 def _joined(every: LaneCourses) -> LaneCourses:

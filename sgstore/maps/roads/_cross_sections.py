@@ -63,6 +63,78 @@ class Sections:
             np.vstack((self.left, left)), np.vstack((self.right, right)), np.append(self.z, z)
         )
 
+    @staticmethod
+    def between(left: Floats, right: Floats) -> Sections:
+        """Compute cross sections of a lane from its two borders, at every point of both.
+
+        Parameters
+        ----------
+        left, right : (n, 3) and (m, 3) float64
+            In the direction of the lane, thinned; at least two points.
+
+        Notes
+        -----
+        Opposite points of both borders, up to :data:`APART`, become the ends of one cross section.
+        Therefore the outline of the lane equals its borders.
+        """
+        runs = run_of(left), run_of(right)
+        shares = [run / run[-1] for run in runs]
+        near = APART / max(runs[0][-1], runs[1][-1])
+        here = there = 0
+        pairs: list[tuple[float, float]] = []
+        while here < len(left) or there < len(right):
+            one = shares[0][here] if here < len(left) else np.inf
+            other = shares[1][there] if there < len(right) else np.inf
+            both = abs(one - other) <= near
+            pairs.append((one if both else min(one, other), other if both else min(one, other)))
+            here += bool(both or one < other)
+            there += bool(both or other < one)
+        at = np.maximum.accumulate(np.array(pairs), axis=0).T
+        ends = [
+            np.column_stack([np.interp(along, share, column) for column in line.T])
+            for along, share, line in zip(at, shares, (left, right), strict=True)
+        ]
+        return Sections(ends[0][:, :2], ends[1][:, :2], (ends[0][:, 2] + ends[1][:, 2]) / 2)
+
+    @staticmethod
+    def across(
+        centre: Floats, lefts: Sequence[Floats], rights: Sequence[Floats], half: float
+    ) -> tuple[Sections, bool]:
+        """Compute cross sections of a lane; the flag is True if its borders define the width.
+
+        Parameters
+        ----------
+        centre : (n, 3) float64
+            Centre line, thinned; at least two points.
+        lefts, rights : sequence of (k, 3) float64
+            Thinned borders on its left and right, as any number of pieces in any order. If only one
+            side has a border, the other side has the same distance; without any border, both distances
+            are ``half``.
+        half : float
+            m.
+        """
+        run = run_of(centre)
+        at = _cuts(run, [along_line(centre, line[:, :2]) for line in (*lefts, *rights)])
+        x, y, z = (np.interp(at, run, column) for column in centre.T)
+        first = np.zeros(len(at), np.bool_)
+        first[0] = True
+        heading = headings(x, y, first)
+        ahead = np.column_stack((np.cos(heading), np.sin(heading)))
+        to_left = np.column_stack((-ahead[:, 1], ahead[:, 0]))
+        places = np.column_stack((x, y))
+        sides = [
+            _side(places, ahead, sign * to_left, borders)
+            for sign, borders in ((1.0, lefts), (-1.0, rights))
+        ]
+        told = any(side is not None for side in sides)
+        one, other = sides if told else (None, None)
+        plain = np.full(len(at), half)
+        left_away = one.away if one else other.away if other else plain
+        right_away = other.away if other else left_away
+        left = one.points if one else places + to_left * left_away[:, None]
+        right = other.points if other else places - to_left * right_away[:, None]
+        return Sections(left, right, z), told
+
 
 def thinned(line: Floats) -> Floats:
     """Remove points of a line (n, 3) that are closer than :data:`APART` to the previous one; keep the end."""
@@ -100,39 +172,6 @@ class Feet:
     is_end: Bools
 
 
-def sections_between(left: Floats, right: Floats) -> Sections:
-    """Compute cross sections of a lane from its two borders, at every point of both.
-
-    Parameters
-    ----------
-    left, right : (n, 3) and (m, 3) float64
-        In the direction of the lane, thinned; at least two points.
-
-    Notes
-    -----
-    Opposite points of both borders, up to :data:`APART`, become the ends of one cross section.
-    Therefore the outline of the lane equals its borders.
-    """
-    runs = run_of(left), run_of(right)
-    shares = [run / run[-1] for run in runs]
-    near = APART / max(runs[0][-1], runs[1][-1])
-    here = there = 0
-    pairs: list[tuple[float, float]] = []
-    while here < len(left) or there < len(right):
-        one = shares[0][here] if here < len(left) else np.inf
-        other = shares[1][there] if there < len(right) else np.inf
-        both = abs(one - other) <= near
-        pairs.append((one if both else min(one, other), other if both else min(one, other)))
-        here += bool(both or one < other)
-        there += bool(both or other < one)
-    at = np.maximum.accumulate(np.array(pairs), axis=0).T
-    ends = [
-        np.column_stack([np.interp(along, share, column) for column in line.T])
-        for along, share, line in zip(at, shares, (left, right), strict=True)
-    ]
-    return Sections(ends[0][:, :2], ends[1][:, :2], (ends[0][:, 2] + ends[1][:, 2]) / 2)
-
-
 def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
     """Return the nearest points on lines to places (n, 2); each line has at least two different points."""
     start = np.concatenate([line[:-1, :2] for line in lines])
@@ -164,45 +203,6 @@ def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
 def along_line(line: Floats, places: Floats) -> Floats:
     """Return the lengths (n,) of a line up to its points nearest to places (n, 2); m."""
     return feet(places, [line]).along
-
-
-def cross_sections(
-    centre: Floats, lefts: Sequence[Floats], rights: Sequence[Floats], half: float
-) -> tuple[Sections, bool]:
-    """Compute cross sections of a lane; the flag is True if its borders define the width.
-
-    Parameters
-    ----------
-    centre : (n, 3) float64
-        Centre line, thinned; at least two points.
-    lefts, rights : sequence of (k, 3) float64
-        Thinned borders on its left and right, as any number of pieces in any order. If only one
-        side has a border, the other side has the same distance; without any border, both distances
-        are ``half``.
-    half : float
-        m.
-    """
-    run = run_of(centre)
-    at = _cuts(run, [along_line(centre, line[:, :2]) for line in (*lefts, *rights)])
-    x, y, z = (np.interp(at, run, column) for column in centre.T)
-    first = np.zeros(len(at), np.bool_)
-    first[0] = True
-    heading = headings(x, y, first)
-    ahead = np.column_stack((np.cos(heading), np.sin(heading)))
-    to_left = np.column_stack((-ahead[:, 1], ahead[:, 0]))
-    places = np.column_stack((x, y))
-    sides = [
-        _side(places, ahead, sign * to_left, borders)
-        for sign, borders in ((1.0, lefts), (-1.0, rights))
-    ]
-    told = any(side is not None for side in sides)
-    one, other = sides if told else (None, None)
-    plain = np.full(len(at), half)
-    left_away = one.away if one else other.away if other else plain
-    right_away = other.away if other else left_away
-    left = one.points if one else places + to_left * left_away[:, None]
-    right = other.points if other else places - to_left * right_away[:, None]
-    return Sections(left, right, z), told
 
 
 def _cuts(run: Floats, more: Sequence[Floats]) -> Floats:

@@ -50,47 +50,47 @@ class DrawnOutlines:
     word: NDArray[np.uint8]
     closed: NDArray[np.uint8]
 
+    @staticmethod
+    def of(road_map: RoadMap, tolerance: float = TOLERANCE) -> DrawnOutlines:
+        """Return the outlines of lanes, crosswalks and objects of a map.
 
-def drawn_outlines(road_map: RoadMap, tolerance: float = TOLERANCE) -> DrawnOutlines:
-    """Return the outlines of lanes, crosswalks and objects of a map.
-
-    Parameters
-    ----------
-    road_map : RoadMap
-    tolerance : float
-        Greatest distance between an outline and the original; m.
-    """
-    nodes = road_map.nodes
-    kinds = [str(KINDS[kind]) for kind in nodes.kind.tolist()]
-    names = [lane or kind for lane, kind in zip(nodes.lane_type, kinds, strict=True)]
-    words = tuple(dict.fromkeys(names))[:255]
-    codes = np.array([min(words.index(name) if name in words else 254, 254) for name in names])
-    # Pavements are painted below carriageways, and crossings above both.
-    layer = np.array([_layer(word) for word in words] or [0])[codes] if len(codes) else codes
-    shapes = shapely.simplify(road_map.outlines(), tolerance)
-    parts, row = shapely.get_parts(shapes, return_index=True)
-    area = np.isin(shapely.get_type_id(parts), [3])
-    rings, of = shapely.get_rings(parts[area], return_index=True)
-    lines = np.isin(shapely.get_type_id(parts), [1, 2])
-    whole = np.concatenate([rings, parts[lines]])
-    owner = np.concatenate([row[area][of], row[lines]]).astype(np.int64)
-    closed = np.concatenate([np.ones(len(rings)), np.zeros(int(lines.sum()))])
-    order = np.lexsort((np.arange(len(whole)), layer[owner])) if len(whole) else np.arange(0)
-    whole, owner, closed = whole[order], owner[order], closed[order]
-    points, ring = shapely.get_coordinates(whole, return_index=True)
-    centre = np.round(points.mean(axis=0)) if len(points) else np.zeros(2)
-    start = np.searchsorted(ring, np.arange(len(whole) + 1))
-    about = (points - centre).astype(np.float32)
-    return DrawnOutlines(
-        (float(centre[0]), float(centre[1])),
-        words,
-        about[:, 0],
-        about[:, 1],
-        start.astype(np.uint32),
-        (-1 - owner).astype(np.int32),
-        codes[owner].astype(np.uint8),
-        closed.astype(np.uint8),
-    )
+        Parameters
+        ----------
+        road_map : RoadMap
+        tolerance : float
+            Greatest distance between an outline and the original; m.
+        """
+        nodes = road_map.nodes
+        kinds = [str(KINDS[kind]) for kind in nodes.kind.tolist()]
+        names = [lane or kind for lane, kind in zip(nodes.lane_type, kinds, strict=True)]
+        words = tuple(dict.fromkeys(names))[:255]
+        codes = np.array([min(words.index(name) if name in words else 254, 254) for name in names])
+        # Pavements are painted below carriageways, and crossings above both.
+        layer = np.array([_layer(word) for word in words] or [0])[codes] if len(codes) else codes
+        shapes = shapely.simplify(road_map.outlines(), tolerance)
+        parts, row = shapely.get_parts(shapes, return_index=True)
+        area = np.isin(shapely.get_type_id(parts), [3])
+        rings, of = shapely.get_rings(parts[area], return_index=True)
+        lines = np.isin(shapely.get_type_id(parts), [1, 2])
+        whole = np.concatenate([rings, parts[lines]])
+        owner = np.concatenate([row[area][of], row[lines]]).astype(np.int64)
+        closed = np.concatenate([np.ones(len(rings)), np.zeros(int(lines.sum()))])
+        order = np.lexsort((np.arange(len(whole)), layer[owner])) if len(whole) else np.arange(0)
+        whole, owner, closed = whole[order], owner[order], closed[order]
+        points, ring = shapely.get_coordinates(whole, return_index=True)
+        centre = np.round(points.mean(axis=0)) if len(points) else np.zeros(2)
+        start = np.searchsorted(ring, np.arange(len(whole) + 1))
+        about = (points - centre).astype(np.float32)
+        return DrawnOutlines(
+            (float(centre[0]), float(centre[1])),
+            words,
+            about[:, 0],
+            about[:, 1],
+            start.astype(np.uint32),
+            (-1 - owner).astype(np.int32),
+            codes[owner].astype(np.uint8),
+            closed.astype(np.uint8),
+        )
 
 
 _ABOVE: Final = {"crosswalk": 4, "parking": 3}

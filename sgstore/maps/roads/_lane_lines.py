@@ -24,7 +24,6 @@ from sgstore.maps.roads._cross_sections import (
     WIDE,
     Sections,
     along_line,
-    cross_sections,
     half_width,
     run_of,
     thinned,
@@ -39,9 +38,6 @@ if TYPE_CHECKING:
 
     from sgstore.model.world import Floats
 
-
-START: Final = "start"
-END: Final = "end"
 
 MAX_POINTS: Final = 2_000_000
 """Greatest number of points of all lines together."""
@@ -67,6 +63,9 @@ class Joint(NamedTuple):
 
     lane: str
     contact: str = ""
+
+    START = "start"
+    END = "end"
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +143,46 @@ class LaneLine:
     speed_limit: float = np.nan
     roundabout: str = ""
 
+    @staticmethod
+    def with_junctions(lines: Sequence[LaneLine]) -> list[LaneLine]:
+        """Assign a junction to lanes for motor traffic whose centre lines run through one another.
+
+        This applies to lanes that cross, diverge and merge, but not to lanes on different storeys.
+        Lanes without sections stay unchanged.
+
+        Raises
+        ------
+        MapError
+            Too many lanes overlap.
+        """
+        rows = [row for row, line in enumerate(lines) if line.type in DRIVING and line.sections]
+        sections = [one for row in rows if (one := lines[row].sections)]
+        outlines: Any = shapely.make_valid(
+            [shapely.Polygon(np.concatenate((one.right, one.left[::-1]))) for one in sections]
+        )
+        centres: Any = np.array([shapely.LineString(one.middle) for one in sections], object)
+        tree = shapely.STRtree(outlines)
+        inside: set[int] = set()
+        pairs = 0
+        for start in range(0, len(rows), _ASKED_AT_ONCE):
+            one, other = tree.query(centres[start : start + _ASKED_AT_ONCE], predicate="intersects")
+            pairs += len(one)
+            if pairs > MAX_RELATED:
+                raise MapError(f"more than {MAX_RELATED:,} lanes on one another", element="lane")
+            one = one + start
+            one, other = one[one != other], other[one != other]
+            common: Any = shapely.intersection(centres[one], outlines[other])
+            long = shapely.length(common) > _ON_ANOTHER
+            for lane, crossed, part in zip(one[long], other[long], common[long], strict=True):
+                place = shapely.point_on_surface(part)
+                heights = [_height(sections[row], centres[row], place) for row in (lane, crossed)]
+                if abs(heights[0] - heights[1]) <= STOREY:
+                    inside |= {rows[lane], rows[crossed]}
+        return [
+            replace(line, junction=None) if row in inside and line.junction == "" else line
+            for row, line in enumerate(lines)
+        ]
+
 
 @dataclass(frozen=True, slots=True)
 class Area:
@@ -169,7 +208,7 @@ class _Network:
     def end_of(self, lane: int, contact: str) -> Floats:
         """Return the start or end point of a lane's line."""
         middle = self.sections[lane].middle
-        return middle[0 if contact == START else -1]
+        return middle[0 if contact == Joint.START else -1]
 
     def gap(self, lane: int, end: str, other: int, contact: str) -> float:
         """Return the distance between an end of a lane and an end of another lane; m."""
@@ -185,12 +224,12 @@ class _Network:
     def exits(self, lane: int, contact: str) -> bool:
         """True if traffic leaves a lane at this end of its line."""
         line = self.lines[lane]
-        return line.both or line.forward == (contact == END)
+        return line.both or line.forward == (contact == Joint.END)
 
     def enters(self, lane: int, contact: str) -> bool:
         """True if traffic enters a lane at this end of its line."""
         line = self.lines[lane]
-        return line.both or line.forward == (contact == START)
+        return line.both or line.forward == (contact == Joint.START)
 
 
 def plain_lanes(
@@ -305,7 +344,7 @@ def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[
         beside = (network.index.get(i) for i in (*line.left_beside, *line.right_beside))
         others = [lines[row].centre for row in beside if row is not None]
         half = half_width(line.centre, [other for other in others if len(other) > 1])
-    return cross_sections(line.centre, lefts, rights, half)
+    return Sections.across(line.centre, lefts, rights, half)
 
 
 def about_lanes(lanes: Sequence[str], what: str) -> str:
@@ -351,7 +390,10 @@ def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
 
 def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) -> None:
     start, end = (network.lines[lane] for lane in lanes)
-    leaves, enters = END if start.forward else START, START if end.forward else END
+    leaves, enters = (
+        Joint.END if start.forward else Joint.START,
+        Joint.START if end.forward else Joint.END,
+    )
     sections = way_between(_gate(network, lanes[0], leaves), _gate(network, lanes[1], enters))
     ident = f"{area}:{start.ident}-{end.ident}"
     network.index[ident] = len(network.lines)
@@ -374,9 +416,9 @@ def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) 
 def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, float, float]:
     """Return an end of a lane: place, heading of its traffic, width and height."""
     sections = network.sections[lane]
-    at, other = (0, 1) if contact == START else (-1, -2)
+    at, other = (0, 1) if contact == Joint.START else (-1, -2)
     middle = sections.middle
-    way = (middle[other] - middle[at]) * (1 if contact == START else -1)
+    way = (middle[other] - middle[at]) * (1 if contact == Joint.START else -1)
     way *= network.direction(lane)
     width = float(np.hypot(*(sections.left[at] - sections.right[at])))
     return middle[at], float(np.arctan2(way[1], way[0])), width, float(sections.z[at])
@@ -390,7 +432,7 @@ def _joints(network: _Network) -> set[_Joined]:
     joints: set[_Joined] = set()
     far: list[str] = []
     for row, line in enumerate(network.lines):
-        for own, touched in ((START, line.before), (END, line.after)):
+        for own, touched in ((Joint.START, line.before), (Joint.END, line.after)):
             for joint in touched:
                 other = network.index.get(joint.lane)
                 if other is None:
@@ -409,12 +451,12 @@ def _contact(network: _Network, lane: int, end: str, other: int) -> str:
     line, ident = network.lines[other], network.lines[lane].ident
     says = {
         contact
-        for contact, touched in ((START, line.before), (END, line.after))
+        for contact, touched in ((Joint.START, line.before), (Joint.END, line.after))
         if any(joint.lane == ident for joint in touched)
     }
     if len(says) == 1:
         return says.pop()
-    return min((START, END), key=lambda contact: network.gap(lane, end, other, contact))
+    return min((Joint.START, Joint.END), key=lambda contact: network.gap(lane, end, other, contact))
 
 
 def _onto(network: _Network, joints: Iterable[_Joined]) -> list[set[int]]:
@@ -435,10 +477,10 @@ def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
     sections = list(network.sections)
     for row, (_, end, other, contact) in nearest.items():
         own, onward = sections[row], network.sections[other]
-        own = own if end == END else own.turned_round()
-        onward = onward if contact == START else onward.turned_round()
+        own = own if end == Joint.END else own.turned_round()
+        onward = onward if contact == Joint.START else onward.turned_round()
         own = own.up_to(onward.left[0], onward.right[0], float(onward.z[0]))
-        network.sections[row] = own if end == END else own.turned_round()
+        network.sections[row] = own if end == Joint.END else own.turned_round()
 
 
 _Sides = tuple[set[int], set[int]]
@@ -609,46 +651,6 @@ def _junctions(network: _Network) -> list[str]:
 _ON_ANOTHER: Final = 0.5
 """Least length of a centre line inside another lane that makes both a junction; m."""
 _ASKED_AT_ONCE: Final = 100
-
-
-def with_junctions(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Assign a junction to lanes for motor traffic whose centre lines run through one another.
-
-    This applies to lanes that cross, diverge and merge, but not to lanes on different storeys.
-    Lanes without sections stay unchanged.
-
-    Raises
-    ------
-    MapError
-        Too many lanes overlap.
-    """
-    rows = [row for row, line in enumerate(lines) if line.type in DRIVING and line.sections]
-    sections = [one for row in rows if (one := lines[row].sections)]
-    outlines: Any = shapely.make_valid(
-        [shapely.Polygon(np.concatenate((one.right, one.left[::-1]))) for one in sections]
-    )
-    centres: Any = np.array([shapely.LineString(one.middle) for one in sections], object)
-    tree = shapely.STRtree(outlines)
-    inside: set[int] = set()
-    pairs = 0
-    for start in range(0, len(rows), _ASKED_AT_ONCE):
-        one, other = tree.query(centres[start : start + _ASKED_AT_ONCE], predicate="intersects")
-        pairs += len(one)
-        if pairs > MAX_RELATED:
-            raise MapError(f"more than {MAX_RELATED:,} lanes on one another", element="lane")
-        one = one + start
-        one, other = one[one != other], other[one != other]
-        common: Any = shapely.intersection(centres[one], outlines[other])
-        long = shapely.length(common) > _ON_ANOTHER
-        for lane, crossed, part in zip(one[long], other[long], common[long], strict=True):
-            place = shapely.point_on_surface(part)
-            heights = [_height(sections[row], centres[row], place) for row in (lane, crossed)]
-            if abs(heights[0] - heights[1]) <= STOREY:
-                inside |= {rows[lane], rows[crossed]}
-    return [
-        replace(line, junction=None) if row in inside and line.junction == "" else line
-        for row, line in enumerate(lines)
-    ]
 
 
 def _height(sections: Sections, centre: Any, place: Any) -> float:

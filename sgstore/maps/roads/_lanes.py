@@ -16,10 +16,10 @@ import shapely
 
 from sgstore.base.tables import chained
 from sgstore.maps.roads._conflicts import conflicts
-from sgstore.maps.roads._courses import lane_courses
-from sgstore.maps.roads._map import STOREY, LaneChanges, MapEdges, MapNodes, RoadMap, turn_words
-from sgstore.maps.roads._places import broad_lines
-from sgstore.maps.roads._ribbons import Ribbons, mean_widths, turned, wrapped
+from sgstore.maps.roads._courses import LaneCourses
+from sgstore.maps.roads._map import LaneChanges, MapEdges, MapNodes, RoadMap, turn_words
+from sgstore.maps.roads._places import MapPlaces
+from sgstore.maps.roads._ribbons import Ribbons, wrapped
 from sgstore.model.vocabulary import DRIVING, RELATION_CODE
 
 if TYPE_CHECKING:
@@ -81,6 +81,34 @@ class PlainLane:
     speed_limit: float = np.nan
     roundabout: str = ""
     broad: tuple[str, ...] = ()
+
+    @staticmethod
+    def painted_across(
+        lanes: Sequence[PlainLane], lines: Sequence[Floats]
+    ) -> list[dict[int, float]]:
+        """For each painted line (n, 2 or 3), find the lanes for motor traffic and the place along each; m.
+
+        A line between two consecutive lanes belongs to the first.
+        """
+        found: list[dict[int, float]] = [{} for _ in lines]
+        rows = [row for row, lane in enumerate(lanes) if lane.type in DRIVING]
+        long = [number for number, line in enumerate(lines) if len(line) > 1]
+        if not rows or not long:
+            return found
+        centres: Any = np.array(
+            [shapely.LineString((lanes[row].left + lanes[row].right) / 2) for row in rows], object
+        )
+        painted: Any = np.array([shapely.LineString(lines[one][:, :2]) for one in long], object)
+        line, lane = shapely.STRtree(centres).query(painted, predicate="dwithin", distance=_ON_LANE)
+        nearest: Any = shapely.shortest_line(centres[lane], painted[line])
+        places: Any = shapely.line_locate_point(centres[lane], shapely.get_point(nearest, 0))
+        for one, row, along in zip(line.tolist(), lane.tolist(), places.tolist(), strict=True):
+            found[long[one]][rows[row]] = along
+        for places in found:
+            onward = {to for row in places for to in lanes[row].onto}
+            for row in [row for row, at in places.items() if at < _AT_START and row in onward]:
+                del places[row]
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,8 +224,8 @@ def road_map_of(
         stops=_stops(signals, first),
         stop_lines=np.array([first + r for r, s in enumerate(signals) if s.is_stop_line], np.int64),
         # Formats of lanes as lines use 0 for an unknown height.
-        courses=lane_courses(ribbons, ribbons.height if ribbons.z.any() else None),
-        broad_lines=broad_lines(
+        courses=LaneCourses.of(ribbons, ribbons.height if ribbons.z.any() else None),
+        broad_lines=MapPlaces.of_lines(
             [
                 (row, side == "left", 0.0, float(length))
                 for row, (lane, length) in enumerate(zip(lanes, ribbons.lengths, strict=True))
@@ -280,7 +308,7 @@ def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
     """Return the nodes of plain lanes with these surfaces."""
     every, length = np.arange(len(ribbons)), ribbons.lengths
     middle = ribbons.at(every, length / 2)
-    turns = turn_words(turned(ribbons))
+    turns = turn_words(ribbons.turned())
     return MapNodes.of(
         "lane",
         [lane.name for lane in lanes],
@@ -295,7 +323,7 @@ def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
         section=np.array([lane.section for lane in lanes], np.int64),
         lane=np.array([lane.number for lane in lanes], np.int64),
         length=length,
-        width=mean_widths(ribbons),
+        width=ribbons.mean_widths(),
         speed_limit=np.array([lane.speed_limit for lane in lanes], np.float64),
     )
 
@@ -390,7 +418,6 @@ def _edges(
         np.array(crossing, np.int64),
         [lane.junction for lane in lanes],
         (flow[:, 0], flow[:, 1]),
-        STOREY,
     )
     against = _spread([lane.against for lane in lanes])
     change = np.array(
@@ -449,29 +476,3 @@ _ON_LANE: Final = 0.1
 """Greatest distance between a stop line and the centre line of its lane; m."""
 _AT_START: Final = 0.5
 """A line this close to the start of a lane belongs to the previous lane, if it is on that lane too; m."""
-
-
-def painted_across(lanes: Sequence[PlainLane], lines: Sequence[Floats]) -> list[dict[int, float]]:
-    """For each painted line (n, 2 or 3), find the lanes for motor traffic and the place along each; m.
-
-    A line between two consecutive lanes belongs to the first.
-    """
-    found: list[dict[int, float]] = [{} for _ in lines]
-    rows = [row for row, lane in enumerate(lanes) if lane.type in DRIVING]
-    long = [number for number, line in enumerate(lines) if len(line) > 1]
-    if not rows or not long:
-        return found
-    centres: Any = np.array(
-        [shapely.LineString((lanes[row].left + lanes[row].right) / 2) for row in rows], object
-    )
-    painted: Any = np.array([shapely.LineString(lines[one][:, :2]) for one in long], object)
-    line, lane = shapely.STRtree(centres).query(painted, predicate="dwithin", distance=_ON_LANE)
-    nearest: Any = shapely.shortest_line(centres[lane], painted[line])
-    places: Any = shapely.line_locate_point(centres[lane], shapely.get_point(nearest, 0))
-    for one, row, along in zip(line.tolist(), lane.tolist(), places.tolist(), strict=True):
-        found[long[one]][rows[row]] = along
-    for places in found:
-        onward = {to for row in places for to in lanes[row].onto}
-        for row in [row for row, at in places.items() if at < _AT_START and row in onward]:
-            del places[row]
-    return found

@@ -75,17 +75,6 @@ def _downstream(
         yield lanes[row], other, best[row, other]
 
 
-def point_shapes(x: Floats, y: Floats) -> NDArray[np.object_]:
-    """Convert coordinates to shapely points, (N,)."""
-    points: Any = shapely.points(np.column_stack([x, y]))
-    return points
-
-
-def within(outline: Any, places: Floats) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the places (N, 2) inside a shapely polygon."""
-    return np.asarray(shapely.contains_xy(outline, *places.T), np.bool_)
-
-
 STRAIGHT: Final = np.radians(30.0)
 """A lane through a junction with a smaller turn goes straight on; rad."""
 
@@ -185,6 +174,16 @@ class MapNodes:
     def take(self, rows: Ints) -> MapNodes:
         """Return these rows, in this order."""
         return taken(self, rows)
+
+    def first_sections(self) -> Ints:
+        """Map each lane to the first lane with its road and number, other nodes to themselves; (K,)."""
+        same = np.arange(len(self))
+        first: dict[tuple[str, int], int] = {}
+        for column in np.flatnonzero(self.kind == KIND_CODE["lane"]).tolist():
+            key = self.road[column], int(self.lane[column])
+            if key[1]:  # lanes without a number in a section, such as parking spaces, stay
+                same[column] = first.setdefault(key, column)
+        return same
 
 
 @dataclass(frozen=True, slots=True)
@@ -488,7 +487,7 @@ class RoadMap:
     def lanes_of_signal(self, signal: str) -> Ints:
         """Return node ids of the driving lanes that a signal applies to; empty for an unknown id.
 
-        For a signal that is missing in the map, :func:`lanes_ref` can replace its id.
+        For a signal that is missing in the map, :meth:`lanes_ref` can replace its id.
         """
         if signal.startswith(_LANES_REF):
             names = _names_in(signal)
@@ -519,7 +518,7 @@ class RoadMap:
         stay, without edges; node ids keep their meaning. Surface queries still distinguish
         sections. The result is another map with another digest.
         """
-        nodes, same = self.nodes, first_sections(self.nodes)
+        nodes, same = self.nodes, self.nodes.first_sections()
         first = same == np.arange(len(nodes))
         lane = (nodes.kind == KIND_CODE["lane"]) & (nodes.lane != 0)
         name = tuple(
@@ -726,13 +725,24 @@ class RoadMap:
         src, dst = self.edges.src[controls], self.edges.dst[controls]
         return {self.nodes.name[-1 - node]: dst[src == node] for node in np.unique(src).tolist()}
 
+    @staticmethod
+    def lanes_ref(names: Iterable[str]) -> str:
+        """Return a substitute id, made of lane names, for a signal that the map lacks."""
+        return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
+
+    @staticmethod
+    def within(outline: Any, places: Floats) -> NDArray[np.bool_]:
+        """Return a mask (N,) of the places (N, 2) inside a shapely polygon."""
+        return np.asarray(shapely.contains_xy(outline, *places.T), np.bool_)
+
+    @staticmethod
+    def point_shapes(x: Floats, y: Floats) -> NDArray[np.object_]:
+        """Convert coordinates to shapely points, (N,)."""
+        points: Any = shapely.points(np.column_stack([x, y]))
+        return points
+
 
 _LANES_REF: Final = "lanes:"
-
-
-def lanes_ref(names: Iterable[str]) -> str:
-    """Return a substitute id, made of lane names, for a signal that the map lacks."""
-    return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
 
 
 def _names_in(ref: str) -> set[str]:
@@ -743,19 +753,8 @@ def _names_in(ref: str) -> set[str]:
     return {name for name in told if isinstance(name, str)} if isinstance(told, list) else set()
 
 
-def first_sections(nodes: MapNodes) -> Ints:
-    """Map each lane to the first lane with its road and number, other nodes to themselves; (K,)."""
-    same = np.arange(len(nodes))
-    first: dict[tuple[str, int], int] = {}
-    for column in np.flatnonzero(nodes.kind == KIND_CODE["lane"]).tolist():
-        key = nodes.road[column], int(nodes.lane[column])
-        if key[1]:  # lanes without a number in a section, such as parking spaces, stay
-            same[column] = first.setdefault(key, column)
-    return same
-
-
 def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
-    """Return unique edges between the representative nodes of :func:`first_sections`."""
+    """Return unique edges between the representative nodes of :meth:`MapNodes.first_sections`."""
     src, dst = -1 - same[-1 - edges.src], -1 - same[-1 - edges.dst]
     table = np.column_stack([edges.relation.astype(np.int64), src, dst])[src != dst]
     relation, src, dst = np.unique(table, axis=0).reshape(-1, 3).T

@@ -77,12 +77,12 @@ class MapPlaces:
         told = tuple(what[int(row)] for row in order)
         return cls(part[order], told, lane[order], start[order], end[order])
 
-
-def broad_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
-    """Make stretches with broad markings from rows of lane, side, start and end; m."""
-    lane = np.array([row[0] for row in rows], np.int64)
-    start, end = (np.array([row[i] for row in rows], np.float64) for i in (2, 3))
-    return MapPlaces.of(lane + 1, [BROAD_LINES[not row[1]] for row in rows], lane, start, end)
+    @staticmethod
+    def of_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
+        """Make stretches with broad markings from rows of lane, side, start and end; m."""
+        lane = np.array([row[0] for row in rows], np.int64)
+        start, end = (np.array([row[i] for row in rows], np.float64) for i in (2, 3))
+        return MapPlaces.of(lane + 1, [BROAD_LINES[not row[1]] for row in rows], lane, start, end)
 
 
 def made_of_lanes(

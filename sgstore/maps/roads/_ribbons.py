@@ -164,6 +164,23 @@ class Ribbons:
         gap = run[before + 1] - run[before]
         return before, np.clip((into - run[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
 
+    def mean_widths(self) -> Floats:
+        """Return mean widths along the road, (L,); m."""
+        width = np.hypot(self.left_x - self.right_x, self.left_y - self.right_y)
+        starts = self.offsets[:-1]
+        step = np.abs(np.diff(self.s, append=0.0))
+        step[self.offsets[1:] - 1] = 0.0
+        total = np.add.reduceat(step, starts)
+        weighted = np.add.reduceat(step * (width + np.append(width[1:], 0.0)) / 2, starts)
+        plain = np.add.reduceat(width, starts) / np.diff(self.offsets)
+        return np.where(total > 0, weighted / np.where(total > 0, total, 1.0), plain)
+
+    def turned(self) -> Floats:
+        """Return the turn of lanes from start to end, positive to the left, (L,); rad, not wrapped."""
+        bend = wrapped(np.diff(self.heading, append=0.0))
+        bend[self.offsets[1:] - 1] = 0.0
+        return np.add.reduceat(bend, self.offsets[:-1])
+
 
 @dataclass(frozen=True, slots=True)
 class LanePoints:
@@ -223,25 +240,6 @@ def waypoints(ribbons: Ribbons, spacing: float) -> LanePoints:
     lane = np.repeat(np.arange(len(ribbons)), counts)
     number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
     return ribbons.at(lane, number.astype(np.float64) * spacing)
-
-
-def mean_widths(ribbons: Ribbons) -> Floats:
-    """Return mean widths along the road, (L,); m."""
-    width = np.hypot(ribbons.left_x - ribbons.right_x, ribbons.left_y - ribbons.right_y)
-    starts = ribbons.offsets[:-1]
-    step = np.abs(np.diff(ribbons.s, append=0.0))
-    step[ribbons.offsets[1:] - 1] = 0.0
-    total = np.add.reduceat(step, starts)
-    weighted = np.add.reduceat(step * (width + np.append(width[1:], 0.0)) / 2, starts)
-    plain = np.add.reduceat(width, starts) / np.diff(ribbons.offsets)
-    return np.where(total > 0, weighted / np.where(total > 0, total, 1.0), plain)
-
-
-def turned(ribbons: Ribbons) -> Floats:
-    """Return the turn of lanes from start to end, positive to the left, (L,); rad, not wrapped."""
-    bend = wrapped(np.diff(ribbons.heading, append=0.0))
-    bend[ribbons.offsets[1:] - 1] = 0.0
-    return np.add.reduceat(bend, ribbons.offsets[:-1])
 
 
 def centre_lines(ribbons: Ribbons) -> NDArray[Any]:

@@ -51,7 +51,7 @@ from sgstore.pipeline.importing._resolve import (
     state_of,
     survey,
 )
-from sgstore.store import Folder, Identity, OnMap, Segment, StoreFile, refuse_name
+from sgstore.store import Folder, Identity, OnMap, Segment, StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -173,7 +173,7 @@ class _ImportRun:
         self._form = form
         self._words = words
         self._answers = answers
-        refuse_name(store)
+        Folder.refuse_name(store)
         self._store = StoreFile(store) if store.exists() else None
         if self._store is not None:
             self._store.settle()

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from sgstore.maps.roads import lanes_ref
+from sgstore.maps.roads import RoadMap
 from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
 from sgstore.model.world import POSE
 from sgstore.readers._blocks import FAR, NAN
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.maps.roads import RoadMap
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.readers._blocks import EntityTable
 
@@ -362,7 +361,7 @@ def _by_boxes(
             found[ident] = name
             taken.add(name)
     named = {
-        ident: lanes_ref(nodes.name[-1 - lane] for lane in sorted(lanes, reverse=True))
+        ident: RoadMap.lanes_ref(nodes.name[-1 - lane] for lane in sorted(lanes, reverse=True))
         for ident, lanes in own.items()
         if lanes
     }

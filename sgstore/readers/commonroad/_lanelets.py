@@ -14,18 +14,16 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.maps.roads import (
-    END,
     MAX_POINTS,
-    START,
     Border,
     Joint,
     LaneLine,
     PlainCrosswalk,
+    PlainLane,
     PlainSignal,
     Sections,
     about_lanes,
     lane_text,
-    painted_across,
     plain_lanes,
     run_of,
 )
@@ -33,7 +31,6 @@ from sgstore.maps.roads import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from sgstore.maps.roads import PlainLane
     from sgstore.model.world import Floats
     from sgstore.readers.commonroad._document import (
         Lanelet,
@@ -184,8 +181,8 @@ def _line(scenario: TrafficScenario, lanelet: Lanelet, left: Floats, right: Floa
         lefts=(Border(left, crossed[0], crossed[0], broad=broad[0]),),
         rights=(Border(right, crossed[1], crossed[1], broad=broad[1]),),
         sections=Sections(left[:, :2], right[:, :2], (left[:, 2] + right[:, 2]) / 2),
-        before=tuple(Joint(name, END) for name in lanelet.before),
-        after=tuple(Joint(name, START) for name in lanelet.after),
+        before=tuple(Joint(name, Joint.END) for name in lanelet.before),
+        after=tuple(Joint(name, Joint.START) for name in lanelet.after),
         left_beside=(lanelet.beside[0],) if lanelet.beside[0] else (),
         right_beside=(lanelet.beside[1],) if lanelet.beside[1] else (),
         junction=None if unnamed else junction,
@@ -251,7 +248,7 @@ def _stops(
         found[row] = float(run_of((lanes[row].left + lanes[row].right) / 2)[-1])
         if len(lanelet.stop_line) > 1:
             told[row] = np.array(lanelet.stop_line)
-    for row, places in zip(told, painted_across(lanes, [*told.values()]), strict=True):
+    for row, places in zip(told, PlainLane.painted_across(lanes, [*told.values()]), strict=True):
         found[row] = places.get(row, found[row])
     return found
 

@@ -23,11 +23,9 @@ import numpy as np
 
 from sgstore.errors import MapError
 from sgstore.maps.roads import (
-    END,
     MAX_NAME,
     MAX_POINTS,
     OF_LANES,
-    START,
     Area,
     Border,
     Joint,
@@ -539,7 +537,7 @@ def _physical(lane: Any) -> set[int]:
 
 def _connections(connections: Iterable[Any]) -> tuple[Joint, ...]:
     return tuple(
-        Joint(str(c.other_lane_id.value), START if c.at_begin_of_other_lane else END)
+        Joint(str(c.other_lane_id.value), Joint.START if c.at_begin_of_other_lane else Joint.END)
         for c in connections
     )
 

@@ -15,10 +15,10 @@ import numpy as np
 from sgstore.errors import StoreError, one_store_needed, url_named
 from sgstore.lang.syntax import node_of_kind
 from sgstore.model.frame_ids import begins, seq_of, trace_of
+from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import KINDS
 from sgstore.model.world import longest_step_ns
 from sgstore.query import Store
-from sgstore.store import scope_of
 from sgstore.testsets.locks import ENDING as LOCK
 from sgstore.testsets.locks import frames_of_lock, read_lock, store_beside
 
@@ -192,7 +192,7 @@ class ChosenFrames:
         return tuple(self.reasons)
 
     def scope(self, *, world: bool) -> dict[str, Any]:
-        """Return the omissions by settings, as :func:`sgstore.store.scope_of`."""
+        """Return the omissions by settings, as :func:`sgstore.model.scope.scope_of`."""
         chosen = None
         if self.frame_id is not None:
             chosen = set(np.unique(trace_of(self.frame_id)).tolist())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,7 +14,13 @@ from sgstore.model.frame_ids import frame_ids, seq_of, trace_of
 from sgstore.model.vocabulary import natural
 from sgstore.query import Store
 from sgstore.readers import read_messages
-from sgstore.store import DIGEST_BYTES, WINDOW, graph_digests, marks, messages_of, trace_id_of
+from sgstore.store import (
+    Identity,
+    Mark,
+    MessagePlaces,
+    StoredTrace,
+    graph_digests,
+)
 from sgstore.testsets.locks._text import (
     Lock,
     LockedCase,
@@ -29,10 +35,15 @@ if TYPE_CHECKING:
 
     from sgstore.collection import Collection
     from sgstore.model.world import Ints
-    from sgstore.store import Mark, MessagePlaces, StoredTrace
 
     Payload = dict[str, str]
 
+
+WINDOW: Final = 4_000
+"""Frames to read messages of at once."""
+
+DIGEST_BYTES: Final = 16
+"""Length of the digests of messages."""
 
 CasePart = tuple["Ints", "Ints", str]
 """Frames of a future case: their ids, ascending, of one trace; their log times (ns); their split."""
@@ -88,7 +99,7 @@ def lock_of(
             cases.append(_case(part, trace.name, graph, payload))
             if progress is not None:
                 progress(len(cases), len(parts))
-        made = marks(store.file)
+        made = Mark.of_traces(store.file)
         used = {trace.trace_id: trace for trace in of}
         traces = [locked(trace, made[i]) for i, trace in used.items()]
         traces.sort(key=lambda trace: natural(trace.name))
@@ -192,7 +203,7 @@ def recording_of(store: Store, trace_id: int) -> Path:
 
 def _digests(store: Store, path: Path, groups: Sequence[Ints]) -> Iterator[Payload]:
     """Yield the digests for groups of frames of one recording."""
-    found = messages_of(store.file, np.unique(np.concatenate(groups)))
+    found = MessagePlaces.of(store.file, np.unique(np.concatenate(groups)))
     places = list(
         zip(found.chunk_offset.tolist(), found.offset.tolist(), found.length.tolist(), strict=True)
     )
@@ -256,11 +267,11 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
 
 def _same(trace: LockedTrace, store: Store) -> StoredTrace:
     """Return the store's trace that corresponds to a lock's trace, with the same settings."""
-    trace_id = trace_id_of(trace.recording, trace.ego)
+    trace_id = Identity.id_of(trace.recording, trace.ego)
     found = next((one for one in store.info() if one.trace_id == trace_id), None)
     if found is None:
         raise _not_there(trace, store.file.path)
-    mine = locked(found, marks(store.file)[trace_id])
+    mine = locked(found, Mark.of_traces(store.file)[trace_id])
     for name, said in (("config", "other settings"), ("map", "another road map")):
         if getattr(mine, name) != getattr(trace, name):
             raise StoreError(
@@ -323,7 +334,9 @@ def by_bundle(
     names = {row["name"]: row["bundle"] for row in whole.traces()} if by_name else {}
     home: dict[str, str] = {}
     for one in lock.traces:
-        found = whole.snapshot.homes.get(trace_id_of(one.recording, one.ego)) or names.get(one.name)
+        found = whole.snapshot.homes.get(Identity.id_of(one.recording, one.ego)) or names.get(
+            one.name
+        )
         if found is not None:
             home[one.name] = found
     by_bundle: dict[str, Lock] = {}
@@ -344,7 +357,7 @@ def store_beside(path: str | Path, lock: Lock) -> Path:
     """
     folders = Path(path).parent, Path()
     beside = {one.resolve(): one for f in folders for one in sorted(f.glob("*.sgstore"))}
-    wanted = {trace_id_of(one.recording, one.ego) for one in lock.traces}
+    wanted = {Identity.id_of(one.recording, one.ego) for one in lock.traces}
     having: list[Path] = []
     for one in beside.values():
         try:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import natural
-from sgstore.store import free_name
+from sgstore.store import Identity
 from sgstore.testsets.locks._text import Lock, LockedCase, made_with
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _made(how: str, a: Lock, b: Lock, ours: list[LockedCase], theirs: list[Locke
     for trace in b.traces:
         source = trace.recording, trace.ego
         if source not in traces:
-            traces[source] = replace(trace, name=free_name(trace.name, taken))
+            traces[source] = replace(trace, name=Identity.free_name(trace.name, taken))
             taken.add(traces[source].name)
         names[trace.name] = traces[source].name
     cases = ours + [_renamed(case, names[case.trace]) for case in theirs]

@@ -10,7 +10,7 @@ import numpy as np
 from sgstore.errors import TraceError
 from sgstore.model.frame_ids import frame_ids
 from sgstore.query import Store
-from sgstore.store import graph_digests, marks, trace_id_of
+from sgstore.store import Identity, Mark, StoredTrace, graph_digests
 from sgstore.testsets.locks._cases import by_bundle, locked, payload_digests, rows_of
 from sgstore.testsets.locks._text import Lock, LockedCase, LockedTrace, lock_from, made_with
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from sgstore.collection import Collection
     from sgstore.model.world import Ints
-    from sgstore.store import StoredTrace
 
 
 _COMPARED = ("recording", "ego", "since", "until", "frames", "config", "map", "flavour", "version")
@@ -71,7 +70,7 @@ def verify(lock: Lock, store: Store | Collection, *, payloads: bool = True) -> I
         return
     with store.file.snapshot():
         known = store.info()
-        made = marks(store.file)
+        made = Mark.of_traces(store.file)
         for trace in lock.traces:
             found = _found(trace, known)
             if found is None:
@@ -132,7 +131,7 @@ def verify_case(
 
 
 def _found(trace: LockedTrace, known: Sequence[StoredTrace]) -> StoredTrace | None:
-    trace_id = trace_id_of(trace.recording, trace.ego)
+    trace_id = Identity.id_of(trace.recording, trace.ego)
     by_id = [one for one in known if one.trace_id == trace_id]
     return next(iter(by_id or [one for one in known if one.name == trace.name]), None)
 

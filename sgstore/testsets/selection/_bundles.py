@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sgstore.base.temporary_folders import working_folder
-from sgstore.store import merged_classes, write_coded
+from sgstore.store import PartFile
 from sgstore.testsets.coverage import ChosenFrames, Classed
 from sgstore.testsets.selection._cover import cheapest_alike
 from sgstore.testsets.selection._sets import SetFamily
@@ -117,7 +117,7 @@ def cheapest_in(store: Store, frames: list[int] | None, wish: dict[str, Any]) ->
 def _classed(chosen: ChosenFrames, abstraction: str) -> Classed:
     """Return the frames with their classes; missing classes are computed but not stored."""
     with working_folder("classes") as folder:
-        part = write_coded(chosen.one_store.file, abstraction, folder / "classes.parquet")
-        of = merged_classes([part])
+        part = PartFile.of_coded(chosen.one_store.file, abstraction, folder / "classes.parquet")
+        of = PartFile.merged_classes([part])
     rows = chosen.rows_of(of.frame_id)
     return Classed(chosen, of.names, of.frame_id[rows], of.code[rows])

@@ -13,7 +13,7 @@ from sgstore.errors import ConfigError, QueryError
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import Call, MatchClause
 from sgstore.model.frame_ids import trace_of
-from sgstore.store import lengths_of_messages
+from sgstore.store import MessagePlaces
 from sgstore.testsets.coverage import (
     UNKNOWN,
     Combinations,
@@ -205,7 +205,9 @@ class Units:
                 return periods_of(self.chosen.store, self.frame_id) / 1e9
             case "bytes":
                 found = np.zeros(len(self.frame_id))
-                for frame_id, length in lengths_of_messages(self.chosen.store.file, self.frame_id):
+                for frame_id, length in MessagePlaces.lengths(
+                    self.chosen.store.file, self.frame_id
+                ):
                     np.add.at(found, np.searchsorted(self.frame_id, frame_id), length)
                 return found
 
