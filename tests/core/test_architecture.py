@@ -87,6 +87,12 @@ OWNERS = {
 }
 """Third-party package → the packages or files that import it."""
 
+MOST_NAMES = 40
+"""Most names of an interface."""
+
+MOST_NAMES_OF_AUTHORS = 10
+"""Most names of an interface for authors of readers, relations or exporters."""
+
 MASKS_ARE_KNOWN_TO = {"store", "lang/sql/_masks", "lang/sql/_mask_counts", "lang/sql/_runs"}
 SQL_OF_MASKS = re.compile(r"\bmask\b|\bbit_or\b|\bbit_count\b|<<")
 FORBIDDEN_MODULES = {"pickle", "marshal", "shelve", "dill"}
@@ -182,7 +188,10 @@ def test_rooms_are_entered_by_their_faces() -> None:
 
 
 def test_interfaces_import_and_list_their_names() -> None:
-    """An ``__init__.py`` has a docstring, imports of its own modules, and the list of their names."""
+    """An ``__init__.py`` has a docstring, imports of its own modules, and the list of their names.
+
+    A second list, ``__all__ += […]``, has the names for authors of plug-ins.
+    """
     for path in sorted(PACKAGE.rglob("__init__.py")):
         body = ast.parse(source_of(path)).body
         if path.parent == PACKAGE or not any(isinstance(node, ast.ImportFrom) for node in body):
@@ -197,6 +206,15 @@ def test_interfaces_import_and_list_their_names() -> None:
             for alias in node.names
         ]
         assert {*package.__all__} <= {*names, *_defined(body)}, package.__name__
+        more = sum(len(_listed(node.value)) for node in body if isinstance(node, ast.AugAssign))
+        assert len(package.__all__) - more <= MOST_NAMES, package.__name__
+        assert more <= MOST_NAMES_OF_AUTHORS, package.__name__
+
+
+def _listed(node: ast.expr) -> list[ast.expr]:
+    """Items of a list display."""
+    assert isinstance(node, ast.List)
+    return node.elts
 
 
 def _defined(body: list[ast.stmt]) -> set[str]:
