@@ -13,7 +13,16 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-COPIED = ("sgstore", "tests", "tools", "docs", "samples", "pyproject.toml", "CONTRIBUTING.md", "README.md")
+COPIED = (
+    "sgstore",
+    "tests",
+    "tools",
+    "docs",
+    "samples",
+    "pyproject.toml",
+    "CONTRIBUTING.md",
+    "README.md",
+)
 IGNORED = shutil.ignore_patterns("__pycache__", "frozen", "pictures", "page")
 BLOCK = re.compile(r"^`([\w/.]+)`[^\n]*\n|^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
