@@ -4,8 +4,7 @@ Both engines return the same results: :func:`evaluate` for all frames of a trace
 frame by frame, as early as possible.
 """
 
-from sgstore.temporal._checks import (
-    CheckRun,
+from sgstore.temporal._check_verdict import (
     Verdict,
     Witness,
     absence_text,
@@ -17,6 +16,7 @@ from sgstore.temporal._checks import (
     verdict_columns,
     verdict_rows,
 )
+from sgstore.temporal._checks import CheckRun
 from sgstore.temporal._followed import RecentGraphs
 from sgstore.temporal._formula import Formula
 from sgstore.temporal._matches import TemporalMatches

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from heapq import merge
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sgstore.base.display import IN_NOTEBOOK
 from sgstore.lang.bind import not_computed, of_check
 from sgstore.lang.help import compared_in_check
-from sgstore.lang.sql import compile_checks, entities, relation, traces_of, value_text
+from sgstore.lang.sql import compile_checks, entities, relation, traces_of
 from sgstore.matches import Interval, notes_in
 from sgstore.model.frame_ids import trace_of
 from sgstore.model.scope import scope_of
@@ -33,16 +33,36 @@ from sgstore.temporal._check_plan import (
     misses_absent,
     plan_of_check,
 )
+from sgstore.temporal._check_verdict import (
+    Verdict,
+    columns_returned,
+    doubt_text,
+    returned_by,
+    unknown_notes,
+    verdict_columns,
+    verdict_of,
+    verdict_rows,
+    within_range,
+)
 from sgstore.temporal._formula import Formula, Proposition, formula_text, propositions, tolerant
 from sgstore.temporal._known_range import ShortRange, short_ranges
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
-from sgstore.temporal._offline import PlanValues, TraceReader, frame_times, refuse_many, traces
-from sgstore.temporal._plan import (
-    kept_throughout,
-    needs_text,
-    plan_of_returned,
-    plan_text,
+from sgstore.temporal._offline import PlanValues, TraceReader, frame_times, traces
+from sgstore.temporal._plan import kept_throughout, needs_text, plan_of_returned, plan_text
+from sgstore.temporal._quantifiers import (
+    HOLDS,
+    PENDING,
+    UNKNOWN,
+    VIOLATED,
+    Level,
+    folded_margins,
+    folded_values,
+    innermost,
+    levels_of,
+    may_wait,
+    newcomers,
+    waits_for_newcomers,
 )
 from sgstore.temporal._robustness import (
     MARGIN_CELLS,
@@ -55,20 +75,19 @@ from sgstore.temporal._robustness import (
 from sgstore.temporal._verdicts import (
     CERTAINLY_TRUE,
     PRESUMABLY_TRUE,
-    STATUS,
     Settled,
     Violation,
     within_bounds,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from sgstore.lang.bind import CheckInCatalog
     from sgstore.lang.catalog import Catalog
-    from sgstore.lang.ir import Bound, BoundCheck, BoundQuantifier, OverMatch
+    from sgstore.lang.ir import BoundQuantifier, OverMatch
     from sgstore.lang.sql import Window
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.store import StoreFile
@@ -77,436 +96,6 @@ if TYPE_CHECKING:
     Keys = NDArray[np.int64]
     Statuses = NDArray[np.int8]
     Array = NDArray[Any]
-
-
-VIOLATED, UNKNOWN, PENDING, HOLDS = range(4)
-"""Verdict codes in order. The minimum is the code of a conjunction, the maximum of a disjunction."""
-
-
-NEWCOMER: Final = -(1 << 60)
-"""First id of placeholders for future entities."""
-
-
-# Quantifiers: their entities in a trace, and the values for all or some of them -------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Level:
-    """Bindings of the variables up to one quantifier.
-
-    Attributes
-    ----------
-    word : str
-        ``FORALL`` or ``FORSOME``.
-    bindings : (B, n) int64
-        Bindings of the variables of this quantifier and of those before it.
-    parents : (B,) int64
-        Index of the outer binding that each binding extends.
-    """
-
-    word: str
-    bindings: Keys
-    parents: Ints
-
-
-def innermost(levels: Sequence[Level]) -> Keys:
-    """Return the bindings of all variables, shape (B, n). Without quantifiers, return one empty binding."""
-    return levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
-
-
-def levels_of(
-    quantifiers: Sequence[BoundQuantifier],
-    domains: Mapping[str, Ints],
-    *,
-    apart: Ints | None,
-    counts: Callable[[BoundQuantifier, tuple[str, ...], Keys], Bools],
-) -> list[Level]:
-    """Return the bindings of each quantifier, each extended from the bindings before.
-
-    Parameters
-    ----------
-    quantifiers : sequence of BoundQuantifier
-    domains : mapping of str to (E,) int64
-        Variable → its possible entities.
-    apart : (A,) int64, optional
-        Entities that no variable may be, because different variables are different entities. ``None`` means
-        that variables may be equal.
-    counts : function
-        Function from a quantifier, the variables so far and their bindings to a mask of the valid bindings.
-
-    Raises
-    ------
-    QueryError
-        The check has too many bindings.
-    """
-    variables: tuple[str, ...] = ()
-    bindings, levels = np.zeros((1, 0), np.int64), list[Level]()
-    for quantifier in quantifiers:
-        parents = np.arange(len(bindings))
-        for node in quantifier.nodes:
-            domain = domains[node]
-            if apart is not None:
-                domain = domain[~np.isin(domain, apart)]
-            named = f"{quantifier.word} {', '.join((*variables, node))} is about too much"
-            refuse_many(len(bindings) * len(domain), named)
-            rows = np.repeat(np.arange(len(bindings)), len(domain))
-            added = np.tile(domain, len(bindings))
-            if apart is not None:
-                fresh = ~np.any(bindings[rows] == added[:, None], axis=1)
-                rows, added = rows[fresh], added[fresh]
-            bindings = np.column_stack((bindings[rows], added))
-            parents = parents[rows]
-            variables = (*variables, node)
-        kept = counts(quantifier, variables, bindings)
-        bindings, parents = bindings[kept], parents[kept]
-        levels.append(Level(quantifier.word, bindings, parents))
-    return levels
-
-
-def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]:
-    """Return the domains of a check, plus one future entity for each variable of ``FORSOME``."""
-    some = [node for q in check.quantifiers if q.word == "FORSOME" for node in q.nodes]
-    return {
-        node: np.append(domain, NEWCOMER + some.index(node)) if node in some else domain
-        for node, domain in domains.items()
-    }
-
-
-def waits_for_newcomers(
-    check: BoundCheck, levels: Sequence[Level], wider: Sequence[Level], codes: Codes
-) -> bool:
-    """True if a failed check can still hold, because ``FORSOME`` includes entities that appear later.
-
-    Parameters
-    ----------
-    check : BoundCheck
-    levels : sequence of Level
-        Current bindings of the check.
-    wider : sequence of Level
-        Current bindings plus newcomers, and plus entities for which ``WHERE`` was not yet true.
-    codes : (B,) int8
-        Verdict codes of the last level of ``wider``. The wait for newcomers is unbounded, so ``HOLDS`` counts
-        as pending only with ``end`` = ``pending``.
-    """
-    known = set(map(tuple, innermost(levels).tolist()))
-    late = np.array([tuple(row) not in known for row in innermost(wider).tolist()], np.bool_)
-    due = (codes != VIOLATED) & ((codes != HOLDS) | (check.end == "pending"))
-    codes = np.where(late, np.where(due, PENDING, VIOLATED), codes).astype(np.int8)
-    return int(folded_values(wider, codes, HOLDS)[0][0]) != VIOLATED
-
-
-def may_wait(check: BoundCheck) -> bool:
-    """True if entities that appear later can fulfil a failed check."""
-    return check.end in {"bounded", "pending"} and any(
-        q.word == "FORSOME" for q in check.quantifiers
-    )
-
-
-def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list[Array]:
-    """Combine values of bindings by quantifier. Return the values of each level, outermost first.
-
-    Parameters
-    ----------
-    levels : sequence of Level
-    values : (B, …) bool or int8
-        Values of the bindings of the last level; without quantifiers (1, …).
-    most : int
-        Largest value: the result of ``FORALL`` without bindings. The result of ``FORSOME`` is 0.
-    """
-    found = [values]
-    for number in range(len(levels) - 1, -1, -1):
-        level = levels[number]
-        outer = len(levels[number - 1].bindings) if number else 1
-        every = level.word == "FORALL"
-        joined = np.full((outer, *values.shape[1:]), most if every else 0, values.dtype)
-        (np.minimum if every else np.maximum).at(joined, level.parents, found[0])
-        found.insert(0, joined)
-    return found
-
-
-def folded_margins(levels: Sequence[Level], values: Floats) -> tuple[float, int | None]:
-    """Return the margin of a check, and the deciding binding. ``None`` means no binding decides.
-
-    Parameters
-    ----------
-    levels : sequence of Level
-    values : (B,) float64
-        Margins of the bindings of the last level.
-    """
-    if not levels:
-        return float(values[0]), 0
-    rows = np.arange(len(values))
-    for number in range(len(levels) - 1, -1, -1):
-        level = levels[number]
-        outer = len(levels[number - 1].bindings) if number else 1
-        every = level.word == "FORALL"
-        order = np.lexsort((values if every else -values, level.parents))
-        parents, where = np.unique(level.parents[order], return_index=True)
-        joined = np.full(outer, np.inf if every else -np.inf)
-        chosen = np.full(outer, -1)
-        joined[parents], chosen[parents] = values[order][where], rows[order][where]
-        values, rows = joined, chosen
-    return float(values[0]), int(rows[0]) if rows[0] >= 0 else None
-
-
-# ``CHECK`` over a store: verdicts, violations, and their entities -------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Witness:
-    """Entities that decide a verdict: violating ones for ``FORALL``, fulfilling ones for ``FORSOME``.
-
-    Attributes
-    ----------
-    nodes : dict of str to int
-        Node ids by variable.
-    names : dict of str to str
-        Entity names by variable.
-    holds : bool
-    violations : tuple of Interval
-        Violations of the check by these entities.
-    """
-
-    nodes: Mapping[str, int]
-    names: Mapping[str, str]
-    holds: bool
-    violations: tuple[Interval, ...]
-
-
-def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Return notes on traces with unknown verdicts, one line per reason.
-
-    Parameters
-    ----------
-    told : iterable of (subject, trace, reason)
-        Such as ``near is unknown``, ``cut_in_1``, ``it has no ego``. Entries without a reason are ignored.
-    """
-    grouped: dict[tuple[str, str], list[str]] = {}
-    for subject, trace, reason in told:
-        if reason:
-            grouped.setdefault((subject, reason), []).append(trace)
-    return [
-        f"{subject} of {', '.join(traces)}: {reason}"
-        for (subject, reason), traces in grouped.items()
-    ]
-
-
-def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
-    """Return the text that names an unknown condition, its entities and its frame."""
-    written = value_text(condition).removeprefix("(").removesuffix(")")
-    return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
-
-
-def absence_text(frames: int) -> str:
-    """Return the text that gives the number of frames with an absent entity."""
-    return f"an entity is absent in {frames} frame{'s' * (frames != 1)}"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
-    """Verdict of a check on a trace.
-
-    Attributes
-    ----------
-    check, trace : str
-        Names of check and trace.
-    verdict : str
-        ``true`` or ``false``, if independent of unknown values; ``pending``, if an obligation is open at the
-        end of the recording; else ``unknown``.
-    first_violation : Interval or None
-        First violation, or ``None``.
-    violations : tuple of Interval
-        Violations in order; with quantifiers, the violations of all witnesses.
-    witnesses : tuple of Witness
-    status : (F,) int8 or None
-        If requested: status of each frame, as indices in :data:`sgstore.temporal._verdicts.STATUS`.
-    reason : str
-        Reason of an ``unknown`` verdict; else empty.
-    robustness : Robustness or None
-        Robustness of the check, if it has ``ROBUSTNESS``.
-    absent_frames : int
-        For a ``true`` verdict: number of frames with an absent entity of the check.
-    """
-
-    check: str
-    trace: str
-    verdict: str
-    violations: tuple[Interval, ...] = ()
-    witnesses: tuple[Witness, ...] = ()
-    status: Statuses | None = None
-    reason: str = ""
-    robustness: Robustness | None = None
-    absent_frames: int = 0
-
-    def __repr__(self) -> str:
-        number = len(self.violations)
-        more = f", {number} violation{'s' * (number > 1)}" if number else ""
-        more += f" by {self.robustness.value:.3g}" if self.robustness else ""
-        why = f", {self.reason}" if self.reason else ""
-        away = f", {absence_text(self.absent_frames)}" if self.absent_frames else ""
-        return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}{away}>"
-
-    def _repr_html_(self) -> str:
-        """Return the verdict with its violations as an HTML table, for notebooks."""
-        from sgstore.base.display import html_table
-
-        margin = self.robustness is not None
-        rows = list(islice(verdict_rows(self, margin=margin), IN_NOTEBOOK + 1))
-        more = f"the first {IN_NOTEBOOK} rows" if len(rows) > IN_NOTEBOOK else ""
-        below = "; ".join(filter(None, [self.reason, more]))
-        return html_table(verdict_columns(margin=margin), rows[:IN_NOTEBOOK], below=below)
-
-    @property
-    def first_violation(self) -> Interval | None:
-        """First violation, or ``None``."""
-        return self.violations[0] if self.violations else None
-
-    @property
-    def violated(self) -> bool:
-        """True if the trace certainly violates the check."""
-        return self.verdict == "false"
-
-    @property
-    def statuses(self) -> tuple[str, ...]:
-        """Status of each frame as a word, if requested."""
-        return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
-
-
-_COLUMNS: Final = ("check", "trace", "verdict", "who", "from", "start", "end", "frames")
-_MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
-
-
-def within_range(found: Verdict, short: ShortRange) -> Verdict:
-    """Return the verdict for the whole world. It is unknown if the stored range is too short."""
-    if found.verdict not in {"true", "false"}:
-        return found
-    reason = short.of(holds=found.verdict == "true")
-    if not reason:
-        return found
-    nothing = {"violations": (), "witnesses": (), "absent_frames": 0}
-    return replace(found, verdict="unknown", reason=reason, **nothing)
-
-
-def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the column names of readable verdict rows.
-
-    Parameters
-    ----------
-    margin : bool
-        True if a check has ``ROBUSTNESS``.
-    returned : sequence of str
-        Names of the values that checks return for violations.
-    """
-    return (*_COLUMNS, *returned, *(_MARGIN_COLUMNS if margin else ()))
-
-
-def verdict_rows(
-    verdict: Verdict, *, margin: bool = False, returned: Sequence[str] = ()
-) -> Iterator[tuple[Any, ...]]:
-    """Yield readable rows of a verdict for :func:`verdict_columns`: one row per violation, at least one."""
-    head = verdict.check, verdict.trace, verdict.verdict
-    tail = margin_cells(verdict) if margin else ()
-    nothing = [("",) * (4 + len(returned))]
-    told = False
-    for witness in verdict.witnesses:
-        who = ", ".join(witness.names.values())
-        for row in _times(witness.violations, returned) or nothing:
-            told = True
-            yield (*head, who, *row, *tail)
-    if not told:
-        for row in _times(verdict.violations, returned) or nothing:
-            yield (*head, "", *row, *tail)
-
-
-def margin_cells(verdict: Verdict) -> tuple[str, str, str]:
-    """Return table cells of the robustness: value, deciding condition with entities, frame.
-
-    Empty means unknown.
-    """
-    found = verdict.robustness
-    if found is None:
-        return "", "", ""
-    who = ", ".join(f"{variable} = {name}" for variable, name in found.names.items())
-    decided = f"{found.condition} ({who})" if found.condition and who else found.condition or who
-    frame = "" if found.seq is None else f"{verdict.trace}#{found.seq}"
-    return f"{found.value:.4g}", decided, frame
-
-
-def _times(violations: tuple[Interval, ...], returned: Sequence[str]) -> list[tuple[Any, ...]]:
-    return [
-        (
-            f"{i.trace}#{i.start_seq}",
-            round(i.start, 3),
-            round(i.end, 3),
-            i.frames,
-            *(cell_of(i.values.get(name, "")) for name in returned),
-        )
-        for i in violations
-    ]
-
-
-def returned_by(checks: Iterable[BoundCheck]) -> dict[str, tuple[str, ...]]:
-    """Return the names of the values that each check returns for its violations."""
-    return {check.name: tuple(column.name for column in check.returns) for check in checks}
-
-
-def columns_returned(returned: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return the distinct names of the values that some checks return."""
-    return tuple(dict.fromkeys(name for names in returned.values() for name in names))
-
-
-def cell_of(value: Any) -> str:
-    """Format a returned value for display."""
-    if value is None:
-        return "unknown"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def verdict_of(
-    check: BoundCheck,
-    verdict: Verdict,
-    levels: Sequence[Level],
-    codes: Codes,
-    names: Mapping[str, Mapping[int, str]],
-    violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
-    last: Interval,
-) -> Verdict:
-    """Return the verdict with violations and witnesses.
-
-    Witnesses bind the outermost quantifiers of one kind.
-
-    Parameters
-    ----------
-    check : BoundCheck
-    verdict : Verdict
-    levels : sequence of Level
-    codes : (B,) int8
-        Verdict codes of the bindings of the last level, from :data:`VIOLATED` to :data:`HOLDS`.
-    names : mapping of str to mapping of int to str
-        Variable → names of its possible entities.
-    violations : function
-        Function from the row of a last-level binding and its entity names to its violations.
-    last : Interval
-        Last frame: the violation if no binding has one.
-    """
-    if not levels:
-        return replace(verdict, violations=violations(0, {}))
-    word = levels[0].word
-    depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
-    folded = folded_values(levels, codes, HOLDS)
-    level, values = levels[depth - 1], folded[depth]
-    variables = [node for q in check.quantifiers[:depth] for node in q.nodes]
-    found: list[Witness] = []
-    for row in np.flatnonzero(values == (HOLDS if word == "FORSOME" else VIOLATED)).tolist():
-        nodes = dict(zip(variables, level.bindings[row].tolist(), strict=True))
-        called = {name: names[name][node] for name, node in nodes.items()}
-        inner = violations(row, called) if depth == len(levels) else ()
-        found.append(Witness(nodes, called, bool(values[row] == HOLDS), inner))
-    told: tuple[Interval, ...] = ()
-    if folded[0][0] == VIOLATED:
-        every = {(i.start_seq, i.end_seq): i for w in found for i in w.violations}
-        told = tuple(every[key] for key in sorted(every)) or (last,)
-    return replace(verdict, violations=told, witnesses=tuple(found))
 
 
 class CheckRun:

@@ -9,14 +9,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from sgstore.temporal._sequence_monitor import NEVER, SequenceMonitor
+from sgstore.temporal._sequence_monitor import SequenceMonitor
+from sgstore.temporal._step_frames import NEVER
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from sgstore.lang.ir import Query, StepLink, StepWay
-    from sgstore.temporal._sequence_monitor import Binding, FoundMatch, StepFrame
-    from sgstore.temporal._valuation import Key, QueryCache, StreamClock
+    from sgstore.temporal._sequence_monitor import FoundMatch
+    from sgstore.temporal._signal_state import StreamClock
+    from sgstore.temporal._step_frames import Binding, StepFrame
+    from sgstore.temporal._valuation import Key, QueryCache
 
 
 _Group = tuple[int, "Key", int]

@@ -19,7 +19,6 @@ from sgstore.base.json_text import shortest
 from sgstore.lang import ir as b
 from sgstore.lang.memory import expression
 from sgstore.lang.operators import Column
-from sgstore.temporal._windows import exact, rounded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -92,9 +91,6 @@ class ReturnedValues:
 
 AT_FRAME: Final = -1
 """Placeholder for a step number: the single frame of a value."""
-
-
-# Offline, over columns ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,77 +216,3 @@ def _summed(word: str, values: Any, known: Bools, starts: Ints) -> Objects:
         if some:
             found[number] = math.fsum(some) / (len(some) if word == "avg" else 1)
     return found
-
-
-# Online, frame by frame ---------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Fold:
-    """Running aggregate of a value over consecutive frames.
-
-    Attributes
-    ----------
-    start, end : int
-        First and last frame number with a known value.
-    first, last : object
-        Values in the first and the last of these frames.
-    best : float
-        Minimum; for ``max`` and ``argmax``, the negated maximum.
-    at : object
-        Value to return at the first frame of the best value.
-    total : int
-        Sum, as a multiple of the smallest positive float.
-    count : int
-        Number of values in the sum.
-    """
-
-    start: int
-    end: int
-    first: Any
-    last: Any
-    best: float = math.inf
-    at: Any = None
-    total: int = 0
-    count: int = 0
-
-    @classmethod
-    def of(cls, word: str, frame: int, value: Any, at: Any) -> Fold | None:
-        """Return the aggregate of one frame. ``None`` means an unknown or ignored value."""
-        if value is None:
-            return None
-        if word in {"first", "last"}:
-            return cls(frame, frame, value, value)
-        if word in {"avg", "sum"}:
-            if not math.isfinite(value):
-                return None
-            return cls(frame, frame, value, value, total=exact(value), count=1)
-        if math.isnan(value):
-            return None
-        best = value if word in {"min", "argmin"} else -value
-        return cls(frame, frame, value, value, best, at)
-
-    def joined(self, later: Fold) -> Fold:
-        """Combine with the aggregate of later frames. The earlier of two equal values wins."""
-        better = self if self.best <= later.best else later
-        total, count = self.total + later.total, self.count + later.count
-        return Fold(
-            self.start, later.end, self.first, later.last, better.best, better.at, total, count
-        )
-
-    def told(self, word: str, start: int, end: int) -> Any:
-        """Return the aggregate of the value over a range of frames."""
-        match word:
-            case "first":
-                return self.first if self.start == start else None
-            case "last":
-                return self.last if self.end == end else None
-            case "min":
-                return self.best
-            case "max":
-                return -self.best
-            case "argmin" | "argmax":
-                return self.at
-            case _:
-                total = rounded(self.total)
-                return total / self.count if word == "avg" else total

@@ -6,25 +6,31 @@ are merged. So the memory grows with the number of open matches, not with their 
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sgstore.temporal._match_values import Fold
-from sgstore.temporal._valuation import BindingTable, Valuation
+from sgstore.temporal._binding_truth import Valuation
+from sgstore.temporal._valuation import BindingTable
+from sgstore.temporal._windows import exact, rounded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from sgstore.lang import ir as b
     from sgstore.lang.operators import Column
     from sgstore.temporal._plan import Plan
-    from sgstore.temporal._valuation import Memory, QueryCache, StreamClock
+    from sgstore.temporal._signal_state import StreamClock
+    from sgstore.temporal._valuation import Memory, QueryCache
 
-    Entry = tuple[Memory, tuple[Fold, ...]]
+    Objects = NDArray[np.object_]
+    Entry = tuple[Memory, tuple["Fold", ...]]
 
 Span = tuple[int, int]
 """First and last frame number of a part of a match."""
@@ -166,3 +172,74 @@ class MatchValues:
 
 def _anywhere(value: b.OverMatch) -> b.OverMatch:
     return replace(value, start=None, end=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """Running aggregate of a value over consecutive frames.
+
+    Attributes
+    ----------
+    start, end : int
+        First and last frame number with a known value.
+    first, last : object
+        Values in the first and the last of these frames.
+    best : float
+        Minimum; for ``max`` and ``argmax``, the negated maximum.
+    at : object
+        Value to return at the first frame of the best value.
+    total : int
+        Sum, as a multiple of the smallest positive float.
+    count : int
+        Number of values in the sum.
+    """
+
+    start: int
+    end: int
+    first: Any
+    last: Any
+    best: float = math.inf
+    at: Any = None
+    total: int = 0
+    count: int = 0
+
+    @classmethod
+    def of(cls, word: str, frame: int, value: Any, at: Any) -> Fold | None:
+        """Return the aggregate of one frame. ``None`` means an unknown or ignored value."""
+        if value is None:
+            return None
+        if word in {"first", "last"}:
+            return cls(frame, frame, value, value)
+        if word in {"avg", "sum"}:
+            if not math.isfinite(value):
+                return None
+            return cls(frame, frame, value, value, total=exact(value), count=1)
+        if math.isnan(value):
+            return None
+        best = value if word in {"min", "argmin"} else -value
+        return cls(frame, frame, value, value, best, at)
+
+    def joined(self, later: Fold) -> Fold:
+        """Combine with the aggregate of later frames. The earlier of two equal values wins."""
+        better = self if self.best <= later.best else later
+        total, count = self.total + later.total, self.count + later.count
+        return Fold(
+            self.start, later.end, self.first, later.last, better.best, better.at, total, count
+        )
+
+    def told(self, word: str, start: int, end: int) -> Any:
+        """Return the aggregate of the value over a range of frames."""
+        match word:
+            case "first":
+                return self.first if self.start == start else None
+            case "last":
+                return self.last if self.end == end else None
+            case "min":
+                return self.best
+            case "max":
+                return -self.best
+            case "argmin" | "argmax":
+                return self.at
+            case _:
+                total = rounded(self.total)
+                return total / self.count if word == "avg" else total

@@ -25,11 +25,12 @@ from sgstore.lang.syntax.tree import CheckClause, Define, MatchClause, Parameter
 from sgstore.model.config import Config
 from sgstore.model.world import seconds_of
 from sgstore.temporal._check_monitor import CheckMonitor
-from sgstore.temporal._checks import Verdict, within_range
+from sgstore.temporal._check_verdict import Verdict, within_range
 from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._known_range import SeenRange
 from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
-from sgstore.temporal._valuation import NodeNames, QueryCache, StreamClock
+from sgstore.temporal._signal_state import StreamClock
+from sgstore.temporal._valuation import NodeNames, QueryCache
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -180,9 +181,6 @@ def _live(source: str, ego: str, sensors: Sequence[Sensor]) -> Generator[FrameSo
 
         told.frames = frames()
         yield told
-
-
-# Monitor loop: frame, graph, queries, checks and patterns ---------------------------------------
 
 
 class Monitor:

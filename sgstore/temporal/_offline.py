@@ -34,7 +34,8 @@ from sgstore.temporal._check_plan import FAVOURABLE, SIGNS, CheckPlan
 from sgstore.temporal._formula import Formula, propositions, tolerant
 from sgstore.temporal._plan import Ask, ask_text
 from sgstore.temporal._robustness import MARGIN_CELLS, MarginTable, margin_columns
-from sgstore.temporal._signals import Clock, SignalValues, evaluate_rows
+from sgstore.temporal._signal_values import Clock, SignalValues
+from sgstore.temporal._signals import evaluate_rows
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -165,7 +166,6 @@ def refuse_many(bindings: int, told: str) -> None:
 
 
 # Trace data for a plan: clock, and relations of atoms and signals, for several traces per query
-# ------------------------------------------------------------------------------------------------
 
 
 def words() -> NDArray[np.str_]:

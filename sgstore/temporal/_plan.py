@@ -527,9 +527,6 @@ def _never_unknown(expression: b.Bound) -> bool:
             return False
 
 
-# Plans as text, for ``explain`` ----------------------------------------------------
-
-
 def plan_text(
     plan: Plan, formula: f.Formula, reset: f.Formula | None, catalog: Catalog | None = None
 ) -> str:

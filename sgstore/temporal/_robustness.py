@@ -34,7 +34,8 @@ from sgstore.temporal._formula import (
     Until,
     propositions,
 )
-from sgstore.temporal._signals import NS, PropositionTable, lasts
+from sgstore.temporal._signal_values import NS, lasts
+from sgstore.temporal._signals import PropositionTable
 from sgstore.temporal._windows import greatest
 
 if TYPE_CHECKING:
@@ -100,9 +101,6 @@ def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> 
     if other.value == -np.inf:
         return found
     return other if other.value < 0 else replace(found, value=0.0)
-
-
-# Margins of propositions --------------------------------------------------------------------------
 
 
 def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.inf) -> Floats:
@@ -178,9 +176,6 @@ def margin_columns(
         else:
             found[name] = margin_of_flags(flags(name))
     return found
-
-
-# Offline, over columns ----------------------------------------------------------------------------
 
 
 class MarginTable:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import QueryError
+from sgstore.temporal._binding_truth import Valuation
 from sgstore.temporal._check_plan import (
     FAVOURABLE,
     SIGNS,
@@ -29,7 +30,6 @@ from sgstore.temporal._check_plan import (
     misses_absent,
     plan_of_margins,
 )
-from sgstore.temporal._checks import folded_margins, innermost
 from sgstore.temporal._formula import (
     TRUE,
     WHOLE,
@@ -46,14 +46,15 @@ from sgstore.temporal._formula import (
     Until,
     propositions,
 )
+from sgstore.temporal._quantifiers import folded_margins, innermost
 from sgstore.temporal._robustness import (
     Robustness,
     apart_from_absence,
     condition_text,
     margin_columns,
 )
-from sgstore.temporal._signals import NS
-from sgstore.temporal._valuation import BindingTable, Valuation
+from sgstore.temporal._signal_values import NS
+from sgstore.temporal._valuation import BindingTable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -63,16 +64,16 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import BoundCheck
     from sgstore.lang.operators import Column
     from sgstore.model.world import Bools, Floats, Ints
-    from sgstore.temporal._checks import Level
-    from sgstore.temporal._formula import Tick
     from sgstore.temporal._plan import Test
-    from sgstore.temporal._valuation import Partial, QueryCache, StreamClock
+    from sgstore.temporal._progression import Tick
+    from sgstore.temporal._quantifiers import Level
+    from sgstore.temporal._signal_state import StreamClock
+    from sgstore.temporal._valuation import Partial, QueryCache
 
     Margins = NDArray[Any]
 
 MOST_OPEN: Final = 8
 """Largest number of unbounded forward operators: each doubles the memory of a margin."""
-
 
 MARGIN: Final = np.dtype([("value", "f8"), ("name", "i8"), ("frame", "i8"), ("time", "i8")])
 """Margin and its origin: proposition number (-1: none), frame, and time (ns)."""

@@ -30,7 +30,7 @@ from sgstore.temporal._offline import (
     chosen_traces,
     times_of,
 )
-from sgstore.temporal._signals import Clock, SignalValues
+from sgstore.temporal._signal_values import Clock, SignalValues
 from sgstore.temporal._windows import over_columns
 
 if TYPE_CHECKING:
@@ -60,7 +60,6 @@ VALUE_BYTES: Final = 20
 
 LARGE: Final = 1e12
 """Window sums of larger numbers are computed one by one, so that they are rounded once."""
-
 
 RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 """Runs: ids of first and last frames, nodes and edges, and returned values."""

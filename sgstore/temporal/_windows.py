@@ -20,12 +20,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.model.world import Floats
-    from sgstore.temporal._formula import Tick
+    from sgstore.temporal._progression import Tick
 
     Places = NDArray[np.int32 | np.int64]
-
-
-# Offline, over columns ----------------------------------------------------------------------------
 
 
 def over_columns(word: str, column: Column, first: Places) -> Column:
@@ -139,8 +136,6 @@ def _counts(known: NDArray[np.bool_], first: Places, end: Places) -> NDArray[np.
     np.cumsum(known, axis=1, out=total[:, 1:])
     return total[:, end] - total[:, first]
 
-
-# Online, frame by frame ---------------------------------------------------------------------------
 
 Point = tuple[int, int, float]
 """Known value: frame number, time (ns), and value."""

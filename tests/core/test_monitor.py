@@ -17,7 +17,7 @@ from oracle_over_time import edge_questions
 from oracle_watched import CHECKS, MARGINS, SEQUENCES, VALUES, Drive, library_checks
 from thorough import LONG
 
-import sgstore.temporal._sequences as joins
+import sgstore.temporal._joint_bindings as joins
 from sgstore.apps.demo import RECORDING
 from sgstore.errors import QueryError
 from sgstore.graphs.online import Frame

@@ -36,10 +36,12 @@ from sgstore.lang.ir import BoundHold, Length
 from sgstore.lang.library import pattern_named
 from sgstore.query import Store
 from sgstore.temporal import _offline, _runs, _sequences, evaluate
+from sgstore.temporal._decision_frames import known
 from sgstore.temporal._formula import And
 from sgstore.temporal._sequences import BindingLine, Leg, matches_of
-from sgstore.temporal._signals import Clock, PropositionTable
-from sgstore.temporal._verdicts import STATUS, Settled, known, within_bounds
+from sgstore.temporal._signal_values import Clock
+from sgstore.temporal._signals import PropositionTable
+from sgstore.temporal._verdicts import STATUS, Settled, within_bounds
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,8 +13,8 @@ import pytest
 from sgstore.lang.catalog import Type
 from sgstore.lang.ir import WINDOWS, SignalCall, Value
 from sgstore.lang.operators import Column
-from sgstore.temporal._formula import Tick
-from sgstore.temporal._signals import Clock, SignalValues
+from sgstore.temporal._progression import Tick
+from sgstore.temporal._signal_values import Clock, SignalValues
 from sgstore.temporal._windows import next_window, over_columns, sums, window_value
 
 NOTHING = Value(0.0, Type.number)

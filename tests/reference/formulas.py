@@ -16,13 +16,10 @@ from sgstore.temporal._formula import (
     WHOLE,
     Bound,
     Formula,
-    Progression,
-    ProgressionFrame,
     Proposition,
-    Term,
-    Tick,
     TruthConstant,
 )
+from sgstore.temporal._progression import Progression, ProgressionFrame, Term, Tick
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -27,13 +27,13 @@ from sgstore.temporal._formula import (
     Previous,
     Proposition,
     Since,
-    Tick,
     TruthConstant,
     Until,
     propositions,
     walk,
     with_operands,
 )
+from sgstore.temporal._progression import Tick
 from sgstore.temporal._robustness import MarginTable
 from sgstore.temporal._robustness_monitor import MOST_OPEN, MarginStream
 

@@ -24,8 +24,9 @@ from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._offline import TimedRelation, TraceReader
 from sgstore.temporal._sequence_monitor import FrameTime
 from sgstore.temporal._sequences import Finder
-from sgstore.temporal._signals import Clock
-from sgstore.temporal._valuation import QueryCache, StreamClock
+from sgstore.temporal._signal_state import StreamClock
+from sgstore.temporal._signal_values import Clock
+from sgstore.temporal._valuation import QueryCache
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

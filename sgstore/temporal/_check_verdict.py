@@ -1,0 +1,287 @@
+"""Verdict of a check on a trace, and its violations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.lang.sql import value_text
+from sgstore.store import IN_NOTEBOOK
+from sgstore.temporal._quantifiers import HOLDS, VIOLATED, Level, folded_values
+from sgstore.temporal._verdicts import STATUS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang.ir import Bound, BoundCheck
+    from sgstore.matches import Interval
+    from sgstore.temporal._known_range import ShortRange
+    from sgstore.temporal._robustness import Robustness
+
+    Codes = NDArray[np.int8]
+    Keys = NDArray[np.int64]
+    Statuses = NDArray[np.int8]
+    Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """Entities that decide a verdict: violating ones for ``FORALL``, fulfilling ones for ``FORSOME``.
+
+    Attributes
+    ----------
+    nodes : dict of str to int
+        Node ids by variable.
+    names : dict of str to str
+        Entity names by variable.
+    holds : bool
+    violations : tuple of Interval
+        Violations of the check by these entities.
+    """
+
+    nodes: Mapping[str, int]
+    names: Mapping[str, str]
+    holds: bool
+    violations: tuple[Interval, ...]
+
+
+def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Return notes on traces with unknown verdicts, one line per reason.
+
+    Parameters
+    ----------
+    told : iterable of (subject, trace, reason)
+        Such as ``near is unknown``, ``cut_in_1``, ``it has no ego``. Entries without a reason are ignored.
+    """
+    grouped: dict[tuple[str, str], list[str]] = {}
+    for subject, trace, reason in told:
+        if reason:
+            grouped.setdefault((subject, reason), []).append(trace)
+    return [
+        f"{subject} of {', '.join(traces)}: {reason}"
+        for (subject, reason), traces in grouped.items()
+    ]
+
+
+def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
+    """Return the text that names an unknown condition, its entities and its frame."""
+    written = value_text(condition).removeprefix("(").removesuffix(")")
+    return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
+
+
+def absence_text(frames: int) -> str:
+    """Return the text that gives the number of frames with an absent entity."""
+    return f"an entity is absent in {frames} frame{'s' * (frames != 1)}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """Verdict of a check on a trace.
+
+    Attributes
+    ----------
+    check, trace : str
+        Names of check and trace.
+    verdict : str
+        ``true`` or ``false``, if independent of unknown values; ``pending``, if an obligation is open at the
+        end of the recording; else ``unknown``.
+    first_violation : Interval or None
+        First violation, or ``None``.
+    violations : tuple of Interval
+        Violations in order; with quantifiers, the violations of all witnesses.
+    witnesses : tuple of Witness
+    status : (F,) int8 or None
+        If requested: status of each frame, as indices in :data:`sgstore.temporal._verdicts.STATUS`.
+    reason : str
+        Reason of an ``unknown`` verdict; else empty.
+    robustness : Robustness or None
+        Robustness of the check, if it has ``ROBUSTNESS``.
+    absent_frames : int
+        For a ``true`` verdict: number of frames with an absent entity of the check.
+    """
+
+    check: str
+    trace: str
+    verdict: str
+    violations: tuple[Interval, ...] = ()
+    witnesses: tuple[Witness, ...] = ()
+    status: Statuses | None = None
+    reason: str = ""
+    robustness: Robustness | None = None
+    absent_frames: int = 0
+
+    def __repr__(self) -> str:
+        number = len(self.violations)
+        more = f", {number} violation{'s' * (number > 1)}" if number else ""
+        more += f" by {self.robustness.value:.3g}" if self.robustness else ""
+        why = f", {self.reason}" if self.reason else ""
+        away = f", {absence_text(self.absent_frames)}" if self.absent_frames else ""
+        return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}{away}>"
+
+    def _repr_html_(self) -> str:
+        """Return the verdict with its violations as an HTML table, for notebooks."""
+        from sgstore.base.display import html_table
+
+        margin = self.robustness is not None
+        rows = list(islice(verdict_rows(self, margin=margin), IN_NOTEBOOK + 1))
+        more = f"the first {IN_NOTEBOOK} rows" if len(rows) > IN_NOTEBOOK else ""
+        below = "; ".join(filter(None, [self.reason, more]))
+        return html_table(verdict_columns(margin=margin), rows[:IN_NOTEBOOK], below=below)
+
+    @property
+    def first_violation(self) -> Interval | None:
+        """First violation, or ``None``."""
+        return self.violations[0] if self.violations else None
+
+    @property
+    def violated(self) -> bool:
+        """True if the trace certainly violates the check."""
+        return self.verdict == "false"
+
+    @property
+    def statuses(self) -> tuple[str, ...]:
+        """Status of each frame as a word, if requested."""
+        return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
+
+
+_COLUMNS: Final = ("check", "trace", "verdict", "who", "from", "start", "end", "frames")
+
+_MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
+
+
+def within_range(found: Verdict, short: ShortRange) -> Verdict:
+    """Return the verdict for the whole world. It is unknown if the stored range is too short."""
+    if found.verdict not in {"true", "false"}:
+        return found
+    reason = short.of(holds=found.verdict == "true")
+    if not reason:
+        return found
+    nothing = {"violations": (), "witnesses": (), "absent_frames": 0}
+    return replace(found, verdict="unknown", reason=reason, **nothing)
+
+
+def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the column names of readable verdict rows.
+
+    Parameters
+    ----------
+    margin : bool
+        True if a check has ``ROBUSTNESS``.
+    returned : sequence of str
+        Names of the values that checks return for violations.
+    """
+    return (*_COLUMNS, *returned, *(_MARGIN_COLUMNS if margin else ()))
+
+
+def verdict_rows(
+    verdict: Verdict, *, margin: bool = False, returned: Sequence[str] = ()
+) -> Iterator[tuple[Any, ...]]:
+    """Yield readable rows of a verdict for :func:`verdict_columns`: one row per violation, at least one."""
+    head = verdict.check, verdict.trace, verdict.verdict
+    tail = margin_cells(verdict) if margin else ()
+    nothing = [("",) * (4 + len(returned))]
+    told = False
+    for witness in verdict.witnesses:
+        who = ", ".join(witness.names.values())
+        for row in _times(witness.violations, returned) or nothing:
+            told = True
+            yield (*head, who, *row, *tail)
+    if not told:
+        for row in _times(verdict.violations, returned) or nothing:
+            yield (*head, "", *row, *tail)
+
+
+def margin_cells(verdict: Verdict) -> tuple[str, str, str]:
+    """Return table cells of the robustness: value, deciding condition with entities, frame.
+
+    Empty means unknown.
+    """
+    found = verdict.robustness
+    if found is None:
+        return "", "", ""
+    who = ", ".join(f"{variable} = {name}" for variable, name in found.names.items())
+    decided = f"{found.condition} ({who})" if found.condition and who else found.condition or who
+    frame = "" if found.seq is None else f"{verdict.trace}#{found.seq}"
+    return f"{found.value:.4g}", decided, frame
+
+
+def _times(violations: tuple[Interval, ...], returned: Sequence[str]) -> list[tuple[Any, ...]]:
+    return [
+        (
+            f"{i.trace}#{i.start_seq}",
+            round(i.start, 3),
+            round(i.end, 3),
+            i.frames,
+            *(cell_of(i.values.get(name, "")) for name in returned),
+        )
+        for i in violations
+    ]
+
+
+def returned_by(checks: Iterable[BoundCheck]) -> dict[str, tuple[str, ...]]:
+    """Return the names of the values that each check returns for its violations."""
+    return {check.name: tuple(column.name for column in check.returns) for check in checks}
+
+
+def columns_returned(returned: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Return the distinct names of the values that some checks return."""
+    return tuple(dict.fromkeys(name for names in returned.values() for name in names))
+
+
+def cell_of(value: Any) -> str:
+    """Format a returned value for display."""
+    if value is None:
+        return "unknown"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def verdict_of(
+    check: BoundCheck,
+    verdict: Verdict,
+    levels: Sequence[Level],
+    codes: Codes,
+    names: Mapping[str, Mapping[int, str]],
+    violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
+    last: Interval,
+) -> Verdict:
+    """Return the verdict with violations and witnesses.
+
+    Witnesses bind the outermost quantifiers of one kind.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    verdict : Verdict
+    levels : sequence of Level
+    codes : (B,) int8
+        Verdict codes of the bindings of the last level, from :data:`VIOLATED` to :data:`HOLDS`.
+    names : mapping of str to mapping of int to str
+        Variable → names of its possible entities.
+    violations : function
+        Function from the row of a last-level binding and its entity names to its violations.
+    last : Interval
+        Last frame: the violation if no binding has one.
+    """
+    if not levels:
+        return replace(verdict, violations=violations(0, {}))
+    word = levels[0].word
+    depth = next((n for n, level in enumerate(levels) if level.word != word), len(levels))
+    folded = folded_values(levels, codes, HOLDS)
+    level, values = levels[depth - 1], folded[depth]
+    variables = [node for q in check.quantifiers[:depth] for node in q.nodes]
+    found: list[Witness] = []
+    for row in np.flatnonzero(values == (HOLDS if word == "FORSOME" else VIOLATED)).tolist():
+        nodes = dict(zip(variables, level.bindings[row].tolist(), strict=True))
+        called = {name: names[name][node] for name, node in nodes.items()}
+        inner = violations(row, called) if depth == len(levels) else ()
+        found.append(Witness(nodes, called, bool(values[row] == HOLDS), inner))
+    told: tuple[Interval, ...] = ()
+    if folded[0][0] == VIOLATED:
+        every = {(i.start_seq, i.end_seq): i for w in found for i in w.violations}
+        told = tuple(every[key] for key in sorted(every)) or (last,)
+    return replace(verdict, violations=told, witnesses=tuple(found))

@@ -1,0 +1,188 @@
+"""Quantifiers of a check: their entities in a trace, and the values for all or some of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.temporal._offline import refuse_many
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.lang.ir import BoundCheck, BoundQuantifier
+    from sgstore.model.world import Bools, Floats, Ints
+
+    Codes = NDArray[np.int8]
+    Keys = NDArray[np.int64]
+    Statuses = NDArray[np.int8]
+    Array = NDArray[Any]
+
+VIOLATED, UNKNOWN, PENDING, HOLDS = range(4)
+"""Verdict codes in order. The minimum is the code of a conjunction, the maximum of a disjunction."""
+
+NEWCOMER: Final = -(1 << 60)
+"""First id of placeholders for future entities."""
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """Bindings of the variables up to one quantifier.
+
+    Attributes
+    ----------
+    word : str
+        ``FORALL`` or ``FORSOME``.
+    bindings : (B, n) int64
+        Bindings of the variables of this quantifier and of those before it.
+    parents : (B,) int64
+        Index of the outer binding that each binding extends.
+    """
+
+    word: str
+    bindings: Keys
+    parents: Ints
+
+
+def innermost(levels: Sequence[Level]) -> Keys:
+    """Return the bindings of all variables, shape (B, n). Without quantifiers, return one empty binding."""
+    return levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
+
+
+def levels_of(
+    quantifiers: Sequence[BoundQuantifier],
+    domains: Mapping[str, Ints],
+    *,
+    apart: Ints | None,
+    counts: Callable[[BoundQuantifier, tuple[str, ...], Keys], Bools],
+) -> list[Level]:
+    """Return the bindings of each quantifier, each extended from the bindings before.
+
+    Parameters
+    ----------
+    quantifiers : sequence of BoundQuantifier
+    domains : mapping of str to (E,) int64
+        Variable → its possible entities.
+    apart : (A,) int64, optional
+        Entities that no variable may be, because different variables are different entities. ``None`` means
+        that variables may be equal.
+    counts : function
+        Function from a quantifier, the variables so far and their bindings to a mask of the valid bindings.
+
+    Raises
+    ------
+    QueryError
+        The check has too many bindings.
+    """
+    variables: tuple[str, ...] = ()
+    bindings, levels = np.zeros((1, 0), np.int64), list[Level]()
+    for quantifier in quantifiers:
+        parents = np.arange(len(bindings))
+        for node in quantifier.nodes:
+            domain = domains[node]
+            if apart is not None:
+                domain = domain[~np.isin(domain, apart)]
+            named = f"{quantifier.word} {', '.join((*variables, node))} is about too much"
+            refuse_many(len(bindings) * len(domain), named)
+            rows = np.repeat(np.arange(len(bindings)), len(domain))
+            added = np.tile(domain, len(bindings))
+            if apart is not None:
+                fresh = ~np.any(bindings[rows] == added[:, None], axis=1)
+                rows, added = rows[fresh], added[fresh]
+            bindings = np.column_stack((bindings[rows], added))
+            parents = parents[rows]
+            variables = (*variables, node)
+        kept = counts(quantifier, variables, bindings)
+        bindings, parents = bindings[kept], parents[kept]
+        levels.append(Level(quantifier.word, bindings, parents))
+    return levels
+
+
+def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]:
+    """Return the domains of a check, plus one future entity for each variable of ``FORSOME``."""
+    some = [node for q in check.quantifiers if q.word == "FORSOME" for node in q.nodes]
+    return {
+        node: np.append(domain, NEWCOMER + some.index(node)) if node in some else domain
+        for node, domain in domains.items()
+    }
+
+
+def waits_for_newcomers(
+    check: BoundCheck, levels: Sequence[Level], wider: Sequence[Level], codes: Codes
+) -> bool:
+    """True if a failed check can still hold, because ``FORSOME`` includes entities that appear later.
+
+    Parameters
+    ----------
+    check : BoundCheck
+    levels : sequence of Level
+        Current bindings of the check.
+    wider : sequence of Level
+        Current bindings plus newcomers, and plus entities for which ``WHERE`` was not yet true.
+    codes : (B,) int8
+        Verdict codes of the last level of ``wider``. The wait for newcomers is unbounded, so ``HOLDS`` counts
+        as pending only with ``end`` = ``pending``.
+    """
+    known = set(map(tuple, innermost(levels).tolist()))
+    late = np.array([tuple(row) not in known for row in innermost(wider).tolist()], np.bool_)
+    due = (codes != VIOLATED) & ((codes != HOLDS) | (check.end == "pending"))
+    codes = np.where(late, np.where(due, PENDING, VIOLATED), codes).astype(np.int8)
+    return int(folded_values(wider, codes, HOLDS)[0][0]) != VIOLATED
+
+
+def may_wait(check: BoundCheck) -> bool:
+    """True if entities that appear later can fulfil a failed check."""
+    return check.end in {"bounded", "pending"} and any(
+        q.word == "FORSOME" for q in check.quantifiers
+    )
+
+
+def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list[Array]:
+    """Combine values of bindings by quantifier. Return the values of each level, outermost first.
+
+    Parameters
+    ----------
+    levels : sequence of Level
+    values : (B, …) bool or int8
+        Values of the bindings of the last level; without quantifiers (1, …).
+    most : int
+        Largest value: the result of ``FORALL`` without bindings. The result of ``FORSOME`` is 0.
+    """
+    found = [values]
+    for number in range(len(levels) - 1, -1, -1):
+        level = levels[number]
+        outer = len(levels[number - 1].bindings) if number else 1
+        every = level.word == "FORALL"
+        joined = np.full((outer, *values.shape[1:]), most if every else 0, values.dtype)
+        (np.minimum if every else np.maximum).at(joined, level.parents, found[0])
+        found.insert(0, joined)
+    return found
+
+
+def folded_margins(levels: Sequence[Level], values: Floats) -> tuple[float, int | None]:
+    """Return the margin of a check, and the deciding binding. ``None`` means no binding decides.
+
+    Parameters
+    ----------
+    levels : sequence of Level
+    values : (B,) float64
+        Margins of the bindings of the last level.
+    """
+    if not levels:
+        return float(values[0]), 0
+    rows = np.arange(len(values))
+    for number in range(len(levels) - 1, -1, -1):
+        level = levels[number]
+        outer = len(levels[number - 1].bindings) if number else 1
+        every = level.word == "FORALL"
+        order = np.lexsort((values if every else -values, level.parents))
+        parents, where = np.unique(level.parents[order], return_index=True)
+        joined = np.full(outer, np.inf if every else -np.inf)
+        chosen = np.full(outer, -1)
+        joined[parents], chosen[parents] = values[order][where], rows[order][where]
+        values, rows = joined, chosen
+    return float(values[0]), int(rows[0]) if rows[0] >= 0 else None
