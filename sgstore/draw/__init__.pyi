@@ -8,13 +8,13 @@ from ._picture import check_installed as check_installed
 from ._picture import draw_frame as draw_frame
 from ._picture import draw_map as draw_map
 from ._stored import Bindings as Bindings
-from ._stored import camera_image as camera_image
+from ._images import camera_image as camera_image
 from ._stored import camera_of as camera_of
 from ._stored import draw_clip as draw_clip
 from ._stored import draw_stored as draw_stored
-from ._stored import frame_image as frame_image
-from ._stored import graph_picture as graph_picture
-from ._stored import thumbnail as thumbnail
+from ._images import frame_image as frame_image
+from ._images import graph_picture as graph_picture
+from ._images import thumbnail as thumbnail
 from ._swimlanes import LETTERS as LETTERS
 from ._swimlanes import NAME as NAME
 from ._swimlanes import Lane as Lane
@@ -23,4 +23,4 @@ from ._swimlanes import draw_timelines as draw_timelines
 from ._swimlanes import lines_of as lines_of
 from ._swimlanes import parts_timeline as parts_timeline
 from ._swimlanes import timelines as timelines
-from ._view import Relations as Relations
+from ._drawn_links import Relations as Relations

@@ -17,26 +17,18 @@ import numpy as np
 from matplotlib.patches import FancyArrowPatch, Rectangle
 
 import sgstore.draw._palette as palette
+from sgstore.draw._drawn_links import ALONG, RANK, ego_lane, linked
 from sgstore.draw._legend import Entry
-from sgstore.draw._page import Placer
-from sgstore.draw._view import (
-    ALONG,
-    RANK,
-    SCENERY,
-    clean,
-    counted,
-    distance,
-    ego_lane,
-    linked,
-)
+from sgstore.draw._placement import Placer
+from sgstore.draw._view import SCENERY, clean, counted, distance
 from sgstore.model.vocabulary import ENTITY_KINDS, PROXIMITY, SIGNALS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from sgstore.draw._drawn_links import Relations
     from sgstore.draw._page import Page, Rect
     from sgstore.draw._scene import DrawnFrame, Point
-    from sgstore.draw._view import Relations
     from sgstore.model.graph import SceneGraph
     from sgstore.model.world import Floats
 
@@ -486,8 +478,6 @@ class _Diagram:
             self._paint_node(node)
         return written.count(False)
 
-    # Places ---------------------------------------------------------------------------------------
-
     def _placed(self, tiers: dict[int, Tier]) -> dict[int, Point]:
         """Return places from the bottom up: junctions, roads, lanes with their arcs, then entities."""
         left, bottom, right, top = self._box
@@ -533,8 +523,6 @@ class _Diagram:
         steps = [h / abs(d) for h, d in zip(half.tolist(), (dx, dy), strict=True) if abs(d) > 1e-9]
         step = min([1.0, *steps])
         return x + step * dx, y + step * dy
-
-    # Drawing --------------------------------------------------------------------------------------
 
     def _text(self, node: int) -> str:
         attributes = self._scene.graph.nodes[node]

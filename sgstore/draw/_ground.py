@@ -324,8 +324,6 @@ def _dense(line: Floats) -> Floats:
     return np.column_stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)])
 
 
-# Aids to read a picture of the ground: rings about the ego, a scale, a compass ------------------
-
 _LENGTHS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000)
 _SMALL: Final = {"fontsize": 6.5, "ha": "center"}
 

@@ -10,8 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle, RegularPolygon
 
 import sgstore.draw._palette as palette
-from sgstore.draw._scene import ROUND_KINDS, lamps
-from sgstore.draw._view import ARROW_SECONDS, SCENERY, clean, ego_lane, seen_from_ego
+from sgstore.draw._drawn_links import ego_lane, seen_from_ego
+from sgstore.draw._symbols import ROUND_KINDS, lamps
+from sgstore.draw._view import ARROW_SECONDS, SCENERY, clean
 from sgstore.graphs.relations import relations
 from sgstore.model.vocabulary import KINDS, PROXIMITY, SIGNALS
 

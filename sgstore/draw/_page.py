@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import threading
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -143,7 +142,6 @@ def packed(colours: NDArray[np.generic]) -> NDArray[np.int32]:
     return 65536 * red + 256 * green + blue
 
 
-# The sheet of paper: the only room that knows how pictures are written --------------------------
 # A page is measured in points (1/72 inch) from its lower left corner. A stage is a window of the
 # map on the page, measured in metres. Each drawing has its own figure, without global state. The
 # user's matplotlib configuration has no effect, so that the same frame gives the same bytes.
@@ -487,137 +485,3 @@ def _decoded(picture: bytes) -> np.ndarray[Any, np.dtype[np.uint8]]:
     # Decoders of untrusted bytes fail in many ways: each error means an unusable picture.
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ExportError(f"the camera picture is not a readable JPEG or PNG: {error}") from error
-
-
-# Placement of texts: beside what they name, on top of nothing that matters ----------------------
-# Greedy placement: texts come in order of importance, each takes the first free place around its
-# anchor, and a text without a free place is left out. All measures are points of the page.
-
-_ROUND: Final = tuple(
-    math.radians(a) for a in (0, 180, 30, -30, 150, -150, 90, -90, 60, 120, -60, -120)
-)
-_STEPS: Final = (2.0, 8.0, 16.0, 26.0)
-_CLEAR: Final = 4.0
-"""Least distance by which a name must be nearer to its own object than to others; points."""
-
-
-class Placer:
-    """Free and taken space in a window.
-
-    Parameters
-    ----------
-    bounds : Rect
-        The window; texts stay inside it.
-    """
-
-    def __init__(self, bounds: Rect) -> None:
-        self._bounds = bounds
-        self._taken: list[Rect] = []
-        self._things: list[Rect] = []
-
-    def stand(self, x: float, y: float, reach: tuple[float, float]) -> None:
-        """Register an object with a possible name, so that other names keep a distance."""
-        self._things.append(_around(x, y, reach))
-
-    def block(self, rect: Rect) -> None:
-        """Keep a rectangle free of texts."""
-        self._taken.append(rect)
-
-    def beside(
-        self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
-    ) -> tuple[float, float] | None:
-        """Reserve the nearest free place for a text at an object; return its middle.
-
-        Parameters
-        ----------
-        x, y : float
-            Middle of the object.
-        reach : (float, float)
-            Extent of the object, horizontal and vertical.
-        size : (float, float)
-            Width and height of the text.
-
-        Returns
-        -------
-        (float, float) or None
-            ``None`` means no room.
-        """
-        return self.first_free(_spots(x, y, reach, size), size)
-
-    def named(
-        self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
-    ) -> tuple[tuple[float, float], bool] | None:
-        """Reserve a place for a name; the flag is True if no other object is as near.
-
-        Places with a clear owner have priority.
-        """
-        spots = _spots(x, y, reach, size)
-        own = _around(x, y, reach)
-        others = np.array([thing for thing in self._things if thing != own]).reshape(-1, 4)
-        texts = np.array([_around(*spot, (size[0] / 2, size[1] / 2)) for spot in spots])
-        rival = _gaps(texts, others).min(axis=1, initial=np.inf)
-        clear = _gaps(texts, np.array([own]))[:, 0] + _CLEAR <= rival
-        for wanted in (clear, ~clear):
-            chosen = [spot for spot, is_wanted in zip(spots, wanted, strict=True) if is_wanted]
-            spot = self.first_free(chosen, size) if chosen else None
-            if spot is not None:
-                return spot, wanted is clear
-        return None
-
-    def along(
-        self, a: tuple[float, float], b: tuple[float, float], size: tuple[float, float]
-    ) -> tuple[float, float] | None:
-        """Reserve a place for a text on the line from ``a`` to ``b``; return its middle."""
-        spots = [
-            (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]))
-            for t in (0.55, 0.65, 0.45, 0.75, 0.35)
-        ]
-        return self.first_free(spots, size)
-
-    def first_free(
-        self, spots: list[tuple[float, float]], size: tuple[float, float]
-    ) -> tuple[float, float] | None:
-        """Reserve the first free place for a text of this size, or return None."""
-        middles = np.array(spots)
-        half = np.array(size) / 2
-        low, high = middles - half, middles + half
-        left, bottom, right, top = self._bounds
-        free = (low >= (left, bottom)).all(axis=1) & (high <= (right, top)).all(axis=1)
-        if self._taken:
-            taken = np.array(self._taken)
-            meets = (low[:, None] < taken[:, 2:]) & (high[:, None] > taken[:, :2])
-            free &= ~(meets[:, :, 0] & meets[:, :, 1]).any(axis=1)
-        if not free.any():
-            return None
-        chosen = int(free.argmax())
-        self._taken.append((*low[chosen].tolist(), *high[chosen].tolist()))
-        return spots[chosen]
-
-
-def _spots(
-    x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
-) -> list[tuple[float, float]]:
-    """Return middles of texts around an object, nearest first."""
-    half_w, half_h = size[0] / 2, size[1] / 2
-    return [
-        (
-            x + (reach[0] + step) * math.cos(a) + half_w * _sign(math.cos(a)),
-            y + (reach[1] + step) * math.sin(a) + half_h * _sign(math.sin(a)),
-        )
-        for step in _STEPS
-        for a in _ROUND
-    ]
-
-
-def _around(x: float, y: float, reach: tuple[float, float]) -> Rect:
-    return (x - reach[0], y - reach[1], x + reach[0], y + reach[1])
-
-
-def _gaps(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return distances (n, m) of rectangles (n, 4) and (m, 4); 0 for overlaps."""
-    apart = np.maximum(one[:, None, :2] - other[:, 2:], other[:, :2] - one[:, None, 2:])
-    return np.hypot(*np.moveaxis(np.maximum(apart, 0.0), -1, 0))
-
-
-def _sign(value: float) -> float:
-    return 0.0 if abs(value) < 1e-9 else math.copysign(1.0, value)

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from sgstore.draw._view import Relations, clean, counted, number, view_of
+from sgstore.draw._view import clean, counted, number, view_of
 from sgstore.errors import ExportError, MissingExtraError
 from sgstore.model.world import seconds_of
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
     from pathlib import Path
 
+    from sgstore.draw._drawn_links import Relations
     from sgstore.draw._legend import Entry
     from sgstore.draw._page import Page, Rect
     from sgstore.draw._scene import DrawnFrame
@@ -130,10 +131,10 @@ def diagram_page(
     blank: Callable[[float, float], Page] | None = None,
 ) -> Page:
     """Return a page with the view from above, the node-link diagram and the legend; see :func:`frame_page`."""
-    from sgstore.draw._atlas import key_height, paint_key
     from sgstore.draw._diagram import diagram_entries, paint_diagram
     from sgstore.draw._legend import entries_of
     from sgstore.draw._page import Page
+    from sgstore.draw._panel import key_height, paint_key
     from sgstore.draw._scene import paint_scene
 
     half = scene.view.radius
@@ -293,7 +294,7 @@ def _paint_panel(
     picture: bytes | None,
     entries: Sequence[Entry] | None,
 ) -> None:
-    import sgstore.draw._atlas as side
+    import sgstore.draw._panel as side
     from sgstore.draw._legend import entries_of
 
     left, bottom, right, top = _panel_box(page)

@@ -5,10 +5,7 @@ A clip becomes an animation: the pictures of its frames, with one scale and one 
 
 from __future__ import annotations
 
-import io
 import re
-import tempfile
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -18,7 +15,7 @@ import numpy as np
 from sgstore.draw._animation import animation
 from sgstore.draw._film import FilmPage
 from sgstore.draw._legend import entries_of
-from sgstore.draw._page import PICTURE_PIXELS, own_style
+from sgstore.draw._page import own_style
 from sgstore.draw._picture import (
     check_installed,
     checked,
@@ -36,10 +33,9 @@ from sgstore.maps.opendrive import read_map
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-    from PIL.Image import Image
-
+    from sgstore.draw._drawn_links import Relations
     from sgstore.draw._legend import Entry
-    from sgstore.draw._view import Names, Relations
+    from sgstore.draw._view import Names
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import SceneGraph
     from sgstore.query import Store
@@ -48,7 +44,6 @@ if TYPE_CHECKING:
 
 DPI: Final = 85.0
 """Pixels per inch: lower than for single pictures, because animations have many."""
-
 
 Shot = tuple["SceneGraph", "Mapping[str, int]", "bytes | None"]
 """Frame of a clip: its graph; marked nodes, as in :func:`sgstore.draw.draw_frame`; the camera picture.
@@ -154,7 +149,6 @@ SAMPLES: Final = 8
 """Sample frames of a clip for scale and legend."""
 AT_ONCE: Final = 8
 """Frames that are read at a time."""
-
 
 _PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 """First bytes of JPEG and PNG. A message contains the complete picture in any encoding."""
@@ -334,10 +328,10 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
 
 def map_of(store: Store, trace: str) -> RoadMap | None:
     """Return the road map of a trace of a store, or ``None``."""
-    return _map_in(store.file, trace)
+    return map_in(store.file, trace)
 
 
-def _map_in(file: StoreFile, trace: str) -> RoadMap | None:
+def map_in(file: StoreFile, trace: str) -> RoadMap | None:
     found = file.road_map_text(trace)
     return read_map(found[1], found[0]) if found else None
 
@@ -368,113 +362,9 @@ def _picture(
 
 def camera_of(store: Store, trace: str) -> str:
     """Return the first channel with pictures, or an empty text."""
-    return _camera_in(store.file, trace)
+    return camera_in(store.file, trace)
 
 
-def _camera_in(file: StoreFile, trace: str) -> str:
+def camera_in(file: StoreFile, trace: str) -> str:
     topics = (c.topic for c in file.channels(trace) if c.schema.endswith("CompressedImage"))
     return min(topics, default="")
-
-
-# Pictures as objects of Pillow ------------------------------------------------------------------
-
-_PICTURES: Final = ("jpeg", "png", "webp", "tiff", "bmp")
-
-
-def camera_image(store: Store, frame: int | str, channel: str) -> Image:
-    """Return the picture in the camera message of a frame.
-
-    Raises
-    ------
-    StoreError
-        The frame or channel is missing, or the frame has no message of the channel.
-    TraceError
-        The recording is missing, was replaced, or is damaged at this place.
-    ExportError
-        The message has no picture: it has a video frame, or data of another sensor.
-    MissingExtraError
-        Pillow is not installed.
-    """
-    check_installed()
-    media = store.file.carried(frame, channel)
-    if media.form not in _PICTURES:
-        held = "no picture" if media.form == "message" else f"{media.form} video, not a picture"
-        raise ExportError(
-            f"{channel}: the message holds {held}; 'sgstore payload' writes it as it is"
-        )
-    return _opened(media.data, channel)
-
-
-def _opened(data: bytes, channel: str) -> Image:
-    """Open an untrusted picture of a recording, with permitted formats and a limited size."""
-    from PIL import Image
-
-    try:
-        image = Image.open(io.BytesIO(data), formats=[form.upper() for form in _PICTURES])
-        if image.width * image.height > PICTURE_PIXELS:
-            raise ExportError(
-                f"{channel}: the picture has {image.width} by {image.height} pixels, more than is opened"
-            )
-        image.load()
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise ExportError(f"{channel}: the picture cannot be read: {error}") from error
-    return image
-
-
-def frame_image(store: Store, frame: int | str, matches: Bindings | None, **look: Any) -> Image:
-    """Return a frame from above; parameters and errors as in :func:`sgstore.draw.draw_stored`."""
-    check_installed()
-    from PIL import Image
-
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "frame.png"
-        draw_stored(store, frame, file, matches=matches, **look)
-        image = Image.open(file)
-        image.load()
-    return image
-
-
-THUMBNAIL: Final = 180
-"""Longest side of a thumbnail; pixels."""
-
-
-def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
-    """Return a thumbnail of a frame as JPEG: the camera picture, or else the view from above.
-
-    Raises
-    ------
-    StoreError, TraceError, ExportError
-        The frame or its recording is missing, or the picture cannot be read.
-    MissingExtraError
-        The packages for drawing are not installed.
-    """
-    check_installed()
-    topic = _camera_in(file, frame.trace)
-    data = b""
-    if topic:
-        with suppress(StoreError):  # cameras are slower than frames: a frame may have no picture
-            media = file.carried(frame.frame_id, topic)
-            data = media.data if media.form in _PICTURES else b""
-    if not data:
-        graph = file.graph(frame.frame_id)
-        title = title_of(graph, file.trace(frame.trace_id).start_ns)
-        data = graph_picture(graph, _map_in(file, frame.trace), title=title)
-    image = _opened(data, topic).convert("RGB")
-    image.thumbnail((side, side))
-    small = io.BytesIO()
-    image.save(small, "JPEG", quality=85)
-    return small.getvalue()
-
-
-def graph_picture(graph: SceneGraph, road_map: RoadMap | None = None, **look: Any) -> bytes:
-    """Return a graph from above as PNG; ``**look`` as in :func:`sgstore.draw.draw_frame`.
-
-    Raises
-    ------
-    MissingExtraError
-        The packages for drawing are not installed.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "graph.png"
-        draw_frame(graph, road_map, file, **look)
-        return file.read_bytes()

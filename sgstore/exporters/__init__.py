@@ -6,12 +6,13 @@ packages add formats with an entry point of the group ``sgstore.exporters``: the
 and an :class:`Exporter`.
 """
 
+from sgstore.exporters._clip_frames import FEW, ClipFrames, Export
 from sgstore.exporters._clips import WrittenClip, WrittenFile, check_folder
-from sgstore.exporters._frames import cloud_of
-from sgstore.exporters._labels import FEW, ClipFrames, Export, Labels, parse_labels
+from sgstore.exporters._labels import Labels, parse_labels
 from sgstore.exporters._nx import graphs_of
 from sgstore.exporters._recorder import Recorder, Written
 from sgstore.exporters._registry import EXPORTERS, GROUP, Exporter, Write, exporter_named, exporters
+from sgstore.exporters._sensor_data import cloud_of
 from sgstore.exporters._transforms import Mount, parse_mounts
 from sgstore.exporters._write import around_frames, labelled, write_export
 

@@ -12,24 +12,21 @@ value in a frame without an ego, and no label has a value in traces that cannot 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from sgstore.errors import ExportError, QueryError, TextSpan
-from sgstore.model.frame_ids import SEQ_BITS, frame_ids, trace_of
-from sgstore.model.world import tolerance_ns
+from sgstore.model.frame_ids import frame_ids, trace_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from sgstore.collection import Collection, PartedMatches, PartedUnion
-    from sgstore.exporters._transforms import Mount
     from sgstore.matches import Matches
-    from sgstore.model.world import Clip, Ints
+    from sgstore.model.world import Ints
     from sgstore.query import Store
-    from sgstore.store import StoredTrace
 
     AnyMatches = Matches | PartedMatches | PartedUnion
 
@@ -227,209 +224,3 @@ def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
     row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
     of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
     return of, row[of]
-
-
-# What is to be exported: clips of a store, and the frames in them with their labels -------------
-
-WINDOW: Final = 240
-"""Frames that are read from the store at once, as columns."""
-FEW: Final = 60
-"""Frames at once for single graphs, which take ten times the memory of columns."""
-
-_FRAMES: Final = """
-SELECT frame_id, seq, time_ns, log_time_ns, t FROM frames
-WHERE frame_id >= $first AND frame_id <= $last AND log_time_ns >= $start AND log_time_ns <= $end
-ORDER BY frame_id
-"""
-
-
-@dataclass(frozen=True, slots=True)
-class Export:
-    """Description of an export: store, clips and options.
-
-    Attributes
-    ----------
-    store : Store
-    clips : tuple of Clip
-        Log times, both ends included; intervals may overlap.
-    labels : Labels, optional
-        Values of the frames, by name; see :mod:`sgstore.exporters._labels`.
-    abstraction : str
-        Abstraction of the graphs; empty means the default of the format.
-    with_graph : bool
-        True if clips of recordings include the scene graphs.
-    mounts : tuple of Mount
-        Poses of sensors, for clips with graphs; see :func:`sgstore.exporters.parse_mounts`.
-    rebase_context : bool
-        True if context messages from outside a clip get log times at its ends.
-    graphml : bool
-        True for additional GraphML files of networkx graphs, one per frame.
-    channels : tuple of str
-        Topics of the wanted sensors; empty means all.
-    clouds : str
-        File format of point clouds: ``pcd``, ``npy`` or ``bin``.
-    provenance : mapping
-        Values about the origin: ``query``, and others of the caller.
-    progress : callable, optional
-        Called with the number of finished frames and the total.
-    """
-
-    store: Store
-    clips: tuple[Clip, ...]
-    labels: Labels | None = None
-    abstraction: str = ""
-    with_graph: bool = False
-    mounts: tuple[Mount, ...] = ()
-    rebase_context: bool = False
-    graphml: bool = False
-    channels: tuple[str, ...] = ()
-    clouds: str = "pcd"
-    provenance: Mapping[str, str] = field(default_factory=dict[str, str])
-    progress: Callable[[int, int], None] | None = None
-
-    def trace(self, name: str) -> StoredTrace:
-        """Return a trace of the store."""
-        return self.store.file.trace(name)
-
-    def frames(self) -> Iterator[ClipFrames]:
-        """Yield the frames of each clip; a frame in several clips occurs several times.
-
-        Raises
-        ------
-        ExportError
-            A clip has no frames.
-        """
-        for number, clip in enumerate(self.clips, 1):
-            frames = ClipFrames.of(self, number, clip)
-            if not len(frames):
-                raise ExportError(
-                    f"no frame of {clip.trace!r} between {clip.start_ns} and {clip.end_ns} ns"
-                )
-            yield frames
-
-    def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
-        """Yield the frames of the clips in windows of ``size``, and report the progress."""
-        for frames in self.frames():
-            yield from frames.windows(size)
-            self.tell(frames.number, len(self.clips))
-
-    def fresh_windows(self) -> Iterator[ClipFrames]:
-        """Yield windows of frames, each frame only with its first clip."""
-        for frames in self.windows():
-            time = frames.log_time_ns
-            slack = tolerance_ns(self.trace(frames.clip.trace).period_ns)
-            known = np.zeros(len(frames), np.bool_)
-            for clip in self.clips[: frames.number - 1]:
-                if clip.trace == frames.clip.trace:
-                    reach = clip.widened(slack)
-                    known |= (time >= reach.start_ns) & (time <= reach.end_ns)
-            if not known.all():
-                yield frames.take(np.flatnonzero(~known))
-
-    def tell(self, done: int, of: int) -> None:
-        """Report the progress."""
-        if self.progress is not None:
-            self.progress(done, of)
-
-    def named_graphs(
-        self, frames: ClipFrames, abstraction: str
-    ) -> Iterator[tuple[dict[str, str], list[tuple[str, str, str]]]]:
-        """Yield nodes and edges of the graphs of frames by names, under an abstraction."""
-        found, _, graphs = self.store.file.abstracted.frames(abstraction, **frames.bounds)
-        for row in np.searchsorted(found, frames.seq).tolist():
-            yield graphs.named(row)
-
-    def label_columns(self, frame_id: Ints) -> dict[str, list[Any]]:
-        """Return the labels of frames, by name."""
-        return {} if self.labels is None else self.labels.of(frame_id)
-
-    def label_cells(self, frame_id: Ints) -> Iterator[list[Any]]:
-        """Yield the labels of each frame as CSV cells."""
-        columns = self.label_columns(frame_id).values()
-        for values in zip(*columns, strict=True) if columns else [()] * len(frame_id):
-            yield [
-                "" if v is None else str(v).lower() if isinstance(v, bool) else v for v in values
-            ]
-
-    def about(self) -> dict[str, Any]:
-        """Return the values of the manifest: clips, labels, and their sources."""
-        traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
-        return {
-            "clips": [
-                {
-                    "trace": clip.trace,
-                    "start_ns": clip.start_ns,
-                    "end_ns": clip.end_ns,
-                    "source": traces[clip.trace].path.name,
-                    "source_sha256": traces[clip.trace].digest,
-                }
-                for clip in self.clips
-            ],
-            "labels": {} if self.labels is None else dict(self.labels.texts),
-            "provenance": dict(self.provenance),
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class ClipFrames:
-    """Frames of a clip, ordered by number; shape (n,).
-
-    Attributes
-    ----------
-    number : int
-        Number of the clip in its export, from 1.
-    clip : Clip
-    frame_id, seq, time_ns, log_time_ns : int64
-    t : float64
-        Time since the start of the trace; s.
-    """
-
-    number: int
-    clip: Clip
-    frame_id: Ints
-    seq: Ints
-    time_ns: Ints
-    log_time_ns: Ints
-    t: np.ndarray[Any, np.dtype[np.float64]]
-
-    @classmethod
-    def of(cls, export: Export, number: int, clip: Clip) -> ClipFrames:
-        """Return the frames of a clip's trace with log times in the clip."""
-        trace = export.trace(clip.trace)
-        trace_id, reach = trace.trace_id, clip.widened(tolerance_ns(trace.period_ns))
-        found = export.store.file.arrays(
-            _FRAMES,
-            {
-                "first": trace_id << SEQ_BITS,
-                "last": (trace_id + 1 << SEQ_BITS) - 1,
-                "start": reach.start_ns,
-                "end": reach.end_ns,
-            },
-        )
-        return cls(
-            number,
-            clip,
-            frame_id=found["frame_id"].astype(np.int64),
-            seq=found["seq"].astype(np.int64),
-            time_ns=found["time_ns"].astype(np.int64),
-            log_time_ns=found["log_time_ns"].astype(np.int64),
-            t=found["t"].astype(np.float64),
-        )
-
-    def __len__(self) -> int:
-        return len(self.frame_id)
-
-    def take(self, rows: slice | Ints) -> ClipFrames:
-        """Return these frames, in their order."""
-        columns = ("frame_id", "seq", "time_ns", "log_time_ns", "t")
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
-
-    def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
-        """Yield the frames in windows of ``size``."""
-        for start in range(0, len(self), size):
-            yield self.take(slice(start, start + size))
-
-    @property
-    def bounds(self) -> dict[str, int]:
-        """Return the first and the last ``frame_id``, as values of ``$first`` and ``$last``."""
-        return {"first": int(self.frame_id[0]), "last": int(self.frame_id[-1])}

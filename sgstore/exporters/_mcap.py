@@ -34,7 +34,8 @@ from mcap.writer import CompressionType, Writer
 from sgstore.base.temporary_folders import working_folder
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import ChannelCount, WrittenClip, clip_name, tool
-from sgstore.exporters._mcap_graphs import LAYOUT, Added, is_added, layout
+from sgstore.exporters._mcap_graphs import Added, is_added
+from sgstore.exporters._viewer_layout import LAYOUT, layout
 from sgstore.mcap import CLIP, HEAD, READ_ERRORS, Loss, OutOfOrder, digest_of, near
 from sgstore.model.world import Clip, TraceReport, tolerance_ns
 from sgstore.readers import channel_rank, open_recording
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
     from mcap.records import Channel
     from numpy.typing import NDArray
 
-    from sgstore.exporters._labels import Export
+    from sgstore.exporters._clip_frames import Export
     from sgstore.exporters._mcap_graphs import ClipMessage
     from sgstore.mcap import Messages
     from sgstore.model.world import MessageRefs

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 import networkx as nx
 
 from sgstore.errors import ExportError
+from sgstore.exporters._clip_frames import FEW
 from sgstore.exporters._clips import WrittenFile, clip_name
-from sgstore.exporters._labels import FEW
 from sgstore.graphs.abstractions import abstraction_named, abstractions
 from sgstore.model.graph import named_graph
 from sgstore.model.vocabulary import RELATION_CODE, normalize_name
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.exporters._labels import ClipFrames, Export
+    from sgstore.exporters._clip_frames import ClipFrames, Export
     from sgstore.model.graph import SceneGraph
 
     Graph = nx.MultiDiGraph[Any]

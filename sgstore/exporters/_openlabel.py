@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from typing import TextIO
 
-    from sgstore.exporters._labels import ClipFrames, Export
+    from sgstore.exporters._clip_frames import ClipFrames, Export
 
 SCHEMA_VERSION: Final = "1.0.0"
 AXES: Final = "map"

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
-    from sgstore.exporters._labels import ClipFrames, Export
+    from sgstore.exporters._clip_frames import ClipFrames, Export
     from sgstore.store import StoreFile
 
 
@@ -196,8 +196,6 @@ def _tested(file: Path, name: str, count: int) -> WrittenFile:
         raise ExportError(f"{file.name}: {count} rows were written, {found} are read back")
     return WrittenFile.of(file, name, count)
 
-
-# What describes the tables ---------------------------------------------------------------------------
 
 _ABOUT_CLIPS: Final = (
     "One row a clip: its trace, its first and last log time, and the recording that it is of."

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from sgstore.exporters._labels import ClipFrames, Export
+    from sgstore.exporters._clip_frames import ClipFrames, Export
     from sgstore.graphs.abstractions import GraphColumns, Labelled
 
 
@@ -58,7 +58,6 @@ FEATURES: Final = (
     ("heading", "rad", "less the ego's heading, in (-pi, pi]"),
 )
 """Columns of ``node_feature``: name, unit, meaning. NaN if the position or the ego is unknown."""
-
 
 _KINDS: Final = {
     "frame_id": ("<i8", 0),

@@ -19,13 +19,12 @@ from sgstore.model.vocabulary import suggestion
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from sgstore.exporters._clip_frames import Export
     from sgstore.exporters._clips import WrittenClip, WrittenFile
-    from sgstore.exporters._labels import Export
 
 
 GROUP: Final = plugins.EXPORTERS.group
 """Group of entry points for formats of other packages."""
-
 
 Write = Callable[["Export", Path], "Sequence[WrittenClip | WrittenFile]"]
 """Writes an export into an empty folder, verifies it with the format's own reader, and returns the files.

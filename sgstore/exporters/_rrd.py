@@ -25,10 +25,10 @@ import numpy as np
 
 import sgstore.exporters._foxglove as drawn
 from sgstore.errors import ExportError, MissingExtraError
+from sgstore.exporters._clip_frames import FEW
 from sgstore.exporters._clips import WrittenFile, clip_name
-from sgstore.exporters._frames import sensor_of
-from sgstore.exporters._labels import FEW
 from sgstore.exporters._nx import graphs_of
+from sgstore.exporters._sensor_data import sensor_of
 from sgstore.exporters._transforms import EGO, FrameTransforms
 from sgstore.maps.opendrive import read_map
 from sgstore.maps.roads import DrawnOutlines
@@ -38,7 +38,7 @@ from sgstore.readers import record_reader
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.exporters._labels import ClipFrames, Export
+    from sgstore.exporters._clip_frames import ClipFrames, Export
     from sgstore.model.graph import SceneGraph
 
 APPLICATION: Final = "sgstore"
@@ -155,8 +155,6 @@ class RerunClip:
         """Return a path from arbitrary names."""
         return str(self._rerun.new_entity_path(list(parts))).lstrip("/")
 
-    # The scene ------------------------------------------------------------------------------------
-
     def _write_map(self) -> None:
         told = self._export.store.file.road_map_text(self._frames.clip.trace)
         if told is None:
@@ -236,8 +234,6 @@ class RerunClip:
         )
         self._out.log("graph", shown, rerun.GraphEdges([*pairs], graph_type="directed"))
         self.paths.add("graph")
-
-    # What sensors saw -----------------------------------------------------------------------------
 
     def _write_messages(self) -> None:
         file, frames = self._export.store.file, self._frames

@@ -22,7 +22,7 @@ from sgstore.mcap import Loss
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from sgstore.exporters._labels import Export
+    from sgstore.exporters._clip_frames import Export
 
 
 HEADER: Final = ("ds", "sg", "n_img", "t_id", "node1", "edge", "node2")

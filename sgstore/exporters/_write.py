@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ExportError, SgstoreError
+from sgstore.exporters._clip_frames import Export
 from sgstore.exporters._clips import (
     WrittenClip,
     WrittenFile,
@@ -16,7 +17,7 @@ from sgstore.exporters._clips import (
     provenance_of,
     write_manifest,
 )
-from sgstore.exporters._labels import Export, Labels
+from sgstore.exporters._labels import Labels
 from sgstore.exporters._registry import exporter_named
 from sgstore.matches import merged
 from sgstore.model.vocabulary import natural

@@ -16,47 +16,39 @@ Source: ASAM OpenSCENARIO XML 1.2.0, its model of classes and its schema.
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any, Final
-from xml.etree import ElementTree as ET
-from xml.sax.saxutils import XMLGenerator
-from xml.sax.xmlreader import AttributesImpl
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile, clip_name, safe_name, tool
+from sgstore.exporters._xosc_elements import (
+    CATEGORIES,
+    ScenarioEntity,
+    XmlWriter,
+    event,
+    group,
+    test,
+    write_entity,
+    write_position,
+    write_signal,
+    write_speed,
+    write_trajectory,
+    write_when,
+)
 from sgstore.maps.roads import is_lane_text
 from sgstore.mcap import Loss
-from sgstore.model.vocabulary import VEHICLES
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from sgstore.exporters._labels import ClipFrames, Export
+    from sgstore.exporters._clip_frames import ClipFrames, Export
 
     Numbers = NDArray[np.float64]
-
-_CATEGORIES: Final = {
-    **{kind: kind for kind in ("car", "truck", "van", "bus", "bicycle", "trailer", "train")},
-    "motorcycle": "motorbike",
-    "vehicle": "car",
-    "person": "pedestrian",
-    "animal": "animal",
-    "prop": "obstacle",
-    "building": "building",
-    "pole": "pole",
-    "barrier": "barrier",
-    "vegetation": "vegetation",
-    "unknown": "none",
-}
-"""Kind → category; without signs and lights, which belong to the map."""
-_PEOPLE: Final = frozenset({"person", "animal"})
 _SIZES: Final = {
     "truck": (8.0, 2.5, 3.2),
     "bus": (12.0, 2.55, 3.2),
@@ -69,9 +61,6 @@ _SIZES: Final = {
 }
 _SIZE: Final = (4.5, 1.8, 1.5)
 """Default length, width and height; m."""
-REAR_AXLE: Final = 0.3
-"""Distance of the rear axle behind the middle of a vehicle, as a share of the length."""
-_MASS: Final = {"person": 75.0, "animal": 20.0}
 TOLERANCE: Final = 0.001
 """Tolerance of positions in the verification; m."""
 
@@ -93,38 +82,6 @@ _LIGHT: Final = """
 SELECT frame_id, light_state::VARCHAR AS state FROM nodes
 WHERE frame_id >= $first AND frame_id <= $last AND node_id = $node AND light_state IS NOT NULL ORDER BY frame_id
 """
-
-
-@dataclass(frozen=True, slots=True)
-class ScenarioEntity:
-    """Entity of a clip.
-
-    Attributes
-    ----------
-    node : int
-    name : str
-        Name in the scenario.
-    kind : str
-    still : bool
-        True if it never moves.
-    size : tuple of float
-        Length, width, height; m.
-    properties : dict
-        Names from the simulator.
-    """
-
-    node: int
-    name: str
-    kind: str
-    still: bool
-    size: tuple[float, float, float]
-    properties: dict[str, str]
-
-    @property
-    def centre(self) -> tuple[float, float, float]:
-        """Return the middle of the box in the axes of the entity; m."""
-        ahead = REAR_AXLE * self.size[0] if self.kind in VEHICLES else 0.0
-        return ahead, 0.0, self.size[2] / 2
 
 
 @dataclass(slots=True)
@@ -164,7 +121,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
         file = folder / clip_name(trace, frames.number, ".xosc")
         scenario = Scenario(export, frames, "" if road_map is None else road_map.name)
         scenario.write(file)
-        _test(file, scenario.vertices)
+        test(file, scenario.vertices)
         written.append(WrittenFile.of(file, "entities", len(scenario.actors), scenario.losses()))
         export.tell(frames.number, len(export.clips))
     found = sorted({one for one in maps.values() if one is not None})
@@ -223,7 +180,7 @@ class Scenario:
                     self._lights.append((node, ref))
                 else:
                     self._unmapped.append(name)
-            elif kind in _CATEGORIES:
+            elif kind in CATEGORIES:
                 if None in size:
                     self._unsized.append(name)
                 length, width, height = (
@@ -257,14 +214,14 @@ class Scenario:
                 self._write_head(xml)
                 with xml.element("Entities"):
                     for actor in self.actors:
-                        _write_entity(xml, actor)
+                        write_entity(xml, actor)
                 with xml.element("Storyboard"):
                     with xml.element("Init"), xml.element("Actions"):
                         self._write_init(xml)
                     with xml.element("Story", name="recorded"):
                         self._write_acts(xml)
                     with xml.element("StopTrigger"):
-                        _write_when(xml, float(self._seconds[-1]), "end")
+                        write_when(xml, float(self._seconds[-1]), "end")
             xml.finish()
 
     def _write_head(self, xml: XmlWriter) -> None:
@@ -286,26 +243,22 @@ class Scenario:
             if self._map:
                 xml.leaf("LogicFile", filepath=self._map)
 
-    # What is there at the beginning ---------------------------------------------------------------
-
     def _write_init(self, xml: XmlWriter) -> None:
         changes = [(ref, next(self._light(node), None)) for node, ref in self._lights]
         for ref, change in changes:
             if change is not None and change[0] == 0:
                 with xml.element("GlobalAction"):
-                    _write_signal(xml, ref, change[1])
+                    write_signal(xml, ref, change[1])
         for actor in self.actors:
             track = self._track(actor, first=not actor.still)
             if not len(track.row) or (not actor.still and track.row[0] != 0):
                 continue
             with xml.element("Private", entityRef=actor.name):
                 with xml.element("PrivateAction"), xml.element("TeleportAction"):
-                    _write_position(xml, track.pose[0])
+                    write_position(xml, track.pose[0])
                 if not actor.still and np.isfinite(track.speed[0]):
                     with xml.element("PrivateAction"):
-                        _write_speed(xml, float(track.speed[0]))
-
-    # What happens ---------------------------------------------------------------------------------
+                        write_speed(xml, float(track.speed[0]))
 
     def _write_acts(self, xml: XmlWriter) -> None:
         with xml.element("Act", name="tracks"):
@@ -314,11 +267,11 @@ class Scenario:
                 self._write_group(xml, actor)
             self._write_lights(xml, alone=not moving)
             with xml.element("StartTrigger"):
-                _write_when(xml, 0.0, "begin")
+                write_when(xml, 0.0, "begin")
 
     def _write_group(self, xml: XmlWriter, actor: ScenarioEntity) -> None:
         track = self._track(actor)
-        with _group(xml, actor.name, actor.name), xml.element("Maneuver", name=actor.name):
+        with group(xml, actor.name, actor.name), xml.element("Maneuver", name=actor.name):
             for number, (low, high) in enumerate(track.stretches(), 1):
                 self._write_stretch(xml, f"{actor.name} {number}", actor, track, (low, high))
 
@@ -336,23 +289,23 @@ class Scenario:
         start = float(times[0])
         if track.row[low] > 0:
             with (
-                _event(xml, f"{name} comes", start),
+                event(xml, f"{name} comes", start),
                 xml.element("GlobalAction"),
                 xml.element("EntityAction", entityRef=actor.name),
                 xml.element("AddEntityAction"),
             ):
-                _write_position(xml, poses[0])
-        with _event(xml, f"{name} moves", start), xml.element("PrivateAction"):
+                write_position(xml, poses[0])
+        with event(xml, f"{name} moves", start), xml.element("PrivateAction"):
             if high > low:
-                _write_trajectory(xml, name, times, poses)
+                write_trajectory(xml, name, times, poses)
                 self.vertices += len(times)
             else:
                 with xml.element("TeleportAction"):
-                    _write_position(xml, poses[0])
+                    write_position(xml, poses[0])
         if track.row[high] + 1 < len(self._seconds):
             leaves = float(self._seconds[track.row[high] + 1])
             with (
-                _event(xml, f"{name} leaves", leaves),
+                event(xml, f"{name} leaves", leaves),
                 xml.element("GlobalAction"),
                 xml.element("EntityAction", entityRef=actor.name),
             ):
@@ -365,16 +318,14 @@ class Scenario:
             if not changes:
                 continue
             alone = False
-            with _group(xml, f"signal {ref}"), xml.element("Maneuver", name=f"signal {ref}"):
+            with group(xml, f"signal {ref}"), xml.element("Maneuver", name=f"signal {ref}"):
                 for number, (row, state) in enumerate(changes, 1):
                     time = float(self._seconds[row])
-                    with _event(xml, f"signal {ref} {number}", time), xml.element("GlobalAction"):
-                        _write_signal(xml, ref, state)
+                    with event(xml, f"signal {ref} {number}", time), xml.element("GlobalAction"):
+                        write_signal(xml, ref, state)
         if alone:
-            with _group(xml, "nothing moves"):
+            with group(xml, "nothing moves"):
                 pass
-
-    # What the store knows -------------------------------------------------------------------------
 
     def _track(self, actor: ScenarioEntity, *, first: bool = False) -> EntityTrack:
         """Return the states of an entity in the clip, or only in its first frame."""
@@ -423,184 +374,3 @@ def _origins(pose: Numbers, centre: tuple[float, float, float]) -> Numbers:
     out[:, 1] -= sh * cp * ahead + (sh * sp * cr - ch * sr) * up
     out[:, 2] -= -sp * ahead + cp * cr * up
     return out
-
-
-# Elements -----------------------------------------------------------------------------------------
-
-
-class XmlWriter:
-    """Writer of XML elements in sequence."""
-
-    def __init__(self, stream: Any) -> None:
-        self._out = XMLGenerator(stream, "utf-8", short_empty_elements=True)
-        self._out.startDocument()
-        self._depth = 0
-
-    @contextmanager
-    def element(self, tag: str, /, **attributes: str) -> Generator[None]:
-        """Write an element around the content of the ``with`` block."""
-        self._begin(tag, attributes)
-        self._out.ignorableWhitespace("\n")
-        self._depth += 1
-        yield
-        self._depth -= 1
-        self._out.ignorableWhitespace("  " * self._depth)
-        self._out.endElement(tag)
-        self._out.ignorableWhitespace("\n")
-
-    def leaf(self, tag: str, /, **attributes: str) -> None:
-        """Write an empty element."""
-        self._begin(tag, attributes)
-        self._out.endElement(tag)
-        self._out.ignorableWhitespace("\n")
-
-    def _begin(self, tag: str, attributes: dict[str, str]) -> None:
-        self._out.ignorableWhitespace("  " * self._depth)
-        told = {name: _readable(text) for name, text in attributes.items()}
-        self._out.startElement(tag, AttributesImpl(told))
-
-    def finish(self) -> None:
-        """End the document."""
-        self._out.endDocument()
-
-
-def _readable(text: str) -> str:
-    """Replace characters that XML cannot hold, and ``$``, which marks scenario parameters."""
-    return "".join(c if c.isprintable() and c != "$" else "\N{REPLACEMENT CHARACTER}" for c in text)
-
-
-def _number(value: float) -> str:
-    text = f"{value:.6f}".rstrip("0").rstrip(".")
-    return "0" if text == "-0" else text
-
-
-def _write_entity(xml: XmlWriter, actor: ScenarioEntity) -> None:
-    category, length = _CATEGORIES[actor.kind], actor.size[0]
-    with xml.element("ScenarioObject", name=actor.name):
-        if actor.kind in VEHICLES:
-            with xml.element("Vehicle", name=actor.kind, vehicleCategory=category):
-                _write_box(xml, actor)
-                xml.leaf("Performance", maxSpeed="70", maxAcceleration="10", maxDeceleration="10")
-                with xml.element("Axles"):
-                    _write_axle(xml, "FrontAxle", actor, 2 * REAR_AXLE * length, "0.6")
-                    _write_axle(xml, "RearAxle", actor, 0.0, "0")
-                _write_properties(xml, actor)
-            return
-        mass = _number(_MASS.get(actor.kind, 100.0))
-        if actor.kind in _PEOPLE:
-            told = {"name": actor.kind, "pedestrianCategory": category, "mass": mass}
-            about = xml.element("Pedestrian", **told)
-        else:
-            told = {"name": actor.kind, "miscObjectCategory": category, "mass": mass}
-            about = xml.element("MiscObject", **told)
-        with about:
-            _write_box(xml, actor)
-            _write_properties(xml, actor)
-
-
-def _write_box(xml: XmlWriter, actor: ScenarioEntity) -> None:
-    x, y, z = map(_number, actor.centre)
-    length, width, height = map(_number, actor.size)
-    with xml.element("BoundingBox"):
-        xml.leaf("Center", x=x, y=y, z=z)
-        xml.leaf("Dimensions", width=width, length=length, height=height)
-
-
-def _write_axle(
-    xml: XmlWriter, name: str, actor: ScenarioEntity, ahead: float, steering: str
-) -> None:
-    xml.leaf(
-        name,
-        maxSteering=steering,
-        wheelDiameter="0.6",
-        trackWidth=_number(0.9 * actor.size[1]),
-        positionX=_number(ahead),
-        positionZ="0.3",
-    )
-
-
-def _write_properties(xml: XmlWriter, actor: ScenarioEntity) -> None:
-    with xml.element("Properties"):
-        for name, value in actor.properties.items():
-            xml.leaf("Property", name=f"sgstore.{name}", value=value)
-
-
-def _write_position(xml: XmlWriter, pose: Numbers) -> None:
-    names = ("x", "y", "z", "h", "p", "r")
-    known = {
-        name: _number(value)
-        for name, value in zip(names, pose.tolist(), strict=True)
-        if np.isfinite(value)
-    }
-    with xml.element("Position"):
-        xml.leaf("WorldPosition", **known)
-
-
-def _write_trajectory(xml: XmlWriter, name: str, times: Numbers, poses: Numbers) -> None:
-    with xml.element("RoutingAction"), xml.element("FollowTrajectoryAction"):
-        with (
-            xml.element("TrajectoryRef"),
-            xml.element("Trajectory", name=name, closed="false"),
-            xml.element("Shape"),
-            xml.element("Polyline"),
-        ):
-            for time, pose in zip(times.tolist(), poses, strict=True):
-                with xml.element("Vertex", time=_number(time)):
-                    _write_position(xml, pose)
-        with xml.element("TimeReference"):
-            xml.leaf("Timing", domainAbsoluteRelative="absolute", scale="1", offset="0")
-        xml.leaf("TrajectoryFollowingMode", followingMode="position")
-
-
-def _write_speed(xml: XmlWriter, speed: float) -> None:
-    with xml.element("LongitudinalAction"), xml.element("SpeedAction"):
-        how = {"dynamicsShape": "step", "dynamicsDimension": "time", "value": "0"}
-        xml.leaf("SpeedActionDynamics", **how)
-        with xml.element("SpeedActionTarget"):
-            xml.leaf("AbsoluteTargetSpeed", value=_number(speed))
-
-
-def _write_signal(xml: XmlWriter, ref: str, state: str) -> None:
-    with xml.element("InfrastructureAction"), xml.element("TrafficSignalAction"):
-        xml.leaf("TrafficSignalStateAction", name=ref, state=state)
-
-
-def _write_when(xml: XmlWriter, time: float, name: str) -> None:
-    """Write a condition that holds from a time on."""
-    with (
-        xml.element("ConditionGroup"),
-        xml.element("Condition", name=name, delay="0", conditionEdge="none"),
-        xml.element("ByValueCondition"),
-    ):
-        xml.leaf("SimulationTimeCondition", value=_number(time), rule="greaterOrEqual")
-
-
-@contextmanager
-def _group(xml: XmlWriter, name: str, actor: str = "") -> Generator[None]:
-    with xml.element("ManeuverGroup", maximumExecutionCount="1", name=name):
-        with xml.element("Actors", selectTriggeringEntities="false"):
-            if actor:
-                xml.leaf("EntityRef", entityRef=actor)
-        yield
-
-
-@contextmanager
-def _event(xml: XmlWriter, name: str, time: float) -> Generator[None]:
-    with xml.element("Event", name=name, priority="parallel", maximumExecutionCount="1"):
-        with xml.element("Action", name=name):
-            yield
-        with xml.element("StartTrigger"):
-            _write_when(xml, time, name)
-
-
-def _test(file: Path, vertices: int) -> None:
-    """Read the written file again, one element at a time."""
-    found = 0
-    try:
-        for _, element in ET.iterparse(file):  # noqa: S314  it is ours
-            found += element.tag == "Vertex"
-            element.clear()
-    except ET.ParseError as error:
-        raise ExportError(f"{file.name}: what was written cannot be read back: {error}") from error
-    if found != vertices:
-        raise ExportError(f"{file.name}: {vertices} vertices were written, {found} are read back")

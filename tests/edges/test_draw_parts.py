@@ -18,20 +18,11 @@ from PIL import Image
 
 import sgstore.draw._page as layers
 import sgstore.draw._palette as palette
+from sgstore.draw._drawn_links import ego_lane, links_of, seen_from_ego, sentences
 from sgstore.draw._ground import GroundView, rings_of
-from sgstore.draw._page import FURTHEST, Placer, indexed
-from sgstore.draw._view import (
-    MapWindow,
-    bodies_of,
-    clean,
-    ego_lane,
-    links_of,
-    number,
-    outline,
-    seen_from_ego,
-    sentences,
-    view_of,
-)
+from sgstore.draw._page import FURTHEST, indexed
+from sgstore.draw._placement import Placer
+from sgstore.draw._view import MapWindow, bodies_of, clean, number, outline, view_of
 from sgstore.maps.opendrive import read_map
 from sgstore.model.vocabulary import ENTITY_KINDS, LIGHT_STATES, PROXIMITY, SIGNALS
 

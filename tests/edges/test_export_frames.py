@@ -22,7 +22,7 @@ import sgstore
 import sgstore.exporters._foxglove as foxglove
 from sgstore.errors import ExportError, TraceError
 from sgstore.exporters import Export, labelled, write_export
-from sgstore.exporters._frames import Sensed, cloud_file, sensor_of
+from sgstore.exporters._sensor_data import Sensed, cloud_file, sensor_of
 from sgstore.ingest import ingest
 from sgstore.model.world import Clip
 from sgstore.readers import png
