@@ -15,7 +15,7 @@ from oracle_over_time import compare_unknown, unknown_check, worlds
 from thorough import LONG
 
 import sgstore
-from sgstore.apps.cli._checks import write_junit
+from sgstore.apps.cli._junit import write_junit
 from sgstore.ingest import ingest
 from sgstore.model.config import Config, RangeSettings
 from sgstore.temporal import Monitor

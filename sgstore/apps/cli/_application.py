@@ -16,11 +16,14 @@ from sgstore.apps.cli import (
     _collections,
     _coverage,
     _exports,
+    _monitor,
     _prioritize,
     _queries,
     _recordings,
     _serve,
     _stores,
+    _testsets,
+    _timeline,
 )
 from sgstore.apps.cli._options import ERROR, USAGE, Quiet, Verbose, Verbs
 from sgstore.apps.cli._output import complain, talk, talk_as_usual, write_error
@@ -65,7 +68,9 @@ for _verbs in (  # in the order of help
     _stores.verbs,
     _queries.verbs,
     _checks.verbs,
-    _coverage.verbs,
+    _monitor.verbs,
+    _timeline.verbs,
+    _testsets.verbs,
     _prioritize.verbs,
     _exports.verbs,
     _serve.verbs,
@@ -74,7 +79,7 @@ for _verbs in (  # in the order of help
 for _group, _panel in (
     (_queries.library, _queries.PANEL),
     (_coverage.coverage, _coverage.PANEL),
-    (_coverage.lock, _coverage.PANEL),
+    (_testsets.lock, _testsets.PANEL),
     (_collections.collection, _collections.PANEL),
 ):
     app.add_typer(_group, rich_help_panel=_panel)

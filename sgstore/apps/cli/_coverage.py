@@ -1,53 +1,33 @@
-"""Verbs about coverage and test sets: content and gaps of a data set, choice, locks, comparison of two."""
+"""Verbs about coverage: content and gaps of a data set."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 from typer import Argument, Option
 
 from sgstore.apps.cli._options import (
-    ERROR,
-    NO_MATCH,
     Abstraction,
-    AskedPath,
     AskOptions,
-    Budget,
-    CaseUnit,
-    LongestClip,
-    Parameters,
     Picture,
-    PrintedRows,
-    QueryLimits,
-    QueryText,
-    RowOptions,
     Verbs,
-    asked_of,
-    parameters_of,
-    pattern_option,
     say_left_out,
     say_scope,
     seconds_of,
 )
-from sgstore.apps.cli._output import count_bar, say
+from sgstore.apps.cli._output import say
 from sgstore.apps.cli._places import CollectionOptions, note_asked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sgstore.collection import Collection
-    from sgstore.query import Store
     from sgstore.testsets.coverage import ChosenFrames, Classed, ReportTable, Specification
-    from sgstore.testsets.locks import Lock
-    from sgstore.testsets.selection import Selection, SelectionSpec, Strategy
 
 PANEL: Final = "Coverage and test sets"
-
-verbs = Verbs()
 
 
 coverage = Verbs(
@@ -320,14 +300,14 @@ def sequences_(
     ours, *others = ask.frames(*(text for text in (a, by) if text is not None))
     say_left_out(ours)
     say_scope(ours.scope(world=False), ask.chosen)
-    found = sequences(ours, k, others[0] if others else None, named, _within(within))
+    found = sequences(ours, k, others[0] if others else None, named, within_seconds(within))
     listed = found.missing if missing else found.covered if covered else found.shares
     for text in found.shares.said if listed is not found.shares else ():
         say(text)
     ask.report(listed, limit)
 
 
-def _within(text: str | None) -> float:
+def within_seconds(text: str | None) -> float:
     from sgstore.testsets.coverage import WITHIN_S
 
     return WITHIN_S if text is None else seconds_of(text, "--within")
@@ -500,342 +480,3 @@ def _short(text: str) -> str:
     path, colon, query = text.partition(":")
     name = f"{Path(path).name}{colon}{query}"
     return name if len(name) <= 60 else f"{name[:59]}…"
-
-
-# Verbs that choose test sets, lock them, and compare stores ---------------------------------------
-
-lock = Verbs(
-    name="lock",
-    help="Locks of test sets: verify, list, unite, intersect, subtract.",
-    no_args_is_help=True,
-)
-
-
-LockPath = Annotated[Path, Argument(metavar="LOCK", help="A lock that select wrote.")]
-LockA = Annotated[Path, Argument(metavar="A", help="A lock.")]
-LockB = Annotated[Path, Argument(metavar="B", help="A lock.")]
-LockOut = Annotated[Path, Option("--output", "-o", metavar="FILE", help="The lock to write.")]
-NoPayloads = Annotated[
-    bool, Option("--no-payloads", help="Skip sensor messages: recordings are not read.")
-]
-Objective = Literal["units", "frames", "seconds", "bytes"]
-
-
-@dataclass(frozen=True)
-class ChoiceOptions:
-    """Options for a selection: strategy, units, and limits."""
-
-    minimal: Annotated[
-        bool, Option("--minimal", help="The fewest that keep everything that occurs.")
-    ] = False
-    per_class: Annotated[
-        int | None, Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times.")
-    ] = None
-    rarest: Annotated[bool, Option("--rarest", help="Rarest classes first.")] = False
-    stratify: Annotated[
-        str, Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
-    ] = ""
-    weakest: Annotated[
-        str,
-        Option("--weakest", metavar="EXPR", help="Least value first: 'robustness(ego.speed < 9)'."),
-    ] = ""
-    budget: Budget = ""
-    unit: CaseUnit = "frame"
-    clip: LongestClip = "2s"
-    stride: Annotated[
-        str,
-        Option(
-            "--stride",
-            metavar="TIME",
-            help="Time from the start of a clip to that of the next; below --clip, they overlap.",
-            show_default="--clip",
-        ),
-    ] = ""
-    abstraction: Abstraction = "RSV"
-    combos: Annotated[
-        int, Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
-    ] = 0
-    ego: Annotated[bool, Option("--ego", help="--combos: only features of the ego.")] = False
-    sequences: Annotated[
-        int, Option("--sequences", metavar="K", min=0, help="Keep sequences of K manoeuvres.")
-    ] = 0
-    manoeuvres: Manoeuvres = None
-    within: Within = None
-    objective: Annotated[
-        Objective, Option("--objective", help="Quantity that --minimal minimizes.")
-    ] = "units"
-    alpha: Annotated[
-        float, Option("--alpha", help="Weight of strata: 1: as frequent as they are, 0: all equal.")
-    ] = 1.0
-    least: Annotated[Objective | None, Option("--least", hidden=True)] = None  # until 0.3
-    temper: Annotated[float | None, Option("--temper", hidden=True)] = None  # until 0.3
-    seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
-
-    def spec(self) -> SelectionSpec:
-        """Return the specification of these options."""
-        from sgstore.testsets.selection import Budget, SelectionSpec, SelectionUnit
-
-        return SelectionSpec(
-            self._strategy(),
-            SelectionUnit(self.unit),
-            seconds_of(self.clip, "--clip"),
-            self.abstraction,
-            self.combos,
-            of_ego=self.ego,
-            each=self.per_class or (0 if self.stratify else 1),
-            by=self.stratify or self.weakest,
-            alpha=self.alpha if self.temper is None else self.temper,
-            budget=Budget.parse(self.budget) if self.budget else None,
-            objective=self.least or self.objective,
-            seed=self.seed,
-            stride_s=seconds_of(self.stride, "--stride") if self.stride else None,
-            sequences=self.sequences,
-            manoeuvres=tuple(self.manoeuvres or ()),
-            within_s=_within(self.within),
-        )
-
-    def _strategy(self) -> Strategy:
-        from sgstore.testsets.selection import Strategy
-
-        per_class = self.per_class is not None and not self.stratify
-        ways = {
-            Strategy.minimal: self.minimal,
-            Strategy.rarest: self.rarest,
-            Strategy.stratify: bool(self.stratify),
-            Strategy.per_class: per_class,
-            Strategy.weakest: bool(self.weakest),
-        }
-        asked = [way for way, wanted in ways.items() if wanted]
-        if len(asked) > 1:
-            known = "--minimal, --per-class, --rarest, --stratify, --weakest"
-            raise typer.BadParameter(f"give one of {known}")
-        return asked[0] if asked else Strategy.every
-
-
-@verbs.command(rich_help_panel=PANEL)
-def select(
-    store: AskedPath,
-    choice: ChoiceOptions,
-    query: QueryText = None,
-    parameters: Parameters = None,
-    split: Annotated[
-        str, Option("--split", help="Parts that share no recording: train=0.8,test=0.2.")
-    ] = "",
-    output: Annotated[
-        Path | None, Option("--output", "-o", metavar="FILE", help="Write a lock.")
-    ] = None,
-    no_payloads: NoPayloads = False,
-    curve: Annotated[
-        bool, Option("--curve", help="Print how much is kept by how many, beside a random order.")
-    ] = False,
-    picture: Annotated[
-        Path | None, Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg.")
-    ] = None,
-    *,
-    whole: CollectionOptions,
-    out: PrintedRows,
-    bounds: QueryLimits,
-) -> None:
-    """Choose frames, clips or traces for tests, rate the choice, and lock it.
-
-    Without --minimal, --per-class, --rarest, --stratify or --weakest all are taken,
-    or some at random within the --budget.
-    """
-    from sgstore.testsets.locks import ENDING
-    from sgstore.testsets.selection import listed, parse_split, split_table
-    from sgstore.testsets.selection import select as choose
-    from sgstore.testsets.selection import split as split_up
-
-    spec = choice.spec()
-    if output is not None and output.suffix != ENDING:  # before the search starts
-        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
-    shares = parse_split(split) if split else {}
-    opened = whole.opened_at(store, bounds)
-    chosen = chosen_frames(opened, str(store), query, parameters)
-    say_scope(chosen.scope(world=False), out.chosen)
-    found = choose(chosen, spec)
-    parts = split_up(found, shares) if shares else {}
-    for text in found.said:
-        say(text)
-    table = split_table(found, parts, shares) if shares else listed(found)
-    if output is not None:
-        asked = query or "", parameters_of(parameters)
-        _lock(found, asked, parts, output, payloads=not no_payloads)
-    # Last, so that the lock exists even if the reader stops after the first rows.
-    if curve or picture is not None:
-        _curve(found, picture, out, printed=curve)
-    else:
-        out.report(table)
-
-
-def chosen_frames(
-    opened: Store | Collection, name: str, query: str | None, parameters: list[str] | None
-) -> ChosenFrames:
-    """Return the frames to select from."""
-    from sgstore.testsets.coverage import ChosenFrames, frames_of
-
-    if query is None:
-        if parameters:
-            raise typer.BadParameter("--param belongs to a QUERY")
-        return ChosenFrames(name, opened)
-    values = parameters_of(parameters)
-    matches = opened.find(query, **values)
-    say_left_out(matches)
-    return ChosenFrames(
-        f"{name}:{query}", opened, frames_of(opened, query, **values), matches.reasons
-    )
-
-
-def _curve(found: Selection, picture: Path | None, out: PrintedRows, *, printed: bool) -> None:
-    from sgstore.testsets.selection import curve, listed
-
-    drawn = curve(found)
-    if printed:
-        out.report(drawn.table)
-    else:
-        out.report(listed(found))
-        say(drawn.table.said[0])
-    if picture is not None and found.holdings is not None:
-        from sgstore.draw import draw_curve
-
-        draw_curve(
-            drawn.table.rows,
-            found.holdings.total,
-            picture,
-            unit=found.units.unit,
-            title=f"What a selection keeps: {found.holdings.kind}",
-            below=drawn.table.said[0],
-        )
-        say(f"drawn: {picture}")
-
-
-def _lock(
-    found: Selection,
-    asked: tuple[str, dict[str, Any]],
-    parts: dict[int, str],
-    output: Path,
-    *,
-    payloads: bool,
-) -> None:
-    from sgstore.testsets.selection import locked_selection
-
-    with count_bar(output.name, "cases") as progress:
-        made = locked_selection(
-            found, asked[0], parts, parameters=asked[1], payloads=payloads, progress=progress
-        )
-    say_made(made, output)
-
-
-@lock.command("verify")
-def verify_(
-    path: LockPath,
-    store: AskedPath,
-    no_payloads: NoPayloads = False,
-    strict: Annotated[
-        bool, Option("--strict", help="Count another version of sgstore as a difference.")
-    ] = False,
-    *,
-    whole: CollectionOptions,
-    ask: AskOptions,
-) -> int:
-    """Verify that a store holds the cases of a lock: recordings, settings, graphs, sensor messages.
-
-    Exit code 1 if not. Other versions alone are told, and no difference
-    without --strict.
-    """
-    from sgstore.testsets.locks import read_lock, verify
-
-    known = read_lock(path)
-    opened = whole.opened_at(store, ask)
-    found = list(verify(known, opened, payloads=not no_payloads))
-    ask.write(("where", "what", "detail"), [(one.where, one.what, one.detail) for one in found])
-    wrong = [one for one in found if strict or one.matters]
-    unread = sum(case.payload is None for case in known.cases)
-    if unread or no_payloads:
-        say(f"payloads of {len(known.cases) if no_payloads else unread} cases were not looked at")
-    said = f"{len(wrong)} differences" if wrong else "as locked"
-    say(f"{path}: {len(known.cases)} cases of {len(known.traces)} traces: {said}")
-    return ERROR if wrong else 0
-
-
-@lock.command("list")
-def list_(path: LockPath, out: RowOptions) -> None:
-    """List the cases of a lock."""
-    from sgstore.testsets.locks import read_lock
-
-    columns = ("id", "trace", "first", "last", "frames", "split", "start_ns", "end_ns", "graph")
-    rows = [tuple(getattr(c, name) for name in columns) for c in read_lock(path).cases]
-    out.write(columns, rows)
-
-
-@lock.command("union")
-def union_(a: LockA, b: LockB, output: LockOut) -> None:
-    """Write a lock of the cases that are in A or in B."""
-    from sgstore.testsets.locks import read_lock, union
-
-    say_made(union(read_lock(a), read_lock(b)), output)
-
-
-@lock.command("intersect")
-def intersect_(a: LockA, b: LockB, output: LockOut) -> None:
-    """Write a lock of the cases that are in A and in B."""
-    from sgstore.testsets.locks import intersect, read_lock
-
-    say_made(intersect(read_lock(a), read_lock(b)), output)
-
-
-@lock.command("minus")
-def minus_(a: LockA, b: LockB, output: LockOut) -> None:
-    """Write a lock of the cases of A that share no frame with B."""
-    from sgstore.testsets.locks import minus, read_lock
-
-    say_made(minus(read_lock(a), read_lock(b)), output)
-
-
-def say_made(made: Lock, output: Path) -> None:
-    """Write a lock, and report its contents."""
-    made.write(output)
-    say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
-
-
-@verbs.command(rich_help_panel=PANEL)
-def diff(
-    a: Annotated[
-        str, Argument(metavar="A", help="Before: a store or collection, STORE:QUERY, or a lock.")
-    ],
-    b: Annotated[str, Argument(metavar="B", help="After, as A.")],
-    name: Annotated[str | None, pattern_option("Compare by a pattern of the library.")] = None,
-    query: Annotated[
-        str | None,
-        Option("--query", "-q", metavar="TEXT", help="Compare by a query, or by 'CHECK …'."),
-    ] = None,
-    by_frame: Annotated[
-        bool, Option("--by-frame", help="Scenes of traces of one name, frame by frame.")
-    ] = False,
-    abstraction: Abstraction = "RSV",
-    parameters: Parameters = None,
-    require: Annotated[
-        bool, Option("--require", help="End with exit code 4 if anything is different.")
-    ] = False,
-    *,
-    ask: FrameAskOptions,
-) -> int:
-    """Compare two stores or runs: which scenes, verdicts or matches appeared, vanished, changed."""
-    from sgstore.testsets import diff as differences
-    from sgstore.testsets.coverage import classed
-
-    if (name is not None) + (query is not None) + by_frame > 1:
-        raise typer.BadParameter("give one of -p NAME, -q TEXT, --by-frame")
-    values = parameters_of(parameters)
-    if name is not None or query is not None:
-        text, values = asked_of(query, None, name, values)
-        compare = differences.verdicts if differences.has_checks(text) else differences.matches
-        before, after = (ask.opened_at(Path(one), ask) for one in (a, b))
-        table = compare(before, after, text, values)
-    else:
-        compare = differences.by_frame if by_frame else differences.scenes
-        table = compare(*(classed(one, abstraction) for one in ask.frames(a, b)))
-    # In a table the reasons are below it, each once.
-    ask.report(table.without(*differences.REASONS) if ask.for_people else table)
-    different = any(row[0] != differences.SAME for row in table.rows)
-    return NO_MATCH if require and different else 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -222,9 +222,6 @@ def _clips(
     return list(matches.clips(*margins))
 
 
-# The verb that cuts clips to what matters ---------------------------------------------------------
-
-
 @verbs.command(rich_help_panel=PANEL)
 def shrink(
     store: StorePath,
@@ -301,9 +298,6 @@ def _cut_out(
     return dict(zip(clips, written, strict=True))
 
 
-# Verbs that draw --------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class DrawOptions:
     """Options for a picture."""
@@ -321,7 +315,7 @@ class DrawOptions:
     north_up: Annotated[bool, Option("--north-up", help="North is up, not the ego's heading.")] = (
         False
     )
-    graph: Annotated[bool, Option("--graph", help="Beside it the graph as nodes and edges.")] = (
+    diagram: Annotated[bool, Option("--graph", help="Beside it the graph as nodes and edges.")] = (
         False
     )
     names: Annotated[
@@ -333,16 +327,10 @@ class DrawOptions:
     ] = 10.0
 
     def options(self, matches: Matches | None) -> dict[str, Any]:
-        """Return the parameters of the drawing functions."""
-        return {
-            "matches": matches,
-            "camera": self.camera,
-            "relations": self.relations,
-            "radius": self.radius,
-            "north_up": self.north_up,
-            "diagram": self.graph,
-            "names": self.names,
-        }
+        """Return the parameters of the drawing functions, except those of animations."""
+        options = asdict(self)
+        del options["fps"]
+        return {"matches": matches, **options}
 
 
 @verbs.command(rich_help_panel=PANEL)

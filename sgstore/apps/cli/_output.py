@@ -374,9 +374,6 @@ def write_binary(write: Callable[[Path], int], form: Format, output: Path | None
     return number
 
 
-# Tables for people ---------------------------------------------------------------------------------
-
-
 def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO) -> int:
     """Write a table with widths from the first rows, so that output starts early."""
     rows = iter(rows)

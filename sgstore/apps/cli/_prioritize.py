@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from typer import Option
 
-from sgstore.apps.cli._coverage import PANEL, NoPayloads, chosen_frames, say_made
+from sgstore.apps.cli._coverage import PANEL
 from sgstore.apps.cli._options import (
     Budget,
     CaseUnit,
@@ -26,6 +26,7 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import count_bar, say
+from sgstore.apps.cli._testsets import NoPayloads, chosen_frames, say_made
 
 if TYPE_CHECKING:
     from sgstore.testsets.selection import Prioritized, PrioritySpec

@@ -408,8 +408,6 @@ def _say_all(answer: Answer) -> None:
         say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
 
 
-# Verbs about the library of named patterns: list, search, show, run -----------------------------
-
 library = Verbs(
     name="patterns",
     help="The library of named patterns: list, search, show, run them.",

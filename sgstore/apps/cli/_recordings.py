@@ -320,8 +320,6 @@ def doctor(traces: Recordings, reading: ReadingOptions, out: PrintedRows) -> int
     return ERROR if ERROR in codes else max(codes, default=0)
 
 
-# Verbs that need a running simulator ------------------------------------------------------------
-
 PORT: Final = 2000
 """Default port of a CARLA server."""
 
@@ -392,9 +390,6 @@ def _counter() -> Generator[Callable[[int, float], None] | None]:
         yield lambda frames, seconds: line.update(
             f"{frames} frames, {seconds:.1f} s of simulation; Ctrl-C ends the recording"
         )
-
-
-# Verbs about graphs that other tools made -------------------------------------------------------
 
 
 @dataclass(frozen=True)

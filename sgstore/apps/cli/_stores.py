@@ -125,9 +125,6 @@ def rebuild(
     out.write(("trace", "status", "frames", "file"), rows)
 
 
-# Verbs about graphs: other relations from the states of a store ---------------------------------
-
-
 @verbs.command(rich_help_panel=PANEL)
 def derive(
     store: StorePath,
@@ -189,9 +186,6 @@ def _write_derived(done: list[Derivation], out: PrintedRows) -> int:
     return LOSS if any(one.losses for one in done) else 0
 
 
-# Verbs about road maps --------------------------------------------------------------------------
-
-
 @verbs.command("map", rich_help_panel=PANEL)
 def map_(
     file: Annotated[
@@ -251,9 +245,6 @@ def _road_map(file: Path) -> RoadMap:
         return read_map(trace.info.map_text, trace.info.map_name)
 
 
-# The verb that fetches sensor messages ----------------------------------------------------------
-
-
 @verbs.command(rich_help_panel=PANEL)
 def payload(
     store: StorePath,
@@ -310,9 +301,6 @@ def _list_channels(file: StoreFile, frame: str, out: PrintedRows) -> None:
     out.write(found.columns, found)
 
 
-# The verb about settings: print them, with what each means --------------------------------------
-
-
 @verbs.command(rich_help_panel=PANEL)
 def config(
     file: Annotated[
@@ -349,9 +337,6 @@ def config(
         return
     settings = preset_named(preset) if preset else load(file) if file else Config()
     typer.echo(as_toml(settings), nl=False)
-
-
-# The verb for newcomers -------------------------------------------------------------------------
 
 
 @verbs.command(rich_help_panel=PANEL)

@@ -1,0 +1,85 @@
+"""Verdicts as JUnit XML for build servers: one test per check and trace."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from sgstore.base.output_files import write_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from sgstore.temporal import Verdict
+
+_NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Characters that XML cannot hold, not even as references."""
+
+
+def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
+    """Write a test suite for each check, with a case for each trace.
+
+    A violated check is a failure whose text names each violation. A trace that cannot answer, or a
+    pending verdict, is skipped. A passed case contains the number of frames without an entity.
+
+    Parameters
+    ----------
+    path : Path
+    verdicts : iterable of Verdict
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written; an existing file stays unchanged.
+    """
+    from xml.etree import ElementTree as Xml  # few need it
+
+    from sgstore.temporal import absence_text
+
+    root = Xml.Element("testsuites", name="sgstore check")
+    suites: dict[str, Xml.Element] = {}
+    for one in verdicts:
+        name = _plain(one.check)
+        if name not in suites:
+            suites[name] = Xml.SubElement(root, "testsuite", name=name)
+        case = Xml.SubElement(suites[name], "testcase", classname=name, name=_plain(one.trace))
+        if one.violated:
+            lines = _violations(one)
+            count = f"{len(lines)} violation{'s' * (len(lines) != 1)}"
+            Xml.SubElement(case, "failure", message=count).text = "\n".join(lines)
+        elif one.verdict != "true":
+            Xml.SubElement(case, "skipped", message=_plain(one.reason or _word(one)))
+        elif one.absent_frames:
+            Xml.SubElement(case, "system-out").text = absence_text(one.absent_frames)
+    for element, cases in [(root, root.findall("*/*")), *((s, list(s)) for s in suites.values())]:
+        element.set("tests", str(len(cases)))
+        element.set("failures", str(sum(case.find("failure") is not None for case in cases)))
+        element.set("errors", "0")
+        element.set("skipped", str(sum(case.find("skipped") is not None for case in cases)))
+    Xml.indent(root)
+    write_bytes(path, Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _word(verdict: Verdict) -> str:
+    """Return the text of a verdict without a reason."""
+    return (
+        "still due at the end of the recording" if verdict.verdict == "pending" else verdict.verdict
+    )
+
+
+def _violations(verdict: Verdict) -> list[str]:
+    """Return a line for each violation: frames, times and values."""
+    return [
+        _plain(
+            f"{one.trace}#{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
+            f" {one.frames} frames"
+            + "".join(f", {name} {value}" for name, value in one.values.items())
+        )
+        for one in verdict.violations
+    ]
+
+
+def _plain(text: str) -> str:
+    """Replace characters that XML cannot hold by escapes."""
+    return _NO_XML.sub(lambda found: f"\\x{ord(found[0]):02x}", text)

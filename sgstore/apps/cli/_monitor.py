@@ -1,0 +1,215 @@
+"""The verb monitor: checks and patterns over a recording as if it were live, or over a running simulator."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from dataclasses import asdict
+from functools import partial
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from sgstore.apps.cli._checks import PANEL, margin_document
+from sgstore.apps.cli._options import (
+    LOSS,
+    NO_MATCH,
+    AsJson,
+    ReadingOptions,
+    Statements,
+    Verbs,
+    seconds_of,
+)
+from sgstore.apps.cli._output import json_text, say
+from sgstore.apps.cli._process import was_ended
+from sgstore.base.output_files import without_controls
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from sgstore.readers import Sensor
+    from sgstore.temporal import FrameSource, Monitor, MonitorEvent, Verdict
+
+verbs = Verbs()
+
+SensorFile = Annotated[
+    Path | None,
+    Option("--sensors", help="With --serve, of a CARLA: cameras for its ego, as record has them."),
+]
+
+
+@verbs.command(rich_help_panel=PANEL)
+def monitor(
+    trace: Annotated[
+        str, Argument(metavar="TRACE", help="A recording; or carla://HOST:PORT, until Ctrl-C.")
+    ],
+    files: Annotated[
+        list[Path] | None,
+        Argument(metavar="[FILE…]", help="Files of CHECK and MATCH statements; - is stdin."),
+    ] = None,
+    ego: Annotated[
+        str, Option("--ego", help="Id, role or name of the ego; else as the recording says.")
+    ] = "",
+    duration: Annotated[
+        str | None, Option("--duration", metavar="TIME", help="Simulation time: 60s.")
+    ] = None,
+    require: Annotated[
+        bool, Option("--require", help="End with exit code 4 if a check is violated.")
+    ] = False,
+    as_json: AsJson = False,
+    serve: Annotated[bool, Option("--serve", help="Show a page of it while it goes on.")] = False,
+    port: Annotated[int, Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
+    sensors: SensorFile = None,
+    *,
+    statements: Statements,
+    reading: ReadingOptions,
+) -> int:
+    """Watch a recording as if it were live, or a running CARLA.
+
+    One line for each violation and each match, as soon as it is known; then the verdicts. The answers are
+    those of check and find over a store. With --serve a page shows
+    the scene, a recording in its own time; it stays until Ctrl-C.
+    """
+    from sgstore.lang.syntax import joined
+    from sgstore.model.config import Config
+    from sgstore.temporal import Monitor, opened
+
+    asked, values = statements.asked(files)
+    settings = reading.settings() or Config()
+    tell = _as_json if as_json else _for_people
+    longest = seconds_of(duration, "--duration") if duration else None
+    cameras = _sensors(sensors, shown=serve and trace.startswith("carla://"))
+    with opened(trace, settings, road_map=reading.road_map, ego=ego, sensors=cameras) as source:
+        watch = partial(
+            Monitor,
+            joined([*chain.from_iterable(asked.values())]),
+            source.road_map,
+            settings,
+            parameters=values,
+            trace=source.name,
+            called=_called(asked),
+            sgsm_compat=statements.sgsm_compat,
+        )
+        if serve:
+            watched, verdicts = _watched_on_a_page(watch, source, tell, longest, port)
+        else:
+            watched = watch(on_event=tell)
+            verdicts = watched.run(source.frames, duration_s=longest)
+    losses = [*source.losses, *(loss.reason for loss in watched.generator.losses)]
+    for warning in [*source.warnings, *losses]:
+        say(warning)
+    for verdict in verdicts:
+        _tell_verdict(verdict, as_json=as_json)
+    if require and any(verdict.violated for verdict in verdicts):
+        return NO_MATCH
+    return LOSS if losses else 0
+
+
+def _sensors(file: Path | None, *, shown: bool) -> list[Sensor]:
+    """Load the sensors listed in a file; ``shown``: a page displays their data."""
+    from sgstore.readers import load_sensors
+
+    if file is not None and not shown:
+        told = "--sensors is for the page of a running CARLA: carla://HOST:PORT --serve"
+        raise typer.BadParameter(told)
+    return [] if file is None else load_sensors(file)
+
+
+def _watched_on_a_page(
+    watch: Callable[..., Monitor],
+    source: FrameSource,
+    tell: Callable[[MonitorEvent], None],
+    longest: float | None,
+    port: int,
+) -> tuple[Monitor, tuple[Verdict, ...]]:
+    """Run a monitor with its page; return it and the verdicts after both have ended."""
+    from sgstore.apps.explorer import LiveRun, serve_live
+    from sgstore.temporal import paced
+
+    page = LiveRun(source.name, source.road_map, source.cameras)
+
+    def told(event: MonitorEvent) -> None:
+        tell(event)
+        page.event(event)
+
+    watched = watch(on_event=told, on_step=page.step)
+    page.follow(watched)
+    with serve_live(page, port=port, on_start=say):
+        frames = source.frames if source.live else paced(source.frames)
+        verdicts = watched.run(frames, duration_s=longest)
+        page.end(verdicts)
+        if not was_ended():
+            say("the page stays until Ctrl-C")
+            with suppress(KeyboardInterrupt):
+                threading.Event().wait()
+    return watched, verdicts
+
+
+def _called(asked: Mapping[str, list[str]]) -> list[str]:
+    """Return the names of the patterns in events, in query order."""
+    from sgstore.lang.sql import each_match
+    from sgstore.lang.syntax import parse
+    from sgstore.lang.syntax.tree import MatchClause
+
+    every: list[str] = []
+    for name, texts in asked.items():
+        statements = (one for text in texts for one in each_match(parse(text)))
+        count = sum(isinstance(one, MatchClause) for one in statements)
+        every += [name] if count == 1 else [f"{name} {number + 1}" for number in range(count)]
+    return every
+
+
+def _for_people(event: MonitorEvent) -> None:
+    who = ", ".join(f"{variable} = {name}" for variable, name in event.names.items())
+    about = f"from {event.start.t:.3f} s" if event.start != event.told else ""
+    if event.kind == "kept again":
+        about = f"after {event.end.t - event.start.t:.3f} s"
+    if event.at_end:
+        about = "at the end"
+    from sgstore.temporal import cell_of
+
+    values = ", ".join(f"{name} = {cell_of(value)}" for name, value in event.values.items())
+    parts = (f"{event.told.t:9.3f} s", event.kind.ljust(10), event.name, who, about, values)
+    _line("  ".join(part for part in parts if part))
+
+
+def _as_json(event: MonitorEvent) -> None:
+    about = asdict(event)
+    if not event.values:
+        del about["values"]
+    _line(json_text({"event": about.pop("kind"), **about}))
+
+
+def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
+    if as_json:
+        about: dict[str, Any] = {
+            "event": "verdict",
+            "name": verdict.check,
+            "trace": verdict.trace,
+            "verdict": verdict.verdict,
+            "violations": len(verdict.violations),
+            "reason": verdict.reason or None,
+            "absent_frames": verdict.absent_frames,
+        }
+        if verdict.robustness is not None:
+            about["robustness"] = margin_document(verdict)
+        _line(json_text(about))
+    else:
+        from sgstore.temporal import absence_text, margin_cells
+
+        count = len(verdict.violations)
+        more = f"  {count} violation{'s' * (count > 1)}" if count else ""
+        why = f"  ({verdict.reason})" if verdict.reason else ""
+        margin, decided, _ = margin_cells(verdict)
+        more += f"  robustness {margin}" if margin else ""
+        more += f"  {decided}" if decided else ""
+        more += f"  {absence_text(verdict.absent_frames)}" if verdict.absent_frames else ""
+        _line(f"{verdict.check}: {verdict.verdict}{more}{why}")
+
+
+def _line(text: str) -> None:
+    """Print a line without buffering."""
+    typer.echo(without_controls(text))

@@ -1,0 +1,127 @@
+"""The verb timeline: matches and violations over time, one lane per entity."""
+
+from __future__ import annotations
+
+import shutil
+from itertools import chain, count
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from sgstore.apps.cli._checks import PANEL
+from sgstore.apps.cli._options import (
+    Parameters,
+    PatternNames,
+    QueryLimits,
+    StorePath,
+    Traces,
+    Verbs,
+    parameters_of,
+    say_unknown,
+    text_of,
+)
+from sgstore.apps.cli._output import say
+from sgstore.base.output_files import without_controls
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+verbs = Verbs()
+
+
+@verbs.command(rich_help_panel=PANEL)
+def timeline(
+    store: StorePath,
+    queries: Annotated[
+        list[str] | None, Argument(metavar="[QUERY…]", help="'MATCH …', or 'CHECK …'.")
+    ] = None,
+    files: Annotated[
+        list[Path] | None,
+        Option("--file", "-f", help="Read a query, or checks, from a file; repeatable."),
+    ] = None,
+    names: PatternNames = None,
+    parameters: Parameters = None,
+    traces: Traces = None,
+    output: Annotated[
+        Path | None, Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
+    ] = None,
+    every: Annotated[
+        bool, Option("--all", help="Also traces in which nothing is found or violated.")
+    ] = False,
+    parts: Annotated[
+        str | None,
+        Option(
+            "--parts",
+            metavar="FRAME",
+            help="Where each part of one pattern holds for the match in this frame.",
+        ),
+    ] = None,
+    *,
+    bounds: QueryLimits,
+) -> int:
+    """Plot matches and rule violations over time, one lane per entity, for each trace that has some.
+
+    In the terminal, or with -o as a picture; all traces have one scale. With --parts FRAME one lane
+    for each part of a pattern.
+    """
+    from sgstore.draw import LETTERS, NAME, lines_of, parts_timeline, timelines
+
+    asked = _asked(queries or [], files or [], names or [], parameters_of(parameters))
+    if parts is None:
+        found = timelines(bounds.opened(store), asked, traces or ())
+    else:
+        if len(asked) > 1 or traces:
+            raise typer.BadParameter("--parts FRAME takes one pattern, and the trace of the frame")
+        ((text, values),) = asked.values()
+        found = [parts_timeline(bounds.opened(store), text, parts, values)]
+    for name in {*(traces or ())} - {one.trace for one in found}:
+        raise typer.BadParameter(f"--trace: the store has no trace {name!r}")
+    say_unknown((lane.name, one.trace, lane.reason) for one in found for lane in one.lanes)
+    hits = [one for one in found if one.hit]
+    if not every and hits:
+        if len(hits) < len(found):
+            say(
+                f"nothing is found or violated in {len(found) - len(hits)} more traces; --all shows them"
+            )
+        found = hits
+    if output is None:
+        letters = max(LETTERS, min(shutil.get_terminal_size().columns - NAME - 26, 3 * LETTERS))
+        longest = max((one.seconds for one in found), default=0.0)
+        for one in found:
+            typer.echo(without_controls("\n".join(lines_of(one, letters, longest))))
+        return 0
+    from sgstore.draw import draw_timelines
+
+    draw_timelines(found, output)
+    typer.echo(output)
+    return 0
+
+
+def _asked(
+    queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
+) -> dict[str, tuple[str, Mapping[str, Any]]]:
+    """Return the texts to plot with their values, by lane name."""
+    from sgstore.lang.library import pattern_named
+
+    found: dict[str, tuple[str, Mapping[str, Any]]] = {}
+    for number, text in enumerate(queries, start=1):
+        found["match" if len(queries) == 1 else f"match {number}"] = text, values
+    for file in files:
+        found[_free(file.stem, str(file), found)] = text_of(file), values
+    for name in names:
+        one = pattern_named(name)
+        own = {key: value for key, value in values.items() if key in one.parameters}
+        found[_free(name, f"pattern {name}", found)] = one.written(**own), {}
+    if not found:
+        raise typer.BadParameter("give a QUERY, -f FILE or -p NAME")
+    return found
+
+
+def _free(name: str, longer: str, taken: Mapping[str, object]) -> str:
+    """Return an unused name for a lane."""
+    if name not in taken:
+        return name
+    numbers = (f"{longer} ({number})" for number in count(2))
+    return next(one for one in chain([longer], numbers) if one not in taken)
