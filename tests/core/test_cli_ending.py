@@ -622,7 +622,7 @@ def test_a_refused_export_removes_the_folders_of_a_killed_one(
 
 def test_the_exit_code_is_kept_wherever_the_interruption_came_from() -> None:
     code = (
-        "import signal, sys; from sgstore.apps.cli import ending\n"
+        "import signal, sys; import sgstore.apps.cli._process as ending\n"
         "ending.heed_signals()\n"
         "try: exec('signal.raise_signal(signal.SIGTERM)')\n"
         "except KeyboardInterrupt: ending.ignore_signals(); sys.exit(ending.exit_code())"
@@ -634,7 +634,8 @@ def test_the_exit_code_is_kept_wherever_the_interruption_came_from() -> None:
 @pytest.mark.parametrize("place", ["ending._hear_of_lost", "run", "ending.clear_deadline"])
 def test_a_signal_at_the_edge_of_a_run_ends_it_like_any_other(place: str) -> None:
     code = (
-        "import signal, sys; from sgstore.apps import cli; sys.argv = ['sgstore', '--version']\n"
+        "import signal, sys; from sgstore.apps.cli import _application as cli\n"
+        "sys.argv = ['sgstore', '--version']\n"
         f"cli.{place} = lambda *a: signal.raise_signal(signal.SIGTERM)\n"
         "cli.main()"
     )
