@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.display import IN_NOTEBOOK
 from sgstore.lang.sql import value_text
-from sgstore.store import IN_NOTEBOOK
 from sgstore.temporal._quantifiers import HOLDS, VIOLATED, Level, folded_values
 from sgstore.temporal._verdicts import STATUS
 
