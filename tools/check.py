@@ -78,6 +78,10 @@ TESTS = {
     "vocabulary": "kinds",
     "world": "sgg extent identity clock",
     "__init__": "api",
+    "frame_ids": "store store_*",
+    "scope": "lang_scope cli",
+    "scene_columns": "relations sgg",
+    "CONTRIBUTING": "recipes docs_house",
     "docs": "docs_* lang_docs",
     "README": "docs_*",
 }
