@@ -23,6 +23,7 @@ from sgstore.store._bundle_catalogue import CATALOGUE, Facts, facts_of, parquet_
 from sgstore.store._bundles import BundleSource
 from sgstore.store._catalog import subset_catalogs
 from sgstore.store._classes import Abstracted
+from sgstore.store._clients import duckdb as duckdb  # for the public API alone
 from sgstore.store._coded_classes import CodedClasses, Triples
 from sgstore.store._contents import Mark, MessagePlaces, graph_digests
 from sgstore.store._encounters import measured
