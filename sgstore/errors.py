@@ -311,8 +311,6 @@ def _columns(text: str) -> int:
     return len(text) + wide - sum(map(bool, map(unicodedata.combining, text)))
 
 
-# Between processes -------------------------------------------------------------------------------
-
 _QUERY_ERRORS: Final = {kind.__name__: kind for kind in (QuerySyntaxError, QueryNameError)}
 _ERRORS: Final = {
     kind.__name__: kind for kind in (SqlError, StoreError, AbstractionError, ConfigError)

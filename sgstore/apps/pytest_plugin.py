@@ -194,9 +194,6 @@ class ClipScene:
             raise IndexError(f"frame {frame} of {len(self.frames)} in {self.id}") from None
 
 
-# What pytest calls ----------------------------------------------------------------------------------------
-
-
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option for the store of locks."""
     group = parser.getgroup("sgstore")
@@ -268,9 +265,6 @@ def violations_text(verdict: Verdict) -> str:
             + f": {who}" * bool(who)
         )
     return "\n".join(lines)
-
-
-# Where scenes come from -----------------------------------------------------------------------------------
 
 
 _FOUND: Final = pytest.StashKey[dict[str, list[ClipScene]]]()

@@ -310,8 +310,6 @@ def _pictures(
     return found
 
 
-# One file -----------------------------------------------------------------------------------------------------
-
 _IMPORT: Final = re.compile(
     r"""^import (?:\* as (?P<whole>\w+)|\{(?P<names>[^}]*)\}) from "(?P<file>[^"]+)";$""",
     re.MULTILINE,

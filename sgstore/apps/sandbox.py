@@ -576,9 +576,6 @@ class SandboxPool:
             box.close()
 
 
-# The process ------------------------------------------------------------------------------------------------
-
-
 def serve(answering: Answering) -> None:
     """Answer the queries on stdin until it ends, then exit the process.
 

@@ -10,10 +10,12 @@ Ray, Spark) then runs ``_worker`` on each bundle that may have results. ``_quest
 results.
 """
 
+from sgstore.collection._commit import commit
 from sgstore.collection._frames import CollectionFrames
-from sgstore.collection._landing import commit, land
+from sgstore.collection._landing import land
+from sgstore.collection._maintenance import CollectionFaults, Garbage, gc, verify
 from sgstore.collection._open import open
-from sgstore.collection._pack import CollectionFaults, Commit, Garbage, gc, pack, unpack, verify
+from sgstore.collection._pack import Commit, pack, unpack
 from sgstore.collection._questions import (
     Collection,
     PartedChecks,

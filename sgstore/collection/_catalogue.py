@@ -351,9 +351,6 @@ class Snapshot:
         return relations_of_set(answered, known, mapped=mapped)
 
 
-# Snapshots of a place -------------------------------------------------------------------------------
-
-
 def _name(number: int) -> str:
     return f"{_SNAPSHOTS}/{number:08d}"
 

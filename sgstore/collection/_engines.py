@@ -302,9 +302,6 @@ def _cause(error: BaseException) -> str:
     return lines[0].strip()[:300]
 
 
-# A process that does tasks for another -----------------------------------------------------------
-
-
 def _function(name: str) -> Callable[[Task], Outcome]:
     module, _, function = name.partition(":")
     return getattr(import_module(module), function)

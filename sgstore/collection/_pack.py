@@ -6,9 +6,7 @@ their recordings, so that names depend only on the committed contents.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
@@ -16,16 +14,9 @@ from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._cache import bundle_path
 from sgstore.collection._storage import digest_of_file, place_at
-from sgstore.errors import SgstoreError, StoreError
+from sgstore.errors import StoreError
 from sgstore.model.vocabulary import natural
-from sgstore.store import (
-    CATALOGUE,
-    BundleSource,
-    Identity,
-    StoreFile,
-    facts_of,
-    verify_file,
-)
+from sgstore.store import CATALOGUE, BundleSource, Identity, StoreFile, facts_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -41,7 +32,7 @@ ATTEMPTS: Final = 100
 GRACE_S: Final = 86_400.0
 """Time that unreferenced files stay, because a commit may be in progress; s."""
 
-_TRACE: Final = {name: place for place, name in enumerate(CATALOGUE["trace"])}
+TRACE: Final = {name: place for place, name in enumerate(CATALOGUE["trace"])}
 
 
 @dataclass(slots=True)
@@ -228,7 +219,7 @@ def put_bundle(
     file.close()
     place.upload(path, f"bundles/{sha}.sgstore")
     path.unlink()
-    at, trace = _TRACE["segment"], _TRACE["trace_id"]
+    at, trace = TRACE["segment"], TRACE["trace_id"]
     known = segments or {}
     facts["trace"] = [(*row[:at], known.get(row[trace], "")) for row in facts["trace"]]
     return facts
@@ -243,9 +234,6 @@ def map_names(before: Snapshot, found: Mapping[str, str]) -> dict[str, str]:
             names[digest] = Identity.free_name(name, taken)
             taken.add(names[digest])
     return {digest: names[digest] for digest in found}
-
-
-# A collection → one store ----------------------------------------------------------------------------
 
 
 def unpack(url: str | Path, store: str | Path) -> list[str]:
@@ -300,155 +288,3 @@ def refuse_others(place: Place, snapshot: Snapshot) -> None:
             f"{place.url}: {len(odd)} of {len(snapshot.bundles)} bundles are of another version than {wanted}:"
             f" {listed}{more}; 'sgstore collection rebuild' makes them anew from their recordings"
         )
-
-
-# Looking after ----------------------------------------------------------------------------------------
-
-
-@dataclass(slots=True)
-class CollectionFaults:
-    """Faults of a collection.
-
-    Attributes
-    ----------
-    number : int
-        Number of the verified snapshot.
-    bundles, traces : int
-        Numbers of verified bundles and traces.
-    faults : list of (str, str, str)
-        Bundle or trace, the verified part, and the fault.
-    """
-
-    number: int
-    bundles: int = 0
-    traces: int = 0
-    faults: list[tuple[str, str, str]] = field(default_factory=list[tuple[str, str, str]])
-
-
-def verify(url: str | Path) -> CollectionFaults:
-    """Verify that all bundles of a collection are unchanged and agree with the catalogue.
-
-    Raises
-    ------
-    StoreError
-        The collection is missing, or its catalogue cannot be read.
-    """
-    place = place_at(url)
-    snapshot = catalogue.latest(place)
-    found = CollectionFaults(snapshot.number)
-    for one in snapshot.bundles:
-        sha = one["bundle"]
-        found.bundles += 1
-        found.traces += one["traces"]
-        try:
-            path = bundle_path(place, sha, again=True)
-            told = verify_file(path)
-            found.faults += [
-                (fault.trace or sha, fault.check, fault.detail) for fault in told.faults
-            ]
-            if not told.faults:
-                found.faults += _differing(
-                    snapshot, sha, facts_of(StoreFile(path), sha, one["bytes"])
-                )
-        except SgstoreError as error:
-            found.faults.append((sha, "file", str(error)))
-    return found
-
-
-def _differing(snapshot: Snapshot, sha: str, facts: Facts) -> list[tuple[str, str, str]]:
-    """Return the tables of the catalogue that disagree with a bundle."""
-    faults: list[tuple[str, str, str]] = []
-    for table in CATALOGUE:
-        if table == "config":
-            continue
-        told = {row[: _TRACE["segment"]] for row in snapshot.of(table, sha)}
-        held = {row[: _TRACE["segment"]] for row in facts[table]}
-        if told != held:
-            wrong = f"{len(told - held)} rows too many, {len(held - told)} missing"
-            faults.append((sha, "catalogue", f"table {table}: {wrong}"))
-    return faults
-
-
-@dataclass(slots=True)
-class Garbage:
-    """Unreferenced files.
-
-    Attributes
-    ----------
-    names : list of str
-    size : int
-        Total bytes.
-    young : int
-        Number of other unreferenced files, kept because a commit may be in progress.
-    """
-
-    names: list[str] = field(default_factory=list[str])
-    size: int = 0
-    young: int = 0
-
-
-def gc(
-    url: str | Path, *, keep: int = 1, older_s: float = GRACE_S, dry_run: bool = False
-) -> Garbage:
-    """Remove old snapshots, and files that no snapshot references.
-
-    Parameters
-    ----------
-    url : str or Path
-    keep : int
-        Number of last snapshots to keep; at least 1.
-    older_s : float
-        Least age of removed files, because a running commit has unreferenced files; s.
-    dry_run : bool
-        True to list the files without removing them.
-
-    Raises
-    ------
-    StoreError
-        The collection is missing, or a file cannot be removed.
-    """
-    if keep < 1:
-        raise StoreError(f"keep is {keep}, expected 1 or more: the last snapshot is the collection")
-    place = place_at(url)
-    catalogue.about(place)
-    known = catalogue.numbers(place)
-    stay, gone = known[-keep:], known[:-keep]
-    snapshots = [catalogue.read(place, number) for number in stay]
-    held = {one["bundle"] for snapshot in snapshots for one in snapshot.bundles}
-    segments = {row["segment"] for snapshot in snapshots for row in snapshot.traces}
-    files, old = catalogue.files(place, stay), catalogue.files(place, gone)
-    young_since = time.time() - older_s
-    found = Garbage()
-    for name, size, written in place.names(""):
-        head, _, tail = name.partition("/")
-        kept = (
-            head not in {"bundles", "segments", "maps", "catalogue"}
-            or (head == "bundles" and tail.removesuffix(".sgstore") in held)
-            or (head == "segments" and _segment_of(tail) not in segments)
-            or head == "maps"
-            or (head == "catalogue" and name in files)
-        )
-        if kept:
-            continue
-        if written > young_since and name not in old:
-            found.young += 1
-            continue
-        found.names.append(name)
-        found.size += size
-    if not dry_run:
-        for remove in [*map(partial(_removal, place), sorted(found.names, key=_last))]:
-            remove()
-    return found
-
-
-def _segment_of(name: str) -> str:
-    return name.split("/")[1] if name.count("/") > 1 else ""
-
-
-def _last(name: str) -> bool:
-    """True for a file that is removed after others: a snapshot goes before its tables."""
-    return not name.endswith(".json")
-
-
-def _removal(place: Place, name: str) -> Callable[[], None]:
-    return partial(place.remove, name)

@@ -317,8 +317,6 @@ class Collection:
             return home
         return self.snapshot.homes[Identity.among(known, name.strip())[0]]
 
-    # How a question is asked ----------------------------------------------------------------------
-
     def each(
         self, step: Callable[..., Any], asked: Mapping[str, Mapping[str, Any]]
     ) -> Iterator[tuple[str, Any]]:

@@ -44,7 +44,7 @@ from sgstore.testsets.coverage import (
 )
 from sgstore.testsets.coverage._classes import Missing
 from sgstore.testsets.coverage._compare import estimate, expected_classes
-from sgstore.testsets.coverage._features import tree
+from sgstore.testsets.coverage._differences import tree
 from sgstore.testsets.coverage._frames import block_of, query_of_features
 from sgstore.testsets.coverage._slots import slot_sets
 

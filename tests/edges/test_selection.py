@@ -41,7 +41,7 @@ from sgstore.testsets.selection import (
     units_of,
     within,
 )
-from sgstore.testsets.selection._cover import bounded
+from sgstore.testsets.selection._bounds import bounded
 from sgstore.testsets.selection._sets import greedy
 
 if TYPE_CHECKING:

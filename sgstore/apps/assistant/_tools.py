@@ -167,8 +167,6 @@ class StoreTools:
         reply = self._ask(ask, **about)
         return ToolAnswer(_rows_text(reply), finite(reply))
 
-    # What there is ----------------------------------------------------------------------------
-
     def list_traces(self, limit: Limit = 100) -> ToolAnswer:
         """List the recordings (traces) of the store: frames, seconds, map, losses."""
         return self._rows("traces", limit=limit)
@@ -233,8 +231,6 @@ class StoreTools:
         return ToolAnswer(
             "\n".join(lines) or "nothing in the library has these words", {"patterns": listed}
         )
-
-    # Questions --------------------------------------------------------------------------------
 
     def find(
         self,
@@ -304,8 +300,6 @@ class StoreTools:
         image = self._drawn(lambda to: draw_timelines(found, to)) if picture and found else b""
         return ToolAnswer(text, finite(reply), image)
 
-    # Pictures ---------------------------------------------------------------------------------
-
     def show(
         self,
         frame: FrameName,
@@ -368,8 +362,6 @@ class StoreTools:
             file = Path(folder) / "drawn.png"
             draw(file)
             return file.read_bytes()
-
-    # Coverage and clips -----------------------------------------------------------------------
 
     def coverage_missing(
         self,
@@ -461,9 +453,6 @@ def _encoded(image: Image, form: str) -> bytes:
     buffer = io.BytesIO()
     image.save(buffer, form)
     return buffer.getvalue()
-
-
-# Answers as they are read in a prompt: few characters, and nothing left out that is not told ----------------
 
 
 def _rows_text(reply: Mapping[str, Any]) -> str:

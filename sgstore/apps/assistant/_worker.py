@@ -76,9 +76,6 @@ def _found(
     return matches, {"left_out": matches.reasons, "notes": matches.notes}
 
 
-# The questions ------------------------------------------------------------------------------------
-
-
 def _traces(store: Store, limit: int) -> Reply:
     columns = ("trace", "frames", "seconds", "hz", "ego", "map", "flavour", "losses")
     rows = (

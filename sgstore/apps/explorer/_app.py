@@ -224,8 +224,6 @@ class Explorer:
     def _side(self, fields: Mapping[str, Any]) -> str:
         return one_of(*self.stores)(fields.get("side"), "side")
 
-    # What somebody typed -------------------------------------------------------------------------
-
     def _answer(self, pool: Callable[[], SandboxPool | Errand], *asked: Any) -> _Answer:
         """Start a query in a thread and return its response.
 
@@ -268,8 +266,6 @@ class Explorer:
         pool = partial(self.pool, side, str(question.get("text", "")))
         return self._answer(pool, question, uuid.uuid4().hex, _last, "application/json")
 
-    # What the page reads by trace and frame --------------------------------------------------------
-
     async def threaded(self, ask: Callable[..., T], *arguments: Any) -> T:
         """Return the result of a slow function, run in a thread."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask, *arguments)
@@ -286,8 +282,6 @@ class Explorer:
         sides = {side: await self.threaded(reads.about) for side, reads in self.reads.items()}
         writing = self.write_to is not None
         return JSONResponse({**sides["a"], "other": sides.get("b"), "writing": writing})
-
-    # Tags, measures, files ---------------------------------------------------------------------------
 
     async def tags(self, request: Request) -> Response:
         """Return all tags; POST adds or removes a tag."""

@@ -102,8 +102,6 @@ class LiveRun:
         self._events: list[dict[str, Any]] = []
         self._origin: tuple[float, float] | None = None
 
-    # What the monitor tells ------------------------------------------------------------------------
-
     def follow(self, monitor: Monitor) -> None:
         """Set the monitor; call it before the first frame."""
         self._monitor = monitor
@@ -166,8 +164,6 @@ class LiveRun:
             size = about.get("length"), about.get("width")
             self._still[node] = finite([node, KIND_CODE[about["kind"]], *place, turned, *size])
         return [self._still[node] for node in new]
-
-    # What the page asks --------------------------------------------------------------------------------
 
     def about(self) -> dict[str, Any]:
         """Return the description for the page, like a store with one trace."""

@@ -104,8 +104,6 @@ class Reads:
     def _trace(self, name: str) -> StoredTrace:
         return _among(self._traces()[0], name)
 
-    # Columns -------------------------------------------------------------------------------------
-
     def thumbs(self, frames: Sequence[tuple[str, int]]) -> bytes:
         """Return states in some frames, for thumbnails."""
         if len(frames) > MOST_THUMBS:
@@ -152,8 +150,6 @@ class Reads:
         """Return an attribute over time."""
         columns = self._store.file.series(self._trace(trace).trace_id, attribute, node, other)
         return packed({"trace": trace, "attribute": attribute}, columns)
-
-    # Plain values, pictures --------------------------------------------------------------------------
 
     def frame(self, trace: str, seq: int) -> dict[str, Any]:
         """Return the scene graph of a frame: all attributes of its nodes and edges."""

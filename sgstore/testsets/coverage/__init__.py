@@ -8,35 +8,37 @@ estimates the number of unseen classes, and evaluates failures of a system. ``_f
 Every result is a table that names the denominators of its shares.
 """
 
-from sgstore.testsets.coverage._classes import UNKNOWN, Classed, classed, shared
-from sgstore.testsets.coverage._compare import (
-    S3C_THRESHOLD,
-    classes,
-    covered,
-    expected_classes,
-    failures,
-    growth,
-    novel,
-    novel_clips,
-    novel_frames,
-    rank_sizes,
-    read_outcomes,
-    told_outcomes,
-    venn,
-)
-from sgstore.testsets.coverage._features import Combinations, combos, explain, features
-from sgstore.testsets.coverage._frames import (
+from sgstore.testsets.coverage._chosen_frames import (
     ChosenFrames,
-    ReportTable,
     frames_of,
     names_of,
-    of_unknown,
     periods_of,
     recordings_of,
     run_begins,
     selection_of,
     traces_of,
 )
+from sgstore.testsets.coverage._classes import UNKNOWN, Classed, classed, shared
+from sgstore.testsets.coverage._compare import (
+    classes,
+    covered,
+    expected_classes,
+    growth,
+    novel,
+    novel_clips,
+    novel_frames,
+    rank_sizes,
+    venn,
+)
+from sgstore.testsets.coverage._differences import explain
+from sgstore.testsets.coverage._failures import (
+    S3C_THRESHOLD,
+    failures,
+    read_outcomes,
+    told_outcomes,
+)
+from sgstore.testsets.coverage._features import Combinations, combos, features
+from sgstore.testsets.coverage._frames import ReportTable, of_unknown
 from sgstore.testsets.coverage._sequences import (
     WITHIN_S,
     check_sequences,

@@ -13,7 +13,7 @@ import numpy as np
 
 from sgstore.errors import AbstractionError
 from sgstore.model.frame_ids import begins, trace_of
-from sgstore.testsets.coverage._frames import ChosenFrames, run_begins, traces_of
+from sgstore.testsets.coverage._chosen_frames import ChosenFrames, run_begins, traces_of
 from sgstore.testsets.coverage._slots import slot_sets
 
 if TYPE_CHECKING:

@@ -22,15 +22,9 @@ from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import MatchClause
 from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.world import JUMP_NS
+from sgstore.testsets.coverage._chosen_frames import ChosenFrames, names_of, traces_of
 from sgstore.testsets.coverage._features import MOST
-from sgstore.testsets.coverage._frames import (
-    SHARES,
-    ChosenFrames,
-    ReportTable,
-    names_of,
-    share,
-    traces_of,
-)
+from sgstore.testsets.coverage._frames import SHARES, ReportTable, share
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

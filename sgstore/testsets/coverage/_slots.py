@@ -37,14 +37,13 @@ from sgstore.errors import ConfigError, QueryError
 from sgstore.lang.sql import each_match
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax import tree as syntax
+from sgstore.testsets.coverage._chosen_frames import frames_of, selection_of
 from sgstore.testsets.coverage._frames import (
     SHARES,
     ReportTable,
     Row,
     block_of,
-    frames_of,
     query_of_blocks,
-    selection_of,
     share,
 )
 
@@ -52,7 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from sgstore.model.world import Bools, Ints
-    from sgstore.testsets.coverage._frames import ChosenFrames
+    from sgstore.testsets.coverage._chosen_frames import ChosenFrames
 
 
 _FRAME: Final = ("frame_id", "trace", "seq", "time_ns", "t")
@@ -156,8 +155,6 @@ def specification(
 
 _LISTED: Final = 1_000_000
 
-
-# Declared slots ----------------------------------------------------------------------------------
 
 Bits = NDArray[np.uint8]
 """Truth values of frames, eight per byte."""

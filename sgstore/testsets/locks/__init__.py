@@ -4,7 +4,8 @@
 again. ``_sets`` has union, intersection and difference. ``_verify`` finds changes.
 """
 
-from sgstore.testsets.locks._cases import CasePart, cases_of, frames_of_lock, lock_of, store_beside
+from sgstore.testsets.locks._cases import CasePart, lock_of
+from sgstore.testsets.locks._find import cases_of, frames_of_lock, store_beside
 from sgstore.testsets.locks._sets import intersect, meets, minus, union
 from sgstore.testsets.locks._text import ENDING, Lock, LockedCase, LockedTrace, made_with, read_lock
 from sgstore.testsets.locks._verify import Difference, verify, verify_case

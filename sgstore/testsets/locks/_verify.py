@@ -11,7 +11,8 @@ from sgstore.errors import TraceError
 from sgstore.model.frame_ids import frame_ids
 from sgstore.query import Store
 from sgstore.store import Identity, Mark, StoredTrace, graph_digests
-from sgstore.testsets.locks._cases import by_bundle, locked, payload_digests, rows_of
+from sgstore.testsets.locks._cases import locked, payload_digests
+from sgstore.testsets.locks._find import by_bundle, rows_of
 from sgstore.testsets.locks._text import Lock, LockedCase, LockedTrace, lock_from, made_with
 
 if TYPE_CHECKING:

@@ -7,11 +7,9 @@ compare a selection with random order.
 
 from sgstore.testsets.selection._apfd import FaultDetection, failure_curve, fault_detection
 from sgstore.testsets.selection._choose import (
-    Curve,
     Selection,
     SelectionSpec,
     Strategy,
-    curve,
     listed,
     locked_selection,
     parse_split,
@@ -20,6 +18,7 @@ from sgstore.testsets.selection._choose import (
     split_table,
 )
 from sgstore.testsets.selection._cover import Cover, Fitted, minimal, within
+from sgstore.testsets.selection._curve import Curve, curve
 from sgstore.testsets.selection._prioritize import (
     MEASURES,
     Prioritized,

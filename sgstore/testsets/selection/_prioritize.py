@@ -44,7 +44,8 @@ from sgstore.testsets.selection._situations import (
     frames_in_parts,
     situations,
 )
-from sgstore.testsets.selection._units import Budget, SelectionUnit, numbers_of_frames, units_of
+from sgstore.testsets.selection._unit_values import numbers_of_frames
+from sgstore.testsets.selection._units import Budget, SelectionUnit, units_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -135,7 +135,6 @@ class SetFamily:
         return replace(found, need=need[wanted])
 
 
-# Sets that are chosen one after another, and what of a choice is superfluous --------------------
 # Source of the greedy choice and its factor H(n): Chvátal, "A greedy heuristic for the set-covering
 # problem", Mathematics of Operations Research 4 (1979).
 

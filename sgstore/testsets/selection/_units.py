@@ -5,13 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from sgstore.errors import ConfigError, QueryError
-from sgstore.lang.syntax import parse
-from sgstore.lang.syntax.tree import Call, MatchClause
+from sgstore.errors import ConfigError
 from sgstore.model.frame_ids import trace_of
 from sgstore.store import MessagePlaces
 from sgstore.testsets.coverage import (
@@ -549,123 +547,3 @@ def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
     first = order[np.unique(elements[order], return_index=True)[1]]
     gained = np.bincount(where[first], weight[elements[first]], minlength=len(picked))
     return np.cumsum(gained).astype(np.int64)
-
-
-# Numbers of frames, and the least one of each unit ----------------------------------------------
-
-
-def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
-    """Evaluate an expression to a number for each frame to select from.
-
-    Parameters
-    ----------
-    units : Units
-    text : str
-        An expression; for a condition its robustness counts.
-
-    Returns
-    -------
-    rows : (R,) int64
-        Rows of those frames among the frames of the units.
-    value : (R,) float64
-        NaN if unknown.
-
-    Raises
-    ------
-    ConfigError
-        The value is neither a number nor a condition.
-    QueryError, ExportError
-        The text is not an expression, or has several values in one frame.
-    """
-    from sgstore.exporters import Labels
-
-    rows = np.flatnonzero(units.asked)
-
-    def asked(expression: str) -> list[Any]:
-        labels = Labels.asked(units.chosen.store, {"measure": expression}, units.frame_id[rows])
-        return labels.of(units.frame_id[rows])["measure"]
-
-    found, condition = asked(text), _condition_in(text)
-    if any(isinstance(one, bool) for one in found):
-        found, condition = asked(f"robustness({text})"), text
-    wrong = next((v for v in found if not isinstance(v, int | float | None)), None)
-    if wrong is not None:
-        raise ConfigError(f"the measure {text} is {wrong!r}; expected a number, or a condition")
-    value = np.array([np.nan if one is None else float(one) for one in found], np.float64)
-    if condition is not None and np.isinf(value).any():
-        # An unknown condition has a margin of minus infinity, too, and must not come first.
-        margin = _margins(units, f"CHECK ALWAYS ({condition}) ROBUSTNESS")[rows]
-        value[np.isinf(value) & np.isnan(margin)] = np.nan
-    return rows, value
-
-
-def _condition_in(text: str) -> str | None:
-    """Return the condition in ``robustness(…)``, if the expression is nothing else."""
-    begun = "MATCH () RETURN "
-    try:
-        match = parse(begun + text)[-1]
-    except QueryError:
-        return None  # a complete query
-    items = match.returns.items if isinstance(match, MatchClause) and match.returns else ()
-    call = items[0].value if len(items) == 1 else None
-    if not isinstance(call, Call) or call.name.lower() != "robustness" or not call.arguments:
-        return None
-    span = call.arguments[0].span
-    return (begun + text)[span.start : span.end]
-
-
-def least_values(units: Units, text: str) -> Floats:
-    """Return the least value of :func:`numbers_of_frames` in each unit, (U,); NaN if unknown."""
-    rows, value = numbers_of_frames(units, text)
-    frames = np.full(len(units.frame_id), np.nan)
-    frames[rows] = value
-    return _least(units, frames)
-
-
-def _least(units: Units, frames: Floats) -> Floats:
-    """Return the least of a value of each frame of the units, (U,); NaN if unknown."""
-    ranges = np.stack([units.begin, units.end], axis=1).ravel()
-    return np.fmin.reduceat(np.append(frames, np.nan), ranges)[::2]
-
-
-_CHECK: Final = re.compile(r"\s*(DEFINE|USING|CHECK)\b", re.IGNORECASE)
-
-
-def is_check(text: str) -> bool:
-    """True if a text is a ``CHECK``."""
-    return bool(_CHECK.match(text))
-
-
-def least_of_check(units: Units, text: str) -> Floats:
-    """Return the least margin of each unit for a check, (U,); NaN if unknown.
-
-    Raises
-    ------
-    ConfigError
-        The text has several checks, no ``ROBUSTNESS``, or a margin for whole traces only with other
-        units.
-    QueryError
-        The check is invalid.
-    """
-    return _least(units, _margins(units, text))
-
-
-def _margins(units: Units, text: str) -> Floats:
-    """Return margins of a check in the frames of the units, (N,); NaN if unknown or not selected from."""
-    run = units.chosen.store.check(text)
-    if len(run.names) > 1:
-        raise ConfigError("several checks have no order together: give one of them")
-    if not run.quantitative:
-        raise ConfigError("the check asks for no margin: write CHECK … ROBUSTNESS")
-    if not run.lasting and units.unit is not SelectionUnit.trace:
-        raise ConfigError(
-            f"this CHECK has one margin for a whole trace, and these are {units.unit}s: take --unit trace,"
-            " or a check that says what is true in each frame: CHECK [FORALL (…)] ALWAYS … ROBUSTNESS"
-        )
-    frames = np.full(len(units.frame_id), np.nan)
-    for frame_id, margins in run.margins():
-        place = np.searchsorted(units.frame_id, frame_id)
-        there = np.append(units.frame_id, -1)[place] == frame_id
-        frames[place[there]] = np.broadcast_to(margins, len(frame_id))[there]
-    frames[~units.asked] = np.nan
-    return frames
