@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
@@ -20,18 +19,6 @@ from sgstore.model.graph import (
     StaticPresence,
 )
 from sgstore.model.vocabulary import MOST_RELATIONS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
-
-    from numpy.typing import NDArray
-
-    from sgstore.model.world import Codes, Ints
-
-    Whole = NDArray[np.signedinteger[Any]]
-    Attributes = dict[str, Any]
-    EdgeRecord = tuple[int, str, int, Attributes]
-
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
