@@ -1,8 +1,6 @@
 """Intermediate representation of queries, between parser and SQL: patterns, sequences and checks.
 
-Names are resolved, and types are known ("bound").
-
-All names are resolved and all values have types. The stages after the binder share these classes.
+All names are resolved and all values have types ("bound"). The stages after the binder share these classes.
 
 A *scope* is the content of one ``MATCH`` or one pair of braces: nodes, edges, conditions that must all be
 true, and pairs of nodes that must differ. Node keys are unique in the query, ignoring case. Keys of unnamed

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Valuation:
-    """Truth values of the atoms and tests of a plan, for the known bindings.
+    """Truth values of the named conditions of a plan in the current frame, for all known combinations of nodes.
 
     Parameters
     ----------
@@ -75,7 +75,10 @@ class Valuation:
         *,
         closed: bool = False,
     ) -> tuple[dict[Partial, int], Mapping[Partial, Memory]]:
-        """Process the next frame. Its query results must be ready.
+        """Process the next frame.
+
+        Return the true conditions (as bits) and the memory of each partial binding. The query
+        results of the frame must be ready.
 
         Parameters
         ----------
@@ -109,7 +112,10 @@ class Valuation:
         return letters, self._measure(list(rows), letters, memory)
 
     def _told(self) -> dict[Partial, int]:
-        """Return the true atoms as bits, for each partial binding."""
+        """Return the true single-frame conditions as bits, for each partial binding.
+
+        A partial binding has nodes for some variables.
+        """
         answers, placed = self._questions.answers, self.lattice.placed
         told: dict[Partial, int] = {}
         for bit, number, places in self._atoms:
@@ -131,7 +137,10 @@ class Valuation:
                     yield self.lattice.placed(key, places)
 
     def _state(self, name: str, rows: list[Partial], letters: Mapping[Partial, int]) -> Column:
-        """Return 0 where a value is known, and 1 where it is unknown. An absent value is masked."""
+        """Return a column: 0 where a value is known, 1 where it is unknown.
+
+        It is masked where an entity is absent.
+        """
         of, doubt = self._states[name]
         if of is None:
             return column_of([0.0] * len(rows))
@@ -152,7 +161,7 @@ class Valuation:
         letters: dict[Partial, int],
         memory: Callable[[Partial], Memory | None],
     ) -> dict[Partial, Memory]:
-        """Set the bits of true tests for each binding, and return the new memory of each binding."""
+        """Set the bits of true expressions for each partial binding, and return the new memory of each."""
         self._courses.step()
         columns: dict[str, Bools] = {}
 

@@ -1,4 +1,4 @@
-"""Online monitor of one ``CHECK``, frame by frame.
+"""Online monitor of one ``CHECK`` statement, which processes a running trace frame by frame.
 
 Each binding of a check has a state. Bindings in the same state share one object, so states compare by identity.
 If time does not matter, the successor of a state and a letter is cached. So most bindings need one table lookup
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class _CheckEntry:
-    """Monitor data of one binding.
+    """Monitoring data of one combination of entities (binding) of a check.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class _CheckEntry:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Alternative state of a binding, with an unknown condition counted against the check.
+    """Second state of a monitored combination of entities, in which unknown conditions count against the check.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ def _same(one: _CheckEntry, other: _CheckEntry) -> bool:
 
 
 class CheckMonitor:
-    """Online monitor of a check over one trace.
+    """Online monitor of one check over one trace.
 
     Parameters
     ----------
@@ -194,18 +194,21 @@ class CheckMonitor:
 
     @property
     def check(self) -> BoundCheck:
-        """Monitored check."""
+        """Check that is monitored, with resolved names."""
         return self._check
 
     @property
     def name(self) -> str:
-        """Name of the check."""
+        """Name of the monitored check."""
         return self._check.name
 
     # Online, frame by frame
 
     def step(self, here: FrameTime) -> list[MonitorEvent]:
-        """Process the next frame, and return the new events. Its query results must be ready."""
+        """Process the next frame of the trace, and return the new events.
+
+        The query results of the frame must be ready.
+        """
         if self._margins is not None:
             self._margins.step()
         self._count_full()
@@ -258,7 +261,10 @@ class CheckMonitor:
         letter: int,
         here: FrameTime,
     ) -> Doubt | None:
-        """Return the alternative state of a binding. ``None`` means that unknown conditions change nothing."""
+        """Return the state of a combination of entities with unknown conditions counted against the check.
+
+        ``None`` means that they change nothing.
+        """
         old = before.doubt
         broken = step.started or (self._compat and not step.state.ended)
         own = entry.since is not None or len(entry.over) > len(before.over)
@@ -279,7 +285,7 @@ class CheckMonitor:
         self._full += all(questions.here[k] == len(questions.met(k)) for k in self._kinds)
 
     def _return(self, grown: list[tuple[Partial, int]]) -> None:
-        """Compute the values that a check returns for violations that ended with this frame."""
+        """Compute the ``RETURN`` values of the violations that ended with this frame."""
         self._values.step()
         for row, before in grown:
             entry = self._known.of(row)
@@ -291,7 +297,7 @@ class CheckMonitor:
         self._values.forget((self._pulse.tick.number, *since))
 
     def _values_of(self, key: Partial, span: Span) -> dict[str, Any]:
-        """Compute the values that a check returns for a violation."""
+        """Return the ``RETURN`` values of one violation of a check: column name → value."""
         binding = dict(zip(self._variables, key, strict=True))
         start, end = (one.seq for one in span)
 
@@ -302,7 +308,7 @@ class CheckMonitor:
         return self._returned.told(part)
 
     def _violation(self, key: Partial, span: Span) -> dict[str, Any]:
-        """Return the values of a violation of a binding, also of an ended violation."""
+        """Return the ``RETURN`` values of one violation. Values of an ended violation are stored already."""
         if not self._check.returns or span not in self._known.of(key).over:
             return self._values_of(key, span)
         wider = ((row, span) for row in self._known.lattice.wider(key))
@@ -311,7 +317,10 @@ class CheckMonitor:
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
     ) -> _CheckEntry:
-        """Return the state of a binding in SGSM mode: violated while the trace must not end."""
+        """Return the next monitoring data of a combination of entities in SGSM mode.
+
+        In this mode, a violation lasts while the trace must not end.
+        """
         since, over = entry.since, entry.over
         if not step.state.ended:
             since = since or here
@@ -328,7 +337,10 @@ class CheckMonitor:
     # Results
 
     def _events(self, here: FrameTime, changed: list[Partial]) -> Iterator[MonitorEvent]:
-        """Yield events of bindings with a new status. A new entity leads to events of all bindings."""
+        """Yield events for combinations of entities whose status changed in this frame.
+
+        A new entity produces events for all its combinations.
+        """
         rows = list(self._known.held) if self._kinds & self._questions.fresh else changed
         for row in rows:
             entry = self._known.of(row)
@@ -350,7 +362,7 @@ class CheckMonitor:
                         yield replace(event, values=values)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
-        """Yield the bindings of known entities that share this state."""
+        """Yield the combinations of known entities that share one monitoring state."""
         if None not in row:
             yield row  # type: ignore[misc]
             return
@@ -363,7 +375,7 @@ class CheckMonitor:
                 yield key  # type: ignore[misc]
 
     def _counts(self, key: Key, entry: _CheckEntry) -> bool:
-        """True if the quantifiers of the check cover this binding."""
+        """True if the quantifiers of the check include this combination of entities."""
         if entry.counted != (1 << len(self._guards)) - 1:
             return False
         if any(n not in self._domains[v] for n, v in zip(key, self._variables, strict=True)):
@@ -395,7 +407,7 @@ class CheckMonitor:
 
     @property
     def robustness(self) -> Robustness | None:
-        """Robustness of the check if the trace ends now. ``None`` means that the check does not request it."""
+        """Robustness (margin of the verdict) of the check if the trace ends now. ``None`` if not requested."""
         return None if self._margins is None else self._margins.told(self._levels(), self._domains)
 
     def status(self) -> str:
@@ -408,7 +420,7 @@ class CheckMonitor:
         return known
 
     def _worst(self) -> int:
-        """Return the verdict code if the trace ends now and all unknown conditions count against the check."""
+        """Return the verdict if the trace ends now and all unknown conditions count against the check."""
         levels = self._levels(doubted=True)
         codes = [self._code_at_end(self._of(key)) for key in innermost(levels).tolist()]
         return int(folded_values(levels, np.array(codes, np.int8), HOLDS)[0][0])
@@ -417,7 +429,7 @@ class CheckMonitor:
         return self._known.of(tuple(key))
 
     def _levels(self, *, doubted: bool = False, waiting: bool = False) -> list[Level]:
-        """Return the bindings of each quantifier.
+        """Return the combinations of entities for each quantifier of the check, outermost first.
 
         ``doubted``: use the second evaluation. ``waiting``: add future bindings of ``FORSOME``.
         """
@@ -444,7 +456,10 @@ class CheckMonitor:
         return int(folded_values(levels, codes, CERTAINLY_TRUE)[0][0])
 
     def _spans(self, entry: _CheckEntry, last: FrameTime) -> list[Span]:
-        """Return the violations of a binding at the end of the trace."""
+        """Return the violations of one combination of entities at the end of the trace.
+
+        Each one is a pair of first and last frame.
+        """
         found = list(entry.over)
         if entry.since is not None:
             found.append((entry.since, last))
@@ -457,7 +472,7 @@ class CheckMonitor:
         return HOLDS if self._compat else state.at_end(self._check.end, self._pulse.tick)
 
     def _code_at_end(self, entry: _CheckEntry) -> int:
-        """Return the verdict code of a binding at the end of the trace."""
+        """Return the verdict code for one combination of entities at the end of the trace."""
         own = self._ends(entry.state)
         if entry.since is not None or entry.over or own == VIOLATED:
             return VIOLATED
@@ -467,7 +482,7 @@ class CheckMonitor:
         return UNKNOWN if other == VIOLATED else other
 
     def finish(self, trace: str, last: FrameTime) -> tuple[Verdict, list[MonitorEvent]]:
-        """End the trace: return the verdict and the events that only the end decides."""
+        """End the trace: return the verdict of the check, and the events that only the end decides."""
         levels = self._levels()
         bindings = innermost(levels)
         entries = [self._of(key) for key in bindings.tolist()]
@@ -504,7 +519,7 @@ class CheckMonitor:
         return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
 
     def _waits(self, levels: list[Level]) -> bool:
-        """True if a failed check can still hold for entities that appear later."""
+        """True if a false check can still become true through entities that appear later."""
         if self._compat or not may_wait(self._check):
             return False
         wider = self._levels(waiting=True)
@@ -512,7 +527,7 @@ class CheckMonitor:
         return waits_for_newcomers(self._check, levels, wider, np.array(codes, np.int8))
 
     def _reason(self, trace: str) -> str:
-        """Return the reason of an unknown verdict: the deciding condition, its entities and its frame."""
+        """Return the reason of an unknown verdict as text: the condition, its entities and its frame."""
         for key in innermost(self._levels(doubted=True)).tolist():
             entry = self._of(key)
             if entry.doubt is not None and self._code_at_end(entry) == UNKNOWN:
@@ -525,7 +540,7 @@ class CheckMonitor:
     def _at_end(
         self, last: FrameTime, *, holds: bool, bindings: Keys, spans: list[list[Span]]
     ) -> Iterator[MonitorEvent]:
-        """Yield events for violations that have no event yet."""
+        """Yield events at the trace end for violations that were not reported before."""
         if holds:
             return
         if not self._immediate:

@@ -1,4 +1,4 @@
-"""Plans of checks, with rules for absent entities and unknown values.
+"""Evaluation plans of checks: formulas with rules for absent entities and unknown values.
 
 A check has two two-valued evaluations: unknown conditions count for the check in the first, and against it in
 the second. In the formula, an unknown condition is a separate proposition. Its name ends in ``+`` for the first
@@ -67,7 +67,7 @@ _CONTRARY: Final = {"+": "-", "-": "+", "": "*", "*": ""}
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Rules for unknown and absent values at one position of a formula.
+    """Rules for one place in a formula: if unknown values and absent entities count as true or false.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Reading:
 
     @property
     def contrary(self) -> Reading:
-        """Rules for unknown and absent values under a negation."""
+        """Return the rules for unknown values and absent entities inside a ``NOT``."""
         absent = None if self.absent is None else not self.absent
         return Reading(_CONTRARY[self.unknown], not self.positive, absent)
 
@@ -101,13 +101,13 @@ CERTAIN: Final = Reading("", absent=False)
 
 
 def base_name(name: str) -> str:
-    """Return the name of a proposition without its suffix ``+`` or ``-``."""
+    """Return the name of a formula's proposition, without the suffix ``+`` or ``-`` for unknown values."""
     return name.rstrip("+-")
 
 
 @dataclass(slots=True)
 class CheckPlan(Plan):
-    """Evaluation plan of a check.
+    """Evaluation plan of a check: its formulas, and the single-frame queries that they need.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class CheckPlan(Plan):
         return Plan._query(self, things | {ego}, (*where, *near))  # noqa: SLF001 - of the base class
 
     def formula(self, expression: b.Bound) -> f.Formula:
-        """Return the formula for "the condition is known to be true", as inside ``run_length``."""
+        """Return the formula for "the condition is known to be true", as needed inside ``run_length``."""
         match expression:
             case b.Operation(word=word, operands=(operand,)) if word == POSSIBLY:
                 return self.read(operand, Reading("*", absent=False))
@@ -152,7 +152,7 @@ class CheckPlan(Plan):
                 return self.read(expression, CERTAIN)
 
     def read(self, expression: b.Bound, reading: Reading) -> f.Formula:
-        """Return the formula of a condition, with the given rules for unknown and absent values."""
+        """Return the temporal formula of a condition, for given rules on unknown values and absent entities."""
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -187,7 +187,7 @@ class CheckPlan(Plan):
                 return self.read(found, reading)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """Return the nodes whose absence makes the condition false, where absence counts as false."""
+        """Return the nodes without which a condition is false, if absence counts as false."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -197,9 +197,9 @@ class CheckPlan(Plan):
                 return self._things(expression)
 
     def _counted(self, things: frozenset[str], reading: Reading) -> bool | None:
-        """Return the truth value of a condition if one of its nodes is absent.
+        """Return the truth value of a condition if one of its entities is absent.
 
-        ``None`` means it depends on the node.
+        ``None`` means that it depends on the node.
         """
         if reading.absent is not None:
             return reading.absent
@@ -235,7 +235,7 @@ class CheckPlan(Plan):
         return self._joined_here(wanted, counted=counted, reading=reading)
 
     def _joined_here(self, wanted: b.Bound, *, counted: bool, reading: Reading) -> f.Formula:
-        """Return the formula of a single-frame condition whose parts use different entities."""
+        """Return the formula of a single-frame condition whose operands concern different entities."""
         assert isinstance(wanted, b.Operation)  # noqa: S101 - a part of it is no logic
         inner = reading.contrary if counted else reading
         parts = self._merged(wanted.operands) if wanted.word == "AND" else wanted.operands
@@ -252,7 +252,7 @@ class CheckPlan(Plan):
         return self._by_levels(self._asked(expression, things, reading.unknown), things, reading)
 
     def _as_written(self, expression: b.Operation, reading: Reading) -> f.Formula:
-        """Return the formula of a logical operation, operand by operand."""
+        """Return the formula of a logical operation (``NOT``, ``AND``, …), built from its operands."""
         match expression:
             case b.Operation("NOT", (operand,)):
                 return f.Not(self.read(operand, reading.contrary))
@@ -264,7 +264,10 @@ class CheckPlan(Plan):
                 return f.LOGIC[word](*(self.read(one, reading) for one in operands))
 
     def _by_levels(self, found: f.Formula, things: frozenset[str], reading: Reading) -> f.Formula:
-        """Add the rules for absent entities to a formula. The outermost quantifier decides."""
+        """Return a formula completed by the rules for absent entities.
+
+        The outermost quantifier has priority.
+        """
         for word, nodes in reversed(self._levels):
             if nodes & things and word != "false" and (word == "FORALL") == reading.positive:
                 away = [f.Not(self.present(node)) for node in sorted(nodes & things)]
@@ -274,7 +277,10 @@ class CheckPlan(Plan):
         return found
 
     def _asked(self, wanted: b.Bound, things: frozenset[str], sign: str) -> f.Formula:
-        """Return the formula that a condition is true, or unknown if unknown values count as true."""
+        """Return a formula that is true if a condition is true.
+
+        If unknown values count as true, it is also true for them.
+        """
         if isinstance(wanted, b.Value) and not things:
             return f.TruthConstant(wanted.value is True)
         found = f.Proposition(self._ask(certain(wanted, decided=self._decided), things))
@@ -286,7 +292,7 @@ class CheckPlan(Plan):
         return f.Or((found, f.Proposition(name + sign.strip("*"))))
 
     def _ask(self, condition: b.Bound, things: frozenset[str]) -> str:
-        """Return the name of the atom for a condition. Add the atom if it is new."""
+        """Return the name of the single-frame query for a condition. Add the query to the plan if it is new."""
         key = unnumbered_text(condition) + f" of {sorted(things)}"
         name = self._names.get(key)
         if name is None:
@@ -326,7 +332,7 @@ class CheckPlan(Plan):
         return name
 
     def _doubtful(self, expression: b.Bound, state: b.Bound) -> b.Bound | None:
-        """Return the condition under which a simple multi-frame condition is unknown."""
+        """Return the condition under which a comparison over several frames is unknown; None if never."""
         ways: list[b.Bound] = []
         if any(self._may_be_unknown(part) for part in b.walk(state)):
             ways.append(b.Operation(">", (state, _number(0)), Type.boolean))
@@ -340,12 +346,12 @@ class CheckPlan(Plan):
         return ways[0] if ways else None
 
     def _open_courses(self, expression: b.Bound) -> bool:
-        """True if a condition inside a time function may be unknown."""
+        """True if the condition inside a function over time, such as ``run_length``, may be unknown."""
         parts = (part for part in b.walk(expression) if isinstance(part, b.SignalCall))
         return any(self._open(p.operand) for p in parts if p.word in _OF_CONDITIONS)
 
     def _open(self, condition: b.Bound) -> bool:
-        """True if a part of a condition may be unknown."""
+        """True if any value in a condition may be unknown."""
         return any(
             self._unknown(part) is not None
             for part in b.walk(condition)
@@ -367,7 +373,10 @@ class CheckPlan(Plan):
         )
 
     def _state(self, expression: b.Bound) -> b.Bound:
-        """Return 0 if all values of an expression are known, more if not, NULL if one is absent."""
+        """Return an expression that is 0 if all values of another expression are known.
+
+        It is greater if a value is unknown, and NULL if an entity is absent.
+        """
         parts = list(dict.fromkeys(self._states(expression)))
         now = [part for part in parts if isinstance(part, b.Operation) and part.word == STATE]
         rest = self._things(expression) - frozenset().union(*map(self._things, now))
@@ -439,7 +448,7 @@ class CheckPlan(Plan):
                 Plan._measure(self, expression, test)  # noqa: SLF001 - of the base class
 
     def presence(self, node: str) -> str:
-        """Return the name of the atom that is true where a node is present."""
+        """Return the name of the single-frame query for the frames in which a node is present."""
         found = self.present(node)
         assert isinstance(found, f.Proposition)  # noqa: S101 - it is about a node
         return found.name
@@ -447,7 +456,7 @@ class CheckPlan(Plan):
     # Margins
 
     def quantity(self, expression: b.Bound) -> f.Formula:
-        """Return the formula over margins of a condition inside ``robustness``."""
+        """Return the formula for the robustness margin of a condition inside ``robustness(…)``."""
         reading = CERTAIN
         while isinstance(expression, b.Operation) and expression.word in {POSSIBLY, IN_FAVOUR}:
             change = {"unknown": "*"} if expression.word == POSSIBLY else {"absent": True}
@@ -458,7 +467,10 @@ class CheckPlan(Plan):
     def margin(  # noqa: PLR0911 - a case each
         self, expression: b.Bound, reading: Reading
     ) -> f.Formula:
-        """Return the formula of a condition's margin, with rules for unknown and absent values."""
+        """Return the formula for a condition's robustness margin.
+
+        ``reading`` has the rules for unknown values and absent entities.
+        """
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -479,7 +491,10 @@ class CheckPlan(Plan):
                 return self.read(expression, reading)
 
     def _margin(self, expression: b.Operation, reading: Reading) -> f.Formula:
-        """Return the margin of a comparison, with a default for absent and unknown values."""
+        """Return the formula for a comparison's robustness margin.
+
+        It has defaults for absent and unknown values.
+        """
         difference = MARGINS[expression.word](*expression.operands)
         things, state = self._things(expression), self._state(expression)
         counted = self._counted(things, reading)
@@ -505,7 +520,10 @@ class CheckPlan(Plan):
     def _differences(
         self, difference: b.Bound, meaning: b.Operation, reading: Reading
     ) -> f.Formula:
-        """Return the margin of a comparison for all treatments of unknown values in its time functions."""
+        """Return the formula for the difference of a comparison's sides.
+
+        It covers all rules for unknown values in functions over time.
+        """
         counted = self._counted(self._things(meaning), reading)
 
         def told(ways: Iterable[b.Bound], *, either: bool) -> f.Formula:
@@ -538,7 +556,7 @@ _OF_CONDITIONS: Final = frozenset({"run_length", "since_true", "robustness"})
 
 
 def _with_possible(expression: b.Bound) -> b.Bound:
-    """Return the expression with unknown conditions of time functions counted as true."""
+    """Return an expression in which unknown conditions inside functions over time count as true."""
     match expression:
         case b.SignalCall(word=word, operand=operand) if word in _OF_CONDITIONS:
             return replace(expression, operand=_boolean(POSSIBLY, operand))
@@ -547,7 +565,7 @@ def _with_possible(expression: b.Bound) -> b.Bound:
 
 
 def _in_favour(expression: b.Bound) -> b.Bound:
-    """Return the expression with ``robustness`` conditions that count absence as true."""
+    """Return an expression in which ``robustness(…)`` counts conditions on absent entities as true."""
     match expression:
         case b.SignalCall(word="robustness", operand=operand):
             return replace(expression, operand=_boolean(IN_FAVOUR, operand))
@@ -558,7 +576,10 @@ def _in_favour(expression: b.Bound) -> b.Bound:
 
 
 def _absence_tried(expression: b.Bound, *, counted: bool) -> b.Bound:
-    """Combine both treatments of absent entities: one must be true if ``counted``, else both."""
+    """Return a condition evaluated with absent entities counted as false and as true.
+
+    If ``counted``, one result must be true, otherwise both.
+    """
     other = _in_favour(expression)
     if other == expression:
         return expression
@@ -578,7 +599,10 @@ def _case(condition: b.Bound, then: b.Bound, otherwise: b.Bound) -> b.Operation:
 
 
 def _contrary(condition: b.Bound) -> b.Bound:
-    """Return the negation of a multi-frame condition. A pair value may have no value."""
+    """Return the negation of a condition over several frames.
+
+    It is false too if a number of two entities is missing.
+    """
     if not has_pairs(condition):
         return _case(condition, FALSE, TRUE)
     return _boolean("case", condition, FALSE, _boolean("IS NULL", condition), FALSE, TRUE)
@@ -593,13 +617,16 @@ PlannedCheck = tuple[CheckPlan, f.Formula, "f.Formula | None", dict[int, f.Formu
 
 
 def empty_plan(check: BoundCheck) -> CheckPlan:
-    """Return a new plan of a check, still without queries."""
+    """Return a new evaluation plan for a check, without queries."""
     words = tuple((q.word if q.absent else "false", frozenset(q.nodes)) for q in check.quantifiers)
     return CheckPlan(query_of_check(check), variables_of(check), words=words, limit=check.limit)
 
 
 def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
-    """Return the plan, formula, reset and guards of a check. ``reset=False`` leaves the reset out."""
+    """Return the evaluation plan of a check, its formula, reset condition and quantifier conditions.
+
+    Without ``reset``, the reset condition is None.
+    """
     plan = empty_plan(check)
     formula = plan.read(check.formula, WHOLE)
     resets = plan.formula(check.reset) if reset and check.reset is not None else None
@@ -612,11 +639,11 @@ def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
 
 
 def plan_of_margins(check: BoundCheck, reading: Reading = WHOLE) -> tuple[CheckPlan, f.Formula]:
-    """Return the robustness plan of a check, and its formula over margins."""
+    """Return the evaluation plan for the robustness of a check, and the formula for its margin."""
     plan = empty_plan(check)
     return plan, plan.margin(check.formula, reading)
 
 
 def misses_absent(check: BoundCheck) -> bool:
-    """True if an absent entity can make the check false."""
+    """True if an absent entity alone can make the check false."""
     return any(one.word == "FORSOME" and one.absent for one in check.quantifiers)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """Entities that decide a verdict: violating ones for ``FORALL``, fulfilling ones for ``FORSOME``.
+    """Entities that decide the verdict of a check. They violate a ``FORALL``, or satisfy a ``FORSOME``.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Witness:
 
 
 def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Return notes on traces with unknown verdicts, one line per reason.
+    """Return notes on traces with unknown verdicts: one text for each check and reason.
 
     Parameters
     ----------
@@ -69,19 +69,19 @@ def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
 
 
 def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
-    """Return the text that names an unknown condition, its entities and its frame."""
+    """Return the text "condition is unknown of entities in frame" for an unknown verdict."""
     written = value_text(condition).removeprefix("(").removesuffix(")")
     return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
 
 
 def absence_text(frames: int) -> str:
-    """Return the text that gives the number of frames with an absent entity."""
+    """Return the text "an entity is absent in N frames" for a verdict."""
     return f"an entity is absent in {frames} frame{'s' * (frames != 1)}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
-    """Verdict of a check on a trace.
+    """Verdict of a check on one trace, with violations and deciding entities.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class Verdict:
 
     @property
     def first_violation(self) -> Interval | None:
-        """First violation, or ``None``."""
+        """First violation of the check in the trace, or ``None``."""
         return self.violations[0] if self.violations else None
 
     @property
@@ -145,7 +145,7 @@ class Verdict:
 
     @property
     def statuses(self) -> tuple[str, ...]:
-        """Status of each frame as a word, if requested."""
+        """Status of the check after each frame as a word, if requested; otherwise empty."""
         return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
 
 
@@ -155,7 +155,10 @@ _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
 
 def within_range(found: Verdict, short: ShortRange) -> Verdict:
-    """Return the verdict for the whole world. It is unknown if the stored range is too short."""
+    """Return a verdict that holds for the whole world.
+
+    It becomes unknown if the trace stores too small a range around the ego.
+    """
     if found.verdict not in {"true", "false"}:
         return found
     reason = short.of(holds=found.verdict == "true")
@@ -166,7 +169,7 @@ def within_range(found: Verdict, short: ShortRange) -> Verdict:
 
 
 def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the column names of readable verdict rows.
+    """Return the column names for a table of verdicts.
 
     Parameters
     ----------
@@ -181,7 +184,10 @@ def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tu
 def verdict_rows(
     verdict: Verdict, *, margin: bool = False, returned: Sequence[str] = ()
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield readable rows of a verdict for :func:`verdict_columns`: one row per violation, at least one."""
+    """Yield the table rows of a verdict: one row for each violation, at least one.
+
+    The columns are :func:`verdict_columns`.
+    """
     head = verdict.check, verdict.trace, verdict.verdict
     tail = margin_cells(verdict) if margin else ()
     nothing = [("",) * (4 + len(returned))]
@@ -197,7 +203,7 @@ def verdict_rows(
 
 
 def margin_cells(verdict: Verdict) -> tuple[str, str, str]:
-    """Return table cells of the robustness: value, deciding condition with entities, frame.
+    """Return table cells for the robustness of a verdict: value, deciding condition with entities, frame.
 
     Empty means unknown.
     """
@@ -224,17 +230,17 @@ def _times(violations: tuple[Interval, ...], returned: Sequence[str]) -> list[tu
 
 
 def returned_by(checks: Iterable[BoundCheck]) -> dict[str, tuple[str, ...]]:
-    """Return the names of the values that each check returns for its violations."""
+    """Return the ``RETURN`` column names of each check: check name → column names."""
     return {check.name: tuple(column.name for column in check.returns) for check in checks}
 
 
 def columns_returned(returned: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return the distinct names of the values that some checks return."""
+    """Return all ``RETURN`` column names of several checks, without duplicates."""
     return tuple(dict.fromkeys(name for names in returned.values() for name in names))
 
 
 def cell_of(value: Any) -> str:
-    """Format a returned value for display."""
+    """Return a value as the text of a table cell."""
     if value is None:
         return "unknown"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
@@ -249,7 +255,7 @@ def verdict_of(
     violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
     last: Interval,
 ) -> Verdict:
-    """Return the verdict with violations and witnesses.
+    """Return a verdict completed by its violations and deciding entities.
 
     Witnesses bind the outermost quantifiers of one kind.
 

@@ -1,4 +1,4 @@
-"""Evaluation of ``CHECK`` over a store: verdicts, violations and quantifiers.
+"""Evaluation of ``CHECK`` statements over a store: verdicts and violations for each trace.
 
 If a trace lacks data for a check, the verdict is ``unknown``, with the reason.
 """
@@ -99,7 +99,7 @@ if TYPE_CHECKING:
 
 
 class CheckRun:
-    """Compiled checks of a text. Iteration evaluates them on a store, trace by trace.
+    """Evaluation of the checks in a text on a store. Iteration yields verdicts, trace by trace.
 
     Parameters
     ----------
@@ -157,17 +157,17 @@ class CheckRun:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the checks in order."""
+        """Names of the checks in the text, in order."""
         return tuple(one.check.name for one in self._checks)
 
     @property
     def quantitative(self) -> bool:
-        """True if a check requests its robustness."""
+        """True if at least one check of the text requests its robustness."""
         return any(one.check.robustness for one in self._checks)
 
     @property
     def lasting(self) -> bool:
-        """True if each check is a condition that must always hold for all entities.
+        """True if each check of the text is a condition that all entities must meet in every frame.
 
         Frames then have margins.
         """
@@ -175,12 +175,12 @@ class CheckRun:
 
     @property
     def returned(self) -> dict[str, tuple[str, ...]]:
-        """Names of the values that each check returns for its violations."""
+        """``RETURN`` column names of each check: check name → column names."""
         return returned_by(one.check for one in self._checks)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes, such as a text that equals no name in the store."""
+        """Notes on likely mistakes in the checks, such as a text that equals no name in the store."""
         with self._file.snapshot():
             compared = [pair for one in self._checks for pair in compared_in_check(one.check)]
             found = dict.fromkeys(compared)
@@ -200,13 +200,18 @@ class CheckRun:
                 yield from check.verdicts()
 
     def unknown(self) -> Iterator[Verdict]:
-        """Yield the verdicts of the traces without the needed data. Other traces are not evaluated."""
+        """Yield the unknown verdicts of the traces that lack data for a check.
+
+        Other traces are not evaluated.
+        """
         with self._file.snapshot():
             for one in compile_checks(self._text, self._catalog(), self._parameters):
                 yield from StoreCheck(self._file, one, compat=False, status=False).unknown()
 
     def margins(self) -> Iterator[tuple[Ints, Floats]]:
-        """Yield frame ids and margins of each trace for the only check; see :meth:`StoreCheck.margins`.
+        """Yield frame ids and robustness margins of each trace for the only check of the text.
+
+        See :meth:`StoreCheck.margins`.
 
         Yields
         ------
@@ -222,7 +227,7 @@ class CheckRun:
                     yield trace.frame_ids, check.margins(trace)
 
     def explain(self) -> str:
-        """Explain the checks: formulas over atoms, and each atom."""
+        """Return a text with the evaluation plan of each check: temporal formula and single-frame queries."""
         parts = [
             StoreCheck(self._file, one, compat=False, status=False).text() for one in self._checks
         ]
@@ -231,7 +236,7 @@ class CheckRun:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Verdict codes and violations of the bindings of a check.
+    """Verdict and violations of each combination of entities of a check.
 
     Attributes
     ----------
@@ -252,7 +257,7 @@ _BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None"]
 
 
 class StoreCheck:
-    """Evaluation of one check on a store.
+    """Evaluation of one check on the traces of a store.
 
     Parameters
     ----------
@@ -296,7 +301,7 @@ class StoreCheck:
 
     @cached_property
     def _lacks(self) -> dict[int, str]:
-        """Return the traces without data for the check: trace id → reason."""
+        """Return the traces that lack data for the check: trace id → reason."""
         found = lacking(self._file, self._catalog, of_check(self._check))
         for facts in self._catalog.traces:
             reasons = not_computed(self._check, facts), found.get(facts.trace_id, "")
@@ -313,7 +318,7 @@ class StoreCheck:
         return replace(self._catalog, unknowing=frozenset(self._lacks))
 
     def text(self) -> str:
-        """Return the plan of the check as text."""
+        """Return the evaluation plan of the check as text."""
         head = [f"---- {self._check.name}"]
         head += [f"{q.word} {', '.join(q.nodes)}" for q in self._check.quantifiers]
         plan = plan_text(self._plan, self._formula, self._reset, self._catalog)
@@ -322,30 +327,33 @@ class StoreCheck:
         return "\n".join([*head, plan, *quantity, *returned])
 
     def verdicts(self) -> Iterator[Verdict]:
-        """Yield the verdict of each trace, ordered by trace name."""
+        """Yield the verdict of the check on each trace, in the order of trace names."""
         known = (self._verdict(trace) for trace in self.readers() if len(trace))
         yield from merge(known, self.unknown(), key=lambda verdict: natural(verdict.trace))
 
     def readers(self, within: Window | None = None) -> Iterator[TraceReader]:
-        """Yield the answerable traces of a window, loaded with the data that the check needs."""
+        """Yield the traces with data for the check, loaded into memory. ``within`` limits them to a window."""
         gaps = "bridge" if self._check.gaps == "bridge" else "break"
         self._read_people()
         asks = self._plan.asks | self._values.asks
         yield from traces(self._file, self._knowing, self._whole, asks, gaps=gaps, within=within)
 
     def unknown(self) -> Iterator[Verdict]:
-        """Yield the verdicts of the traces without the needed data."""
+        """Yield the unknown verdicts of the traces that lack data for the check."""
         yield from self._unknown(self._knowing, self._lacks)
 
     def watched(self) -> dict[str, str]:
-        """Return for each variable the proposition of its presence. It is queried from now on."""
+        """Return, for each check variable, the name of the query for the presence of its entity.
+
+        Later reads include this query.
+        """
         found = (
             (node, self._plan.present(node)) for q in self._check.quantifiers for node in q.nodes
         )
         return {node: one.name for node, one in found if isinstance(one, Proposition)}
 
     def violated(self, trace: TraceReader, present: Mapping[str, str]) -> bool:
-        """True if the selected frames of a trace violate the check, taken as a whole trace.
+        """True if the selected frames of a trace violate the check, as if they were the whole trace.
 
         Parameters
         ----------
@@ -367,7 +375,7 @@ class StoreCheck:
             self._people[trace.trace_id] = everybody
 
     def _unknown(self, catalog: Catalog, lacks: Mapping[int, str]) -> Iterator[Verdict]:
-        """Yield the verdicts of the traces without the needed data."""
+        """Yield the unknown verdicts of the traces in ``lacks``, with the reasons."""
         _, left = traces_of(self._whole, catalog)
         for facts in catalog.traces:
             if facts.trace_id in left and self._check.ego in {None, facts.ego}:
@@ -376,7 +384,7 @@ class StoreCheck:
 
     @cached_property
     def _absences(self) -> dict[int, int]:
-        """Return, for each trace, the number of frames in which an entity of the check is absent."""
+        """Return the number of frames in which an entity of the check is absent: trace id → number."""
         frames = frame_times(self._file, None)["frame_id"]
         full = np.ones(len(frames), np.bool_)
         owners = trace_of(frames)
@@ -440,7 +448,7 @@ class StoreCheck:
         return replace(found, robustness=robustness)
 
     def _judged(self, trace: TraceReader, levels: Sequence[Level]) -> Judged:
-        """Return the verdict codes of all bindings of the last level."""
+        """Return the verdict for each combination of entities of a check in a trace."""
         kinds, members = self._alike(trace, innermost(levels))
         codes = np.zeros(len(kinds), np.int8)
         told: list[_BindingVerdict] = [((), None)] * len(kinds)
@@ -462,7 +470,7 @@ class StoreCheck:
         return any(len(trace.relations[name].frames) for name in doubts)
 
     def _reason(self, trace: TraceReader, levels: Sequence[Level], judged: Judged) -> str:
-        """Return the reason of an unknown verdict: the deciding condition, its entities and its frame."""
+        """Return the reason of an unknown verdict as text: the condition, its entities and its frame."""
         rows = np.flatnonzero(judged.codes == UNKNOWN)
         if not len(rows):
             return "it is unknown whether a quantifier is about an entity"
@@ -479,7 +487,7 @@ class StoreCheck:
         return doubt_text(self._plan.doubts[name], who, f"{trace.name}#{trace.numbers[frame]}")
 
     def _decisive_doubt(self, trace: TraceReader, binding: Keys) -> tuple[str, int] | None:
-        """Return the unknown proposition that decides the verdict of a binding, and its frame."""
+        """Return the unknown condition that decides the verdict for some entities, and its frame; or None."""
         values = PlanValues(self._plan, trace, self._variables, binding)
         columns: dict[str, Floats] = {}
         for name in propositions(self._formula):
@@ -498,7 +506,7 @@ class StoreCheck:
         return None
 
     def _robustness(self, quantity: Formula, trace: TraceReader, levels: list[Level]) -> Robustness:
-        """Return the lower and upper robustness of the check on a trace."""
+        """Return the robustness of the check on a trace: the margin by which the verdict is true or false."""
         kinds, members = self._alike(trace, innermost(levels))
         ends: list[tuple[float, int | None]] = []
         for sign in (UNFAVOURABLE, FAVOURABLE):
@@ -527,7 +535,7 @@ class StoreCheck:
         return Robustness(value, condition_text(self._plan, name), *when, nodes, called, upper)
 
     def margins(self, trace: TraceReader) -> Floats:
-        """Return the margins of the check on a trace. NaN means that only unknown numbers decide.
+        """Return the robustness margins of the check on a trace. NaN means that only unknown numbers decide.
 
         For an ``ALWAYS`` check over all entities: shape (F,), the margin of each frame. Unknown entities and
         frames are ignored. For any other check: shape (1,), the margin of the whole trace.
@@ -567,7 +575,10 @@ class StoreCheck:
         return MarginTable(columns, trace.clock.times, trace.clock.tolerance)
 
     def _bounds(self, trace: TraceReader, bindings: Keys) -> tuple[Bools, Bools]:
-        """Return the lower and upper verdict of bindings over all possible events in recording gaps."""
+        """Return the lowest and highest possible verdict of each entity combination.
+
+        Unseen events in recording gaps may change the verdict.
+        """
         parts: list[tuple[Bools, Bools]] = []
         for low in range(0, len(bindings), trace.together):
             some = bindings[low : low + trace.together]
@@ -583,7 +594,10 @@ class StoreCheck:
     def _levels(
         self, trace: TraceReader, counted: str = FAVOURABLE, *, waiting: bool = False
     ) -> list[Level]:
-        """Return the bindings of each quantifier. ``waiting`` adds future bindings of ``FORSOME``."""
+        """Return the combinations of entities for each quantifier.
+
+        ``waiting`` adds entities that may appear later.
+        """
         people = self._people.get(trace.trace_id, {})
         domains = {
             node: np.array(sorted(people.get(node, ())), np.int64)
@@ -612,7 +626,7 @@ class StoreCheck:
         )
 
     def _alike(self, trace: TraceReader, bindings: Keys) -> tuple[Keys, Ints]:
-        """Group bindings with equal truth values in all frames. One evaluation per group is enough.
+        """Group combinations of entities with equal truth values in all frames, to evaluate each group once.
 
         Return one binding per group, and the group of each binding.
         """
@@ -629,7 +643,7 @@ class StoreCheck:
         return bindings[first], members.reshape(-1)
 
     def _evaluated(self, trace: TraceReader, bindings: Keys) -> tuple[Codes, list[_BindingVerdict]]:
-        """Return verdict codes of bindings, and details of the bindings that decide the verdict."""
+        """Return the verdict for each combination of entities, with violations of those that need them."""
         values = PlanValues(self._plan, trace, self._variables, bindings)
         codes, told = self._in_evaluation(trace, values, len(bindings))
         doubts = [name for name in propositions(self._formula) if name[-1] in SIGNS]
@@ -647,7 +661,10 @@ class StoreCheck:
     def _in_evaluation(
         self, trace: TraceReader, values: PlanValues, rows: int, among: Bools | None = None
     ) -> tuple[Codes, list[_BindingVerdict]]:
-        """Return verdict codes and details of bindings, for one treatment of unknown conditions."""
+        """Return the verdict and violations of each entity combination.
+
+        Unknown conditions all count in the same way.
+        """
         columns = values.columns(self._formula)
         truths = values.formula(self._formula)[:, 0]
         resets = values.formula(self._reset) if self._reset is not None else None
@@ -696,7 +713,7 @@ class StoreCheck:
     def _values_of(
         self, trace: TraceReader, binding: Keys, spans: Sequence[Violation]
     ) -> list[dict[str, Any]]:
-        """Return the values that a check returns for each violation of a binding."""
+        """Return the ``RETURN`` values of each violation, for one combination of entities."""
         if not self._returned.parts:
             return [self._returned.told(lambda _: None) for _ in spans]
         values = PlanValues(self._values, trace, self._variables, binding)
@@ -715,7 +732,7 @@ class StoreCheck:
     def _joined(
         self, levels: Sequence[Level], told: list[_BindingVerdict], frames: int
     ) -> Statuses | None:
-        """Combine the statuses of the bindings to the status of the check at each frame."""
+        """Return the status of the check after each frame, combined from all combinations of entities."""
         if not self._want_status:
             return None
         rows = [status for _, status in told if status is not None]

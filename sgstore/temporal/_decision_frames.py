@@ -42,7 +42,9 @@ Decided = tuple["Places", "Places"]
 def known(  # noqa: PLR0911 - a case each
     formula: Formula, table: PropositionTable, *, ended: int | None = None
 ) -> Decided:
-    """Return, for each frame, the frame that makes the value of a formula certain.
+    """Return, for each frame, the frame at which a formula becomes certainly true, and certainly false.
+
+    F means never.
 
     Parameters
     ----------
@@ -86,7 +88,7 @@ def known(  # noqa: PLR0911 - a case each
 
 
 def endless(formula: Formula) -> bool:
-    """True if the formula has no time limit and stays open until the trace ends."""
+    """True if a formula is an *until* without upper time bound, which stays open until the trace ends."""
     return isinstance(formula, Until) and formula.bound.high is None
 
 
@@ -107,7 +109,7 @@ def _known_until(formula: Until, table: PropositionTable, *, ended: int | None) 
 
 
 def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
-    """Return a mask (F,) of the frames whose forward bound ends within the trace."""
+    """Return a mask (F,) of the frames whose future time bound ends before the trace ends."""
     if bound.high is None:
         return np.ones(len(table.times), np.bool_)
     if bound.frames:
@@ -116,7 +118,10 @@ def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
 
 
 def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) -> Decided:
-    """Return, for each frame, the frame that makes a *since* certain. The past of the first frame is known."""
+    """Return, for each frame, the frames at which a temporal *since* becomes certainly true and false.
+
+    The frames before the trace count as known.
+    """
     here, frames = table.frames, len(table.times)
     left = (None, None)
     if formula.left != TRUE:
@@ -136,7 +141,9 @@ def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) 
 
 
 def met(right: Places, left: Places | None, bound: Bound, table: PropositionTable) -> Places:
-    """Return, for each frame, the frame from which on an *until* is true. Its sides must stay true.
+    """Return, for each frame, the first frame by which a temporal *until* is certainly true.
+
+    Operands that become true must stay true.
 
     Parameters
     ----------
@@ -153,7 +160,10 @@ def met(right: Places, left: Places | None, bound: Bound, table: PropositionTabl
 
 
 def _asked(bound: Bound, table: PropositionTable) -> tuple[Places, Places | None]:
-    """Return the range of frames of an *until* bound: first frame, and frame after the last, or ``None``."""
+    """Return the frames in the time bound of an *until*, for each frame: first frame, and frame after the last.
+
+    ``None`` means no upper bound.
+    """
     here, frames = table.frames, len(table.times)
     near, far = table.window(bound, forward=True)
     start = here if near is None else np.minimum(near, frames)
@@ -169,7 +179,9 @@ def _chained(
     *,
     least: bool,
 ) -> Places:
-    """Combine the two sides of an *until* over a range of frames, by minima and maxima.
+    """Return, for each frame, the value of a temporal *until* from frame numbers for its operands.
+
+    It uses minima and maxima of the numbers.
 
     Parameters
     ----------
@@ -207,7 +219,10 @@ def _chained(
 
 
 def _most(values: Places, start: Places, end: Places | None) -> Places:
-    """Return the maximum from ``start`` to before ``end``. An empty range gives the smallest integer."""
+    """Return the maximum of the values from index ``start`` to before ``end``.
+
+    An empty range gives the smallest integer.
+    """
     nothing = np.iinfo(values.dtype).min
     if end is None:
         onward = np.append(np.maximum.accumulate(values[::-1])[::-1], nothing)

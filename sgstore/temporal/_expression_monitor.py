@@ -1,4 +1,4 @@
-"""Online monitor of a step expression: ``A THEN (B | C)``, ``(A THEN B){2,3}``.
+"""Online monitor of sequences with alternatives or repetitions: ``A THEN (B | C)``, ``(A THEN B){2,3}``.
 
 An expression stands for several sequences. Among all matches that begin in one run of one step with one
 binding, only the best one counts. So a match is reported as soon as no sequence can produce a better one.
@@ -35,13 +35,13 @@ _ANY = -1
 def sequence_monitor(
     name: str, query: Query, questions: QueryCache, pulse: StreamClock
 ) -> SequenceMonitor:
-    """Return the monitor of a pattern, a sequence, or a step expression."""
+    """Return the online monitor for a pattern, a sequence, or a sequence with alternatives."""
     kind = ExpressionMonitor if query.alternatives else SequenceMonitor
     return kind(name, query, questions, pulse)
 
 
 class ExpressionMonitor(SequenceMonitor):
-    """Online monitor of a step expression over one trace; see :class:`SequenceMonitor`."""
+    """Online monitor of a sequence with alternatives over one trace; see :class:`SequenceMonitor`."""
 
     def __init__(self, name: str, query: Query, questions: QueryCache, pulse: StreamClock) -> None:
         super().__init__(name, query, questions, pulse)
@@ -68,7 +68,10 @@ class ExpressionMonitor(SequenceMonitor):
         return way.steps[0], told, run
 
     def _see(self, way: StepWay, binding: Binding) -> None:
-        """Record the matches of a sequence with a binding. Keep the best match of each run."""
+        """Record the matches of one alternative sequence, for given nodes.
+
+        Only the best match of each start is kept.
+        """
         held, seen = self._of(way.steps[0], binding), set[int]()
         for place in held.places if held is not None else ():
             run = place.run.number
@@ -84,7 +87,10 @@ class ExpressionMonitor(SequenceMonitor):
                     self._best[group] = found
 
     def _better(self, one: FoundMatch, other: FoundMatch) -> bool:
-        """True if the first match wins. For equal frames, the alternative written first wins."""
+        """True if the first of two matches is preferred.
+
+        For equal frames, the first alternative of the query is preferred.
+        """
         frames, known = _frames(one), _frames(other)
         place, written = self._written[one[0]], self._written[other[0]]
         if self.query.policy == "longest" and frames[0] == known[0]:
@@ -92,7 +98,7 @@ class ExpressionMonitor(SequenceMonitor):
         return (frames, place) < (known, written)
 
     def _decided(self, group: _Group, found: FoundMatch) -> bool:
-        """True if no future match can win over this match."""
+        """True if no later match can be preferred over this match."""
         step, told, run = group
         bound, frames = dict(zip(self._named, told, strict=True)), _frames(found)
         for way in self._asked:
@@ -125,7 +131,7 @@ class ExpressionMonitor(SequenceMonitor):
     def _may_be_earlier(
         self, standing: _Standing, frames: tuple[int, ...], *, before: bool
     ) -> bool:
-        """True if a partial match can still complete with earlier frames than the given ones."""
+        """True if an incomplete match can still become complete with earlier frames than the given ones."""
         way, at, binding, place = standing
         if at == len(way.links):
             return False  # an ended match is already known
@@ -153,7 +159,10 @@ class ExpressionMonitor(SequenceMonitor):
     def _next_step(
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
     ) -> tuple[int, StepLink, bool]:
-        """Return the next required step, its link, and True if a forbidden step between is undecided."""
+        """Return the next required step of a sequence, and its time relation to the previous step.
+
+        The third result is True if a ``NOT MATCH`` between them is undecided.
+        """
         following, link = at + 1, way.links[at]
         if not self._steps[way.steps[following]].absent:
             return following, link, False
@@ -167,7 +176,7 @@ class ExpressionMonitor(SequenceMonitor):
     # Stored data
 
     def _forget(self) -> None:
-        """Drop the step frames that no match can use any more."""
+        """Delete the stored frames of steps that no later match can use."""
         firsts = {way.steps[0] for way in self._asked}
         alive = {
             n: {key: self._followed(n, key, one.places) for key, one in self._held[n].items()}
@@ -197,7 +206,7 @@ class ExpressionMonitor(SequenceMonitor):
                 one.places = [p for p in one.places if p.number >= low or id(p) in own_ids]
 
     def _since(self, first: int, n: int, key: Key, begun: dict[int, dict[Key, int]]) -> int:
-        """Return the first frame in which a match with this step and binding can begin."""
+        """Return the first frame at which a match with this step and these nodes can begin."""
         names, columns = self._columns[first], self._columns[n]
         own = {name: node for name, node in zip(columns, key, strict=True) if name in names}
         places = [(names.index(name), node) for name, node in own.items()]
@@ -209,7 +218,7 @@ class ExpressionMonitor(SequenceMonitor):
         return min(found, default=NEVER)
 
     def _followed(self, n: int, key: Key, places: list[StepFrame]) -> list[StepFrame]:
-        """Return the frames of a step with which future matches can begin."""
+        """Return the stored frames of a first step with which later matches can begin."""
         binding = dict(zip(self._columns[n], key, strict=True))
         ways = [way for way in self._asked if way.steps[0] == n]
         found: list[StepFrame] = []
@@ -222,7 +231,10 @@ class ExpressionMonitor(SequenceMonitor):
         return found
 
     def _open_ended(self, way: StepWay) -> bool:
-        """True if the first frame of a run has every continuation that later frames have."""
+        """True if only the first frame of each run must be kept, because the next step has no time limit.
+
+        A run is a series of frames in which the step matches.
+        """
         if not way.links:
             return False
         link = way.links[0]

@@ -1,4 +1,4 @@
-"""Recent graphs of an online run, and the matches and curves followed in them."""
+"""Recent scene graphs of an online run, and the matches and attribute curves followed in them."""
 
 from __future__ import annotations
 
@@ -40,11 +40,14 @@ W = TypeVar("W", "FollowedMatch", "FollowedCurve")
 
 
 class NotKeptError(SgstoreError):
-    """A query needs the class or the lane roles of a past frame, which the monitor does not keep."""
+    """Error for a query that needs data of a past frame which the monitor does not keep.
+
+    These data are the frame class and the lane roles.
+    """
 
 
 class FollowedMatch:
-    """Truth of each part of a pattern for one binding, frame by frame.
+    """Truth of each part of a pattern in each recent frame, for the nodes of one match.
 
     Parameters
     ----------
@@ -76,7 +79,7 @@ class FollowedMatch:
         self.begun = self.seen = -1
 
     def look(self, views: Iterable[FrameView]) -> None:
-        """Evaluate the pattern in the new frames."""
+        """Evaluate the parts of the pattern in the new frames."""
         for view in views:
             seq = view.frame["seq"]
             if seq <= self.seen:
@@ -94,7 +97,10 @@ class FollowedMatch:
                     spans.append((seq, seq))
 
     def lanes(self, trace: str, first: int) -> TruthLanes:
-        """Return the truth lanes from a frame on, in the format of :meth:`sgstore.Store.parts`."""
+        """Return truth lanes (the frames in which each pattern part is true) from a frame on.
+
+        The format is that of :meth:`sgstore.Store.parts`.
+        """
         lanes = (
             TruthLane(part, (), ("what is asked of other frames",))
             if search is None
@@ -105,7 +111,7 @@ class FollowedMatch:
 
 
 class FollowedCurve:
-    """Attribute of an entity, or value of a pair, frame by frame.
+    """Curve of an attribute of an entity, or of a number of two entities, over recent frames.
 
     Parameters
     ----------
@@ -130,7 +136,7 @@ class FollowedCurve:
         self._seen = -1
 
     def look(self, views: Iterable[FrameView]) -> None:
-        """Read the value in the new frames."""
+        """Append the values of the new frames to the curve."""
         for view in views:
             seq, about = view.frame["seq"], view.nodes.get(self._node)
             if seq <= self._seen or about is None:
@@ -143,14 +149,17 @@ class FollowedCurve:
             self._told.append((seq, view.frame["t"], math.nan if value is None else float(value)))
 
     def columns(self) -> dict[str, Any]:
-        """Return frame numbers, times (s) and values, as :meth:`sgstore.store.StoreFile.series` does."""
+        """Return the curve as arrays of frame numbers, times (s) and values.
+
+        The format is that of :meth:`sgstore.store.StoreFile.series`.
+        """
         types = {"seq": np.uint32, "t": np.float64, "value": np.float32}
         told = zip(*self._told, strict=True) if self._told else ((), (), ())
         return {name: np.array(c, types[name]) for name, c in zip(types, told, strict=True)}
 
 
 class RecentGraphs:
-    """Most recent graphs of a run. Followed matches and curves are updated with each new graph.
+    """Most recent scene graphs of an online run. Each new graph updates the followed matches and curves.
 
     Memory is bounded: at most :data:`MOST_EDGES` edges, or one graph, and :data:`MOST_FOLLOWED` matches and
     curves. The object is not thread-safe.
@@ -162,7 +171,7 @@ class RecentGraphs:
         self._followed: OrderedDict[tuple[Any, ...], FollowedMatch | FollowedCurve] = OrderedDict()
 
     def add(self, here: FrameTime, graph: SceneGraph, trace: str) -> None:
-        """Add the graph of the next frame."""
+        """Add the scene graph of the next frame, and drop old graphs."""
         frame = {"id": here.seq, "seq": here.seq, "time_ns": here.time_ns, "t": here.t}
         view = FrameView(graph, frame, {"id": 0, "name": trace}, _not_kept, _not_kept)
         self._views.append(view)
@@ -173,7 +182,7 @@ class RecentGraphs:
             one.look([view])
 
     def view(self, seq: int) -> FrameView:
-        """Return a recent frame that is still stored.
+        """Return the scene graph of a recent frame by its number. An old frame raises an error.
 
         Raises
         ------
@@ -187,11 +196,17 @@ class RecentGraphs:
         raise StoreError(f"the graph of frame #{seq} is not kept; those from #{first} on are")
 
     def match(self, name: str, query: Query, nodes: Mapping[str, int]) -> FollowedMatch:
-        """Return the truth of a match so far, and follow it from now on. Errors: see :class:`FollowedMatch`."""
+        """Return the truth of each part of a pattern in recent frames, and update it in later frames.
+
+        Errors: see :class:`FollowedMatch`.
+        """
         return self._follow((name, *sorted(nodes.items())), partial(FollowedMatch, query, nodes))
 
     def curve(self, attribute: str, node: int, other: int | None = None) -> FollowedCurve:
-        """Return a curve so far, and follow it from now on. Errors: see :class:`FollowedCurve`."""
+        """Return the curve of a value in recent frames, and update it in later frames.
+
+        Errors: see :class:`FollowedCurve`.
+        """
         key = attribute, node, other
         return self._follow(key, partial(FollowedCurve, *key))
 

@@ -1,4 +1,4 @@
-"""Temporal formulas over named propositions, for the offline and the online engine.
+"""Temporal logic formulas over named propositions, for recorded traces and online monitors.
 
 The semantics is pointwise over frames. A formula is true or false at each frame of a finite trace: ``NEXT`` is
 false at the last frame and ``WEAKNEXT`` true, ``PREVIOUS`` is false at the first (LTLf). Time bounds compare
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Time or frame range of an operator, measured from its frame in its direction.
+    """Time or frame range of a temporal operator, such as [0 s, 2 s]. It is measured from the current frame.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Bound:
     frames: bool = False
 
     def widened(self, by: int) -> Bound:
-        """Return a time range extended by a tolerance at both ends; ns. Frame ranges do not change."""
+        """Return the time range, extended by a tolerance (ns) at both ends. Frame ranges do not change."""
         if self.frames or not by:
             return self
         return Bound(max(self.low - by, 0), None if self.high is None else self.high + by)
@@ -43,42 +43,45 @@ WHOLE: Final = Bound()
 
 @dataclass(frozen=True, slots=True)
 class TruthConstant:
-    """Constant true or false."""
+    """Formula that is always true, or always false."""
 
     value: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Proposition:
-    """Named proposition. It is true or false at each single frame."""
+    """Named condition in a formula, true or false in each single frame."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class Not:
-    """Negation of a formula."""
+    """Negation (``NOT``) of a formula."""
 
     operand: Formula
 
 
 @dataclass(frozen=True, slots=True)
 class And:
-    """Conjunction of formulas."""
+    """Conjunction (``AND``) of formulas."""
 
     operands: tuple[Formula, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Or:
-    """Disjunction of formulas."""
+    """Disjunction (``OR``) of formulas."""
 
     operands: tuple[Formula, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Next:
-    """Operator: the operand holds at the next frame. At the last frame, the value is ``weak``."""
+    """Temporal operator *next*: the operand is true at the next frame.
+
+    At the last frame, the value is ``weak``.
+    """
 
     operand: Formula
     weak: bool = False
@@ -86,14 +89,21 @@ class Next:
 
 @dataclass(frozen=True, slots=True)
 class Previous:
-    """Operator: the operand holds at the previous frame. At the first frame, it is false."""
+    """Temporal operator *previous*: the operand is true at the previous frame.
+
+    At the first frame, it is false.
+    """
 
     operand: Formula
 
 
 @dataclass(frozen=True, slots=True)
 class Until:
-    """Operator: ``right`` holds at a later frame within the bound, and ``left`` at all frames before it."""
+    """Temporal operator *until*, on this frame and later ones.
+
+    ``right`` is true at a frame within the future bound. ``left`` is true at all frames before that
+    frame.
+    """
 
     left: Formula
     right: Formula
@@ -102,7 +112,11 @@ class Until:
 
 @dataclass(frozen=True, slots=True)
 class Since:
-    """Operator: ``right`` holds at an earlier frame within the bound, and ``left`` at all frames after it."""
+    """Temporal operator *since*, on this frame and earlier ones.
+
+    ``right`` is true at a frame within the past bound. ``left`` is true at all frames after that
+    frame.
+    """
 
     left: Formula
     right: Formula
@@ -115,33 +129,36 @@ TRUE: Final = TruthConstant(value=True)
 
 
 def eventually(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the formula: the operand holds at this frame or a later one."""
+    """Return the temporal formula: the operand is true at this frame or a later one."""
     return Until(TRUE, operand, bound)
 
 
 def always(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the formula: the operand holds at this frame and all later ones."""
+    """Return the temporal formula: the operand is true at this frame and all later ones."""
     return Not(eventually(Not(operand), bound))
 
 
 def once(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the formula: the operand holds at this frame or an earlier one."""
+    """Return the temporal formula: the operand is true at this frame or an earlier one."""
     return Since(TRUE, operand, bound)
 
 
 def historically(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the formula: the operand holds at this frame and all earlier ones."""
+    """Return the temporal formula: the operand is true at this frame and all earlier ones."""
     return Not(once(Not(operand), bound))
 
 
 def release(left: Formula, right: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the formula: ``right`` holds up to and including the first ``left``, or for ever."""
+    """Return the formula "``right`` stays true until ``left`` is true, or for ever" (*release*).
+
+    ``right`` is still true in the frame of ``left``.
+    """
     return Not(Until(Not(left), Not(right), bound))
 
 
 @lru_cache(maxsize=256)
 def tolerant(formula: Formula, by: int) -> Formula:
-    """Return the formula with all time bounds extended by a tolerance; ns."""
+    """Return a temporal formula with all time bounds extended by a tolerance; ns."""
     found = with_operands(formula, lambda operand: tolerant(operand, by))
     if isinstance(found, Until | Since):
         return replace(found, bound=found.bound.widened(by))
@@ -149,19 +166,19 @@ def tolerant(formula: Formula, by: int) -> Formula:
 
 
 def propositions(formula: Formula) -> frozenset[str]:
-    """Return the names of the propositions in a formula."""
+    """Return the names of the propositions (single-frame conditions) in a temporal formula."""
     return frozenset(part.name for part in walk(formula) if isinstance(part, Proposition))
 
 
 def walk(formula: Formula) -> Iterator[Formula]:
-    """Yield a formula and all its parts, parts first. Equal parts may repeat."""
+    """Yield a temporal formula and all its subformulas, subformulas first. Equal ones may repeat."""
     for operand in operands_of(formula):
         yield from walk(operand)
     yield formula
 
 
 def operands_of(formula: Formula) -> tuple[Formula, ...]:
-    """Return the direct operands of a formula."""
+    """Return the direct operands of a temporal formula."""
     match formula:
         case And(operands=operands) | Or(operands=operands):
             return operands
@@ -174,7 +191,7 @@ def operands_of(formula: Formula) -> tuple[Formula, ...]:
 
 
 def with_operands(formula: Formula, change: Callable[[Formula], Formula]) -> Formula:
-    """Apply a function to each of the :func:`operands_of` a formula."""
+    """Return a copy of a temporal formula with a function applied to each direct operand."""
     match formula:
         case And() | Or():
             return replace(formula, operands=tuple(map(change, formula.operands)))
@@ -187,7 +204,7 @@ def with_operands(formula: Formula, change: Callable[[Formula], Formula]) -> For
 
 
 def looks_ahead(formula: Formula) -> bool:
-    """True if the formula depends on later frames."""
+    """True if a temporal formula depends on later frames."""
     return any(isinstance(part, Next | Until) for part in walk(formula))
 
 
@@ -240,7 +257,7 @@ TEMPORAL: Final[dict[str, Callable[..., Formula]]] = {
 
 
 def formula_text(formula: Formula) -> str:  # noqa: C901, PLR0911 - a case each
-    """Return a formula as text, with the names of its propositions."""
+    """Return a temporal formula as text, with the names of its propositions."""
     match formula:
         case TruthConstant(value=value):
             return str(value).upper()
@@ -265,7 +282,10 @@ def formula_text(formula: Formula) -> str:  # noqa: C901, PLR0911 - a case each
 
 
 def bound_text(bound: Bound) -> str:
-    """Return a bound as text. An unlimited bound gives an empty text."""
+    """Return the time bound of a temporal operator as text, such as ``[0s, 2s]``.
+
+    An unlimited bound gives an empty text.
+    """
     if bound == Bound():
         return ""
     ends = [_length(bound.low, bound), "INF" if bound.high is None else _length(bound.high, bound)]

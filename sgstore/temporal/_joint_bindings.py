@@ -24,7 +24,7 @@ ROWS: Final = 2_000_000
 
 @dataclass(frozen=True, slots=True)
 class JoinedBindings:
-    """Joint bindings of several relations.
+    """Combinations of nodes that match several sequence steps, with their rows in the table of each step.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class JoinedBindings:
     places: Ints
 
     def parts(self, relations: Sequence[TimedRelation]) -> Iterator[JoinedBindings]:
-        """Split the bindings into groups with a limited number of rows."""
+        """Split the node combinations into groups with a limited number of frame rows."""
         if not len(self.bindings):
             return
         rows = np.zeros(len(self.bindings), np.int64)
@@ -54,7 +54,7 @@ class JoinedBindings:
 def joined(
     relations: Sequence[tuple[tuple[str, ...], TimedRelation]], apart: Collection[str]
 ) -> JoinedBindings:
-    """Return the joint bindings of relations that agree on their shared variables.
+    """Return the node combinations that match several sequence steps, which agree on shared nodes.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def _with(
 
 
 def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
-    """Return index pairs of equal rows in two tables, ordered by the first."""
+    """Return the index pairs of equal rows in two tables, ordered by the first table."""
     if not len(left) or not len(right):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     both = np.concatenate((left, right))

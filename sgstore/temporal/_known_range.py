@@ -1,4 +1,4 @@
-"""Comparison of the stored range around the ego with the range that a check needs."""
+"""Comparison of two ranges around the ego: the stored range, and the range that a check needs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ SELECT frame_id >> 24 AS trace_id, max(speed) AS speed FROM known_state GROUP BY
 
 @dataclass(frozen=True, slots=True)
 class ShortRange:
-    """Reasons why a trace with a short range cannot prove a check true, or false. Empty means that it can.
+    """Reasons why a trace with a short range around the ego cannot prove a check true, or false.
+
+    An empty text means that it can.
 
     Attributes
     ----------
@@ -36,16 +38,19 @@ class ShortRange:
     false: str = ""
 
     def of(self, *, holds: bool) -> str:
-        """Return the reason against a true or a false verdict, or an empty string."""
+        """Return the reason why the range of a trace does not allow a true (or false) verdict.
+
+        An empty text means that it does.
+        """
         return self.true if holds else self.false
 
     def or_else(self, other: ShortRange) -> ShortRange:
-        """Return these reasons, completed by the reasons of another range."""
+        """Return the reasons against a verdict, with missing ones taken from ``other``."""
         return ShortRange(self.true or other.true, self.false or other.false)
 
 
 def short_ranges(file: StoreFile, catalog: Catalog, check: BoundCheck) -> Mapping[int, ShortRange]:
-    """Return the traces whose stored range is too short for a check: trace id → reasons.
+    """Return the traces whose stored range around the ego is too short for a check: trace id → reasons.
 
     Parameters
     ----------
@@ -76,7 +81,9 @@ def _any_short(needed: Horizon, known: list[float]) -> bool:
 
 
 def short_range(needed: Horizon, known: float) -> ShortRange:
-    """Return the reasons for a stored range of this many metres.
+    """Return the reasons why a stored range around the ego (m) is too short for a check.
+
+    They are empty if it is long enough.
 
     Parameters
     ----------
@@ -95,7 +102,7 @@ def short_range(needed: Horizon, known: float) -> ShortRange:
 
 
 def without_kinds(check: BoundCheck, excluded: frozenset[str]) -> ShortRange:
-    """Return the reasons for a trace whose settings exclude some kinds.
+    """Return the reasons why a trace cannot prove a check, because its settings exclude node kinds.
 
     Parameters
     ----------
@@ -116,7 +123,7 @@ def without_kinds(check: BoundCheck, excluded: frozenset[str]) -> ShortRange:
 
 @dataclass(slots=True)
 class SeenRange:
-    """Range around the ego that a monitor has seen.
+    """Range around the ego that the frames of an online monitor covered.
 
     Attributes
     ----------
@@ -139,14 +146,14 @@ class SeenRange:
     fastest: float = 0.0
 
     def see(self, view: FrameView) -> None:
-        """Update the seen range with a frame."""
+        """Update the covered range around the ego with the data of a new frame."""
         self.cut = self.cut or view.graph.out_of_world > 0
         self.excluded |= view.graph.excluded
         speeds = (about.get("speed", 0.0) for about in view.nodes.values())
         self.fastest = max(self.fastest, *speeds, 0.0)
 
     def short(self, check: BoundCheck) -> ShortRange:
-        """Return the reasons why the seen frames cannot prove a check true, or false."""
+        """Return the reasons why the frames of the monitor cannot prove a check true, or false."""
         if not check.world or check.unknown_is_false:
             return ShortRange()
         found = ShortRange()

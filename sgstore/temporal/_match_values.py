@@ -1,4 +1,4 @@
-"""Aggregates over the frames of a match: minimum, maximum, mean, first, and their times.
+"""Aggregates over the frames of a match: minimum, maximum, mean, first value, and their times.
 
 Offline, a match is a row of bindings and a frame interval. Online, a :class:`Fold` is the aggregate of an
 interval, and consecutive ones are combined.
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class ReturnedValues:
-    """Values that a query returns for a match, computed from aggregates and step times.
+    """``RETURN`` values of a match, computed from aggregates over its frames and from step times.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class ReturnedValues:
         part: Callable[[b.OverMatch], Any],
         seconds: Callable[[int], float | None] | None = None,
     ) -> dict[str, Any]:
-        """Return the values: column name → value.
+        """Return the ``RETURN`` values of one match: column name → value.
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ AT_FRAME: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """Frame intervals of matches, each with its binding.
+    """First and last frame of matches, each with the row of its nodes in an array of values.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Stretches:
     last: Ints
 
     def told(self, word: str, column: Column, at: Column | None = None) -> Objects:
-        """Return the aggregate of a value over each interval, shape (M,). ``None`` means unknown.
+        """Return the aggregate of a value over the frames of each match, (M,). ``None`` means unknown.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class Stretches:
 
 
 def over_rows(word: str, column: Column, starts: Ints, at: Column | None = None) -> Objects:
-    """Return the aggregate of a value over each group of rows. ``None`` means unknown.
+    """Return an aggregate, such as the minimum, over each group of array rows. ``None`` means unknown.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def over_rows(word: str, column: Column, starts: Ints, at: Column | None = None)
 
 
 def picked(column: Column, rows: Ints, frames: Ints) -> Objects:
-    """Return values at some positions as Python objects. ``None`` means unknown.
+    """Return the values of a column at some rows and frames as Python objects. ``None`` means unknown.
 
     Parameters
     ----------
@@ -198,7 +198,10 @@ def _told(values: Any, known: Any, places: Any) -> Objects:
 
 
 def _at(column: Column, rows: Ints, frames: Ints) -> tuple[Any, Bools]:
-    """Return values at some positions, and a mask of the known ones. Columns may broadcast."""
+    """Return the values of a column at some rows and frames, and a mask of the known ones.
+
+    Axes of length 1 are broadcast.
+    """
 
     def some(array: Any) -> Any:
         array = np.atleast_2d(array)

@@ -1,4 +1,4 @@
-"""Online aggregates over matches, frame by frame.
+"""Online aggregates over the frames of a match, updated frame by frame.
 
 The history of a value begins at the first frame that a match may still need. Frames between possible match ends
 are merged. So the memory grows with the number of open matches, not with their duration.
@@ -37,7 +37,7 @@ Span = tuple[int, int]
 
 
 class _Course:
-    """History of one value, kept while a match may need it."""
+    """History of one aggregated value for all matched nodes, kept while a match may need it."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class _Course:
         self._known: BindingTable[Entry] = BindingTable(self._valuation.lattice, begun)
 
     def step(self) -> None:
-        """Process the next frame. Its query results must be ready."""
+        """Add the value of the next frame. The query results of the frame must be ready."""
         known, word, number = self._known, self._word, self._pulse.tick.number
         letters, memories = self._valuation.read(known.held, lambda row: known.of(row)[0])
         values = self._told(self._test, len(letters))
@@ -76,14 +76,17 @@ class _Course:
         return [value if there else None for value, there in zip(values, known, strict=True)]
 
     def value(self, binding: Mapping[str, int | None], span: Span) -> Any:
-        """Return the aggregate of a binding over a range of frames."""
+        """Return the aggregate of the value for given nodes over a range of frames."""
         start, end = span
         _, folds = self._known.of(tuple(binding.get(name) for name in self._variables))
         inside = [fold for fold in folds if start <= fold.start and fold.end <= end]
         return reduce(Fold.joined, inside).told(self._word, start, end) if inside else None
 
     def forget(self, kept: Sequence[int]) -> None:
-        """Merge the values of old frames. ``kept`` holds the frames at which a later range may begin or end."""
+        """Merge the values of old frames to save memory.
+
+        ``kept`` lists the frames at which a later range may begin or end.
+        """
         held = {
             row: (memory, _merged(folds, kept)) for row, (memory, folds) in self._known.held.items()
         }
@@ -104,7 +107,7 @@ def _merged(folds: tuple[Fold, ...], kept: Sequence[int]) -> tuple[Fold, ...]:
 
 
 class MatchValues:
-    """Online aggregates over the matches of one trace.
+    """Online aggregates over the frames of the matches of one trace.
 
     Parameters
     ----------
@@ -140,12 +143,12 @@ class MatchValues:
                 self._courses[course] = made
 
     def step(self) -> None:
-        """Process the next frame. Its query results must be ready."""
+        """Add the values of the next frame. The query results of the frame must be ready."""
         for course in self._courses.values():
             course.step()
 
     def forget(self, kept: Iterable[int]) -> None:
-        """Drop the values that no match needs any more.
+        """Merge the values of old frames. ``kept`` lists the frames at which a later match may begin or end.
 
         Parameters
         ----------
@@ -157,7 +160,7 @@ class MatchValues:
             course.forget(ordered)
 
     def value(self, part: b.OverMatch, binding: Mapping[str, int | None], span: Span) -> Any:
-        """Return an aggregate over a part of a match. ``None`` means unknown.
+        """Return an aggregate over a range of frames of a match, for its nodes. ``None`` means unknown.
 
         Parameters
         ----------
@@ -176,7 +179,7 @@ def _anywhere(value: b.OverMatch) -> b.OverMatch:
 
 @dataclass(frozen=True, slots=True)
 class Fold:
-    """Running aggregate of a value over consecutive frames.
+    """Aggregates (minimum, sum, first, …) of a value over a range of consecutive frames.
 
     Attributes
     ----------
@@ -205,7 +208,7 @@ class Fold:
 
     @classmethod
     def of(cls, word: str, frame: int, value: Any, at: Any) -> Fold | None:
-        """Return the aggregate of one frame. ``None`` means an unknown or ignored value."""
+        """Return the aggregate data of a single frame. ``None`` means that the value is unknown or ignored."""
         if value is None:
             return None
         if word in {"first", "last"}:
@@ -220,7 +223,10 @@ class Fold:
         return cls(frame, frame, value, value, best, at)
 
     def joined(self, later: Fold) -> Fold:
-        """Combine with the aggregate of later frames. The earlier of two equal values wins."""
+        """Return the aggregate data of two ranges of frames, this and a later one.
+
+        For equal extremes, the earlier frame counts.
+        """
         better = self if self.best <= later.best else later
         total, count = self.total + later.total, self.count + later.count
         return Fold(
@@ -228,7 +234,7 @@ class Fold:
         )
 
     def told(self, word: str, start: int, end: int) -> Any:
-        """Return the aggregate of the value over a range of frames."""
+        """Return one aggregate of the value, such as the minimum, over a range of frames."""
         match word:
             case "first":
                 return self.first if self.start == start else None

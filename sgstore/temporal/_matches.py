@@ -1,4 +1,4 @@
-"""Matches of single-frame and multi-frame queries, and the traces without the needed data."""
+"""Matches of queries on single frames and on sequences, and the traces that lack data for them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[int, str]:
-    """Return the traces without needed data: trace id → reason. Results are cached in the catalog.
+    """Return the traces that lack required data: trace id → reason. Results are cached in the catalog.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[in
 
 
 def _knowing(file: StoreFile, every: frozenset[int], need: Need) -> frozenset[int]:
-    """Return the traces that have the needed data, or have no entities that need it."""
+    """Return the ids of the traces that have the required data, or have no entities that need it."""
     if need.event:
         return frozenset(trace for (trace,) in file.rows(told_events(need.event)).values)
     if need.lanes:
@@ -97,7 +97,7 @@ class TemporalMatches(Matches):
 
     @contextmanager
     def asked(self) -> Generator[Compiled]:
-        """Yield the query compiled for the store. The store cannot change inside the block."""
+        """Context manager with the query compiled for the store. The store cannot change inside the block."""
         with self._compiled() as compiled:
             yield compiled
 
@@ -107,7 +107,7 @@ class TemporalMatches(Matches):
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Reasons for the skipped traces in :attr:`left_out`: trace name → reason."""
+        """Reasons why the query skips the traces in :attr:`left_out`: trace name → reason."""
         found = super().reasons
         with super()._compiled() as compiled:
             lacks = self._lacking(compiled)
@@ -121,7 +121,10 @@ class TemporalMatches(Matches):
         return lacking(self._file, compiled.catalog, of_query(compiled.bound))
 
     def explain(self) -> str:
-        """Explain the query stage by stage. For a multi-frame query, add the queries of single frames."""
+        """Return the query as text after each stage of the compiler.
+
+        For a sequence, the single-frame queries are added.
+        """
         with self._compiled() as compiled:
             text = compiled.stages()
             if not compiled.query.steps:

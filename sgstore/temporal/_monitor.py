@@ -1,4 +1,4 @@
-"""Online monitor, and its sources of frames.
+"""Online monitor of checks and patterns, and the sources of its frames.
 
 The frames are from a recording, replayed as if live, or from a running CARLA.
 """
@@ -52,7 +52,7 @@ PORT: Final = 2000
 
 @dataclass(slots=True)
 class FrameSource:
-    """Source of consecutive frames and their road map.
+    """Source of consecutive frames, with their road map.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ def opened(
 
 
 def paced(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Yield recorded frames in real time."""
+    """Yield recorded frames at the speed at which they were recorded."""
     begun = first = None
     for frame in frames:
         if begun is None or first is None:
@@ -285,7 +285,7 @@ class Monitor:
         return f"<Monitor of {', '.join(self.names)} after {seen} frames>"
 
     def _of_scope(self, ego: str | None, *, world: bool) -> tuple[int, QueryCache]:
-        """Return number and queries of a graph scope: an ego, with or without the world around."""
+        """Return the index and the query cache for an ego and a scope (scene graph only, or whole world)."""
         if (ego or "") not in self._egos:
             self._egos.append(ego or "")
         scope = self._egos.index(ego or ""), world
@@ -297,7 +297,7 @@ class Monitor:
         return number, self._questions[number]
 
     def step(self, frame: Frame) -> tuple[MonitorEvent, ...]:
-        """Process the next frame, and return the new events.
+        """Process the next frame of the running trace, and return the new events.
 
         Raises
         ------
@@ -313,7 +313,7 @@ class Monitor:
     def look(
         self, graphs: Sequence[SceneGraph], *, classed: bool = False
     ) -> tuple[MonitorEvent, ...]:
-        """Process graphs of the next frame made by the caller, and return the new events.
+        """Process the next frame from scene graphs that the caller made, and return the new events.
 
         Parameters
         ----------
@@ -331,7 +331,7 @@ class Monitor:
     def _ask(
         self, graphs: Sequence[SceneGraph], *, classed: bool = False
     ) -> tuple[FrameTime, list[NodeNames]]:
-        """Evaluate all queries on the graphs of a frame."""
+        """Run all single-frame queries on the scene graphs of a frame."""
         self._pulse.step(graphs[0].time_ns)
         tick, time = self._pulse.tick, self._pulse.told(self._pulse.tick.time)
         here = FrameTime(tick.number, time, seconds_of(time - self._pulse.start))
@@ -347,7 +347,7 @@ class Monitor:
         return here, people
 
     def _tell(self, here: FrameTime, people: list[NodeNames]) -> tuple[MonitorEvent, ...]:
-        """Update checks and patterns with the results of a frame."""
+        """Update the checks and patterns with the query results of a frame, and return the new events."""
         self._last = here
         found: list[MonitorEvent] = []
         for ego, watch, waiting in self._watches:
@@ -377,14 +377,12 @@ class Monitor:
 
     @property
     def patterns(self) -> dict[str, Query]:
-        """Patterns by name, with resolved names."""
+        """Monitored patterns: name → query with resolved names."""
         return {follow.name: follow.query for _, follow, _ in self._follows}
 
     @property
     def status(self) -> dict[str, str]:
         """Return the status of each check: ``true``, ``false``, ``presumably_true`` or ``presumably_false``.
-
-        ``true``, ``false``, ``presumably_true``, ``presumably_false``.
 
         The ``presumably`` values are the verdicts if the trace ended now. The status can also be ``unknown``.
         """
@@ -396,7 +394,7 @@ class Monitor:
 
     @property
     def robustness(self) -> dict[str, Robustness]:
-        """Return the robustness of each check with ``ROBUSTNESS``, if the trace ends now."""
+        """Return the robustness of each check with ``ROBUSTNESS`` if the trace ends now: name → robustness."""
         watches = self._watches if self._last is not None else []
         told = ((w.name, w.robustness) for _, w, waiting in watches if not waiting.reason)
         return {name: one for name, one in told if one is not None}
@@ -404,7 +402,7 @@ class Monitor:
     def run(
         self, frames: Iterable[Frame], *, duration_s: float | None = None
     ) -> tuple[Verdict, ...]:
-        """Process frames until they end or Ctrl-C is pressed, and return the verdicts.
+        """Process frames until they end or Ctrl-C is pressed, and return the verdicts of the checks.
 
         Parameters
         ----------
@@ -422,7 +420,10 @@ class Monitor:
         return self.finish()
 
     def finish(self) -> tuple[Verdict, ...]:
-        """End the trace, and return the verdicts. They equal the verdicts of a store with the same trace."""
+        """End the trace, and return the verdicts of the checks.
+
+        A store with the same trace gives the same verdicts.
+        """
         if self._last is None:
             return ()
         verdicts: list[Verdict] = []
@@ -444,7 +445,7 @@ class Monitor:
 
 
 class _PendingEvents:
-    """Events held back until the trace has provided the data they need.
+    """Monitor events that are held back until the trace has the data that they need.
 
     Parameters
     ----------
@@ -465,7 +466,7 @@ class _PendingEvents:
     def passed(
         self, found: list[MonitorEvent], here: FrameTime, people: NodeNames
     ) -> list[MonitorEvent]:
-        """Return the events to report at this frame, including released earlier events."""
+        """Return the monitor events to report at this frame, with earlier events that were held back."""
         if not self._open:
             return found
         self._open = [need for need in self._open if not self._told(need, people)]
@@ -497,7 +498,7 @@ class _PendingEvents:
 
 
 def _names(called: str | Sequence[str], count: int) -> Sequence[str]:
-    """Return a name for each pattern in events."""
+    """Return a name for each monitored pattern, to use in events."""
     if isinstance(called, str):
         return [called] if count == 1 else [f"{called} {i + 1}" for i in range(count)]
     if len(called) != count:
@@ -508,7 +509,7 @@ def _names(called: str | Sequence[str], count: int) -> Sequence[str]:
 def _bound(
     text: str, catalog: Catalog, parameters: Mapping[str, Any]
 ) -> tuple[list[BoundCheck], list[Query]]:
-    """Parse a text, and return its checks and patterns with resolved names."""
+    """Return the checks and patterns of a query text, with resolved names."""
     statements = [*each_match(parse(text))]
     written = [one for one in statements if not isinstance(one, MatchClause)]
     named = {name for one in statements for name in _parameters(one)}
@@ -539,7 +540,7 @@ def _bound(
 
 
 def _parameters(part: object) -> Iterator[str]:
-    """Yield the parameter names in a part of a text."""
+    """Yield the names of the query parameters (``$name``) in a part of a syntax tree."""
     if isinstance(part, Parameter):
         yield part.name
     elif isinstance(part, tuple | list):

@@ -41,7 +41,9 @@ Duties = tuple["frozenset[Term] | Term | None", ...]
 
 
 class ObligationState:
-    """State of a formula: its open obligations, and the memory of its past operators.
+    """State of a temporal formula during monitoring: its obligations, and the memory of past operators.
+
+    An obligation is a condition on later frames.
 
     Attributes
     ----------
@@ -70,7 +72,7 @@ class ObligationState:
 
     @property
     def terms(self) -> list[Term]:
-        """Return all open obligations of the state."""
+        """Return all open obligations (conditions on later frames) in the state."""
         found = [term for term, _ in self.past]
         found += [term for _, entries in self.past for *_, term in entries]
         for duty in self.duties:
@@ -79,7 +81,7 @@ class ObligationState:
 
     @property
     def ended(self) -> bool:
-        """True if the formula holds when no frame follows."""
+        """True if the temporal formula is true when the trace ends now."""
         if self.word in {"broken", "begins"}:
             return self.word == "begins"
         return all(term.ended for term in self._open)
@@ -89,7 +91,7 @@ class ObligationState:
         return [d for duty in self.duties if duty for d in _open(duty)]
 
     def at_end(self, end: str, tick: Tick) -> int:
-        """Return the verdict code if this frame is the last: ``VIOLATED``, ``PENDING`` or ``HOLDS``."""
+        """Return the formula's verdict code if the trace ends now: ``VIOLATED``, ``PENDING``, ``HOLDS``."""
         if self.ended or end == "weak":
             return HOLDS
         due = end == "pending" or (end == "bounded" and all(may_end(t, tick) for t in self._open))
@@ -98,7 +100,7 @@ class ObligationState:
 
 @dataclass(frozen=True, slots=True)
 class ObligationStep:
-    """Result of a state after one frame: the next state, and the changes of violations.
+    """Result of one frame for a monitored formula: the next state, and violations that begin or end.
 
     Attributes
     ----------
@@ -116,7 +118,7 @@ class ObligationStep:
 
 
 class Automaton:
-    """Formula with its reset condition and its guards, which are conditions of single frames.
+    """Monitored formula of a check as a state machine, with its reset condition and quantifier conditions.
 
     Parameters
     ----------
@@ -166,7 +168,7 @@ class Automaton:
         tick: Tick,
         seen: dict[tuple[ObligationState, int], ObligationStep],
     ) -> ObligationStep:
-        """Return the next state after one frame, and the changes of violations.
+        """Return the state of the formula after one frame, and the violations that begin or end.
 
         Parameters
         ----------
@@ -195,7 +197,7 @@ class Automaton:
         return found
 
     def _until(self, state: ObligationState, tick: Tick) -> tuple[int, int]:
-        """Return the time and frame number up to which no open time bound begins or ends."""
+        """Return the time (ns) and frame number until which no time bound of the formula begins or ends."""
         bounds = [begun for term in state.terms for begun in term.bounds()]
         for part, (_, entries) in zip(self._progression.past, state.past, strict=True):
             if isinstance(part, Since):
@@ -249,7 +251,10 @@ class Automaton:
         return word == "kept" or (word == "broken" and self._reset is None)
 
     def final(self, state: ObligationState, counted: int) -> bool:
-        """True if no later frame can change the state. ``counted`` holds the guards that were true so far."""
+        """True if no later frame can change the state of the formula.
+
+        The bits of ``counted`` are quantifier conditions that were true.
+        """
         return self._lasts(state.word) and counted == (1 << len(self._guards)) - 1
 
     def _moved(self, state: ObligationState, frame: ProgressionFrame) -> tuple[str, Duties]:
@@ -287,7 +292,10 @@ def _conjuncts(formula: Formula) -> list[Formula]:
 
 
 def _part(formula: Formula) -> tuple[bool, Formula]:
-    """Split off ``ALWAYS``: return True and its bounded operand, or False and the whole formula."""
+    """Split a formula ``ALWAYS p``: return True and p, or False and the whole formula.
+
+    The split requires a p with bounded future.
+    """
     body = always_true(formula)
     if body is None or not bounded(body):
         return False, formula

@@ -1,4 +1,4 @@
-"""Relations and signals of whole traces, read from the store.
+"""Query results and values over time of whole traces, read from the store.
 
 A relation holds, for each binding, the frames of one trace in which a condition is true. Lookups process many
 bindings at once.
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TimedRelation:
-    """Table of bindings and the frames in which each holds.
+    """Table of query matches: node ids of each match, and the frames in which it occurs.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class TimedRelation:
 
     @classmethod
     def of(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> TimedRelation:
-        """Build the table from unsorted rows. One row per binding and frame is kept.
+        """Return the table of matches from unsorted rows of frame and node ids. Duplicate rows are dropped.
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class TimedRelation:
         return cls(keys[first], starts, frames, tuple(value[order] for value in values))
 
     def between(self, first: int, last: int) -> TimedRelation:
-        """Return the rows in a range of frames, ends included. Frame numbers restart at 0."""
+        """Return the table limited to a range of frames, ends included. Frame numbers restart at 0."""
         rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
         owners = np.searchsorted(self.starts, rows, "right") - 1
         new = np.flatnonzero(np.diff(owners, prepend=-1))
@@ -104,7 +104,7 @@ class TimedRelation:
         return TimedRelation(keys, starts, self.frames[rows] - first, values)
 
     def find(self, wanted: Keys) -> Ints:
-        """Return the index of each binding (B, n) in the table, shape (B,). -1 means not found."""
+        """Return the table index of each combination of node ids (B, n), shape (B,). -1 means not found."""
         if not len(self.keys) or not len(wanted):
             return np.full(len(wanted), -1)
         if not wanted.shape[1]:
@@ -117,7 +117,10 @@ class TimedRelation:
         return place[codes[len(self.keys) :]]
 
     def rows_of(self, places: Ints) -> tuple[Ints, Ints]:
-        """Return all rows of some keys: the index of each row's key in ``places``, and the row index."""
+        """Return all frame rows of some matches, given their indices in the table.
+
+        The result is the position in ``places`` and the row index of each.
+        """
         known = np.flatnonzero(places >= 0)
         first, end = self.starts[places[known]], self.starts[places[known] + 1]
         counts = end - first
@@ -126,14 +129,14 @@ class TimedRelation:
         return owner, np.repeat(first, counts) + offset
 
     def flags(self, places: Ints, length: int) -> Bools:
-        """Return a mask (B, length) of the frames in which each key holds. Key -1 never holds."""
+        """Return a mask (B, length) of the frames in which each match occurs. For index -1 it is false."""
         found = np.zeros((len(places), length), np.bool_)
         owner, rows = self.rows_of(places)
         found[owner, self.frames[rows]] = True
         return found
 
     def column(self, places: Ints, length: int, number: int = 0) -> Column:
-        """Return the value of each binding in each frame."""
+        """Return the value of each match in each frame, as a column (B, length) with a mask of known values."""
         told = self.values[number]
         plain = np.ma.getdata(told)
         kind = np.float64 if plain.dtype.kind in "iuf" else plain.dtype
@@ -151,7 +154,7 @@ class TimedRelation:
 
 
 def refuse_many(bindings: int, told: str) -> None:
-    """Raise an error if there are too many combinations of nodes.
+    """Raise an error if a query has too many combinations of nodes in one trace.
 
     Raises
     ------
@@ -169,7 +172,7 @@ def refuse_many(bindings: int, told: str) -> None:
 
 
 def words() -> NDArray[np.str_]:
-    """Return all relation names in alphabetical order."""
+    """Return the names of all scene graph relations in alphabetical order."""
     return np.array(sorted(RELATIONS))
 
 
@@ -196,7 +199,7 @@ NODES_NAMED: Final = 1_000
 
 @dataclass(slots=True)
 class TraceReader:
-    """Data of one trace during evaluation.
+    """Data of one trace in memory: frames, times and query results.
 
     Attributes
     ----------
@@ -224,7 +227,7 @@ class TraceReader:
         return len(self.frame_ids)
 
     def between(self, first: int, last: int) -> TraceReader:
-        """Return a range of frames (ends included) as a trace of its own."""
+        """Return a range of frames (ends included) as a separate trace."""
         rows = slice(first, last + 1)
         return replace(
             self,
@@ -238,16 +241,16 @@ class TraceReader:
 
     @property
     def together(self) -> int:
-        """Number of bindings to process at once, over all frames."""
+        """Number of node combinations to process at once, so that arrays over all frames fit into memory."""
         return max(CELLS // max(len(self), 1), 1)
 
     def seconds(self, frame: int) -> float:
-        """Return the time of a frame since the trace start; s."""
+        """Return the time of a frame since the start of the trace; s."""
         return seconds_of(int(self.times[frame] - self.start))
 
 
 class PlanValues(SignalValues):
-    """Values of a plan's formulas and tests in one trace, for some bindings.
+    """Values of temporal formulas and expressions in all frames of one trace, for some combinations of nodes.
 
     Parameters
     ----------
@@ -276,29 +279,35 @@ class PlanValues(SignalValues):
         self._tests: dict[str, Column] = {}
 
     def evaluation(self, counted: str) -> PlanValues:
-        """Return a copy with unknown conditions counted the other way. Shared values are reused."""
+        """Return a copy in which unknown conditions count as ``counted`` says: for or against the check.
+
+        Other values are shared.
+        """
         found = copy(self)
         found._counted = counted  # noqa: SLF001 - of one's own kind
         return found
 
     def test(self, test: Test) -> Column:
-        """Return the value of a test. It is computed once."""
+        """Return the values of an expression over several frames. They are computed once and cached."""
         if test.name not in self._tests:
             self._tests[test.name] = super().test(test)
         return self._tests[test.name]
 
     def formula(self, formula: Formula) -> Bools:
-        """Return a mask (B, F) of the bindings and frames in which a formula is true."""
+        """Return a mask (B, F) of the node combinations and frames for which a temporal formula is true."""
         lenient = tolerant(formula, self.clock.tolerance)
         times, rows = self.clock.times, len(self._bindings)
         return evaluate_rows(lenient, self.columns(formula), times, rows)
 
     def columns(self, formula: Formula) -> dict[str, Bools]:
-        """Return the propositions of a formula as masks (B, F), or (1, F) if equal for all bindings."""
+        """Return the propositions (single-frame conditions) of a formula as masks: name → (B, F) or (1, F).
+
+        (1, F) is equal for all node combinations.
+        """
         return {name: self.proposition(name) for name in propositions(formula)}
 
     def proposition(self, name: str) -> Bools:
-        """Return a mask (B, F) or (1, F) of the frames in which an atom or test is true."""
+        """Return a mask (B, F) or (1, F) of the frames in which a proposition of a formula is true."""
         if name[-1] in SIGNS:
             if name[-1] != self._counted:
                 return np.zeros((1, len(self._trace)), np.bool_)
@@ -313,11 +322,11 @@ class PlanValues(SignalValues):
         return self._atoms[name]
 
     def condition(self, expression: Bound, test: Test) -> Bools:
-        """Return a mask (B, F) of the frames in which a condition inside a test is true."""
+        """Return a mask (B, F) of the frames in which the condition inside ``run_length(…)`` etc. is true."""
         return self.formula(test.formulas[expression])
 
     def margins(self, course: SignalCall, test: Test) -> Floats:
-        """Return the margins (B, F) of a condition inside a test."""
+        """Return the robustness margins (B, F) of the condition inside ``robustness(…)``."""
         rows, size = len(self._bindings), max(self._trace.together // MARGIN_CELLS, 1)
         if rows > size:
             parts = (self._bindings[low : low + size] for low in range(0, rows, size))
@@ -330,7 +339,7 @@ class PlanValues(SignalValues):
         return np.broadcast_to(value, (rows, len(self._trace)))
 
     def signal(self, signal: Ask) -> Column:
-        """Return the values (B, F) of a signal."""
+        """Return the values (B, F) of a single-frame query with a value, such as a speed."""
         if isinstance(self._plan, CheckPlan) and signal.name in self._plan.states:
             return self._state(*self._plan.states[signal.name])
         found = self._trace.relations[signal.name]
@@ -338,7 +347,10 @@ class PlanValues(SignalValues):
         return found.column(places, len(self._trace))
 
     def _state(self, of: Ask | None, doubt: str | None) -> Column:
-        """Return 0 where a value is known, and 1 where it is unknown. An absent value is masked."""
+        """Return a column (B, F): 0 where a value is known, 1 where it is unknown.
+
+        Frames without the entity are masked.
+        """
         frames = len(self._trace)
         if of is None:
             return Column(np.zeros((1, frames)), np.ones((1, frames), np.bool_))
@@ -362,7 +374,7 @@ def traces(
     gaps: str = "break",
     within: Window | None = None,
 ) -> Iterator[TraceReader]:
-    """Yield the answerable traces of a query in catalog order, with the queried relations.
+    """Yield the traces that have the data of a query, loaded into memory, in catalog order.
 
     Traces are read in small groups, so memory does not grow with the store. If a group has too many rows, its
     halves are read again.
@@ -405,7 +417,7 @@ def read(
     *,
     gaps: str,
 ) -> tuple[list[TraceReader], int]:
-    """Return the traces of a window for :func:`traces`, and the number of rows read.
+    """Return the traces of a window, loaded into memory, and the number of rows read. :func:`traces` calls it.
 
     Raises
     ------
@@ -430,7 +442,10 @@ def read(
 
 
 def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
-    """Limit a query to the nodes found by earlier steps. ``None`` means that they found no nodes."""
+    """Return a single-frame query limited to the nodes that earlier steps matched.
+
+    ``None`` means that they matched no nodes.
+    """
     ids: dict[str, Ints] = {}
     narrow = ask.loose or ask.value is not None
     for before in ask.after:
@@ -447,7 +462,7 @@ def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
 def _window_left(
     ask: Ask, catalog: Catalog, window: Window | None, traces: Mapping[int, TraceReader]
 ) -> Window | None:
-    """Limit a window to the traces in which all earlier steps have matches."""
+    """Return a window limited to the traces in which all earlier steps have matches."""
     left = {
         trace_id
         for trace_id, trace in traces.items()
@@ -464,7 +479,7 @@ def _no_rows(ask: Ask) -> TimedRelation:
 
 
 def chosen_traces(file: StoreFile, query: Query, catalog: Catalog) -> dict[int, tuple[Any, ...]]:
-    """Return the answerable traces of a query: id → name, start (ns) and period (ns)."""
+    """Return the selected traces with data for the query: id → name, start (ns) and frame period (ns)."""
     chosen, left = traces_of(query, catalog)
     return {
         row[0]: tuple(row[1:])
@@ -484,7 +499,10 @@ def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
 
 
 def buckets_of(file: StoreFile, window: Window | None) -> dict[str, Ints]:
-    """Return the buckets of a window, with masks of all frames and of frames without a gap before."""
+    """Return the buckets (64 frames each) of a window, with bit masks of their frames.
+
+    One mask has all frames, one has the frames without a gap before them.
+    """
     low, high = (window.low, window.high) if window else (0, _LAST)
     return _ordered(file, BUCKETS, low, high)
 
@@ -497,7 +515,7 @@ def times_of(file: StoreFile, window: Window | None) -> tuple[Ints, Ints]:
 
 
 def _ordered(file: StoreFile, sql: str, low: int, high: int) -> dict[str, Ints]:
-    """Return integer columns of a range, sorted by the first column."""
+    """Return the integer columns of an SQL query on a range of frames, sorted by the first column."""
     asked = file.arrays(sql, (low, high), plain=True).items()
     found = {name: np.ma.getdata(column).astype(np.int64) for name, column in asked}
     first = next(iter(found.values()))
@@ -534,7 +552,7 @@ def arrays_of(
     values: Sequence[Bound],
     most: int,
 ) -> tuple[Ints, Keys, list[Any]]:
-    """Return the rows of a pattern's matches, unsorted: frame ids, bindings, and values.
+    """Return the matches of a single-frame query as arrays, unsorted: frame ids, node ids, and values.
 
     For a signal, the relations of its edges follow the nodes.
 
@@ -570,7 +588,10 @@ def _relate(
     found: Mapping[int, TraceReader],
     most: int,
 ) -> int:
-    """Query one relation, add its rows to each trace, and return their number. ``most`` limits it."""
+    """Run one single-frame query, add its matches to each trace, and return their number.
+
+    ``most`` is the largest number allowed.
+    """
     if ask.everywhere:
         for trace in found.values():
             every = np.arange(len(trace))
@@ -594,7 +615,7 @@ def _relate(
 
 
 def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
-    """Return the trace ids of ordered frames, and the slice of frames of each trace."""
+    """Return pairs of trace id and slice, which split ordered frame ids by trace."""
     if not len(ids):
         return []
     owners = trace_of(ids)
@@ -604,7 +625,7 @@ def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
 
 
 def ascending(times: Ints) -> Ints:
-    """Return strictly ascending times. Repeated times and backward jumps are corrected.
+    """Return frame times corrected to ascend strictly. Repeated times and backward jumps are moved forward.
 
     A repeated time becomes a nanosecond later. After a backward jump, all times are shifted by
     :data:`sgstore.model.world.JUMP_NS` after the last one. So the jump is a gap that no time bound spans.

@@ -1,4 +1,4 @@
-"""Evaluation plans: temporal expressions as formulas over atoms, and their text.
+"""Evaluation plans: temporal formulas over the results of single-frame queries, and their text.
 
 A :class:`Plan` contains all single-frame data that the expressions of a statement need, without duplicates:
 
@@ -53,7 +53,7 @@ TRUE: Final = b.Value(value=True, type=Type.boolean)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ask:
-    """Query on single frames: an atom, a signal, or the pattern of a step.
+    """Query on single frames, whose results a temporal formula or a sequence needs.
 
     Attributes
     ----------
@@ -81,18 +81,18 @@ class Ask:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Keys of the nodes and edges in a binding."""
+        """Keys of the nodes and edges that identify a match of the query."""
         return (*self.variables, *self.edges) if self.value is None else self.variables
 
     @property
     def everywhere(self) -> bool:
-        """True if the query has no condition and so holds in every frame."""
+        """True if the query has no pattern and no condition, so that every frame matches."""
         scope = self.query.scope
         return self.value is None and not (scope.nodes or scope.edges or scope.where)
 
     @property
     def loose(self) -> bool:
-        """True if edges do not connect all nodes. Such a query may have very many matches."""
+        """True if edges do not connect all nodes of the query. Such a query may have very many matches."""
         scope = self.query.scope
         groups = [{node} for node in scope.nodes]
         for edge in scope.edges:
@@ -101,7 +101,7 @@ class Ask:
         return len(groups) > 1
 
     def among(self, nodes: Mapping[str, Iterable[int]]) -> Ask:
-        """Return the query limited to these ids for some of its nodes."""
+        """Return the query limited to some ids for some of its nodes."""
         scope = self.query.scope
         where = (b.node_among(node, ids) for node, ids in nodes.items())
         narrower = replace(scope, where=(*scope.where, *where))
@@ -110,7 +110,7 @@ class Ask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Test:
-    """Expression that uses values of several frames.
+    """Expression on values of several frames, evaluated as a column over the frames.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class Test:
 
 @dataclass(slots=True)
 class Plan:
-    """Atoms, signals and tests of single frames, which make up temporal expressions.
+    """Evaluation plan of temporal formulas: the single-frame queries and the expressions that they need.
 
     Parameters
     ----------
@@ -173,11 +173,14 @@ class Plan:
 
     @property
     def asks(self) -> dict[str, Ask]:
-        """All queries on single frames by name."""
+        """All single-frame queries of the plan: name → query."""
         return self.atoms | self.signals
 
     def formula(self, expression: b.Bound) -> f.Formula:
-        """Return the formula of a condition. Needed atoms and tests are added to the plan."""
+        """Return the temporal formula of a condition.
+
+        The single-frame queries that it needs are added to the plan.
+        """
         if b.is_temporal(expression):
             return self._over_time(expression)
         things = self._things(expression)
@@ -187,7 +190,10 @@ class Plan:
         return self._logic(expression)
 
     def quantity(self, expression: b.Bound) -> f.Formula:
-        """Return the formula of a condition with a proposition for each number comparison: :attr:`margins`."""
+        """Return the formula of a condition, for its robustness margin.
+
+        Each comparison of numbers becomes a proposition in :attr:`margins`.
+        """
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -207,7 +213,7 @@ class Plan:
         return frozenset(edge.key for edge in edges if len(edge.relations) > 1)
 
     def _things(self, expression: b.Bound) -> frozenset[str]:
-        """Return the keys of an expression's nodes and edges, with the end nodes of these edges."""
+        """Return the keys of the nodes and edges in an expression, with the end nodes of the edges."""
         edges = b.edges_of(expression)
         ends = (
             e for edge in self.whole.scope.edges if edge.key in edges for e in (edge.src, edge.dst)
@@ -215,7 +221,7 @@ class Plan:
         return b.nodes_of(expression) | edges | frozenset(ends)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """Return the nodes and edges whose absence makes a single-frame condition false."""
+        """Return the nodes and edges without which a single-frame condition is false."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -250,7 +256,7 @@ class Plan:
                 return self._atom(expression, self._things(expression))
 
     def _merged(self, operands: tuple[b.Bound, ...]) -> list[b.Bound]:
-        """Group the operands of a conjunction by their nodes, to use one query per group.
+        """Group the operands of an ``AND`` by their nodes, so that one query evaluates each group.
 
         A condition joins a group if the group already uses all its nodes, and is false when one of them is
         absent. One combined query has fewer matches than separate queries.
@@ -279,7 +285,7 @@ class Plan:
         return [_all(parts) for _, parts in groups] + alone
 
     def present(self, node: str) -> f.Formula:
-        """Return the formula that is true where a node is present."""
+        """Return the formula that is true in the frames with a node."""
         return self._atom(TRUE, frozenset({node}))
 
     def _atom(self, expression: b.Bound, things: frozenset[str]) -> f.Formula:
@@ -294,7 +300,7 @@ class Plan:
         return f.Proposition(name)
 
     def test(self, expression: b.Bound) -> Test:
-        """Return the test of an expression over several frames. Add it if new."""
+        """Return the plan entry for an expression on values of several frames. Add it if it is new."""
         key = "=" + unnumbered_text(expression)
         name = self._names.get(key)
         if name is None:
@@ -359,7 +365,10 @@ class Plan:
 
 
 def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
-    """Return a plan for conditions of steps. Its bindings cover the nodes of all steps."""
+    """Return an evaluation plan for the temporal conditions of sequence steps.
+
+    It uses the nodes of all steps.
+    """
     nodes = {key: node for step in reversed(steps) for key, node in step.scope.nodes.items()}
     edges = tuple(edge for step in steps for edge in step.scope.edges)
     scope = b.Scope(nodes, {}, edges, (), frozenset())
@@ -368,7 +377,7 @@ def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
 
 
 def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
-    """Return the condition that a check requires in every frame for all entities, or ``None``."""
+    """Return the condition that a check requires in every frame for all entities. ``None`` for other checks."""
 
     def lasting(formula: b.Bound) -> b.Bound | None:
         match formula:
@@ -385,23 +394,23 @@ def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
 
 
 def plan_of_returned(check: BoundCheck) -> Plan:
-    """Return a plan, without queries yet, for the values that a check returns."""
+    """Return a new evaluation plan for the ``RETURN`` values of a check, without queries."""
     return Plan(query_of_check(check), variables_of(check), prefix="returned ")
 
 
 def query_of_check(check: BoundCheck) -> b.Query:
-    """Return a query with the settings and nodes of a check."""
+    """Return a query with the settings and the nodes of a check."""
     about = check.relations, check.injective, check.ego, check.unknown_is_false
     return b.Query(check.scope, b.Result(), *about, world=check.world)
 
 
 def variables_of(check: BoundCheck) -> tuple[str, ...]:
-    """Return the node keys bound by the quantifiers of a check."""
+    """Return the keys of all nodes in the quantifiers of a check."""
     return tuple(node for q in check.quantifiers for node in q.nodes)
 
 
 def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str]) -> list[Ask]:
-    """Return the patterns of steps, named ``step 1``, ``step 2`` and so on.
+    """Return the single-frame query of each sequence step, named ``step 1``, ``step 2`` and so on.
 
     A query binds all nodes of a step if its conditions need them, else only the kept nodes.
     """
@@ -418,7 +427,7 @@ def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str
 
 
 def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the named nodes and edges, which connect the steps of alternatives."""
+    """Return the named nodes and edges that alternative steps of a sequence share."""
     happen = [step for step in query.steps if query.alternatives and not step.absent]
     nodes = (node for step in happen for node in step.scope.nodes.values())
     edges = (edge.key for step in happen for edge in step.scope.edges if edge.named)
@@ -427,7 +436,7 @@ def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
 
 
 def _together(query: b.Query, size: int) -> list[frozenset[int]]:
-    """Return for each step the other steps that occur in every match with this step."""
+    """Return, for each sequence step, the steps that occur in every match with it, itself included."""
     if not query.alternatives:
         return [frozenset(range(size))] * size
     ways = [frozenset(way.steps) for way in query.alternatives]
@@ -476,7 +485,7 @@ MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
 
 
 def has_margin(comparison: b.Operation) -> bool:
-    """True if a condition compares numbers, and not only constants."""
+    """True if a condition compares numbers, not all of them constant. Then it has a robustness margin."""
     constants = b.Value | b.Operation
     return (
         comparison.word in MARGINS
@@ -490,7 +499,7 @@ def _all(parts: list[b.Bound]) -> b.Bound:
 
 
 def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # noqa: PLR0911 - a case each
-    """Return a single-frame condition in which unknown simple conditions count as false.
+    """Return a single-frame condition that is never unknown: comparisons of unknown values count as false.
 
     A plain conjunction does not change: unknown is not true.
     """
@@ -519,7 +528,7 @@ def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # n
 
 
 def _never_unknown(expression: b.Bound) -> bool:
-    """True if the condition compares a count of matches with a constant. Such a condition is always known."""
+    """True if a condition compares ``COUNT {…}`` with a constant. Such a condition is never unknown."""
     match expression:
         case b.Operation(operands=(b.BlockValue(word="COUNT"), b.Value(value=value))):
             return value is not None
@@ -530,7 +539,7 @@ def _never_unknown(expression: b.Bound) -> bool:
 def plan_text(
     plan: Plan, formula: f.Formula, reset: f.Formula | None, catalog: Catalog | None = None
 ) -> str:
-    """Return a plan as text: the formula and its propositions. With a catalog, add the SQL of the atoms."""
+    """Return an evaluation plan as text: the temporal formula and its queries. With a catalog, SQL is added."""
     lines = [f"formula {formula_text(formula)}"]
     lines += [f"reset {formula_text(reset)}"] if reset is not None else []
     lines += needs_text(plan, catalog)
@@ -538,7 +547,7 @@ def plan_text(
 
 
 def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
-    """Return the queries and tests of a plan as text lines. With a catalog, add the SQL."""
+    """Return the queries and expressions of an evaluation plan as text lines. With a catalog, SQL is added."""
     lines: list[str] = []
     for ask in plan.asks.values():
         where = " AND ".join(value_text(part) for part in ask.query.scope.where) or "TRUE"
@@ -554,7 +563,7 @@ def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
 
 
 def ask_text(ask: Ask) -> str:
-    """Return the name of a query for error messages: step number, signal text or condition text."""
+    """Return a short text for a single-frame query in error messages: step number, value or condition."""
     if ask.value is not None:
         return value_text(ask.value)
     conditions = " AND ".join(value_text(part) for part in ask.query.scope.where)
@@ -562,26 +571,26 @@ def ask_text(ask: Ask) -> str:
 
 
 def sql_text(statement: SqlStatement) -> list[str]:
-    """Return an indented SQL statement with its parameter values."""
+    """Return an SQL statement and its parameter values as indented text lines."""
     lines = [f"    {line}" for line in statement.sql.splitlines()]
     return lines + [f"    ${n} = {value!r}" for n, value in enumerate(statement.values, start=1)]
 
 
 def hold_text(hold: BoundHold) -> str:
-    """Return the duration of a step as text."""
+    """Return the duration condition of a sequence step as text."""
     inclusive = " INCLUSIVE" if hold.inclusive else ""
     return f"for {hold.comparison} {length_text(hold.length)}{inclusive}"
 
 
 def link_text(link: StepLink) -> str:
-    """Return a link between steps as text."""
+    """Return the time relation between two sequence steps as text, such as ``then within 5s``."""
     after = f" after {length_text(link.after)}" if link.after else ""
     within = f" within {length_text(link.within)}" if link.within else ""
     return f"{link.kind}{after}{within}"
 
 
 def way_text(way: StepWay) -> str:
-    """Return one of the sequences of a step expression as text."""
+    """Return one alternative step sequence of a query as text, such as ``sequence step 1 then step 2``."""
     links = ["", *(f"{link_text(link)} " for link in way.links)]
     steps = (f"{link}step {n + 1}" for link, n in zip(links, way.steps, strict=True))
     return f"sequence {' '.join(steps)}"
@@ -593,7 +602,7 @@ def length_text(length: Length) -> str:
 
 
 def _refuse_large(value: b.Bound) -> None:
-    """Reject a value over time with integers beyond the exact range of float64.
+    """Raise an error if an expression over several frames uses integers that float64 cannot represent exactly.
 
     Single-frame conditions are exact.
 

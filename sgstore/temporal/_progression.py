@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 
 
 class Term:
-    """Combination of obligations. Equal terms are one object.
+    """Obligations of a temporal formula (conditions on later frames), joined by logic.
+
+    Equal terms are one object.
 
     Attributes
     ----------
@@ -84,7 +86,7 @@ class Term:
             self.begins = tuple(since for operand in operands for since in operand.begins)
 
     def bounds(self) -> Iterator[tuple[Bound, int]]:
-        """Yield the time bounds that have begun in these obligations, and the start of each."""
+        """Yield the time bounds that run in these obligations, each with its start time or frame number."""
         if self.word == "duty":
             if self.timed:
                 yield self.operands[0].bound, self.operands[1]
@@ -93,13 +95,13 @@ class Term:
                 yield from operand.bounds()
 
     def implies(self, other: Term) -> bool:
-        """True if these obligations imply other obligations of the same structure."""
+        """True if these obligations imply other ones that differ only in the starts of time bounds."""
         pairs = zip(self.begins, other.begins, strict=True)
         return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
 
     @property
     def ended(self) -> bool:
-        """Truth value of the obligations if no frame follows."""
+        """Truth value of these obligations (conditions on later frames) if the trace ends now."""
         match self.word:
             case "true" | "false":
                 return self.word == "true"
@@ -114,7 +116,7 @@ class Term:
 
 
 def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
-    """True if the obligations are fulfilled or still open when this frame is the last.
+    """True if obligations (conditions on later frames) are fulfilled or still open when the trace ends.
 
     A forward operator is open if its bound is not over, and so is ``NEXT``. An operator without an upper bound
     has failed.
@@ -142,7 +144,7 @@ def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
 
 
 class Terms:
-    """Table of all combinations of obligations in use."""
+    """Table of all obligations (conditions on later frames) in use. Equal ones are stored once."""
 
     def __init__(self) -> None:
         self._known: WeakValueDictionary[tuple[Any, ...], Term] = WeakValueDictionary()
@@ -160,18 +162,20 @@ class Terms:
         return term
 
     def constant(self, value: bool) -> Term:  # noqa: FBT001 - it is the value
-        """Return the obligation that is always true, or always false."""
+        """Return the obligation (condition on later frames) that is always true, or always false."""
         return self.true if value else self.false
 
     def duty(self, formula: Formula, since: int | None, *, weak: bool) -> Term:
-        """Return the obligation on the next frame. ``since`` is the start of its bound, if begun.
+        """Return the obligation that a formula is true from the next frame on.
+
+        ``since`` is the start of its time bound, if begun.
 
         Formulas compare by identity, so equal parts must be one object.
         """
         return self._made("duty", (formula, since, weak), (id(formula), since, weak))
 
     def negated(self, term: Term) -> Term:
-        """Return the negation of a combination of obligations."""
+        """Return the negation of obligations (conditions on later frames)."""
         if term is self.true or term is self.false:
             return self.constant(term is self.false)
         if term.word == "not":
@@ -179,7 +183,7 @@ class Terms:
         return self._made("not", (term,), (id(term),))
 
     def joined(self, word: str, terms: Iterable[Term]) -> Term:
-        """Return the conjunction or disjunction of obligations, without redundant ones.
+        """Return obligations (conditions on later frames) joined by ``and`` or ``or``, without redundant ones.
 
         A term and its negation are not simplified; later frames decide them. The offline verdicts
         (:mod:`sgstore.temporal._verdicts`) do the same, and both must agree.
@@ -202,7 +206,7 @@ class Terms:
 
 
 def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
-    """Remove redundant obligations from a conjunction or disjunction.
+    """Return obligations joined by ``and`` or ``or`` without those that others imply.
 
     So a repeated obligation of an ``ALWAYS`` is stored once.
     """
@@ -231,7 +235,7 @@ Past = tuple[tuple[Term, tuple[Entry, ...]], ...]
 
 
 class Progression:
-    """Formula prepared for frame-by-frame evaluation.
+    """Temporal formula, prepared for evaluation frame by frame.
 
     Parameters
     ----------
@@ -261,7 +265,7 @@ class Progression:
 
     @property
     def untimed(self) -> bool:
-        """True if the formula has no bounds, so timestamps do not matter."""
+        """True if the temporal formula has no time bounds, so that frame times do not matter."""
         return not any(
             isinstance(p, Until | Since) and (p.bound.low or p.bound.high is not None)
             for p in walk(self.formula)
@@ -269,7 +273,7 @@ class Progression:
 
 
 def interned(formula: Formula, known: dict[Formula, Formula] | None = None) -> Formula:
-    """Return a copy of a formula in which equal parts are one object."""
+    """Return a copy of a temporal formula in which equal subformulas are one object."""
     known = {} if known is None else known
     if formula not in known:
         known[formula] = with_operands(formula, lambda part: interned(part, known))
@@ -278,7 +282,7 @@ def interned(formula: Formula, known: dict[Formula, Formula] | None = None) -> F
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Time and number of a frame.
+    """Time and number of the current frame in an online evaluation.
 
     Attributes
     ----------
@@ -295,18 +299,18 @@ class Tick:
     tolerance: int = 0
 
     def begun(self, bound: Bound, age: int) -> bool:
-        """True if an age (ns or frames) has reached the lower end of a bound."""
+        """True if a duration (ns or frames) has reached the lower end of a time bound."""
         return age >= bound.low - (0 if bound.frames else self.tolerance)
 
     def over(self, bound: Bound, age: int) -> bool:
-        """True if an age (ns or frames) is past the upper end of a bound."""
+        """True if a duration (ns or frames) has passed the upper end of a time bound."""
         if bound.high is None:
             return False
         return age > bound.high + (0 if bound.frames else self.tolerance)
 
 
 class ProgressionFrame:
-    """Evaluation of a formula at one frame.
+    """Evaluation of a temporal formula at one frame of an online run.
 
     Parameters
     ----------
@@ -333,7 +337,7 @@ class ProgressionFrame:
             self._entries.append(kept)
 
     def now(self, formula: Formula, since: int | None = None) -> Term:
-        """Return the obligations of a formula at this frame.
+        """Return the conditions on later frames (obligations) under which a formula is true at this frame.
 
         ``since`` is the start of an *until* bound, by default here.
         """
@@ -380,7 +384,7 @@ class ProgressionFrame:
         return terms.joined("or", (right, terms.joined("and", (left, later))))
 
     def resolved(self, term: Term) -> Term:
-        """Update the obligations of the previous frame with the data of this frame."""
+        """Return obligations from the previous frame, updated with the data of this frame."""
         if term not in self._resolved:
             self._resolved[term] = self._resolve(term)
         return self._resolved[term]
@@ -400,7 +404,10 @@ class ProgressionFrame:
     def _of_past(
         self, part: Formula, before: Term, entries: tuple[Entry, ...]
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """Return the value of a past operator at this frame, and its memory for the next frame."""
+        """Return the value of a past operator (*previous* or *since*) at this frame.
+
+        The second result is its memory for the next frame.
+        """
         terms, before = self._terms, self.resolved(before)
         if isinstance(part, Previous):
             return before, ()
@@ -416,7 +423,10 @@ class ProgressionFrame:
     def _known_past(
         self, part: Since, entries: tuple[Entry, ...], right: Term
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """Evaluate a *since* with known sides. Its memory is the frames in which the right side was true."""
+        """Return the value and the memory of a *since* whose operands are known.
+
+        The memory is the list of frames in which the right operand was true.
+        """
         bound = part.bound
         if right is self._terms.true:
             # Without a lower bound, the latest entry suffices.
@@ -459,7 +469,7 @@ class ProgressionFrame:
         return self._tick.time - entry[0]
 
     def past(self) -> Past:
-        """Return the memory of past operators for the next frame."""
+        """Return the memory of the past operators (*previous*, *since*) for the next frame."""
         return tuple(
             (self.now(p.operand) if isinstance(p, Previous) else self._present[id(p)], entries)
             for p, entries in zip(self._parts, self._entries, strict=True)

@@ -31,7 +31,7 @@ NEWCOMER: Final = -(1 << 60)
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """Bindings of the variables up to one quantifier.
+    """Combinations of entities for the variables of one quantifier and those outside it.
 
     Attributes
     ----------
@@ -49,7 +49,10 @@ class Level:
 
 
 def innermost(levels: Sequence[Level]) -> Keys:
-    """Return the bindings of all variables, shape (B, n). Without quantifiers, return one empty binding."""
+    """Return the combinations of entities for all variables of a check, (B, n).
+
+    Without quantifiers, B is 1 and n is 0.
+    """
     return levels[-1].bindings if levels else np.zeros((1, 0), np.int64)
 
 
@@ -60,7 +63,9 @@ def levels_of(
     apart: Ints | None,
     counts: Callable[[BoundQuantifier, tuple[str, ...], Keys], Bools],
 ) -> list[Level]:
-    """Return the bindings of each quantifier, each extended from the bindings before.
+    """Return the combinations of entities for each quantifier.
+
+    Each level extends the combinations of the level before.
 
     Parameters
     ----------
@@ -103,7 +108,7 @@ def levels_of(
 
 
 def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]:
-    """Return the domains of a check, plus one future entity for each variable of ``FORSOME``."""
+    """Return the entities of each check variable, with an extra future entity for ``FORSOME`` variables."""
     some = [node for q in check.quantifiers if q.word == "FORSOME" for node in q.nodes]
     return {
         node: np.append(domain, NEWCOMER + some.index(node)) if node in some else domain
@@ -114,7 +119,7 @@ def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]
 def waits_for_newcomers(
     check: BoundCheck, levels: Sequence[Level], wider: Sequence[Level], codes: Codes
 ) -> bool:
-    """True if a failed check can still hold, because ``FORSOME`` includes entities that appear later.
+    """True if a false check can still become true, because ``FORSOME`` includes entities that appear later.
 
     Parameters
     ----------
@@ -135,14 +140,17 @@ def waits_for_newcomers(
 
 
 def may_wait(check: BoundCheck) -> bool:
-    """True if entities that appear later can fulfil a failed check."""
+    """True if the settings of a check allow entities that appear later to make a false check true."""
     return check.end in {"bounded", "pending"} and any(
         q.word == "FORSOME" for q in check.quantifiers
     )
 
 
 def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list[Array]:
-    """Combine values of bindings by quantifier. Return the values of each level, outermost first.
+    """Combine the values of entity combinations, from the innermost quantifier to the outermost.
+
+    ``FORALL`` takes the minimum, ``FORSOME`` the maximum. Return the values of each level,
+    outermost first.
 
     Parameters
     ----------
@@ -164,7 +172,9 @@ def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list
 
 
 def folded_margins(levels: Sequence[Level], values: Floats) -> tuple[float, int | None]:
-    """Return the margin of a check, and the deciding binding. ``None`` means no binding decides.
+    """Return the robustness margin of a check, and the index of the entity combination that decides it.
+
+    ``None`` means that no combination decides.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Robustness of a formula: its distance from being true or false.
+"""Robustness of a temporal formula: the margin by which it is true (positive) or false (negative).
 
 A comparison of numbers has a **margin**: positive if it holds, negative if it fails. Any other condition has an
 infinite margin. Negation changes the sign, *and* is the minimum, *or* the maximum, and time operators are
@@ -56,7 +56,7 @@ MARGIN_CELLS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Robustness:
-    """Robustness of a check on a trace, with the condition and frame that decide it.
+    """Robustness of a check on a trace (margin of the verdict), with the deciding condition and frame.
 
     Attributes
     ----------
@@ -86,7 +86,9 @@ class Robustness:
 
 
 def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> Robustness:
-    """Replace a margin of minus infinity that comes from an absent entity.
+    """Replace a robustness of minus infinity that an absent entity causes.
+
+    The other margin is computed without absence, and at most 0.
 
     Parameters
     ----------
@@ -104,7 +106,7 @@ def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> 
 
 
 def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.inf) -> Floats:
-    """Return the margin (B, F) of a comparison. Unknown counts as false.
+    """Return the robustness margin (B, F) of a comparison. By default, an unknown value counts as false.
 
     Parameters
     ----------
@@ -125,12 +127,12 @@ def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.i
 
 
 def margin_of_flags(flags: Bools) -> Floats:
-    """Return infinite margins for a Boolean condition."""
+    """Return the robustness margins of a condition without numbers: plus or minus infinity."""
     return np.where(flags, np.inf, -np.inf)
 
 
 def condition_text(plan: Plan, name: str) -> str:
-    """Return the condition behind a proposition of a plan as text."""
+    """Return the condition that a named proposition of a formula stands for, as text."""
     name = base_name(name)
     meanings = plan.meanings if isinstance(plan, CheckPlan) else {}
     if name in meanings:
@@ -153,7 +155,7 @@ def margin_columns(
     tolerance: int,
     unknown: float = -np.inf,
 ) -> dict[str, Floats]:
-    """Return the margins of the propositions of a formula.
+    """Return the robustness margins of the propositions in a formula: name → margins (B, F).
 
     Parameters
     ----------
@@ -179,7 +181,7 @@ def margin_columns(
 
 
 class MarginTable:
-    """Margins of the propositions of a trace, and of formulas over them.
+    """Robustness margins of temporal formulas in one trace, from the margins of their propositions.
 
     Parameters
     ----------
@@ -197,7 +199,10 @@ class MarginTable:
         self._known: dict[Formula, Floats] = {}
 
     def value(self, formula: Formula) -> Floats:
-        """Return the margin (B, F) of a formula at each frame, or (1, F) if equal for all bindings."""
+        """Return the robustness margin (B, F) of a formula at each frame.
+
+        The shape is (1, F) if all node combinations have the same margin.
+        """
         if formula not in self._known:
             self._known[formula] = self._value(formula)
         return self._known[formula]
@@ -232,7 +237,10 @@ class MarginTable:
                 return until(sides, self.value(right)[:, ::-1], first, end)[:, ::-1]
 
     def _asked(self, formula: Until | Since) -> tuple[Places, Places]:
-        """Return the range of frames in a bound, for each frame: first frame, and frame after the last."""
+        """Return, for each frame, the range of frames in an operator's time bound.
+
+        The range is: first frame, and frame after the last.
+        """
         forward = isinstance(formula, Until)
         bound = formula.bound.widened(self._tolerance)
         near, far = self._clock.window(bound, forward=forward)
@@ -246,7 +254,7 @@ class MarginTable:
     # Deciding frames
 
     def decisive(self, formula: Formula, row: int, frame: int) -> tuple[str, int] | None:  # noqa: PLR0911
-        """Return the proposition and frame whose margin equals the margin of a formula.
+        """Return the proposition and frame that decide the robustness margin of a formula, or None.
 
         The first of several wins.
 
@@ -298,7 +306,7 @@ class MarginTable:
 
 
 def until(left: Floats | None, right: Floats, first: Places, end: Places) -> Floats:
-    """Return the margin (B, F) of an *until* at each frame.
+    """Return the robustness margin (B, F) of a temporal *until* at each frame.
 
     Parameters
     ----------
@@ -334,7 +342,7 @@ def _behind(values: Floats) -> Floats:
 
 
 def _unbounded(left: Floats, right: Floats) -> Floats:
-    """Return the margin of an unbounded *until* at each frame, shape (B, F).
+    """Return the robustness margin (B, F) of an *until* without time bound at each frame.
 
     Each step is a clamp, and a sequence of clamps is a clamp. So blocks of frames are processed in parallel,
     then combined.

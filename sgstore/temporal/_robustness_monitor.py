@@ -1,4 +1,4 @@
-"""Online robustness, frame by frame, in bounded memory.
+"""Online computation of robustness (margin of a verdict), frame by frame in bounded memory.
 
 The margin of a formula may depend on later frames. For a bounded operator, the monitor waits. For an unbounded
 operator, *one* number is unknown: its margin at the next frame. A margin is a function of known and unknown
@@ -91,7 +91,7 @@ def _best(margins: Margins, *, greatest: bool) -> Margins:
 
 
 def _best_so_far(margins: Margins, *, greatest: bool) -> Margins:
-    """Return the running maximum or minimum (N, B, V)."""
+    """Return the running maximum or minimum of robustness margins over frames, (N, B, V)."""
     values = margins["value"] if greatest else -margins["value"]
     new = np.ones(values.shape, np.bool_)
     new[1:] = values[1:] > np.maximum.accumulate(values, axis=0)[:-1]
@@ -112,7 +112,7 @@ def _constant(value: Any, shape: tuple[int, ...]) -> Margins:
 
 @dataclass(slots=True)
 class _Tape:
-    """Margins of consecutive frames.
+    """Robustness margins of consecutive frames, stored while later margins need them.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class _Tape:
 
 @dataclass(slots=True)
 class _Part:
-    """Subformula with its margins.
+    """Subformula of a temporal formula, with its robustness margins.
 
     Attributes
     ----------
@@ -175,21 +175,23 @@ class _Part:
     tape: _Tape = field(default_factory=lambda: _Tape(0, np.zeros((0, 1, 1), MARGIN)))
 
     def join(self, one: Margins, other: Margins) -> Margins:
-        """Combine margins as a disjunction, or as a conjunction in the dual formula."""
+        """Return the margins of an ``OR`` of two operands. Under a negation, it is an ``AND``."""
         return _better(one, other, greatest=self.positive)
 
     def meet(self, one: Margins, other: Margins) -> Margins:
-        """Combine margins as a conjunction, or as a disjunction in the dual formula."""
+        """Return the margins of an ``AND`` of two operands. Under a negation, it is an ``OR``."""
         return _better(one, other, greatest=not self.positive)
 
     @property
     def nothing(self) -> float:
-        """Margin of a condition that is always false. In the dual formula, it is always true."""
+        """Margin of a condition that is always false. Under a negation, it is always true."""
         return -np.inf if self.positive else np.inf
 
 
 class MarginStream:
-    """Margin of a formula at the first frame, updated online for several bindings.
+    """Online computation of the robustness margin of a temporal formula at the first frame.
+
+    It handles several node combinations.
 
     Parameters
     ----------
@@ -272,7 +274,7 @@ class MarginStream:
     # Online, frame by frame
 
     def step(self, columns: Mapping[str, Floats], tick: Tick, parents: Ints) -> None:
-        """Process the next frame.
+        """Update the margins of the formula with the data of the next frame.
 
         Parameters
         ----------
@@ -297,15 +299,15 @@ class MarginStream:
         self._forget()
 
     def margins(self) -> Margins:
-        """Return the margins (B,) if the trace ended now, with dtype :data:`MARGIN`."""
+        """Return the robustness margins (B,) if the trace ends now, with dtype :data:`MARGIN`."""
         return copy(self)._finished()  # noqa: SLF001 - of one's own kind
 
     def name(self, number: int) -> str:
-        """Return the name of the proposition with this number."""
+        """Return the name of the formula's proposition with this number."""
         return self._names[number]
 
     def _finished(self) -> Margins:
-        """Return the margins (B,) of the ended trace. No further frame is possible."""
+        """End the trace, and return its robustness margins (B,). No further frame is possible."""
         self._parts = [replace(part, tape=copy(part.tape)) for part in self._parts]
         self._ended = True
         self._advance()
@@ -323,7 +325,7 @@ class MarginStream:
                 self._answer = part.tape.at(0)
 
     def _replace(self, bit: int, value: Margins) -> None:
-        """Replace unknown margins by the values of a frame."""
+        """Replace margins that were unknown by their values, when the next frame provides them."""
         low, high = self._vertices & ~bit, self._vertices | bit
 
         def shown(old: Margins) -> Margins:
@@ -339,7 +341,7 @@ class MarginStream:
         return _constant(value, (self._rows, len(self._vertices)))
 
     def _here(self, name: str, *, positive: bool) -> Margins:
-        """Return the margins of a proposition in this frame."""
+        """Return the margins of one proposition of the formula in this frame."""
         found = self._all(0.0)
         column = self._columns[name][:, None]
         found["value"] = column if positive else -column
@@ -348,7 +350,7 @@ class MarginStream:
         return found
 
     def _told(self, part: _Part) -> Iterator[Margins]:
-        """Yield the margins of a subformula that have become known, frame by frame."""
+        """Yield the margins of a subformula that have become known with this frame, frame by frame."""
         match part.formula:
             case TruthConstant(value=value):
                 if not self._ended:
@@ -385,7 +387,7 @@ class MarginStream:
 
     @property
     def _count(self) -> int:
-        """Number of frames so far."""
+        """Number of frames processed until now."""
         return self._start + len(self._times)
 
     def _right(self, part: _Part) -> _Tape:
@@ -442,9 +444,9 @@ class MarginStream:
             yield _best(found, greatest=part.positive)
 
     def _window_ahead(self, at: int, bound: Bound, *, single: bool) -> tuple[int, int] | None:
-        """Return the first frame of a bound and the frame after the last.
+        """Return the range of later frames in a time bound: first frame, and frame after the last.
 
-        ``None`` means a later frame decides.
+        ``None`` means that a later frame decides.
         """
         bound, count = bound.widened(self._tolerance), self._count
         if bound.frames:
@@ -484,7 +486,7 @@ class MarginStream:
             yield _best(found, greatest=part.positive)
 
     def _window_back(self, at: int, bound: Bound, *, single: bool) -> tuple[int, int]:
-        """Return the first and the last frame of a bound. -1 means before the trace."""
+        """Return the first and last earlier frame in a time bound. -1 means before the trace."""
         bound = bound.widened(self._tolerance)
         if bound.frames:
             last = max(at - bound.low, -1)
@@ -528,7 +530,7 @@ class MarginStream:
 
 
 class RobustnessMonitor:
-    """Online robustness of a check.
+    """Online monitor of the robustness of a check (margin of its verdict).
 
     Parameters
     ----------
@@ -571,7 +573,7 @@ class RobustnessMonitor:
         self._rows: dict[Partial, int] = {}
 
     def step(self) -> None:
-        """Process the next frame. Its query results must be ready."""
+        """Update the robustness with the next frame. The query results of the frame must be ready."""
         if self._without is not None:
             self._without.step()
         valuation, known = self._valuation, self._memories

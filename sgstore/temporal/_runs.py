@@ -1,4 +1,4 @@
-"""Runs of a single-frame pattern, and values over them, for many traces at once.
+"""Runs (consecutive matching frames) of a single-frame pattern, for many traces at once.
 
 All rows (one binding in one frame) form one array, ordered by trace, binding and frame. So the work does not
 grow with the number of traces. A value over a run is read only for the rows of the pattern.
@@ -67,7 +67,7 @@ RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 
 @dataclass(frozen=True)
 class FrameLine:
-    """Frames of many traces in one array.
+    """Frames of many traces in one array, with their times.
 
     Frames come from the buckets of a store, 60 at a time. Times are read on demand.
 
@@ -100,7 +100,7 @@ class FrameLine:
     def read(
         cls, file: StoreFile, about: Mapping[int, tuple[Any, ...]], window: Window | None
     ) -> FrameLine:
-        """Read the frames of the traces in a window. ``about`` is the result of :func:`chosen_traces`."""
+        """Return the frames of the traces in a window. ``about`` is the result of :func:`chosen_traces`."""
         buckets = buckets_of(file, window)
         owners = buckets["bucket"] >> BUCKET_BITS
         rows = np.isin(owners, [*about])
@@ -144,7 +144,7 @@ class FrameLine:
         return found
 
     def places(self, ids: Ints) -> Ints:
-        """Return the index of each frame id, shape (R,). -1 means not present."""
+        """Return the array index of each frame id, shape (R,). -1 means not present."""
         if not len(self.ids):
             return np.full(len(ids), -1)
         traces = trace_of(ids)
@@ -163,7 +163,9 @@ class FrameLine:
 
 @dataclass(frozen=True)
 class BindingRows:
-    """Rows of frame and binding, sorted by trace, binding and frame, without duplicates.
+    """Table of query matches in many traces: one row for each frame and combination of nodes.
+
+    Rows are sorted by trace, nodes and frame, without duplicates.
 
     Attributes
     ----------
@@ -187,7 +189,7 @@ class BindingRows:
     def of(
         cls, line: FrameLine, ids: Ints, keys: Keys, values: Mapping[b.Bound, Column]
     ) -> BindingRows:
-        """Build the table from unsorted rows. Rows of other traces are dropped."""
+        """Return the table of matches from unsorted rows. Rows of other traces are dropped."""
         frames = line.places(ids)
         known = frames >= 0
         if not known.all():
@@ -206,7 +208,7 @@ class BindingRows:
         return found.only(~again) if again.any() else found
 
     def only(self, rows: Bools) -> BindingRows:
-        """Return the selected rows."""
+        """Return the table of matches limited to the selected rows."""
         owners = np.cumsum(self.fresh)[rows]
         fresh = np.diff(owners, prepend=0) != 0
         values = {name: _rows(value, rows) for name, value in self.values.items()}
@@ -217,12 +219,12 @@ class BindingRows:
 
     @cached_property
     def starts(self) -> Ints:
-        """Index of the first row of each run. A run has consecutive frames and one binding."""
+        """Index of the first row of each run. A run has consecutive frames and the same nodes."""
         follows = np.diff(self.frames, prepend=-2) == 1
         return np.flatnonzero(self.fresh | ~follows | self.line.begins[self.frames])
 
     def held(self, hold: b.BoundHold) -> BindingRows:
-        """Return the rows of the runs with the required duration."""
+        """Return the table limited to runs (consecutive frames with the same nodes) of a required duration."""
         if not len(self):
             return self
         counts = np.diff(self.starts, append=len(self))
@@ -237,7 +239,7 @@ class BindingRows:
 
 
 class RowValues(SignalValues):
-    """Values of the tests of a plan, one column per row of frame and binding: (1, R).
+    """Values of expressions over several frames, as columns (1, R): one value for each row of frame and nodes.
 
     Parameters
     ----------
@@ -250,12 +252,12 @@ class RowValues(SignalValues):
         self._rows = rows
 
     def signal(self, signal: Ask) -> Column:
-        """Return the values (1, R) of a signal."""
+        """Return the values (1, R) of a single-frame query, one for each row of frame and nodes."""
         assert signal.value is not None  # noqa: S101 - it is no atom
         return self._rows.values[signal.value]
 
     def course(self, course: b.SignalCall, test: Test) -> Column:
-        """Return the values (1, R) of a function over a time window."""
+        """Return the values (1, R) of a function over a time window, such as ``avg_over(x, 2s)``."""
         column = self.signal(test.signals[course.operand])
         first = self.window_starts(course)
         if course.word in {"sum_over", "avg_over"}:
@@ -265,7 +267,7 @@ class RowValues(SignalValues):
         return over_columns(course.word, column, first)
 
     def window_starts(self, course: b.SignalCall) -> Ints:
-        """Return the first row of the time window at each row, shape (R,)."""
+        """Return, for each row, the first row of the time window that ends there, shape (R,)."""
         rows, line = self._rows, self._rows.line
         here = np.arange(len(rows))
         stretch = np.cumsum(line.begins)[rows.frames]
@@ -288,7 +290,7 @@ class RowValues(SignalValues):
 
 
 class RunFinder:
-    """Search for the runs of a single-frame pattern in a store.
+    """Search in a store for the runs (consecutive matching frames) of a single-frame pattern.
 
     Parameters
     ----------
@@ -321,7 +323,7 @@ class RunFinder:
         self._window_nodes = frozenset(ask.variables) if bare else None
 
     def fits(self, places: Sequence[b.Bound]) -> bool:
-        """True if the rows of the pattern are enough to compute its frames and the requested values."""
+        """True if the rows of the pattern's query are enough for the matches and the returned values."""
         step = self._query.steps[0]
         if self._query.spans or step.absent or self._query.gaps != "break" or self._ask.everywhere:
             return False
@@ -348,7 +350,7 @@ class RunFinder:
         return chosen_traces(self._file, self._query, self._catalog)
 
     def found(self, places: Sequence[b.Bound], within: Window | None) -> Iterator[RunsTold]:
-        """Yield the runs in whole traces, in groups that fit into memory.
+        """Yield the runs (consecutive matching frames) of whole traces, in portions that fit into memory.
 
         Parameters
         ----------
@@ -370,7 +372,7 @@ class RunFinder:
                 yield told
 
     def _found(self, places: Sequence[b.Bound], window: Window | None) -> tuple[RunsTold, int]:
-        """Return the runs in a window, and the number of rows read."""
+        """Return the runs (consecutive matching frames) in a window of frames, and the number of rows read."""
         step = self._query.steps[0]
         tests = {one: self._plan.test(one) for one in step.when}
         tests |= {one: self._plan.test(one) for place in places for one in _values(place)}
@@ -397,7 +399,10 @@ class RunFinder:
         return self._parts(rows, told), many
 
     def _parts(self, rows: BindingRows, told: list[Any]) -> RunsTold:
-        """Split runs where a returned value changes or a frame id is skipped."""
+        """Return first and last frame, nodes and values of each run.
+
+        A run ends where a returned value changes or a frame id is skipped.
+        """
         ids = rows.line.ids[rows.frames]
         new = np.diff(ids, prepend=-2) != 1
         new[rows.starts] = True
@@ -409,7 +414,7 @@ class RunFinder:
         return ids[first], ids[last], rows.keys[first], values
 
     def _projected(self, rows: BindingRows) -> BindingRows:
-        """Return the rows with only the columns that a match returns."""
+        """Return the table of matches with only the node columns that the query returns."""
         if self._named == self._ask.columns:
             return rows
         columns = [self._ask.columns.index(name) for name in self._named]
@@ -417,7 +422,7 @@ class RunFinder:
         return BindingRows.of(rows.line, ids, rows.keys[:, columns], rows.values)
 
     def _read(self, tests: Collection[Test], window: Window | None) -> BindingRows:
-        """Return the rows of the pattern, with the values that the tests need."""
+        """Return the table of the pattern's matches in a window, with the values that some expressions need."""
         signals = (signal.value for test in tests for signal in test.signals.values())
         asked = list(dict.fromkeys(value for value in signals if value is not None))
         line = FrameLine.read(self._file, self._about, window)
@@ -437,7 +442,7 @@ def _values(place: b.Bound) -> tuple[b.Bound, ...]:
 
 
 def _column(told: Any) -> Column:
-    """Convert a database column to a column of shape (1, R)."""
+    """Return a database column as a column of values and mask of known values, shape (1, R)."""
     values, known = np.ma.getdata(told), ~np.ma.getmaskarray(told)
     if values.dtype.kind in "iuf":
         values = values.astype(np.float64)
@@ -455,7 +460,7 @@ def _whole(column: Column, rows: int) -> Column:
 
 
 def _order(columns: Sequence[Ints]) -> Ints:
-    """Return the sort order of rows by some columns. The first column is the primary key."""
+    """Return the sort order of table rows by several columns. The first column is the primary key."""
     rows = len(columns[0])
     if not rows:
         return np.zeros(0, np.int64)
@@ -481,7 +486,7 @@ def _order(columns: Sequence[Ints]) -> Ints:
 
 
 def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
-    """Return the first indices between ``low`` and ``high`` at which ascending numbers reach a limit."""
+    """Return the first indices from ``low`` to ``high`` where ascending numbers reach some limits."""
     low, high = low.copy(), high.copy()
     while np.any(low < high):
         middle = (low + high) // 2
@@ -491,7 +496,7 @@ def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
 
 
 def _one_by_one(word: str, values: Any, known: Bools, first: Ints) -> Column:
-    """Return exact sums or means of the known values in each window."""
+    """Return exact sums or means of the known values in the time window of each row."""
     count = np.concatenate(([0], np.cumsum(known)))
     some = values[known].tolist()
     ends = zip(count[first].tolist(), count[1:].tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""Online monitor of one ``MATCH`` or sequence, frame by frame, and its events."""
+"""Online monitor of one ``MATCH`` or sequence, and the events that it reports."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class FrameTime:
-    """Number and times of a monitored frame.
+    """Number and times of a frame in an online monitor.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class FrameTime:
 
 @dataclass(frozen=True, slots=True)
 class MonitorEvent:
-    """Event reported by an online monitor at a frame.
+    """Event that an online monitor reports at a frame, such as a match or a violation.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ FoundMatch = tuple[StepWay, Binding, tuple[StepFrame, ...]]
 
 
 class SequenceMonitor:
-    """Online monitor of a pattern over one trace.
+    """Online monitor of one pattern or sequence over one trace.
 
     Parameters
     ----------
@@ -152,7 +152,10 @@ class SequenceMonitor:
     # Online, frame by frame
 
     def step(self, here: FrameTime, people: NodeNames) -> list[MonitorEvent]:
-        """Process the next frame, and return the new events. Its query results must be ready."""
+        """Process the next frame of the trace, and return the new events.
+
+        The query results of the frame must be ready.
+        """
         self._conditions.step()
         gap = self._pulse.breaks(bridge=self.query.gaps == "bridge")
         for number in range(len(self._steps)):
@@ -169,7 +172,7 @@ class SequenceMonitor:
         return self._found(here)
 
     def _now(self, number: int) -> dict[Key, Needs]:
-        """Return the bindings of a step's pattern in this frame, and the open conditions of each."""
+        """Return the matches of a step's pattern in this frame: nodes → open conditions, or True."""
         question, variables = self._asks[number]
         places = [variables.index(name) for name in self._columns[number]]
         answers = self._questions.answers[question]
@@ -210,7 +213,7 @@ class SequenceMonitor:
         return found
 
     def _certain(self) -> Iterator[FoundMatch]:
-        """Yield the matches that became certain with this frame."""
+        """Yield the matches of the sequence that are certain with the data of this frame."""
         (way,) = self._asked
         if all(self._held[number] for number in self._happen[way]):
             for binding in self._bindings({}, self._happen[way]):
@@ -219,7 +222,7 @@ class SequenceMonitor:
 
     @cached_property
     def _lasting(self) -> dict[StepWay, frozenset[int]]:
-        """Positions of the steps whose runs must end before a match can be reported."""
+        """Positions of the steps whose runs of frames must end before a match can be reported."""
         return {way: frozenset(self._lasting_in(happen)) for way, happen in self._happen.items()}
 
     def _lasting_in(self, happen: tuple[int, ...]) -> Iterator[int]:
@@ -232,7 +235,7 @@ class SequenceMonitor:
             yield len(happen) - 1
 
     def _frames(self) -> Iterator[int]:
-        """Yield the numbers of the frames at which a part of a match can begin or end."""
+        """Yield the numbers of the stored frames at which a step of a match can begin or end."""
         for number in frozenset[int]().union(*self._happen.values()):
             for one in self._held[number].values():
                 yield from one.frames()
@@ -241,7 +244,7 @@ class SequenceMonitor:
                 yield from place.ends
 
     def _bindings(self, binding: Binding, steps: Sequence[int]) -> Iterator[Binding]:
-        """Yield the joint bindings of all steps, if each step has frames."""
+        """Yield the combinations of nodes for which every step of the sequence has matching frames."""
         if not steps:
             yield binding
             return
@@ -252,7 +255,7 @@ class SequenceMonitor:
                     yield from self._bindings(both, steps[1:])
 
     def _agreeing(self, number: int, binding: Binding) -> list[tuple[Key, StepState]]:
-        """Return the bindings of a step that are compatible with another binding."""
+        """Return the node combinations of a step that agree with the given nodes, each with its state."""
         names, held = self._columns[number], self._held[number]
         if all(name in binding for name in names):
             key = tuple(binding[name] for name in names)
@@ -285,7 +288,7 @@ class SequenceMonitor:
         return self._held[number].get(tuple(binding[name] for name in self._columns[number]))
 
     def _ways(self, way: StepWay, at: int, place: StepFrame, binding: Binding) -> Ways:
-        """Yield the frames of the remaining steps of a sequence, starting from a given frame."""
+        """Yield the possible frames of the remaining steps of a sequence, after a given frame."""
         steps, following = way.steps, at + 1
         if following == len(steps):
             return (place,)
@@ -317,7 +320,7 @@ class SequenceMonitor:
     def _reached(
         self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
     ) -> list[StepFrame]:
-        """Return the frames of the next step that a link allows."""
+        """Return the frames of the next step that its time relation to the previous step allows."""
         found = [p for p in held.places if p.number <= stop] if held is not None else []
         first = place.number
         match link.kind:
@@ -340,7 +343,7 @@ class SequenceMonitor:
     def _closed(  # noqa: PLR0911 - a case each
         self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
     ) -> bool:
-        """True if a link allows no further frame of the next step."""
+        """True if no later frame of the next step can meet its time relation to the previous step."""
         if self._ended:
             return True
         tick = self._pulse.tick
@@ -398,7 +401,7 @@ class SequenceMonitor:
     def _span(
         self, part: OverMatch, happen: tuple[int, ...], ways: tuple[StepFrame, ...]
     ) -> tuple[int, int]:
-        """Return the first and the last frame of a part of a match."""
+        """Return the first and last frame of a match, or of the steps in an ``OVER`` clause."""
         if part.start == AT_FRAME:
             return ways[-1].number, ways[-1].number
         if part.start is None or part.end is None:
@@ -418,7 +421,7 @@ class SequenceMonitor:
     # Stored data
 
     def _forget(self) -> None:
-        """Drop the step frames that no match can use any more."""
+        """Delete the stored frames of steps that no later match can use."""
         first = self._held[0]
         for key, one in first.items():
             if one.places:
@@ -436,7 +439,9 @@ class SequenceMonitor:
                     one.places.pop(0)
 
     def _oldest(self, number: int) -> tuple[dict[Key, int], list[int]]:
-        """Return the first possible frames of matches, by the nodes that two steps share.
+        """Return the first frame at which a match can begin, for each combination of shared nodes.
+
+        The nodes are those of the first step and a given step.
 
         Also return the columns of the other step with these nodes.
         """
@@ -467,7 +472,7 @@ class SequenceMonitor:
     def _alive(  # noqa: PLR0911 - a case each
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
     ) -> bool:
-        """True if later frames can still continue a sequence after this frame."""
+        """True if later frames can still continue a sequence after the given frame."""
         following, steps = at + 1, way.steps
         if following == len(steps):
             return False
@@ -493,7 +498,7 @@ class SequenceMonitor:
         return False
 
     def finish(self, here: FrameTime) -> list[MonitorEvent]:
-        """End the trace, and return the events that only the end decides."""
+        """End the trace, and return the events of the sequence that only the end decides."""
         self._ended = True
         for held in self._held:
             for one in held.values():
@@ -502,7 +507,7 @@ class SequenceMonitor:
 
 
 def _returned(query: Query) -> list[ReturnColumn]:
-    """Return the columns that describe multi-frame matches. Aggregates over all matches have none."""
+    """Return the ``RETURN`` columns that use several frames of a match. Queries with aggregates have none."""
     if query.result.aggregated:
         return []
     return [
@@ -521,7 +526,7 @@ def _named(query: Query) -> tuple[str, ...]:
 
 
 def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) -> bool:
-    """True if the delay between two frames meets the limits of a link; tolerance in ns."""
+    """True if the delay between two frames meets the time relation of two steps; tolerance in ns."""
     later = {True: other.number - place.number, False: other.time - place.time}
     slack = {True: 0, False: tolerance}
     after, within = link.after, link.within
@@ -531,7 +536,7 @@ def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) 
 
 
 class _Conditions:
-    """Conditions of steps that depend on other frames."""
+    """Conditions of sequence steps that depend on several frames."""
 
     def __init__(
         self, query: Query, steps: Sequence[BoundStep], questions: QueryCache, pulse: StreamClock
@@ -552,7 +557,7 @@ class _Conditions:
         self._frames: dict[Partial, ProgressionFrame] = {}
 
     def step(self) -> None:
-        """Process the next frame. Its query results must be ready."""
+        """Update the conditions with the next frame. The query results of the frame must be ready."""
         if not any(self._asked):
             return
         known = self._known
@@ -572,15 +577,15 @@ class _Conditions:
         known.keep(entries, lambda one, other: one == other)
 
     def row(self, nodes: Binding) -> Partial:
-        """Return the nodes of a binding in the order of the condition variables."""
+        """Return the nodes of a match in the order of the variables in the conditions."""
         return tuple(nodes.get(name) for name in self._variables)
 
     def now(self, number: int, row: Partial) -> Term:
-        """Return the open conditions of a step for a binding in this frame."""
+        """Return the open conditions of a step for given nodes in this frame."""
         return self._frame(row).now(self._when[number])
 
     def resolved(self, needs: Needs) -> Needs:
-        """Update the open conditions of an earlier frame with the data of this frame."""
+        """Return the open conditions of an earlier frame, updated with the data of this frame."""
         if isinstance(needs, bool):
             return needs
         return settled([(row, self._frame(row).resolved(term)) for row, term in needs])
@@ -591,7 +596,7 @@ class _Conditions:
 
 
 def settled(needs: list[tuple[Partial, Term]]) -> Needs:
-    """Return True if one of the conditions holds, False if none can, else the open conditions."""
+    """Return True if one of the open conditions is true, False if none can be, otherwise the open ones."""
     if any(term.word == "true" for _, term in needs):
         return True
     left = tuple((row, term) for row, term in needs if term.word != "false")

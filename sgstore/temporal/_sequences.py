@@ -1,4 +1,4 @@
-"""Sequences over a store: the steps of a query joined over time as arrays."""
+"""Search for sequences in a store: the matches of the steps are joined over time, as arrays."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """Link from one step to the next.
+    """Time relation from one sequence step to the next, with the frames of the next step.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Leg:
 
 
 class BindingLine:
-    """Frames of many bindings in one index: frame i of binding b has position ``b * stride + i``.
+    """Frames of many node combinations in one index: frame i of combination b has position ``b * stride + i``.
 
     Parameters
     ----------
@@ -100,11 +100,11 @@ class BindingLine:
         ]  # before the clock jumps
 
     def frame(self, places: Ints) -> Ints:
-        """Return the frame number of each position in the line."""
+        """Return the frame number for each position in the joint index."""
         return places % self.stride
 
     def run_ends(self, places: Ints) -> Ints:
-        """Return the last position of the run of each ascending position, shape (R,)."""
+        """Return the last position of the run (consecutive frames) of each ascending position, shape (R,)."""
         if not len(places):
             return places
         last = np.append(self._starts(places)[1:], True)
@@ -112,7 +112,7 @@ class BindingLine:
         return places[np.minimum.accumulate(ends[::-1])[::-1]]
 
     def run_starts(self, places: Ints) -> Ints:
-        """Return the first position of the run of each ascending position, shape (R,)."""
+        """Return the first position of the run (consecutive frames) of each ascending position, shape (R,)."""
         if not len(places):
             return places
         return places[
@@ -120,18 +120,18 @@ class BindingLine:
         ]
 
     def runs(self, places: Ints) -> Ints:
-        """Return the run number of each ascending position, shape (R,)."""
+        """Return the number of the run (consecutive frames) of each ascending position, shape (R,)."""
         return np.cumsum(self._starts(places)) - 1
 
     def _starts(self, places: Ints) -> Bools:
-        """Return a mask of run starts: after a missing frame, a gap, or the last frame of another binding."""
+        """Return a mask of the positions that start a run: after a missing frame, a gap, or other nodes."""
         starts = np.ones(len(places), np.bool_)
         follows = np.diff(places) == 1
         starts[1:] = ~follows | self._breaks[self.frame(places[1:])]
         return starts
 
     def held(self, places: Ints, hold: BoundHold) -> Ints:
-        """Return the positions whose run has the required duration."""
+        """Return the positions whose run of consecutive frames has the required duration."""
         if not len(places):
             return places
         runs = self.runs(places)
@@ -146,7 +146,7 @@ class BindingLine:
         return places[hold.fits(length, self.clock.tolerance)[runs]]
 
     def window(self, leg: Leg, places: Ints) -> tuple[Ints, Ints]:
-        """Return the first and last allowed position of the next step for each position, both (R,)."""
+        """Return the first and last allowed position of the next step, for each position of a step."""
         frame = self.frame(places)
         base = places - frame
         if leg.kind == "while":
@@ -170,7 +170,10 @@ class BindingLine:
         return low, high
 
     def _moved(self, frame: Ints, by: Length | None, side: str) -> Ints:
-        """Return the first frame at or after a delay (``left``), or the last frame within it (``right``)."""
+        """Return, for each frame, the frame after a delay.
+
+        ``left`` means the first frame at or after it, ``right`` the last frame within it.
+        """
         times = self.clock.times
         if by is None:
             return frame if side == "left" else np.full_like(frame, self.frames - 1)
@@ -187,7 +190,7 @@ class BindingLine:
 
 
 def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str) -> Ints:
-    """Return the matches of a sequence.
+    """Return the matches of a sequence as positions of its steps in the joint frame index.
 
     Parameters
     ----------
@@ -225,7 +228,7 @@ def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str)
 
 
 def _next(possible: Ints, low: Ints, high: Ints, *, latest: bool) -> tuple[Ints, Bools]:
-    """Return the earliest or latest position in each window, and a mask of the windows that have one."""
+    """Return the earliest or latest possible position in each window, and a mask of non-empty windows."""
     if not len(possible):
         return low, np.zeros(len(low), np.bool_)
     if latest:
@@ -245,7 +248,7 @@ def _unfollowed(line: BindingLine, leg: Leg, places: Ints) -> Ints:
 
 
 def _one_a_run(line: BindingLine, first: Ints, possible: Ints) -> Ints:
-    """Return the first possible position in each run of the first step."""
+    """Return the first possible start position in each run (consecutive frames) of the first step."""
     runs = line.runs(first)[np.searchsorted(first, possible)] if len(possible) else possible
     return possible[np.diff(runs, prepend=-1) != 0] if len(possible) else possible
 
@@ -259,7 +262,7 @@ _Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchesOfWay:
-    """Matches of one alternative sequence of a query, for some of its bindings.
+    """Matches of one alternative step sequence of a query, for some combinations of nodes.
 
     Attributes
     ----------
@@ -283,7 +286,7 @@ class MatchesOfWay:
 
 
 class Finder:
-    """Search for the matches of a multi-frame query in a store.
+    """Search in a store for the matches of a sequence, or another query on several frames.
 
     Parameters
     ----------
@@ -307,7 +310,7 @@ class Finder:
         self._runs = None if query.spans else RunFinder(*about)
 
     def __call__(self, places: tuple[Bound, ...], window: Window | None) -> ExternalRelation:
-        """Return the matches in a window, extended to whole traces.
+        """Return the matches of the query in all traces that a window touches.
 
         Parameters
         ----------
@@ -336,7 +339,7 @@ class Finder:
     def _parts(
         self, places: tuple[Bound, ...], window: Window | None
     ) -> Iterator[tuple[str, _Part]]:
-        """Yield the matches in a window in parts, each with the name of one of its traces."""
+        """Yield the matches of the query in portions, each with the name of a trace for messages."""
         if self._runs is not None and self._runs.fits(places):
             for first, last, keys, values in self._runs.found(places, _whole(window)):
                 yield "a trace", (first, last, self._ordered(self._named(0), keys), values)
@@ -348,7 +351,7 @@ class Finder:
     def readers(
         self, window: Window | None, places: tuple[Bound, ...] = ()
     ) -> Iterator[TraceReader]:
-        """Yield the traces of a window, extended to whole traces, with the data that the query needs.
+        """Yield all traces that a window touches, loaded with the data that the query needs.
 
         Parameters
         ----------
@@ -361,11 +364,14 @@ class Finder:
         return traces(*about, gaps=self._query.gaps, within=_whole(window))
 
     def matches(self, trace: TraceReader) -> bool:
-        """True if the selected frames of a trace contain a match."""
+        """True if the selected frames of a trace contain a match of the query."""
         return any(len(part[0]) for part in self._find(trace, ()))
 
     def _asks_of(self, places: tuple[Bound, ...], steps: Sequence[Ask]) -> dict[str, Ask]:
-        """Return all single-frame queries. Queries of returned values cover only the bindings of the steps."""
+        """Return all single-frame queries: of steps, conditions and returned values.
+
+        Queries of returned values need only the nodes that match the steps.
+        """
         for place in places:
             for value in _worked_out(place):
                 self._planned(value)
@@ -381,7 +387,7 @@ class Finder:
         return self._plan.test(place)
 
     def text(self, places: tuple[Bound, ...]) -> str:
-        """Return the single-frame queries, and the formulas over their results, as text."""
+        """Return the evaluation plan of the query as text: single-frame queries and temporal formulas."""
         lines: list[str] = []
         for number, (step, ask) in enumerate(zip(self._query.steps, self._steps, strict=True)):
             if number and not self._query.alternatives:
@@ -414,7 +420,7 @@ class Finder:
     def _of_way(
         self, line: BindingLine, held: list[TimedRelation], way: StepWay
     ) -> Iterator[MatchesOfWay]:
-        """Yield the matches of one alternative sequence of the query."""
+        """Yield the matches of one alternative step sequence of the query."""
         happen = way.happen
         together = joined([(self._named(n), held[n]) for n in happen], self._apart)
         for part in together.parts([held[n] for n in happen]):
@@ -434,7 +440,9 @@ class Finder:
     def _chosen(
         self, line: BindingLine, held: list[TimedRelation], found: list[MatchesOfWay]
     ) -> Iterator[MatchesOfWay]:
-        """Yield the best match for each run of the first step and each binding.
+        """Yield the preferred match for each combination of nodes and each run of the first step.
+
+        A run is a series of consecutive frames.
 
         Matches compare by the positions of their steps. A longer match counts as later than a shorter one. For
         equal positions, the alternative written first wins.
@@ -473,12 +481,12 @@ class Finder:
         return self._tied if self._query.injective else frozenset()
 
     def _named(self, number: int) -> tuple[str, ...]:
-        """Return the columns of a step's relation that other steps or results use."""
+        """Return the node and edge columns of a step that other steps or the results use."""
         ask = self._steps[number]
         return (*(n for n in ask.variables if n in self._tied), *ask.edges)
 
     def _held(self, trace: TraceReader, line: BindingLine, number: int) -> TimedRelation:
-        """Return the frames in which a step holds, after its pattern, conditions and duration."""
+        """Return the table of frames in which a step matches, with its pattern, conditions and duration."""
         step, ask = self._query.steps[number], self._steps[number]
         relation = trace.relations[ask.name]
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
@@ -497,7 +505,7 @@ class Finder:
     def _true(
         self, trace: TraceReader, relation: TimedRelation, ask: Ask, formula: Formula, owners: Ints
     ) -> Any:
-        """Return a mask of the relation rows in which a formula is true."""
+        """Return a mask of the rows of a step's matches for which a temporal formula is true."""
         true = np.zeros(len(owners), np.bool_)
         for low, high, rows in _chunks(relation.starts, trace.together):
             bindings = relation.keys[low:high, : len(ask.variables)]
@@ -565,7 +573,10 @@ class Finder:
         return owner * line.stride + relation.frames[rows]
 
     def _legs(self, way: StepWay, at: list[Ints], absent: dict[int, Ints]) -> list[Leg]:
-        """Return the links between the occurring steps. Absent steps become conditions of a link."""
+        """Return the time relations between required steps.
+
+        A ``NOT MATCH`` step becomes part of a time relation.
+        """
         legs: list[Leg] = []
         links, number, following = way.links, 1, iter(at[1:])
         while number <= len(links):
@@ -581,7 +592,7 @@ class Finder:
     def _span(
         self, line: BindingLine, place: OverMatch, one: MatchesOfWay, ends: Ints
     ) -> tuple[Ints, Ints]:
-        """Return the first and last frame of the part of each match that a value covers, both (M,)."""
+        """Return the first and last frame (M,) of the part of each match that an ``OVER`` clause covers."""
         told, happen = one.told, one.happen
         if place.start is None or place.end is None:
             return line.frame(told[:, 0]), ends
@@ -648,14 +659,14 @@ def _whole(window: Window | None) -> Window | None:
 
 
 def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:
-    """Yield ranges of at most ``size`` keys, with their rows."""
+    """Yield ranges of at most ``size`` node combinations, with the slice of their frame rows."""
     for low in range(0, len(starts) - 1, size):
         high = min(low + size, len(starts) - 1)
         yield low, high, slice(int(starts[low]), int(starts[high]))
 
 
 def _worked_out(place: Bound) -> tuple[Bound, ...]:
-    """Return the single-frame values behind a returned value of a match."""
+    """Return the single-frame values that a returned value of a match needs."""
     match place:
         case StepTime():
             return ()

@@ -1,4 +1,4 @@
-"""Shortest clips: the fewest consecutive frames that still contain a match or a violation.
+"""Shortest clips: the fewest consecutive frames that still contain a match or violate a check.
 
 Each candidate clip is evaluated as a separate trace: operators see no frames outside, and entities without a
 frame in the clip are absent. Single-frame values do not change, including times since the trace start,
@@ -207,7 +207,7 @@ def _matching(
 def _of_one_frame(
     file: StoreFile, matches: TemporalMatches, span: Span | None
 ) -> Iterator[ShortestClip]:
-    """Yield the first matching frame of each trace, or of a clip."""
+    """Yield the first matching frame of each trace, or of a clip, as the shortest clip."""
     low, high = (-1, (1 << 63) - 1) if span is None else (one.frame_id for one in span)
     found: dict[int, FrameRef] = {}
     for one in matches.frames():
@@ -250,7 +250,7 @@ def _stays(query: Query) -> bool:
 
 
 def _cut(trace: TraceReader, span: Span | None) -> TraceReader:
-    """Return the frames of a clip in a trace, or the whole trace."""
+    """Return the frames of a trace in a given span, or the whole trace."""
     if span is None:
         return trace
     first, last = np.searchsorted(trace.frame_ids, [one.frame_id for one in span]).tolist()

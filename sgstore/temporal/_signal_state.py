@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 
 
 def _courses(expression: b.Bound) -> Iterator[b.SignalCall]:
-    """Yield the time functions in an expression, except those inside their conditions."""
+    """Yield the calls of functions over time, such as ``delta(x, 2s)``, in an expression.
+
+    Nested calls are not included.
+    """
     if isinstance(expression, b.SignalCall):
         yield expression
     elif not b.is_formula(expression):
@@ -38,7 +41,7 @@ def _courses(expression: b.Bound) -> Iterator[b.SignalCall]:
 
 
 class SignalState:
-    """Tests of a plan, evaluated frame by frame.
+    """Online evaluation of expressions over several frames, frame by frame.
 
     Parameters
     ----------
@@ -83,12 +86,12 @@ class SignalState:
 
     @property
     def begun(self) -> Memory:
-        """Memory before the first frame."""
+        """Memory of functions over time and past operators before the first frame."""
         pasts = (progression.begun for progression in self.conditions.values())
         return (*(None for _ in self.places), *pasts)
 
     def step(self) -> None:
-        """Process the next frame. The clock must be up to date."""
+        """Add the next frame. The clock must contain the frame already."""
         tick = self.pulse.tick
         if self.gap:
             self._frames.clear()
@@ -99,23 +102,26 @@ class SignalState:
 
     @property
     def gap(self) -> bool:
-        """True if a gap lies before this frame."""
+        """True if a recording gap is between the previous frame and this frame."""
         return self.pulse.breaks(bridge=self._bridge)
 
     @property
     def oldest(self) -> int:
-        """Number of the oldest frame that a test can still read."""
+        """Number of the oldest frame whose values an expression can still need."""
         return self._frames[0][1]
 
     def window(self, course: b.SignalCall) -> tuple[int, int]:
-        """Return number and time of the oldest frame in the current window of a time function."""
+        """Return number and time of the oldest frame in the time window of a function over time.
+
+        An example is ``avg_over(x, 2s)``.
+        """
         tick = self.pulse.tick
         if course.frames:
             return max(tick.number - course.by + 1, self._begun), -NEVER
         return self._begun, tick.time - course.by - tick.tolerance
 
     def there(self, course: b.SignalCall) -> int:
-        """Return the number of the frame that ``delta`` compares with this frame, or -1."""
+        """Return the number of the earlier frame with which ``delta(x, 2s)`` compares this frame, or -1."""
         tick = self.pulse.tick
         if course.frames:
             number = tick.number - course.by
@@ -133,7 +139,9 @@ class SignalState:
         atom: Callable[[str], Bools],
         signal: Callable[[Ask], Column],
     ) -> tuple[dict[str, Column], list[Memory]]:
-        """Return the values of all tests in this frame for some bindings, and their new memories.
+        """Return the values of all expressions in this frame, and the new memories.
+
+        There is one of each for every node combination.
 
         Parameters
         ----------
@@ -154,7 +162,7 @@ class SignalState:
 
 
 class _Now(SignalValues):
-    """Evaluation of tests in one frame for some bindings."""
+    """Evaluation of expressions over several frames at the current frame, for some combinations of nodes."""
 
     def __init__(
         self,
@@ -179,37 +187,43 @@ class _Now(SignalValues):
         self._rows = len(memories)
 
     def memories(self) -> list[Memory]:
-        """Return the new memory of each binding."""
+        """Return the memory for the next frame, for each combination of nodes."""
         columns = [self._new[course] for course in self._all.places]
         columns += [self._kept[condition] for condition in self._all.conditions]
         return list(zip(*columns, strict=True)) if columns else [() for _ in range(self._rows)]
 
     def test(self, test: Test) -> Column:
-        """Return the value (B, 1) of a test. It is computed once, because it updates the memory."""
+        """Return the values (B, 1) of an expression in this frame.
+
+        They are computed once, because this changes the memory.
+        """
         if test.name not in self._tests:
             self._tests[test.name] = super().test(test)
         return self._tests[test.name]
 
     def signal(self, signal: Ask) -> Column:
-        """Return the values (B, 1) of a signal."""
+        """Return the values (B, 1) of a single-frame query in this frame."""
         return self._signal(signal)
 
     def proposition(self, name: str) -> Bools:
-        """Return a mask (B, 1) of the bindings for which an atom or test is true."""
+        """Return a mask (B, 1) of the node combinations for which a named condition is true in this frame."""
         if name in self._all.plan.tests:
             found = self.test(self._all.plan.tests[name]).true
             return np.broadcast_to(found, (self._rows, 1))
         return self._atom(name)[:, None]
 
     def margins(self, course: b.SignalCall, test: Test) -> Floats:
-        """Return the margins (B, 1) of a condition on this frame."""
+        """Return the robustness margins (B, 1) of a condition in this frame."""
         formula, tolerance = test.quantities[course.operand], self._tick.tolerance
         columns = margin_columns(self._all.plan, formula, self.test, self.proposition, tolerance)
         value = MarginTable(columns, np.zeros(1, np.int64)).value(formula)
         return np.broadcast_to(value, (self._rows, 1))
 
     def condition(self, expression: b.Bound, test: Test) -> Bools:
-        """Return a mask (B, 1) of the bindings for which a condition inside a test is true."""
+        """Return a mask (B, 1) of node combinations.
+
+        It is true where the condition inside ``run_length(…)`` or similar is true in this frame.
+        """
         if expression not in self._flags:
             self._flags[expression] = self._condition(expression)[:, None]
         return self._flags[expression]
@@ -231,7 +245,7 @@ class _Now(SignalValues):
         return np.array([value for value, _ in found], np.bool_)
 
     def course(self, course: b.SignalCall, test: Test) -> Column:
-        """Return the value of a time function."""
+        """Return the values of a function over time, such as ``delta(x, 2s)``, in this frame."""
         if course not in self._courses:
             self._courses[course] = self._course(course, test)
         return self._courses[course]
@@ -337,7 +351,7 @@ _Trail = tuple[_Point, tuple[_Point, ...]]
 
 
 def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _Trail | None:
-    """Return an angle history extended by the value of one frame."""
+    """Return the history of an angle (with full turns), extended by the value of this frame."""
     points = old[1] if old is not None else ()
     if points and points[0][0] < oldest:
         points = tuple(point for point in points if point[0] >= oldest)
@@ -353,7 +367,7 @@ def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _
 
 
 def column_of(values: list[Any]) -> Column:
-    """Return a column (B, 1) with one value per binding. ``None`` means unknown."""
+    """Return a list of values as a column (B, 1) with a mask of the known ones. ``None`` means unknown."""
     known = [value is not None for value in values]
     like = next((value for value in values if value is not None), 0.0)
     empty = "" if isinstance(like, str) else type(like)()
@@ -362,7 +376,7 @@ def column_of(values: list[Any]) -> Column:
 
 
 class StreamClock:
-    """Recent frame times, as far back as an operator needs them.
+    """Times of the recent frames of an online run, as many as temporal operators need.
 
     Parameters
     ----------
@@ -398,7 +412,10 @@ class StreamClock:
         return self._sorted[(len(self._sorted) - 1) // 2] if self._sorted else 0
 
     def step(self, time_ns: int) -> None:
-        """Add the next frame. A time that does not ascend: see :func:`sgstore.temporal._offline.ascending`."""
+        """Add the time of the next frame.
+
+        A time that does not ascend is corrected, as in :func:`sgstore.temporal._offline.ascending`.
+        """
         last, told = self.tick, self._last_ns
         self._last_ns = time_ns
         self.jump = last.number >= 0 and time_ns < told
@@ -418,16 +435,19 @@ class StreamClock:
         self.tick = Tick(time_ns, last.number + 1, tolerance_ns(self.period))
 
     def breaks(self, *, bridge: bool) -> bool:
-        """True if runs end before the last frame. With ``bridge``, only backward jumps end runs."""
+        """True if this frame does not continue the previous one: after a gap or a backward jump of time.
+
+        With ``bridge``, gaps do not count.
+        """
         return self.jump or (self.gap and not bridge)
 
     def told(self, time: int) -> int:
-        """Return the original time of a frame from its corrected time; ns."""
+        """Return the recorded time of a frame from its corrected, ascending time; ns."""
         after = bisect_right(self._jumps, (time, NEVER, 0))
         return time - self._jumps[after - 1][1] if after else time
 
     def jump_after(self, time: int) -> int:
-        """Return the number of the first frame after the next backward jump, or :data:`NEVER`."""
+        """Return the number of the first frame after the next backward jump of time, or :data:`NEVER`."""
         after = bisect_right(self._jumps, (time, NEVER, 0))
         return self._jumps[after][2] if after < len(self._jumps) else NEVER
 

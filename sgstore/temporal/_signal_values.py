@@ -35,7 +35,7 @@ NS: Final = 1e9
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Times and runs of the frames of a trace.
+    """Times of the frames of a trace, and their runs (frames without a gap between them).
 
     Attributes
     ----------
@@ -58,19 +58,24 @@ class Clock:
     def of(
         cls, times: Ints, numbers: Ints, period: int, longest: float, tolerance: int = 0
     ) -> Clock:
-        """Return a clock with gaps at time steps over ``longest`` (ns) and at skipped frame numbers."""
+        """Return a clock for frame times.
+
+        A gap is a time step over ``longest`` (ns) or a skipped frame number.
+        """
         gaps = (np.diff(times) > longest) | (np.diff(numbers) != 1)
         runs = np.concatenate(([0], np.cumsum(gaps)))[: len(times)]
         return cls(times, runs, period, tolerance)
 
     @property
     def gap_before(self) -> Bools:
-        """Mask (F,) of the frames directly after a gap. The first frame is not one of them."""
+        """Mask (F,) of the frames directly after a recording gap. The first frame does not count."""
         return np.concatenate(([False], np.diff(self.runs) != 0))[: len(self.times)]
 
 
 class SignalValues:
-    """Values of the tests of a plan for some bindings. Subclasses provide signals and propositions.
+    """Values of expressions over several frames, for some combinations of nodes.
+
+    Subclasses provide the single-frame values.
 
     Parameters
     ----------
@@ -81,29 +86,32 @@ class SignalValues:
         self.clock = clock
 
     def signal(self, signal: Ask) -> Column:
-        """Return the values (B, F) of a signal."""
+        """Return the values (B, F) of a single-frame query with a value, such as a speed."""
         raise NotImplementedError
 
     def condition(self, expression: b.Bound, test: Test) -> Bools:
-        """Return a mask (B, F) of the frames in which a condition inside a test is true."""
+        """Return a mask (B, F) of the frames in which the condition inside ``run_length(…)`` etc. is true."""
         raise NotImplementedError
 
     def proposition(self, name: str) -> Bools:
-        """Return a mask (B, F) of the frames in which an atom or test is true."""
+        """Return a mask (B, F) of the frames in which a named condition is true."""
         raise NotImplementedError
 
     def margins(self, course: b.SignalCall, test: Test) -> Floats:
-        """Return the margins (B, F) of a condition inside a test."""
+        """Return the robustness margins (B, F) of the condition inside ``robustness(…)``."""
         raise NotImplementedError
 
     def test(self, test: Test) -> Column:
-        """Return the value of a test: (B, F), with length 1 in an axis of equal values."""
+        """Return the values (B, F) of an expression over several frames.
+
+        An axis of equal values has length 1.
+        """
         with np.errstate(all="ignore"):
             found = _evaluator(test)(self)
         return Column(np.atleast_2d(found.values), found.known)
 
     def course(self, course: b.SignalCall, test: Test) -> Column:  # noqa: PLR0911 - a case each
-        """Return the value of a :class:`~sgstore.lang.ir.SignalCall`."""
+        """Return the values of a function over time, such as ``delta(x, 2s)``, at each frame."""
         match course.word:
             case "prev":
                 return self._back(self.signal(test.signals[course.operand]), 1)
@@ -124,7 +132,10 @@ class SignalValues:
                 return self._age(seen) if word == "age" else Column(seen)
 
     def _back(self, column: Column, by: int | Ints) -> Column:
-        """Return the values some frames earlier. Values before the trace start or across a gap are unknown."""
+        """Return the values of some frames earlier, at each frame.
+
+        Values before the trace or across a gap are unknown.
+        """
         frames = len(self.clock.times)
         here = np.arange(frames)
         there = here - by if isinstance(by, int) else by
@@ -136,7 +147,10 @@ class SignalValues:
         return Column(values[:, inside], known[:, inside] & told)
 
     def window_starts(self, course: b.SignalCall) -> Ints:
-        """Return the first frame of the time window at each frame, shape (F,). A window never crosses a gap."""
+        """Return, for each frame, the first frame of the time window that ends there, (F,).
+
+        A window never crosses a gap.
+        """
         times, here = self.clock.times, np.arange(len(self.clock.times))
         begun = np.maximum.accumulate(np.where(self.clock.gap_before, here, 0))
         if course.frames:
@@ -158,7 +172,10 @@ class SignalValues:
         return Column(self._turned(now, by, change), known)
 
     def _turned(self, now: Column, by: int | Ints, change: Array) -> Array:
-        """Return the change of an angle with full turns. If values are missing, assume the shortest turn."""
+        """Return the change of an angle over some frames, with full turns; degrees.
+
+        If values are missing, the shortest turn is assumed.
+        """
         frames = len(self.clock.times)
         there = np.arange(frames) - by if isinstance(by, int) else by
         there = np.clip(there, 0, None)
@@ -169,7 +186,10 @@ class SignalValues:
         return np.where(whole, sums - sums[:, there], wrapped(change))
 
     def _run_length(self, flags: Bools, *, frames: bool) -> Column:
-        """Return the duration for which a condition has held, at each frame: in frames, or in s."""
+        """Return the duration for which a condition has been true without a break, at each frame.
+
+        It is in frames, or in s.
+        """
         here = np.arange(flags.shape[1])
         first = flags.copy()
         first[:, 1:] = flags[:, 1:] & (~flags[:, :-1] | self.clock.gap_before[1:])
@@ -219,7 +239,7 @@ def _over_time(part: b.Bound, test: Test) -> Columns[SignalValues] | None:
 
 
 def lasts(expression: b.Bound) -> bool:
-    """True if the expression depends on a duration in seconds."""
+    """True if an expression contains a duration in seconds, such as ``run_length(c)``."""
     parts = b.walk(expression)
     return any(isinstance(p, b.SignalCall) and p.word in _TIMES and not p.frames for p in parts)
 
@@ -228,7 +248,7 @@ _TIMES: Final = frozenset({"run_length", "since_true", "age"})
 
 
 def wrapped(degrees: Any) -> Any:
-    """Return angles in [-180, 180) degrees."""
+    """Return angles converted to the range [-180, 180) degrees."""
     return (degrees + 180.0) % 360.0 - 180.0
 
 

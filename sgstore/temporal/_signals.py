@@ -1,4 +1,4 @@
-"""Signals and formulas over whole traces, as columns.
+"""Evaluation of temporal formulas and values over time on whole traces, as arrays.
 
 A column has a truth value for each frame; operators map columns to columns. An *until* compares two frames: the
 next frame in its bound at which its right side holds, and the next frame at which its left side fails.
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Bools:
-    """Evaluate a formula at each frame of a trace.
+    """Return the truth value of a temporal formula at each frame of a trace, (F,).
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Boo
 
 
 def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, rows: int) -> Bools:
-    """Evaluate a formula at each frame of a trace for several bindings.
+    """Return the truth value of a temporal formula at each frame, for several combinations of nodes, (B, F).
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, r
 
 @dataclass(frozen=True, slots=True)
 class PropositionTable:
-    """Truth values of the propositions of a trace, and of formulas over them.
+    """Truth values of temporal formulas in one trace, from the truth values of their propositions.
 
     Parameters
     ----------
@@ -109,11 +109,14 @@ class PropositionTable:
     times: Ints
 
     def whole(self, formula: Formula) -> Bools:
-        """Return the value (F,) of a formula at each frame of a trace with at least one frame."""
+        """Return the truth value (F,) of a formula at each frame. The trace must have a frame."""
         return self.value(formula)[0]
 
     def value(self, formula: Formula) -> Bools:  # noqa: PLR0911 - a case each
-        """Return the value (B, F) of a formula at each frame, or (1, F) if equal for all bindings."""
+        """Return the truth value (B, F) of a formula at each frame.
+
+        The shape is (1, F) if all node combinations have the same value.
+        """
         match formula:
             case TruthConstant(value=value):
                 return np.full((1, len(self.times)), value)
@@ -147,7 +150,7 @@ class PropositionTable:
                 return true if left == TRUE else true & (hit >= _last(~self.value(left)))
 
     def window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
-        """Return the nearest and farthest frame of an operator's bound, for each frame.
+        """Return, for each frame, the nearest and farthest frame in the time bound of an operator.
 
         ``None`` as nearest frame means the frame itself; as farthest frame, the trace end.
         """
@@ -174,12 +177,12 @@ class PropositionTable:
 
     @property
     def frames(self) -> Places:
-        """Numbers of the frames, shape (F,)."""
+        """Numbers of the frames of the trace, shape (F,)."""
         return _frames(len(self.times))
 
     @property
     def _period(self) -> int | None:
-        """Constant time between frames; ns. ``None`` means a varying time."""
+        """Constant time between frames; ns. ``None`` means that it varies."""
         if len(self.times) < 2:
             return None
         period = int(self.times[1] - self.times[0])
@@ -207,7 +210,10 @@ def _last(flags: Bools) -> Places:
 
 
 def _at(places: Places, frame: Places | None) -> Places:
-    """Return values at other frames. Before the trace, return -1; after it, F."""
+    """Return an array of frame numbers, taken at other frames.
+
+    The value is -1 before the trace, and F after it.
+    """
     if frame is None:
         return places
     frames = places.shape[1]

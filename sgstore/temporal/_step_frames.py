@@ -25,7 +25,7 @@ NEVER: Final = 1 << 62
 
 @dataclass(slots=True)
 class Run:
-    """Consecutive frames without a gap in which a step holds.
+    """Consecutive frames without a gap in which a sequence step matches.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class StepFrame:
-    """Frame in which a step holds.
+    """Frame in which a sequence step matches.
 
     Attributes
     ----------
@@ -62,12 +62,15 @@ class StepFrame:
 
     @property
     def ends(self) -> tuple[int, ...]:
-        """Numbers of the frame and of the first and last frame of its run, as far as known."""
+        """Numbers of the frame, and of the first and last frame of its run.
+
+        The last frame is absent while the run continues.
+        """
         return (self.number, self.run.number, *([self.run.last] if self.run.over else []))
 
 
 class StepState:
-    """State of one step for one binding.
+    """State of one sequence step for one combination of nodes: its matching and undecided frames.
 
     Parameters
     ----------
@@ -98,25 +101,25 @@ class StepState:
 
     @property
     def idle(self) -> bool:
-        """True if the state is empty."""
+        """True if the step has no stored frame and no current run, so that its state can be deleted."""
         return not (self.places or self._queue or self._run)
 
     @property
     def oldest(self) -> int:
-        """First frame of the stored or possible runs. :data:`NEVER` means no frame."""
+        """First frame of the stored or undecided runs of the step. :data:`NEVER` means no frame."""
         runs = [place.run.number for place in self.places[:1]]
         runs += [self._run.number] if self._run is not None else []
         return min([*runs, self.undecided])
 
     @property
     def undecided(self) -> int:
-        """Number of the first undecided frame. :data:`NEVER` means no frame."""
+        """Number of the first frame in which the step is undecided. :data:`NEVER` means no frame."""
         if self._waiting:
             return self._waiting[0].number
         return self._queue[0][0] if self._queue else NEVER
 
     def frames(self) -> Iterator[int]:
-        """Yield the numbers of decided and undecided frames of the step, and of the ends of their runs."""
+        """Yield the numbers of the stored frames of the step, decided or not, and of the ends of their runs."""
         for place in (*self.places, *self._waiting):
             yield from place.ends
         if self._run is not None:
@@ -124,12 +127,12 @@ class StepState:
         yield from (number for number, _, _ in self._queue)
 
     def ask(self, holds: Needs, *, gap: bool) -> None:
-        """Add the next frame of the step, with conditions that are still open."""
+        """Add the next frame in which the step may match, with conditions that are still open."""
         self._queue.append((self._pulse.tick.number, self._pulse.tick.time, gap))
         self.open.append(holds)
 
     def decide(self, needs: list[Needs]) -> None:
-        """Decide the open frames whose conditions are known."""
+        """Decide the open frames of the step whose conditions have become known."""
         self.open = deque(needs)
         while self.open and isinstance(self.open[0], bool):
             number, time, gap = self._queue.popleft()
@@ -156,7 +159,7 @@ class StepState:
         self._waiting = []
 
     def _long(self) -> bool:
-        """True if the run has the required duration."""
+        """True if the current run of matching frames has the required duration."""
         if self._hold is None:
             return True
         last = self._waiting[-1]
@@ -174,7 +177,7 @@ class StepState:
         self._run = None
 
     def finish(self) -> None:
-        """End the trace."""
+        """End the trace: decide all open frames of the step."""
         self.decide([n if isinstance(n, bool) else any(t.ended for _, t in n) for n in self.open])
         self._end()
 
@@ -184,7 +187,7 @@ Binding = dict[str, int]
 
 
 def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]) -> Binding | None:
-    """Merge two bindings. ``None`` means a conflict, or two equal nodes that must differ."""
+    """Merge the nodes of two matches. ``None`` means a conflict, or two equal nodes that must differ."""
     both = dict(one)
     for name, node in zip(names, key, strict=True):
         known = both.get(name)

@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 class Lattice:
-    """Order of partial bindings of some variables, from none bound to all bound.
+    """Partial bindings (nodes for some of the variables), ordered from none bound to all bound.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Lattice:
         self._patterns = [frozenset(pattern) for pattern in patterns]
 
     def placed(self, key: Key, places: tuple[int, ...]) -> Partial:
-        """Return the binding with these values at some variables."""
+        """Return the partial binding that has given nodes at some variables, and None at the others."""
         if self.size == 1:
             return key or self.stranger
         told: list[int | None] = [None] * self.size
@@ -55,7 +55,7 @@ class Lattice:
         return tuple(told)
 
     def wider(self, binding: Partial) -> Iterator[Partial]:
-        """Yield the binding and its generalisations, most specific first."""
+        """Yield a partial binding, then its generalisations (fewer bound variables), most specific first."""
         if self.size == 1:
             yield binding
             if binding[0] is not None:
@@ -67,7 +67,9 @@ class Lattice:
                 yield tuple(n if place in pattern else None for place, n in enumerate(binding))
 
     def closed(self, bindings: Iterable[Partial], known: Iterable[Partial] = ()) -> set[Partial]:
-        """Return a set of bindings closed under union, including the empty binding.
+        """Return a set of partial bindings that also contains the union of any two of them.
+
+        The empty binding is included.
 
         ``known`` bindings are closed already.
         """
@@ -83,14 +85,17 @@ class Lattice:
         return found
 
     def ordered(self, bindings: Iterable[Partial]) -> list[Partial]:
-        """Sort bindings by the number of bound variables, fewest first."""
+        """Sort partial bindings by the number of bound variables, fewest first."""
         if self.size < 2:
             return sorted(bindings, key=lambda one: one != self.stranger)
         return sorted(bindings, key=lambda one: sum(node is not None for node in one))
 
 
 def _both(one: Partial, other: Partial) -> Partial | None:
-    """Return the union of two bindings. ``None`` means a contradiction."""
+    """Return the union of two partial bindings.
+
+    ``None`` means that they have different nodes for a variable.
+    """
     told: list[int | None] = []
     for first, second in zip(one, other, strict=True):
         if first is not None and second is not None and first != second:
@@ -100,7 +105,9 @@ def _both(one: Partial, other: Partial) -> Partial | None:
 
 
 class BindingTable(Generic[T]):
-    """Values by binding. A binding without a value inherits it from its generalisation.
+    """Values by partial binding.
+
+    A binding without an entry has the value of its next generalisation (fewer bound variables).
 
     Parameters
     ----------
@@ -114,7 +121,7 @@ class BindingTable(Generic[T]):
         self.held: dict[Partial, T] = {lattice.stranger: strangers}
 
     def of(self, binding: Partial) -> T:
-        """Return the value of a binding."""
+        """Return the value of a partial binding, from its own entry or from a generalisation."""
         held = self.held
         found = held.get(binding)
         if found is not None:
@@ -122,7 +129,10 @@ class BindingTable(Generic[T]):
         return next(held[wider] for wider in self.lattice.wider(binding) if wider in held)
 
     def keep(self, found: dict[Partial, T], same: Callable[[T, T], bool]) -> None:
-        """Store new values, without bindings whose value equals that of a generalisation."""
+        """Store new values by partial binding.
+
+        Bindings whose value equals that of a generalisation are dropped.
+        """
         lattice = self.lattice
         strangers = found[lattice.stranger]
         if lattice.size < 2:
@@ -143,7 +153,9 @@ Key = tuple[int, ...]
 
 
 def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
-    """Return a function from a graph to the bindings of a query, each with its value (``None``: unknown).
+    """Return a function that runs a query on one scene graph.
+
+    Its result is: matched nodes → value (``None``: unknown).
 
     Edges in a binding are indices in :data:`RELATIONS`.
     """
@@ -180,7 +192,7 @@ def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
 
 
 class NodeNames:
-    """Nodes of one graph by kind, with their names.
+    """Nodes of one scene graph in an online monitor, by kind, with their names.
 
     Parameters
     ----------
@@ -195,7 +207,7 @@ class NodeNames:
         return node in self._view.nodes
 
     def of(self, kinds: b.Kinds) -> frozenset[int]:
-        """Return the nodes of some kinds."""
+        """Return the ids of the nodes of the graph that have some kinds."""
         if kinds not in self._found:
             view, ego = self._view, self._view.graph.ego
             found = {n for kind in kinds.other for n in view.by_kind.get(kind, ())}
@@ -211,7 +223,7 @@ class NodeNames:
         return self._view.nodes[node].get(attribute)
 
     def records(self, kind: str) -> bool:
-        """True if the trace records events of this kind."""
+        """True if the trace records events of a kind."""
         return kind in self._view.graph.events
 
     def has_lanes(self, what: str) -> bool:
@@ -226,7 +238,7 @@ class NodeNames:
 
 @dataclass(slots=True)
 class QueryCache:
-    """All queries on the graphs of one ego, with their results in the last frame.
+    """All single-frame queries of a monitor for one ego, with their results in the last frame.
 
     Attributes
     ----------
@@ -246,11 +258,14 @@ class QueryCache:
     here: dict[b.Kinds, int] = field(default_factory=dict["b.Kinds", int])
 
     def met(self, kinds: b.Kinds) -> Mapping[int, str]:
-        """Return the nodes of some kinds seen so far: node → name. The mapping grows with each frame."""
+        """Return the nodes of some kinds that occurred until now: node → name.
+
+        Each frame extends the mapping.
+        """
         return self._met.setdefault(kinds, {})
 
     def add(self, ask: Ask) -> int:
-        """Add a query, and return its number. Equal queries share a number."""
+        """Add a single-frame query, and return its number. Equal queries get the same number."""
         value = None if ask.value is None else unnumbered_text(ask.value)
         key = _told(ask.query), ask.variables, value, ask.edges
         if key not in self._known:
@@ -259,7 +274,7 @@ class QueryCache:
         return self._known[key]
 
     def add_parts(self, query: b.Query, keys: tuple[str, ...]) -> int:
-        """Add a query for the rows of several pattern parts, and return its number.
+        """Add a query with several clauses (``MATCH``, ``WITH``), and return its number.
 
         The result has the bindings of the named nodes and edges, each with the values of its first row.
         """
@@ -281,7 +296,7 @@ class QueryCache:
         return len(self._all) - 1
 
     def ask(self, view: FrameView, people: NodeNames) -> None:
-        """Evaluate all queries on a graph."""
+        """Run all queries on the scene graph of a frame, and store the results."""
         self.fresh.clear()
         for kinds, known in self._met.items():
             present = people.of(kinds)

@@ -1,4 +1,4 @@
-"""Verdicts of formulas: their values, the frame that decides them, and their value at every prefix.
+"""Verdicts of temporal formulas: their values, the deciding frames, and the values for each end of the trace.
 
 At a frame, a forward formula has a *course*: its value if the trace ends there, and the later ends at which the
 value changes. Logic combines courses. An *until* with monotonic sides is true from one end on. At the requested
@@ -43,12 +43,15 @@ if TYPE_CHECKING:
 
 
 class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way
-    """A formula is nested too deeply for the fast evaluation. The caller uses the slow one."""
+    """Signal that a temporal formula is nested too deeply for the fast evaluation.
+
+    The caller then uses the slow one.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class PrefixVerdicts:
-    """Values of a formula at each frame, for each possible end of the trace.
+    """Truth values of a formula at each frame, for each possible last frame of the trace.
 
     Attributes
     ----------
@@ -62,12 +65,12 @@ class PrefixVerdicts:
     switches: Places
 
     def at(self, ends: Places) -> Bools:
-        """Return the values (F,) of the formula at each frame, for one end per frame."""
+        """Return the truth values (F,) of the formula at each frame, given a last frame for each."""
         return self.start ^ (np.sum(self.switches <= ends, axis=0) % 2 == 1)
 
     @property
     def rising(self) -> Places:
-        """Return the first end from which the formula stays true, shape (F,). F means never.
+        """Return the first last-frame from which the formula stays true, for each frame, (F,). F means never.
 
         Raises
         ------
@@ -82,7 +85,7 @@ class PrefixVerdicts:
 
 
 def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
-    """Return the value at the first frame for each possible end of the trace, shape (F,).
+    """Return the truth value of a formula at the first frame, for each possible last frame of the trace, (F,).
 
     Raises
     ------
@@ -93,7 +96,7 @@ def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
 
 
 def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # noqa: PLR0911
-    """Return the value at one frame for each end from there on, shape (F,)."""
+    """Return the truth value of a formula at one frame, for each possible last frame from there on, (F,)."""
     frames = len(table.times)
     if not looks_ahead(formula):
         return np.full(frames, table.whole(formula)[at])
@@ -117,7 +120,7 @@ def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # n
 
 
 def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
-    """Return, for each end of the trace, True if an *until* is fulfilled at one frame."""
+    """Return True for each last frame of the trace at which an *until* from one frame is fulfilled already."""
     near, far = table.window(formula.bound, forward=True)
     frames = len(table.times)
     first = at if near is None else int(near[at])
@@ -140,7 +143,7 @@ def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
 
 
 def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
-    """Return the values of a formula at all frames for all ends.
+    """Return the truth values of a formula at all frames, for each possible last frame of the trace.
 
     Raises
     ------
@@ -175,7 +178,10 @@ def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
 
 
 def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
-    """Combine prefix verdicts by a logical operation, and drop switches without effect."""
+    """Combine the truth values of several formulas by a logical operator.
+
+    There is a value for each frame and each last frame of the trace.
+    """
     frames = len(courses[0].start)
     start = join([course.start for course in courses])
     switches = np.sort(np.concatenate([course.switches for course in courses]), axis=0)
@@ -206,7 +212,7 @@ Violation = tuple[int, int, bool]
 
 
 class Settled:
-    """Formula with its proposition columns in one trace.
+    """Evaluation of one temporal formula in one trace: truth values, violations and status.
 
     Parameters
     ----------
@@ -227,7 +233,7 @@ class Settled:
 
     @cached_property
     def value(self) -> Bools:
-        """Mask (F,) of the frames in which the formula is true."""
+        """Mask (F,) of the frames in which the temporal formula is true."""
         return self._table.whole(self.formula)
 
     @cached_property
@@ -235,17 +241,17 @@ class Settled:
         return known(self.formula, self._table)
 
     def trap(self, start: int) -> int | None:
-        """Return the frame that makes the formula certainly false at ``start``, or ``None``."""
+        """Return the frame at which it becomes certain that the formula is false at ``start``, or ``None``."""
         trap = int(self._known[1][start])
         return trap if trap < self._frames else None
 
     @cached_property
     def _missed(self) -> Places:
-        """Frames (F,) at which the formula is certainly false if no frame follows."""
+        """For each frame, the frame at which the formula becomes certainly false if the trace ends, (F,)."""
         return known(self.formula, self._table, ended=self._tolerance)[1]
 
     def due(self, start: int, end: str) -> bool:
-        """True if a formula that is false at ``start`` is still open at the end of the trace.
+        """True if the formula at frame ``start`` is still open at the end of the trace, instead of false.
 
         Parameters
         ----------
@@ -269,7 +275,7 @@ class Settled:
         return told
 
     def _stepped(self) -> Bools:
-        """Return the value at the first frame for each possible end of the trace, computed step by step."""
+        """Return the truth value at the first frame for each possible last frame, computed frame by frame."""
         progression = Progression(self.formula)
         names, plain = progression.names, progression.untimed and not progression.past
         end = min(int(self._known[0][0]), int(self._known[1][0]), self._frames - 1) + 1
@@ -295,7 +301,7 @@ class Settled:
         return ended
 
     def violations(self, reset: Bools | None, *, weak: bool = False) -> list[Violation]:
-        """Return the violations of the formula, evaluated from the first frame on.
+        """Return the violations of the formula as frame ranges, evaluated from the first frame on.
 
         Parameters
         ----------
@@ -307,7 +313,7 @@ class Settled:
         return self.judged(reset, "weak" if weak else "strong")[0]
 
     def judged(self, reset: Bools | None, end: str) -> tuple[list[Violation], bool]:
-        """Return the violations of the formula, and True if it is still open at the end.
+        """Return the violations of the formula as frame ranges, and True if it is still open at the trace end.
 
         Parameters
         ----------
@@ -336,7 +342,9 @@ class Settled:
 def within_bounds(
     formula: Formula, columns: Mapping[str, Bools], times: Ints, gaps: Bools, rows: int
 ) -> tuple[Bools, Bools]:
-    """Return the lowest and highest value of a formula at the first frame, over all contents of gaps.
+    """Return the lowest and highest possible value of a formula at the first frame.
+
+    Unseen events in recording gaps may change the value.
 
     Each gap is treated as one additional frame with arbitrary propositions. For the lower value, they are the
     least favourable ones; for the upper value, the most favourable.
@@ -380,7 +388,7 @@ def _taken(formula: Formula, *, upper: bool) -> Formula:
 
 
 def always_true(formula: Formula) -> Formula | None:
-    """Return the operand of an unbounded ``ALWAYS``. ``None`` means another form of formula."""
+    """Return the formula p of ``ALWAYS p`` without time bound. ``None`` means another formula."""
     match formula:
         case Not(operand=Until(left=left, right=right, bound=bound)) if (
             left == TRUE and bound == WHOLE
@@ -391,5 +399,5 @@ def always_true(formula: Formula) -> Formula | None:
 
 
 def bounded(formula: Formula) -> bool:
-    """True if the formula depends on later frames only within a limited time."""
+    """True if all future operators of a formula have an upper time bound."""
     return all(part.bound.high is not None for part in walk(formula) if isinstance(part, Until))

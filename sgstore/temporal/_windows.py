@@ -1,4 +1,4 @@
-"""Aggregates over frame intervals: minimum, maximum, sum and mean.
+"""Aggregates over ranges of frames or time windows: minimum, maximum, sum and mean.
 
 Offline, each frame has an interval, given by its first frame and the frame after its last. All frames are
 processed at once, in O(n log w) for the longest interval w. Online, a stream keeps the values in its window.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def over_columns(word: str, column: Column, first: Places) -> Column:
-    """Return an aggregate of the known values in the window that ends at each frame.
+    """Return, for each frame, an aggregate of the known values in the time window that ends there.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def over_columns(word: str, column: Column, first: Places) -> Column:
 
 
 def greatest(values: Floats, first: Places, end: Places) -> Floats:
-    """Return the maximum of the values from ``first`` to before ``end``, shape (B, F).
+    """Return, for each frame, the maximum of the values from frame ``first`` to before ``end``, (B, F).
 
     An empty range gives ``-inf``.
 
@@ -92,7 +92,9 @@ def greatest(values: Floats, first: Places, end: Places) -> Floats:
 
 
 def sums(values: Floats, first: Places, end: Places) -> Floats:
-    """Return the correctly rounded sums of the values from ``first`` to before ``end``, shape (B, F).
+    """Return, for each frame, the sum of the values from frame ``first`` to before ``end``, (B, F).
+
+    Sums are correctly rounded.
 
     Parameters
     ----------
@@ -150,7 +152,7 @@ _UNIT: Final = 1074
 def next_window(
     word: str, window: Window | None, value: float | None, here: Tick, oldest: tuple[int, int]
 ) -> Window | None:
-    """Add the value of one frame to a window, and drop values outside it.
+    """Return a time window after one more frame: its value is added, and values outside are dropped.
 
     Parameters
     ----------
@@ -187,7 +189,7 @@ def next_window(
 
 
 def window_value(word: str, window: Window | None) -> float | None:
-    """Return the aggregate of a window. ``None`` means that it has no known value."""
+    """Return the aggregate of the values in a time window. ``None`` means that no value is known."""
     if window is None:
         return None
     points, total = window
@@ -198,13 +200,13 @@ def window_value(word: str, window: Window | None) -> float | None:
 
 
 def exact(value: float) -> int:
-    """Return a float as an exact multiple of the smallest positive float."""
+    """Return a float as an integer: its exact multiple of the smallest positive float."""
     part, whole = float(value).as_integer_ratio()
     return part << (_UNIT - whole.bit_length() + 1)
 
 
 def rounded(total: int) -> float:
-    """Convert a multiple of the smallest positive float back to a float."""
+    """Return a float from its exact multiple (an integer) of the smallest positive float."""
     try:
         return total / (1 << _UNIT)
     except OverflowError:

@@ -1,4 +1,4 @@
-"""Truth lanes: for each part of a pattern, the frames in which it holds for the nodes of one match."""
+"""Truth lanes of a match: for each part of the pattern, the frames in which the part is true."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TruthLane:
-    """Frames of a trace in which one part of a pattern holds for given nodes.
+    """Frames of a trace in which one part of a pattern is true for given nodes.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class TruthLane:
 
 @dataclass(frozen=True, slots=True)
 class TruthLanes:
-    """Truth lanes of all parts of a pattern over a whole trace, for the nodes of one match.
+    """Truth lanes of a match over a whole trace: for each part of the pattern, the frames in which it is true.
 
     Attributes
     ----------
@@ -60,11 +60,11 @@ class TruthLanes:
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """Numbers of the steps with lanes; 0 for a pattern of single frames."""
+        """Numbers of the sequence steps that have truth lanes; 0 for a pattern of single frames."""
         return tuple(dict.fromkeys(lane.part.step for lane in self.lanes))
 
     def together(self, step: int = 0) -> tuple[tuple[int, int], ...]:
-        """Return the runs of frames in which all parts of a step hold."""
+        """Return the frame ranges (first, last) in which all parts of a step's pattern are true."""
         spans = [lane.spans for lane in self.lanes if lane.part.step == step]
         found = spans[0] if spans else ()
         for others in spans[1:]:
@@ -72,7 +72,10 @@ class TruthLanes:
         return found
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values: ``trace``, ``binding``, ``lanes``, and ``together`` (the runs by step)."""
+        """Return the truth lanes as a dictionary with frame ranges.
+
+        Keys: ``trace``, ``binding``, ``lanes``, and ``together`` (ranges by step).
+        """
         lanes = [
             {name: getattr(lane.part, name) for name in ("text", "step", "nodes", "conditions")}
             | {"edges": [*map(asdict, lane.part.edges)]}
@@ -87,7 +90,7 @@ class TruthLanes:
 def _intersection(
     one: tuple[tuple[int, int], ...], other: tuple[tuple[int, int], ...]
 ) -> Iterator[tuple[int, int]]:
-    """Yield the intersections of two lists of runs, in order."""
+    """Yield the intersections of two sorted lists of frame ranges (first, last), in order."""
     a, z = 0, 0
     while a < len(one) and z < len(other):
         first, last = max(one[a][0], other[z][0]), min(one[a][1], other[z][1])
@@ -106,7 +109,9 @@ def truth_lanes(
     given: Mapping[str, int],
     numbers: Callable[[Query], NDArray[np.generic]],
 ) -> TruthLanes:
-    """Return the truth lanes of a query in a trace.
+    """Return the truth lanes of a match in a trace.
+
+    A lane has the frames in which one part of the query's pattern is true.
 
     Parameters
     ----------
@@ -138,7 +143,10 @@ def truth_lanes(
 
 
 def _runs_of(seq: NDArray[np.generic]) -> tuple[tuple[int, int], ...]:
-    """Return the first and last number of each run of consecutive numbers. The input may be unsorted."""
+    """Return the first and last number of each series of consecutive frame numbers.
+
+    The input may be unsorted.
+    """
     numbers = np.unique(np.ma.getdata(seq)).astype(np.int64)
     if not len(numbers):
         return ()

@@ -80,8 +80,6 @@ class WhyNot:
     def relaxed(self, text: str) -> Iterator[tuple[int, int, str]]:
         """Yield replacements for numbers in the query text that could make the failed condition true.
 
-        Each one is (start, end, new text).
-
         Each result is the start, the end and the new text. A number may occur several times in the query, so
         the caller must test each replacement.
 

@@ -209,8 +209,6 @@ def with_bindings(query: Query) -> Query:
     """Return a query for intervals of frames in which the same nodes match.
 
     The columns are the nodes and their names.
-
-    The columns are the nodes and their names.
     """
     columns: list[ReturnColumn] = []
     for node in query.scope.nodes.values():
@@ -569,8 +567,6 @@ def _kept(value: Bound) -> tuple[Bound, ...]:
 
 def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
     """Return the query expression for the name of a node.
-
-    For an entity, the last SELECT composes it from kind and id.
 
     For an entity, the last SELECT composes it from kind and id.
     """

@@ -107,8 +107,6 @@ def _staged(query: Query, catalog: Catalog) -> Query:
 
     The rules apply to each clause.
 
-    The rules apply to each clause.
-
     Nodes are limited to the kinds that the patterns allow. A node that may be absent is looked up by its id.
     This includes the ego: even if the frame has an ego, the pattern may not bind it.
     """
@@ -220,8 +218,6 @@ def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
 
 def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
     """Replace the trace attribute ``computed`` by a test of trace ids.
-
-    It is true if sgstore computed the trace's relations.
 
     It is true if sgstore computed the trace's relations.
     """
@@ -420,8 +416,6 @@ def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
     """True if an ``EXISTS {…}`` with a long path is evaluated as a separate subquery.
 
     This occurs only in scope ``world``.
-
-    This occurs only in scope ``world``.
     """
     if not catalog.around or not isinstance(condition, BlockValue) or condition.word != "EXISTS":
         return False
@@ -476,8 +470,6 @@ def kinds_left(
     """Return the possible kinds of each pattern node, given the triples (relation, kind, kind) in a store.
 
     ``None`` means no match.
-
-    ``None`` means no match.
     """
     kinds = {key: scope.kinds(key).only(held) for key in (*scope.nodes, *scope.outer)}
     single = [edge for edge in scope.edges if edge.high == 1]
@@ -489,8 +481,6 @@ def kinds_left(
 
 def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) -> bool:
     """Remove node kinds and triples that the edges of a pattern exclude, once.
-
-    Return True if something changed.
 
     Return True if something changed.
     """
@@ -509,8 +499,6 @@ def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) 
 
 def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> Iterator[Triple]:
     """Yield the triples (relation, kind, kind) that a pattern edge can match.
-
-    The second item is the kind of ``src``.
 
     The second item is the kind of ``src``.
     """

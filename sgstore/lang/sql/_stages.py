@@ -160,8 +160,6 @@ def _given(sql: SqlBuilder, rows: SharedRelation, outer: frozenset[str]) -> Shar
     """Return a subquery with the outer nodes of a pattern and bit masks of their frames.
 
     Rows with NULL are excluded.
-
-    Rows with NULL are excluded.
     """
     keys = columns_of(outer)
     known = [f"{key} IS NOT NULL" for key in keys]

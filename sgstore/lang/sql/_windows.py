@@ -24,8 +24,6 @@ class Window:
     """Range of frame buckets (64 frames each): from ``low`` to before ``high``.
 
     ``traces`` limits it to some traces.
-
-    ``traces`` limits it to some traces.
     """
 
     low: int

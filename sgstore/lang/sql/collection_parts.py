@@ -280,8 +280,6 @@ def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
     """Return the columns of the value in ``SAMPLE n PER value`` or ``LIMIT n PER value``.
 
     For a node, the owner is included.
-
-    For a node, the owner is included.
     """
     if chosen is None or chosen.per is None:
         return []

@@ -34,8 +34,6 @@ class Pruning:
 
     A triple is relation, kind and kind.
 
-    A triple is relation, kind and kind.
-
     The filter uses the narrowing of the compiler: a pattern that becomes false for the content of a part has
     no match there.
 

@@ -146,8 +146,6 @@ def node_of_kind(kind: str, name: str = "", mark: str = "!Ego") -> str:
 
     ``mark`` includes or excludes the ego.
 
-    ``mark`` includes or excludes the ego.
-
     A label for several kinds, such as ``Vehicle``, also needs the kind as a property.
     """
     exact = f" {{kind: '{kind}'}}" if kind in SUPER_KINDS else ""

@@ -287,8 +287,6 @@ def _listed(machine: Tables, names: list[str]) -> str:
     """Return the expected terminals as words for an error message.
 
     Operators form a group, as do starts of values.
-
-    Operators form a group, as do starts of values.
     """
     left = set(names) - _LATER or set(names)
     said: list[str] = []

@@ -166,8 +166,6 @@ def _walk(states: dict[int, dict[str, int]], start: int) -> dict[int, int]:
     """Return new numbers for parser states that depend only on the grammar: old → new.
 
     The old numbers change from run to run.
-
-    The old numbers change from run to run.
     """
     order = {start: 0}
     waiting = [start]
