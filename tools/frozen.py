@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from sgstore.query import Store
 
-FROZEN = Path(__file__).parent / "frozen"
+FROZEN = Path(__file__).parents[1] / "tests" / "frozen"
 DATA = Path(os.environ.get("SGSTORE_DATA") or Path(__file__).parents[2] / "shared/data").resolve()
 ENDINGS = (".mcap", ".osi")
 FRAMES = 60
