@@ -108,10 +108,10 @@ test-ui: $(VENV)/.browser
 	$(BIN)/python -m pytest -q -rs --durations 10 --durations-min 3 tests/ui
 
 test-wheel: $(VENV)/.dev
-	$(TOOL) tools/packages.py wheel
+	$(BIN)/python tools/packages.py wheel
 
 test-versions: $(VENV)/.dev
-	$(TOOL) tools/packages.py versions
+	$(BIN)/python tools/packages.py versions
 
 # Every page is in the list of docs/conf.py, every link and heading that a page speaks of is there.
 docs: $(VENV)/.docs
