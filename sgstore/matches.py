@@ -41,7 +41,6 @@ from sgstore.store import (
     GivenTable,
     ParquetTable,
     Tabular,
-    as_told,
 )
 
 if TYPE_CHECKING:
@@ -437,7 +436,7 @@ class Matches(Tabular):
                 found.append(table)
                 if most is not None and sum(map(len, found)) >= most:
                     break
-            return as_told(found, self.columns, most)
+            return self._joined_tables(found, self.columns, most)
 
     def parquet(self, path: str | Path) -> int:
         """Stream all rows into a Parquet file, and return the number of rows.

@@ -18,12 +18,11 @@ Collections: ``_bundles`` copies traces into new stores, and ``_bundle_catalogue
 ``_inbox_segments`` keeps segments before that, and ``_merge`` merges the results of several bundles.
 """
 
-from sgstore.store._arrow import as_told
 from sgstore.store._bundle_catalogue import CATALOGUE, Facts, facts_of, parquet_rows
 from sgstore.store._bundles import BundleSource
 from sgstore.store._catalog import subset_catalogs
 from sgstore.store._classes import Abstracted
-from sgstore.store._clients import duckdb as duckdb  # for the public API alone
+from sgstore.store._clients import duckdb
 from sgstore.store._coded_classes import CodedClasses, Triples
 from sgstore.store._contents import Mark, MessagePlaces, graph_digests
 from sgstore.store._encounters import measured
@@ -75,8 +74,8 @@ __all__ = [
     "Tabular",
     "Triples",
     "UserTables",
-    "as_told",
     "count_parquet",
+    "duckdb",
     "facts_of",
     "graph_digests",
     "measured",

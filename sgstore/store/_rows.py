@@ -51,6 +51,8 @@ _READS: Final = {"SELECT", "EXPLAIN"}
 class Tabular:
     """Source of rows that converts to tables of other packages and to files."""
 
+    _joined_tables = staticmethod(as_told)  # for subclasses in other packages
+
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         raise NotImplementedError
 
