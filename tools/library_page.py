@@ -152,7 +152,7 @@ PARTS: Final = (
     (
         "manoeuvres",
         "Manoeuvres",
-        "What somebody does. `sgstore coverage sequences` counts who did what after what "
+        "Actions of one entity. `sgstore coverage sequences` counts their sequences "
         "([how](coverage.md#sequences-of-manoeuvres)).",
     ),
     (

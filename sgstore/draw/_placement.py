@@ -1,4 +1,4 @@
-"""Placement of texts: beside their objects, clear of other texts."""
+"""Placement of texts near their objects, without overlaps."""
 
 from __future__ import annotations
 

@@ -506,7 +506,7 @@ class StoreCheck:
         return None
 
     def _robustness(self, quantity: Formula, trace: TraceReader, levels: list[Level]) -> Robustness:
-        """Return the robustness of the check on a trace: the margin by which the verdict is true or false."""
+        """Return the robustness of the check on a trace: positive if true, negative if false."""
         kinds, members = self._alike(trace, innermost(levels))
         ends: list[tuple[float, int | None]] = []
         for sign in (UNFAVOURABLE, FAVOURABLE):

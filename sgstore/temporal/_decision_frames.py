@@ -141,7 +141,7 @@ def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) 
 
 
 def met(right: Places, left: Places | None, bound: Bound, table: PropositionTable) -> Places:
-    """Return, for each frame, the first frame by which a temporal *until* is certainly true.
+    """Return, for each frame, the first frame in which a temporal *until* is certain to be true.
 
     Operands that become true must stay true.
 

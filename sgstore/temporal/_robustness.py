@@ -1,4 +1,4 @@
-"""Robustness of a temporal formula: the margin by which it is true (positive) or false (negative).
+"""Robustness of a temporal formula: positive if it is true, negative if it is false.
 
 A comparison of numbers has a **margin**: positive if it holds, negative if it fails. Any other condition has an
 infinite margin. Negation changes the sign, *and* is the minimum, *or* the maximum, and time operators are
@@ -132,7 +132,7 @@ def margin_of_flags(flags: Bools) -> Floats:
 
 
 def condition_text(plan: Plan, name: str) -> str:
-    """Return the condition that a named proposition of a formula stands for, as text."""
+    """Return the text of the condition behind a named proposition."""
     name = base_name(name)
     meanings = plan.meanings if isinstance(plan, CheckPlan) else {}
     if name in meanings:

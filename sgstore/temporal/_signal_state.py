@@ -376,7 +376,7 @@ def column_of(values: list[Any]) -> Column:
 
 
 class StreamClock:
-    """Times of the recent frames of an online run, as many as temporal operators need.
+    """Times of the recent frames of an online run. Temporal operators set their number.
 
     Parameters
     ----------

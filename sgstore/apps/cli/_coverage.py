@@ -143,7 +143,7 @@ def classes_(
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """List the classes of scenes, the most frequent first, and estimate what is unseen."""
+    """List the classes of scenes by frequency, and estimate the unseen classes."""
     from sgstore.testsets.coverage import classes, rank_sizes
 
     (frames,) = scenes.of(ask, a, slots=scenes.slots)
@@ -210,7 +210,7 @@ def growth_(
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """Show how the number of classes grows, beside a random order, to tell if more data helps."""
+    """Compare the growth of the number of classes with that of a random order."""
     from sgstore.testsets.coverage import growth
 
     (frames,) = scenes.of(ask, a, slots=scenes.slots)
@@ -293,7 +293,7 @@ def sequences_(
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """Count the sequences of k manoeuvres, such as (car stops, ego stops): who did what after what."""
+    """Count the sequences of k manoeuvres, such as (car stops, ego stops)."""
     from sgstore.testsets.coverage import manoeuvres_named, sequences
 
     named = manoeuvres_named(manoeuvres or ())

@@ -142,7 +142,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "coverage combos drives.sgstore --k 3 --slots slots.toml --missing  # of declared slots",
     ),
     "coverage sequences": (
-        "coverage sequences drives.sgstore --covered  # who did what after what, and where",
+        "coverage sequences drives.sgstore --covered  # sequences of manoeuvres, with a place",
         "coverage sequences new.sgstore --by drives.sgstore --missing  # what the new one lacks",
     ),
     "coverage spec": (
@@ -166,7 +166,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "select drives.sgstore --rarest --budget 10min --unit clip  # ten minutes of the rarest",
     ),
     "criticality": (
-        "criticality drives.sgstore -m pet -m tet  # measures of what was recorded, a row a pair",
+        "criticality drives.sgstore -m pet -m tet  # measures of recorded encounters, one row per pair",
         "criticality drives.sgstore -m pet --most 1.5 -o close.csv  # as a table: who came close",
     ),
     "prioritize": (

@@ -52,7 +52,7 @@ def criticality(
     out: RowOptions,
     bounds: QueryLimits,
 ) -> None:
-    """List measures of what was recorded: PET, TET, CPI, the closest encounter.
+    """List measures of recorded encounters: PET, TET, CPI, the closest encounter.
 
     A row is the ego of a trace and one of those that it could meet: the view
     encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.

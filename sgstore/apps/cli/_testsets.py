@@ -170,7 +170,7 @@ def select(
     ] = None,
     no_payloads: NoPayloads = False,
     curve: Annotated[
-        bool, Option("--curve", help="Print how much is kept by how many, beside a random order.")
+        bool, Option("--curve", help="Print the kept share by size, and that of a random order.")
     ] = False,
     picture: Annotated[
         Path | None, Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg.")

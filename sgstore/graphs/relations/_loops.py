@@ -151,13 +151,13 @@ def sides(
     ends: tuple[Nodes, Nodes],
     place: tuple[Floats, Floats, Floats],
     turn: tuple[Floats, Floats],
-    beside: float,
+    least: float,
     codes: Codes,
     doubt: float,
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Write the left and right edges of pairs; ``beside`` is the least distance off the axis."""
+    """Write the left and right edges of pairs with a distance from the axis above ``least``."""
     x, y, _ = place
     cos, sin = turn
     frame, node = ends
@@ -170,10 +170,10 @@ def sides(
             reach = (abs(dx) + abs(dy)) * doubt + 1e-30
             left = dy * cos[one] - dx * sin[one]
             aside = abs(left)
-            if not (aside if beside < 0 else abs(aside - beside)) > reach:
+            if not (aside if least < 0 else abs(aside - least)) > reach:
                 doubtful[unsure] = i + len(a) * mirrored
                 unsure += 1
-            elif aside > beside:
+            elif aside > least:
                 of[at], relation[at] = frame[one], codes[0 if left >= 0 else 1]
                 src[at], dst[at] = node[other], node[one]
                 at += 1

@@ -118,7 +118,7 @@ class Doubts:
         return bool(lanes.both[lane] or lanes.forward[lane] == (end == END))
 
     def _before(self, road: int, s: float) -> str:
-        """Return the end of the road with a junction near this place; empty if there is none near."""
+        """Return the end of the road with a junction near this place, or an empty text."""
         if not self._junctions:
             self._lengths = self.document.rough_numbers("road", "length").tolist()
             self._junctions = {
