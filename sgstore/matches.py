@@ -32,7 +32,7 @@ from sgstore.lang.sql import (
     joined_rows,
     rewritten,
 )
-from sgstore.model.frame_ids import SEQ_BITS
+from sgstore.model.frame_ids import FRAME_BITS, SEQ_BITS
 from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import natural
 from sgstore.model.world import Clip, tolerance_ns
@@ -64,8 +64,6 @@ SHOWN: Final = 80
 FIRST_WINDOW: Final = 1024
 """Buckets of the first window: 61,440 frames, about 30 ms for real traffic. The caller may stop early."""
 
-BUCKET_SHIFT: Final = 6
-"""``frame_id >> 6`` is the bucket of a frame."""
 
 GROWTH: Final = 16
 """Growth factor of windows after a window with few rows."""
@@ -310,7 +308,7 @@ class Matches(Tabular):
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
         """Return all bindings in one frame: variable name → node id. ``RETURN`` has no effect."""
-        bucket = frame.frame_id >> BUCKET_SHIFT
+        bucket = frame.frame_id >> FRAME_BITS
         with self._compiled() as compiled:
             statement = compiled.bindings(Window(bucket, bucket + 1))
             rows = self._file.rows(**self._asked(statement)).values

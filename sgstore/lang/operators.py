@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
     SqlOf = Callable[[Sequence[str]], str]
 
+MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "=", "<>": "<>"}
+"""Comparison → comparison with the operands exchanged."""
+
 
 @dataclass(frozen=True, slots=True)
 class Column:

@@ -17,6 +17,7 @@ from sgstore.temporal._progression import (
     may_end,
 )
 from sgstore.temporal._quantifiers import HOLDS, PENDING, VIOLATED
+from sgstore.temporal._valuation import NEVER
 from sgstore.temporal._verdicts import always_true, bounded
 
 if TYPE_CHECKING:
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
     Keys = NDArray[np.int64]
     Span = tuple[FrameTime, FrameTime]
 
-NEVER: Final = 1 << 62
-"""Frame number after all frames."""
 
 REMEMBERED: Final = 100_000
 """Largest number of cached transitions before a reset."""

@@ -27,7 +27,7 @@ from sgstore.lang.sql import (
     traces_of,
 )
 from sgstore.matches import TooMuchError, Windows
-from sgstore.model.frame_ids import trace_of
+from sgstore.model.frame_ids import FRAME_BITS, trace_of
 from sgstore.model.vocabulary import RELATIONS
 from sgstore.model.world import JUMP_NS, longest_step_ns, seconds_of, tolerance_ns
 from sgstore.temporal._check_plan import FAVOURABLE, SIGNS, CheckPlan
@@ -185,8 +185,6 @@ ROW_BYTES: Final = 100
 EDGE_BYTES: Final = 100
 """Additional memory for one edge of a row; bytes."""
 
-BUCKET_SHIFT: Final = 6
-"""``frame_id >> 6`` is the bucket of a frame."""
 
 _LAST: Final = (1 << 63) - 1
 
@@ -490,7 +488,7 @@ def chosen_traces(file: StoreFile, query: Query, catalog: Catalog) -> dict[int, 
 
 def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
     """Return ids, numbers, times and log times of the frames of a window, ordered by id."""
-    low, high = (window.low << BUCKET_SHIFT, window.high << BUCKET_SHIFT) if window else (0, _LAST)
+    low, high = (window.low << FRAME_BITS, window.high << FRAME_BITS) if window else (0, _LAST)
     sql, values = CLOCK, (low, high)
     if window and window.traces is not None:
         sql, values = CLOCK_OF_TRACES, (low, high, list(window.traces))
@@ -509,7 +507,7 @@ def buckets_of(file: StoreFile, window: Window | None) -> dict[str, Ints]:
 
 def times_of(file: StoreFile, window: Window | None) -> tuple[Ints, Ints]:
     """Return the ordered frame ids of a window, and their times; ns."""
-    low, high = (window.low << BUCKET_SHIFT, window.high << BUCKET_SHIFT) if window else (0, _LAST)
+    low, high = (window.low << FRAME_BITS, window.high << FRAME_BITS) if window else (0, _LAST)
     ids, times = _ordered(file, TIMES, low, high).values()
     return ids, times
 

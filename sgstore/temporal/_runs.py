@@ -17,11 +17,10 @@ from sgstore.lang import ir as b
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import extents
 from sgstore.matches import Windows
-from sgstore.model.frame_ids import BUCKET_BITS, seq_of, trace_of
+from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS, seq_of, trace_of
 from sgstore.model.world import BUCKET_FRAMES, longest_step_ns, tolerance_ns
 from sgstore.temporal._match_values import over_rows, picked
 from sgstore.temporal._offline import (
-    BUCKET_SHIFT,
     EDGE_BYTES,
     ROW_BYTES,
     arrays_of,
@@ -108,7 +107,7 @@ class FrameLine:
             rows &= np.isin(owners, window.traces)
         bucket, valid, joined = (buckets[n][rows] for n in ("bucket", "valid", "joined"))
         held, bits = np.nonzero((valid[:, None] >> np.arange(BUCKET_FRAMES)) & 1)
-        ids = (bucket[held] << BUCKET_SHIFT) + bits
+        ids = (bucket[held] << FRAME_BITS) + bits
         starts = np.flatnonzero(np.diff(trace_of(ids), prepend=-1))
         traces, counts = trace_of(ids[starts]), np.diff(starts, append=len(ids))
         owners = np.repeat(np.arange(len(traces)), counts)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from sgstore.temporal._progression import Term
-from sgstore.temporal._valuation import Partial
+from sgstore.temporal._valuation import NEVER, Partial
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 
 Needs = bool | tuple[tuple[Partial, Term], ...]
 """Truth value of conditions, or the open terms of which one must become true."""
-
-NEVER: Final = 1 << 62
-"""Frame number after all frames."""
 
 
 @dataclass(slots=True)

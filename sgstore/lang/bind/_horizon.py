@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
+from sgstore.lang.operators import MIRRORED
 from sgstore.model.vocabulary import PROXIMITY, SIGNALS, entity_kinds
 
 if TYPE_CHECKING:
@@ -268,7 +269,7 @@ class _Looking:
                 return self.place(one, key, wanted=wanted)
             case b.Operation("<" | "<=", (b.SignalCall(word="run_length", operand=one), _)):
                 return self.place(one, key, wanted=not wanted)
-            case b.Operation(word, (one, other)) if word in _MIRRORED:
+            case b.Operation(word, (one, other)) if word in MIRRORED:
                 return self._compared(word if wanted else _COMPLEMENT[word], one, other, key)
             case b.BlockValue(word="EXISTS", scope=scope) if wanted and key in scope.outer:
                 return self.in_scope(scope, key)
@@ -279,7 +280,7 @@ class _Looking:
 
     def _compared(self, word: str, one: Bound, other: Bound, key: str) -> _Place:
         found = self._measured(word, one, other, key)
-        return found.both(self._measured(_MIRRORED[word], other, one, key))
+        return found.both(self._measured(MIRRORED[word], other, one, key))
 
     def _measured(self, word: str, one: Bound, other: Bound, key: str) -> _Place:
         """Return bounds on the distance of an entity from the ego, from a comparison: ``dist(e, v) < 20``."""
@@ -334,7 +335,6 @@ def _joined(scope: Scope, key: str, known: Mapping[str, float]) -> bool:
     return any(known.get(other, math.inf) < math.inf for other in reached - {key})
 
 
-_MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "=", "<>": "<>"}
 _COMPLEMENT: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.lang import ir as b
 from sgstore.lang.help._pattern_text import Writer, kind_label, text_written
 from sgstore.lang.memory import Binding, FrameView, NodePair, ScopeSearch, expression
+from sgstore.lang.operators import MIRRORED
 from sgstore.lang.sql import TRACE_OF_FRAME, happened_in_frame, leaves, told_events
 from sgstore.model.vocabulary import EVENT_KINDS, KINDS, RELATIONS
 
@@ -319,7 +320,7 @@ def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str
         match part:
             case b.Operation(word=word, operands=(left, right)) if word in _COMPARED:
                 if isinstance(_constant_of(left), float):
-                    word, left, right = _MIRRORED[word], right, left
+                    word, left, right = MIRRORED[word], right, left
                 limit = _constant_of(right)
                 if limit is None or _value(part, at, query) is not False:
                     continue
@@ -339,9 +340,6 @@ def _constant_of(value: b.Bound) -> float | None:
             return -float(number)
         case _:
             return None
-
-
-_MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "="}
 
 
 def shortfall(condition: b.Bound, at: Binding, query: b.Query) -> float:

@@ -55,6 +55,7 @@ from sgstore.lang.ir import (
     walk,
     with_operands,
 )
+from sgstore.lang.operators import MIRRORED
 from sgstore.lang.sql._expressions import is_constant, leaves
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.model.vocabulary import KINDS
@@ -70,7 +71,6 @@ _OPPOSITE: Final = {"=": "<>", "<>": "=", "<": ">=", ">=": "<", ">": "<=", "<=":
     "IS NULL": "IS NOT NULL",
     "IS NOT NULL": "IS NULL",
 }
-_MIRRORED: Final = {"=": "=", "<>": "<>", "<": ">", ">=": "<=", ">": "<", "<=": ">="}
 
 
 def rewritten(query: Query, catalog: Catalog) -> Query:
@@ -312,7 +312,7 @@ def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
         case Operation(
             word, (Value(value=int() | float() as n), BlockValue(word="COUNT") as block)
         ):
-            return (block, _MIRRORED[word], n) if word in _OPPOSITE else None
+            return (block, MIRRORED[word], n) if word in _OPPOSITE else None
         case _:
             return None
 
