@@ -137,9 +137,9 @@ def test_a_search_that_may_not_end_still_gives_a_cover_and_a_bound_below_it(
 ENDED = """
 import signal
 import numpy as np
-from sgstore.testsets.selection import SetFamily, _cover, minimal
+from sgstore.testsets.selection import SetFamily, _bounds, minimal
 
-_cover.SECONDS = 3600.0  # the solver does not give up by itself
+_bounds.SECONDS = 3600.0  # the solver does not give up by itself
 
 class EndedError(Exception):
     pass

@@ -182,16 +182,21 @@ def _silent() -> Any:
 def _run(solver: Any) -> None:
     """Solve in a thread, so that an exception from a signal handler stops it."""
     # All solvers of a process share one lock; an interrupted solver holds it until it stops.
-    while not solver.wait(_LOOK_S)[0]:
-        pass
+    _wait(solver)
     solver.HandleUserInterrupt = True
     solver.startSolve()
     try:
-        while not solver.wait(_LOOK_S)[0]:
-            pass
+        _wait(solver)
     except BaseException:
         solver.cancelSolve()
+        _wait(solver)  # a process that ends while the thread runs is aborted
         raise
+
+
+def _wait(solver: Any) -> None:
+    """Wait for the end of a solver. A signal handler can raise meanwhile."""
+    while not solver.wait(_LOOK_S)[0]:
+        pass
 
 
 def _programme(family: SetFamily) -> Any:
