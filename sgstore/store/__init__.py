@@ -1,4 +1,4 @@
-"""The store: one DuckDB file. Only this package uses DuckDB.
+"""Store of scene graphs: one DuckDB file. Only this package of sgstore uses DuckDB.
 
 Reading: ``_file`` has the main class, :class:`StoreFile`. ``_locking`` shares the file between readers and
 writers, with ``_gate`` and ``_lease``. ``_schema`` checks it against ``schema.sql`` before the first read.

@@ -1,4 +1,4 @@
-"""Statement results as Arrow tables and batches. pyarrow is optional."""
+"""Results of SQL statements as Arrow tables and batches. The package pyarrow is optional."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def table_of(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None) -> Any:
-    """Return all rows of a statement as a ``pyarrow.Table``. Enumeration values are texts.
+    """Run an SQL statement, and return its rows as a ``pyarrow.Table``. Enumeration values are texts.
 
     ``None`` means that a column is not a number, truth value or text; the statement does not run. Arrow and
     Python values of other types differ.
@@ -52,7 +52,7 @@ def is_plain(relation: Any) -> bool:
 def as_told(
     tables: Sequence[Any], columns: Sequence[str] | None = None, most: int | None = None
 ) -> Any:
-    """Concatenate Arrow tables, with the types that Python values would have.
+    """Concatenate Arrow tables, and convert integers to int64 and floats to float64, like Python.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ ROWS_AT_ONCE: Final = 50_000
 def record_batches(
     connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None
 ) -> ArrowStream | None:
-    """Return the columns of a statement, and a stream of Arrow batches, one in memory at a time.
+    """Run an SQL statement, and return its columns and an iterator of Arrow batches.
 
     ``None`` means that pyarrow is missing, or a column is not plain (:func:`table_of`); the statement does not
     run.
@@ -146,7 +146,7 @@ def record_batches(
 
 
 def as_told_batches(columns: Sequence[str], stream: ArrowStream) -> ArrowStream:
-    """Return an Arrow stream with new column names and with the types that Python values would have."""
+    """Rename the columns of Arrow batches, and convert numbers to int64 and float64, like Python."""
     (named, batches), first, rows = stream, list[Any](), 0
     for batch in batches:
         first.append(batch)

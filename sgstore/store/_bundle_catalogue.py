@@ -1,4 +1,4 @@
-"""Catalogue rows of a bundle: its traces, classes, names and sets of relations."""
+"""Catalogue of a bundle (store in a collection): its traces, frame classes, names and relations."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ _INFO: Final = "SELECT key, value FROM store_info"
 
 
 def facts_of(file: StoreFile, bundle: str, size: int) -> Facts:
-    """Return the catalogue rows that describe the content of a store.
+    """Return table rows that summarise a store: its traces, frame classes, names and settings.
 
     For triples outside the graphs, ``moving`` is NULL.
 
@@ -191,7 +191,7 @@ def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
 
 
 def parquet_rows(path: Path, columns: Iterable[str]) -> list[tuple[Any, ...]]:
-    """Return named columns of a sgstore Parquet file. Missing columns of :data:`LATER` are NULL.
+    """Return some columns of an sgstore Parquet file as rows. Missing columns of :data:`LATER` are NULL.
 
     Raises
     ------

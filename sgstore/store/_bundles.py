@@ -1,4 +1,4 @@
-"""Bundles: new stores with sorted, renamed traces of one or several stores.
+"""Bundles: store files of a collection, with sorted and renamed traces of one or several stores.
 
 Ids of traces, maps, recordings and settings come from digests. They are equal in every store, so rows are
 copied unchanged.
@@ -51,7 +51,7 @@ _SORTED: Final = frozenset({*STATES, *REPEATED, *REPEATED.values(), "frame", *MA
 
 @dataclass(frozen=True, slots=True)
 class BundleSource:
-    """Store with traces for a bundle. It does not change.
+    """Read-only store from which traces are copied into a bundle (store file of a collection).
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class BundleSource:
     path: Path
 
     def names(self) -> dict[int, tuple[str, str, str]]:
-        """Return trace id → (name, recording digest, ego), sorted by name in natural order."""
+        """Return all traces by id, sorted by name: trace id → (name, recording digest, ego)."""
         with Access(self.path).reading() as connection:
             found = stored_traces(connection)
         return {one.trace_id: (one.name, one.digest, one.ego) for one in found}
@@ -78,7 +78,7 @@ class BundleSource:
     def write(
         self, to: Path, traces: Mapping[int, str], maps: Mapping[str, str] | None = None
     ) -> None:
-        """Copy traces into a new store, sorted across all traces.
+        """Copy some traces into a new store, with the table rows sorted across all traces.
 
         Parameters
         ----------
@@ -106,7 +106,7 @@ class BundleSource:
     def join(
         sources: Sequence[Path], to: Path, traces: Mapping[int, str], maps: Mapping[str, str]
     ) -> None:
-        """Copy traces of several stores into a new store. No process may write to the sources.
+        """Copy traces of several stores into a new store. No process may write to these stores.
 
         Parameters
         ----------
@@ -166,7 +166,7 @@ def _copied(
     *,
     whole: bool = True,
 ) -> None:
-    """Fill a new store with traces of attached stores."""
+    """Create a new store, and copy the selected traces of attached stores into it."""
     attach_empty(connection, to)
     for database in sources:
         words = {enum: shape.labels_of(connection, database, enum) for enum in NAMES}
@@ -190,7 +190,7 @@ def _copied(
 def _choose(
     connection: DuckDBPyConnection, traces: Mapping[int, str], maps: Mapping[str, str]
 ) -> None:
-    """Create temporary tables of the selected traces and of the new map names."""
+    """Create temporary SQL tables of the selected traces and of the new names of road maps."""
     for table, kind, values in (("chosen", "BIGINT", traces), ("named", "VARCHAR", maps)):
         connection.execute(
             f"CREATE OR REPLACE TEMP TABLE {table} AS SELECT unnest(CAST($1 AS {kind}[])) AS key,"
@@ -204,7 +204,7 @@ _ONCE: Final = {table: owner for owner, tables in SHARED.items() for table in ta
 
 
 def _chosen(table: str, database: str) -> str:
-    """Return SQL for the rows of an attached store's table that belong to the selected traces."""
+    """Return SQL that selects the rows of the chosen traces from one table of an attached store."""
     inside = f"{quoted(database)}.inside"
     traces = f"(SELECT t.* FROM {inside}.trace t WHERE t.trace_id IN (SELECT key FROM chosen))"
     if table == "trace":

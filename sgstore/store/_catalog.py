@@ -1,4 +1,4 @@
-"""Catalog of a store for the query compiler, including the catalog of each abstraction.
+"""Catalog of a store (names, types and row counts) for the query compiler, one per abstraction.
 
 With an abstraction, a query sees other tables under the same names: *shadows*, defined before its statement.
 """
@@ -40,7 +40,7 @@ _NUMBERS: Final = frozenset({"BIGINT", "UBIGINT", "HUGEINT", "DOUBLE"})
 
 
 def catalog_of(connection: DuckDBPyConnection) -> Catalog:
-    """Return the catalog of a store, including the catalogs of its abstractions."""
+    """Return the catalog of a store: names, types and counts for the query compiler."""
 
     def kinds(of: str) -> frozenset[str]:
         found = connection.execute(f"SELECT DISTINCT kind FROM {of}").fetchall()
@@ -93,12 +93,12 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
 
 
 def subset_catalogs() -> dict[str, Callable[[Catalog], Catalog]]:
-    """Return functions that derive the catalog of each subset abstraction from a store's catalog."""
+    """Return functions for abstractions that drop nodes or edges: store catalog → abstraction catalog."""
     return {name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()}
 
 
 def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
-    """Return the derived sets of a store. Most stores have none, so the slow import is avoided."""
+    """Return the derived sets of relations in a store. Most stores have none, so the slow import is avoided."""
     if connection.execute("SELECT 1 FROM derived LIMIT 1").fetchone() is None:
         return ()
     from sgstore.store._derive import sets_of
@@ -107,7 +107,7 @@ def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
 
 
 def known_range(scope: Mapping[str, Any] | None) -> float:
-    """Return the distance from the ego within which all recorded objects are stored; m.
+    """Return the distance around the ego within which the store has all recorded objects; m.
 
     Infinite means everything.
 
@@ -126,7 +126,7 @@ _KNOWN: Final = ("state", "node", "lane_state", "lane_gap")
 
 
 def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:
-    """Return the catalog fields for data outside the graphs. The result is empty without such data."""
+    """Return the catalog fields for objects outside the graphs. A store without such objects gives {}."""
     tables = ("world_state", "world_node", "world_edge")
     there = " UNION ALL ".join(f"(SELECT 1 FROM {table} LIMIT 1)" for table in tables)
     if connection.execute(there).fetchone() is None:
@@ -140,7 +140,7 @@ def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:
 
 
 def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
-    """Return the types of user-defined node or edge attributes; see :func:`sgstore.lang.catalog.own_type`.
+    """Return the types of user-defined attributes of nodes or of edges: attribute name → type.
 
     In a trace, an attribute is a number or a truth value if all its values are; else it is a text.
     """
@@ -160,7 +160,7 @@ def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
 
 
 def _type_of(traces: list[tuple[Type, bool, bool]]) -> Type:
-    """Return the common type of an attribute.
+    """Return the common type of a user-defined attribute from its type in each trace.
 
     Each trace adds its type and two flags: whole values, large values.
     """
@@ -176,7 +176,7 @@ def _counted(connection: DuckDBPyConnection, table: str) -> dict[Triple, int]:
 
 
 def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
-    """Return the catalog of an abstraction that has a subset of the nodes and edges."""
+    """Return the store catalog for an abstraction that drops some nodes and edges of each graph."""
     kinds = of.kinds
     if kinds is None:
         return replace(whole, name=name)
@@ -223,7 +223,7 @@ def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
 def _derived(
     connection: DuckDBPyConnection, whole: Catalog, name: str, of: list[DerivedSet]
 ) -> dict[str, Any]:
-    """Return the catalog fields that a derived set changes, for the traces with this set."""
+    """Return the catalog fields that a derived set of relations changes, for the traces with this set."""
     answers = {one.trace_id: frozenset(one.answers) for one in of}
     reaches = {one.trace_id: RelationScope.of(one.settings) for one in of}
     word = literal(name)
@@ -267,7 +267,7 @@ def _derived(
 
 
 def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) -> dict[str, str]:
-    """Return the tables of scope ``world`` for a derived set: its edges replace the edges of the graphs."""
+    """Return SQL tables of objects outside the graphs, with the edges of a derived set of relations."""
     if not beyond:
         return {}
     traces = f"(SELECT d.trace_id FROM derived AS d WHERE d.name = {word})"
@@ -286,7 +286,7 @@ def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) 
 def _relations(
     connection: DuckDBPyConnection, whole: Catalog, of: list[DerivedSet]
 ) -> frozenset[str] | None:
-    """Return the relations of a derived set according to its settings. ``None`` means unknown.
+    """Return the relation names that a derived set can contain. ``None`` means unknown.
 
     If a trace has a road map, the set lacks the relations that no trace answers: a relation needs only settings
     and a map. Without a map, the set lacks only the relations that the traces can answer in the store.

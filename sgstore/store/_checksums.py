@@ -1,4 +1,4 @@
-"""Checksums of table rows, equal for arrays and for the stored table.
+"""Checksums of table rows. Rows in memory and the same rows in the database have equal checksums.
 
 They do not depend on the order of rows, nor on the DuckDB version.
 
@@ -55,7 +55,7 @@ _ASSIGNED: Final = {
 
 @dataclass(slots=True)
 class Checksum:
-    """Checksum of table rows.
+    """Checksum of the rows of a table. It does not depend on the row order.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Checksum:
     value: int = 0
 
     def add(self, columns: Mapping[str, NDArray[Any] | None]) -> None:
-        """Add rows given as masked columns of numbers and truth values.
+        """Update the checksum with rows, as columns of numbers and truth values with masked missing values.
 
         ``None`` means an all-missing column.
         """
@@ -101,7 +101,7 @@ def _mix(words: Words, spare: Words) -> None:
 
 
 def _words(values: NDArray[Any], out: Words) -> None:
-    """Convert values to 64-bit words for the checksum."""
+    """Write the values of a column as 64-bit words into an output array, for the checksum of rows."""
     plain = np.ma.getdata(values)
     if plain.dtype.kind == "f":
         plain = plain + plain.dtype.type(0)  # merges -0 and 0: DuckDB 1.5 drops the sign
@@ -113,7 +113,7 @@ def _words(values: NDArray[Any], out: Words) -> None:
 
 
 def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, NDArray[Any] | None]:
-    """Return staged columns in the form of :meth:`Checksum.add`. Absent columns are ``None``."""
+    """Convert table columns to numbers for :meth:`Checksum.add`. Absent columns are ``None``."""
     enums = enums_of(table)
     found: dict[str, NDArray[Any] | None] = {}
     for name, kind in types_of(table).items():
@@ -142,7 +142,7 @@ def _number(kind: str, text: str) -> int:
 
 
 def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:
-    """Return enumeration codes that are equal in every store. Codes of added names are hashed."""
+    """Return enumeration codes that are equal in every store. Codes of user-defined names become hashes."""
     own = len(own_labels(enum))
     if codes.max(initial=0) < own:
         return codes
@@ -161,7 +161,7 @@ def columns_of(
 
 
 def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
-    """Return SQL for the columns of a table, in the form of :meth:`Checksum.add`.
+    """Return an SQL list of a table's columns as numbers, for a checksum of the stored rows.
 
     Numbers stay unchanged. Enumerations become codes, and texts become 60 bits of their MD5.
     """

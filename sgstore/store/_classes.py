@@ -1,4 +1,4 @@
-"""Frame classes of each abstraction: written at ingest, or computed at the first query.
+"""Frame classes (groups of frames with equal abstracted graphs), stored at ingest or at the first query.
 
 Classes are stored as masks, like edges: one row per class and bucket, because driving repeats itself. Ingest
 publishes some classes with their trace. Other classes are computed and stored at the first query.
@@ -71,7 +71,7 @@ _FEW_EDGES: Final = 1 << 16
 
 
 class TraceClasses:
-    """Frame classes of one trace, computed block by block.
+    """Frame classes of one trace for several abstractions, computed from one block of frames at a time.
 
     Parameters
     ----------
@@ -85,11 +85,11 @@ class TraceClasses:
         self._known: OrderedDict[bytes, list[str]] = OrderedDict()
 
     def columns(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
-        """Return columns of table ``later_class`` for the frames with numbers ``seq``."""
+        """Return the frame classes of a block of frames as columns of the table ``later_class``."""
         return self._columns(self._named(seen), trace_id, seq)
 
     def ingested(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
-        """Return columns of table ``frame_class``. Frames with equal content reuse their classes."""
+        """Return the frame classes of a block of frames as columns of the table ``frame_class``."""
         contents = contents_of(seen)
         rows = {content: row for row, content in enumerate(contents) if content not in self._known}
         fresh = sorted(rows.values())
@@ -103,7 +103,7 @@ class TraceClasses:
         return self._columns([*zip(*of_frames, strict=True)], trace_id, seq)
 
     def _named(self, seen: GraphColumns) -> list[tuple[str, ...]]:
-        """Return the classes of the frames for each abstraction."""
+        """Return the class names of each frame, as one tuple with a class per abstraction."""
         # Crowded frames are processed one abstraction at a time, to limit memory.
         together = len(self._of) if len(seen.frame) < _FEW_EDGES else 1
         named: list[str] = []
@@ -135,14 +135,14 @@ class TraceClasses:
 
 
 class IngestedClasses:
-    """Frame classes and lane roles of a trace during ingest."""
+    """Computes the frame classes and the lane roles of one trace during ingest."""
 
     def __init__(self, road_map: RoadMap | None) -> None:
         self._grounds = None if road_map is None else MapColumns.of(road_map)
         self._classes = TraceClasses()
 
     def tables(self, graph: GraphBlock, trace_id: int, kinds: Codes) -> dict[str, Columns]:
-        """Return tables ``frame_class`` and ``lane_role``; ``kinds`` are the entity kinds by node id."""
+        """Return the tables ``frame_class`` and ``lane_role`` for a block of graphs."""
         seen = GraphColumns.of(graph, kinds, self._grounds)
         seq = graph.frames.seq
         return {
@@ -166,7 +166,7 @@ def _role_columns(seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
 
 
 class Abstracted:
-    """Frames of a store in abstractions. Created by :attr:`StoreFile.abstracted`."""
+    """Abstracted graphs and frame classes of a store. Created by :attr:`StoreFile.abstracted`."""
 
     def __init__(self, path: Path, access: Access) -> None:
         self._path = path
@@ -174,7 +174,7 @@ class Abstracted:
         self._graphs = Graphs()
 
     def complete(self, name: str) -> int:
-        """Compute and store the missing frame classes of an abstraction.
+        """Compute and store missing frame classes of an abstraction. Return the number of completed traces.
 
         Each transaction covers traces with some thousand frames. After an interruption, the next call continues
         with the rest.
@@ -227,7 +227,7 @@ class Abstracted:
                         note(connection, trace_id, [_LATER])
 
     def classes(self, name: str, trace: int | str | None = None) -> dict[str, NDArray[np.generic]]:
-        """Return the class of each frame in an abstraction. Missing classes are computed.
+        """Return each frame's class in an abstraction, as columns. Missing classes are computed.
 
         Returns
         -------
@@ -256,7 +256,7 @@ class Abstracted:
         return {"frame_id": found["frame_id"], "class": np.asarray(found["class"], object)}
 
     def class_of(self, frame_id: int, name: str) -> str | None:
-        """Return the class of a frame in an abstraction.
+        """Return the stored class of a frame in an abstraction. ``None`` means that no class is stored.
 
         ``None`` means not stored, or abandoned as too symmetric.
         """
@@ -268,7 +268,7 @@ class Abstracted:
         return found[0] if found else None
 
     def roles_of(self, frame_id: int) -> dict[int, str]:
-        """Return the lane roles relative to a frame's ego: node id → role."""
+        """Return the roles of lanes relative to the ego in a frame: node id of the lane → role."""
         with self._access.reading() as connection:
             found = connection.execute(
                 "SELECT node_id, role FROM roles WHERE frame_id = ?", [frame_id]
@@ -276,7 +276,7 @@ class Abstracted:
         return dict(found)
 
     def coded(self, name: str) -> CodedClasses:
-        """Return the class of each frame as a number. Missing classes are computed.
+        """Return the class of each frame in an abstraction as a number. Missing classes are computed.
 
         Raises
         ------
@@ -290,7 +290,7 @@ class Abstracted:
             return coded_classes(connection, abstraction_named(name).name)
 
     def masks(self, name: str) -> Iterator[tuple[str | None, int, int]]:
-        """Yield (class, bucket, frame mask) for all frames. Missing classes are computed but not stored.
+        """Yield (class, bucket, bit mask) for all frames; a bucket has 64 frames. Missing classes are computed.
 
         Computed classes are not stored.
         """
@@ -306,17 +306,17 @@ class Abstracted:
                     yield from ((own or None, *rest) for own, *rest in zip(*of, strict=True))
 
     def times(self) -> tuple[Ints, Ints]:
-        """Return the ids of all frames in ascending order, and their simulation times; ns."""
+        """Return the ids of all frames of a store in ascending order, and their simulation times; ns."""
         with self._access.reading() as connection:
             return times(connection)
 
     def imported_names(self) -> dict[str, int]:
-        """Return graph names from imported files: graph name → frame id."""
+        """Return the names of the graphs that come from imported files: graph name → frame id."""
         with self._access.reading() as connection:
             return imported_names(connection)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """Yield graph features of frames in an abstraction, in groups of frames.
+        """Yield label counts of nodes and edges for given frames in an abstraction, in groups of frames.
 
         Parameters
         ----------
@@ -341,7 +341,7 @@ class Abstracted:
                 yield rows, triples(function(seen))
 
     def frames(self, name: str, first: int, last: int) -> tuple[Ints, GraphColumns, Labelled]:
-        """Return numbers, graphs and abstracted graphs of a range of frames of one trace.
+        """Return frame numbers, graphs and abstracted graphs of a range of frames of one trace.
 
         Raises
         ------
@@ -356,7 +356,7 @@ class Abstracted:
         return seq, seen, function(seen)
 
     def labelled(self, ref: int | str, name: str) -> tuple[Labelled, dict[str, int | str]]:
-        """Return one frame as an abstracted graph in columns, and its id, trace, number and time.
+        """Return the abstracted graph of one frame as columns, and the frame's id, trace, number and time.
 
         Raises
         ------
@@ -380,5 +380,5 @@ class Abstracted:
 
 
 def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> dict[int, int]:
-    """Return the traces without stored classes of an abstraction: trace id → number of frames."""
+    """Return the traces whose frame classes are not stored for an abstraction: trace id → number of frames."""
     return dict(connection.execute(_MISSING.format(catalog), {"name": name}).fetchall())

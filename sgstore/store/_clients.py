@@ -1,4 +1,4 @@
-"""Plain DuckDB connections to a store, for clients with their own SQL."""
+"""DuckDB connections to a store, for client programs with their own SQL statements."""
 
 from __future__ import annotations
 

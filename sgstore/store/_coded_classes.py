@@ -1,4 +1,4 @@
-"""Input of coverage: classes of all frames as numbers, and features of graphs."""
+"""Input of the coverage search: classes of all frames as numbers, and label counts of graphs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TIMES: Final = "SELECT frame_id, time_ns FROM frame ORDER BY frame_id"
 
 @dataclass(frozen=True, slots=True)
 class CodedClasses:
-    """Frame classes of an abstraction as numbers.
+    """Class of each frame in one abstraction, as an index into a list of class names.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class CodedClasses:
 
 
 def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
-    """Return the stored frame classes of an abstraction.
+    """Return the stored class of each frame in an abstraction, as a number per frame.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
 def classes_coded(
     connection: DuckDBPyConnection, kept: str, values: dict[str, Any] | None = None
 ) -> CodedClasses:
-    """Return the frame classes selected by an SQL statement with columns ``class``, ``bucket``, ``mask``."""
+    """Run SQL with columns ``class``, ``bucket``, ``mask``, and return the class of each frame as a number."""
     names = connection.execute(_NAMES.format(kept), values).fetchnumpy()["name"]
     rows = connection.execute(_MASKS.format(kept), values).fetchnumpy()
     frame_id, row = frames_of(rows["bucket"].astype(np.int64), rows["mask"].astype(np.int64))
@@ -80,19 +80,19 @@ def classes_coded(
 
 
 def times(connection: DuckDBPyConnection) -> tuple[Ints, Ints]:
-    """Return the ids of all frames in ascending order, and their simulation times; ns."""
+    """Return the ids of all frames of a store in ascending order, and their simulation times; ns."""
     rows = connection.execute(_TIMES).fetchnumpy()
     return rows["frame_id"].astype(np.int64), rows["time_ns"].astype(np.int64)
 
 
 def imported_names(connection: DuckDBPyConnection) -> dict[str, int]:
-    """Return graph names from imported files: graph name → frame id. The last frame wins."""
+    """Return the graph names from imported files: name → frame id. Of equal names, the last frame is used."""
     return dict(connection.execute(_IMPORTED).fetchall())
 
 
 @dataclass(frozen=True, slots=True)
 class Triples:
-    """Graph features, one row per frame and feature.
+    """Features of graphs (labels of nodes and edges) with their counts, one row per frame and feature.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class Triples:
 
 
 def triples(graphs: Labelled) -> Triples:
-    """Count, per frame, nodes by label and edges by the labels of edge and both ends."""
+    """Count the labels of each frame: labels of nodes, and labels of edges with both end nodes."""
     size = len(graphs.labels)
     of_node = graphs.node_frame.astype(np.int64), graphs.node_label.astype(np.int64)
     ends = [
@@ -140,7 +140,7 @@ def triples(graphs: Labelled) -> Triples:
 
 
 def _single(graphs: Labelled) -> tuple[Ints, Ints]:
-    """Split edges with several labels: return one row of edge and label for each label."""
+    """Return one row (edge, label) for each label of each edge, because an edge can have several labels."""
     bundles = [np.array(one, np.int64) for one in graphs.bundles]
     label = graphs.label.astype(np.int64)
     many = np.ones(len(label), np.int64)

@@ -1,4 +1,4 @@
-"""Columns of store tables as arrays: types and sort order."""
+"""Columns of the store's tables as arrays, with their types and sort order."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _FLOATS: Final = {"FLOAT": np.dtype(np.float32), "DOUBLE": np.dtype(np.float64)}
 
 @cache
 def types_of(table: str) -> Mapping[str, str]:
-    """Return the column types of a table in ``schema.sql``. Enumerations have type ``ENUM``."""
+    """Return the column types of a table in ``schema.sql``: column → type. Enumerations have type ``ENUM``."""
     if table == "message":
         return MESSAGES
     found: dict[str, str] = {}
@@ -59,7 +59,7 @@ def types_of(table: str) -> Mapping[str, str]:
 
 
 def kept(table: str, name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """Convert a numeric column to its staged form. Missing values become NaN or :data:`MISSING`.
+    """Convert a numeric column to the array type of its table. Missing values become NaN or :data:`MISSING`.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def kept(table: str, name: str, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def blank(table: str, name: str, count: int) -> NDArray[Any]:
-    """Return a staged column with only missing values."""
+    """Return an array with only missing values for a table column."""
     kind = types_of(table)[name]
     if kind in _FLOATS:
         return np.full(count, np.nan, _FLOATS[kind])
@@ -94,7 +94,7 @@ def blank(table: str, name: str, count: int) -> NDArray[Any]:
 
 
 def missing_of(table: str, name: str, values: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Return a mask of the missing values in a staged column. ``None`` means all values are present."""
+    """Return a mask of the missing values in a table column. ``None`` means all values are present."""
     if types_of(table)[name] in TEXTS:
         missing = values < 0
     elif values.dtype.kind == "f":
@@ -167,7 +167,7 @@ def _keys(table: str) -> tuple[tuple[str, int, bool], ...]:
 
 
 def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
-    """Sort the rows of a table. Merge rows that differ only in their masks.
+    """Sort the rows of a table. Rows that differ only in their bit mask of frames become one row.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
 
 
 def parted(columns: Columns) -> tuple[Columns, Columns]:
-    """Split sorted rows (one per frame) into single rows and repeated rows.
+    """Split rows into single rows and rows that repeat in consecutive frames; return two tables.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def parted(columns: Columns) -> tuple[Columns, Columns]:
 
 
 def marked(columns: Columns) -> Columns:
-    """Add the column ``repeated`` to sorted states, and sort them by it."""
+    """Add a column ``repeated`` (True if the values repeat in the next or previous frame), and sort by it."""
     bucket = columns["frame_id"] >> FRAME_BITS
     values = {name: of for name, of in columns.items() if name != "frame_id"}
     same = _as_before({"bucket": bucket, **values})
@@ -243,7 +243,7 @@ def marked(columns: Columns) -> Columns:
 
 
 def _as_before(columns: Columns) -> NDArray[np.bool_]:
-    """Return a mask of the rows that equal the row before, without the first row."""
+    """Return a mask of the rows that equal the previous row. The mask has no value for the first row."""
     same = np.ones(len(next(iter(columns.values()))) - 1, np.bool_)
     for values in columns.values():
         if not same.any():
@@ -254,7 +254,7 @@ def _as_before(columns: Columns) -> NDArray[np.bool_]:
 
 
 def chained(table: str, blocks: Sequence[Columns]) -> Columns:
-    """Concatenate staged rows of a table. The result has the columns of all blocks."""
+    """Concatenate blocks of rows of a table. A column of any block is a column of the result."""
     if len(blocks) == 1:
         return blocks[0]
     return {

@@ -1,4 +1,4 @@
-"""Digests of frame content. Two digests are equal if the public views of both frames are equal.
+"""Digests of the graphs in frames. Frames with equal digests have equal nodes, edges and attributes.
 
 A digest covers the bits of numbers, the characters of texts, and frame numbers in the trace. So the digest of a
 part of a trace does not depend on the store, nor on its other content.
@@ -82,7 +82,7 @@ TOGETHER: Final = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Settings and map used for the graphs of a trace.
+    """Digests of the settings and of the road map that produced the graphs of a trace.
 
     Attributes
     ----------
@@ -95,12 +95,12 @@ class Mark:
 
     @staticmethod
     def of_traces(file: StoreFile) -> dict[int, Mark]:
-        """Return the settings and maps of the traces of a store by trace id."""
+        """Return the settings digest and map digest of every trace of a store: trace id → digests."""
         return {row[0]: Mark(*row[1:]) for row in file.rows(_MARKS).values}
 
 
 def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
-    """Return one digest of the graphs for each group of frames.
+    """Return one digest for each group of frames. Groups with equal graphs have equal digests.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
 
 
 def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Yield ranges of groups with about :data:`GRAPHS` frames in total, at least one group each."""
+    """Yield index ranges of groups; each range has at least one group and about :data:`GRAPHS` frames."""
     low = together = 0
     for high, size in enumerate(sizes):
         if together + size > GRAPHS and high > low:
@@ -139,7 +139,7 @@ def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
 
 
 def _labels(file: StoreFile, view: str, columns: Sequence[str]) -> dict[str, Words]:
-    """Return the hash words of enumeration values for each column, indexed by code."""
+    """Return hashes of enumeration values: column → array of 64-bit words, indexed by enumeration code."""
     found: dict[str, Words] = {}
     for name, kind, *_ in file.rows(f"DESCRIBE SELECT * FROM {view}").values:
         if name in columns and kind.startswith("ENUM"):
@@ -155,7 +155,7 @@ def _rows(
     labels: Mapping[str, Words],
     wanted: Ints,
 ) -> tuple[Ints, Words]:
-    """Return the rows of a view as frame ids and hash words, sorted by value."""
+    """Return the rows of a view for some frames, as frame ids and 64-bit words, sorted by value."""
     listed = ", ".join(
         f'enum_code(v."{name}") AS "{name}"' if name in labels else f'v."{name}"'
         for name in columns
@@ -180,7 +180,7 @@ def _rows(
 
 
 def _like_before(order: NDArray[np.intp], *columns: NDArray[Any]) -> Bools:
-    """Return a mask (N,) of the ordered rows that equal the row before."""
+    """Return a mask (N,): True if a row equals the previous row in the given order."""
     like = np.ones(len(order), np.bool_)
     like[:1] = False
     for column in columns:
@@ -193,7 +193,7 @@ _MISSING_DIGEST: Final = np.uint64(0x6E756C6C6E756C6C)
 
 
 def _words(values: NDArray[Any], labels: Words | None) -> Words:
-    """Return values as 64-bit words. Codes become the words of their names."""
+    """Return column values as 64-bit words for a digest. Enumeration codes become hashes of their names."""
     plain = np.ma.getdata(values)
     missing = np.ma.getmaskarray(values)
     if labels is not None:
@@ -231,7 +231,7 @@ def _add(digest: Any, rows: tuple[Ints, Words], group: Ints, *, always: bool) ->
 
 @dataclass(frozen=True, slots=True)
 class MessagePlaces:
-    """Positions in the recording of the messages of frames, in order of position.
+    """File positions of the recorded messages that belong to frames, sorted by position.
 
     Attributes
     ----------
@@ -250,7 +250,7 @@ class MessagePlaces:
 
     @staticmethod
     def of(file: StoreFile, frame_id: Ints) -> MessagePlaces:
-        """Return the messages of frames of one trace, one row per frame and message."""
+        """Return the file positions of the messages of some frames, one row per frame and message."""
         found = file.arrays(_MESSAGES, {"frames": frame_id.tolist()})
         frame, channel, *numbers = found.values()
         return MessagePlaces(
@@ -261,7 +261,7 @@ class MessagePlaces:
 
     @staticmethod
     def lengths(file: FileOfFrames, frame_id: Ints) -> Iterator[tuple[Ints, Ints]]:
-        """Yield message sizes for ascending frame ids; bytes. Each message counts once, for its first frame."""
+        """Yield message sizes of some frames; bytes. A message of several frames counts once."""
         ends = np.append(np.flatnonzero(np.diff(trace_of(frame_id))) + 1, len(frame_id))
         low = 0
         while low < len(frame_id):
@@ -272,6 +272,6 @@ class MessagePlaces:
 
 
 class FileOfFrames(Protocol):
-    """Interface of a store file, or of the bundles of a collection."""
+    """Interface of a store of frames: a single store file, or the bundles of a collection."""
 
     def arrays(self, sql: str, parameters: Any) -> dict[str, NDArray[Any]]: ...

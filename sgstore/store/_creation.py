@@ -1,4 +1,4 @@
-"""Creation of empty stores."""
+"""Creation of empty store files (DuckDB databases with the tables of sgstore)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NEW: Final = f"STORAGE_VERSION '{STORAGE_VERSION}', BLOCK_SIZE {BLOCK_SIZE}"
 
 
 def create(path: Path) -> None:
-    """Create an empty store atomically. An existing file is not overwritten.
+    """Create an empty store file in one step. An existing file stays unchanged.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def create(path: Path) -> None:
 
 
 def _name(place: Path, path: Path) -> None:
-    """Move a new file to its final name. If another process created the store first, keep that file."""
+    """Rename a new store file to its final name. A store of another process at that name is kept."""
     try:
         os.link(place, path)
     except FileExistsError:
@@ -60,14 +60,14 @@ def _name(place: Path, path: Path) -> None:
 
 
 def attach_empty(connection: DuckDBPyConnection, place: Path) -> None:
-    """Create an empty store, and attach it as ``fresh``."""
+    """Create an empty store file, and attach it to a DuckDB connection under the name ``fresh``."""
     write_empty(place)
     file = literal(str(place.absolute()))
     connection.execute(f"ATTACH {file} AS fresh ({_NEW})")
 
 
 def write_empty(place: Path) -> None:
-    """Create an empty store at an unused path.
+    """Create an empty store file at a path without a file.
 
     Raises
     ------

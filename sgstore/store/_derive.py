@@ -1,4 +1,4 @@
-"""Derived sets of relations, in addition to the relations computed at ingest.
+"""Derived sets of relations: edges computed later from stored frames, beside the edges from ingest.
 
 The module returns the stored states as generator input, and stores the result of other settings.
 """
@@ -88,7 +88,7 @@ _HERE: Final = "bucket = $bucket AND mask & $bit <> 0"
 
 @dataclass(frozen=True, slots=True)
 class DerivedSet:
-    """Derived set of relations of one trace, computed from its stored states.
+    """Named set of relations (edges) of one trace, computed after ingest from the stored states of objects.
 
     Attributes
     ----------
@@ -114,19 +114,19 @@ class DerivedSet:
 
 
 class Deriving:
-    """Derived sets of a store. Created by :attr:`StoreFile.deriving`."""
+    """Derived sets of relations in a store. Created by :attr:`StoreFile.deriving`."""
 
     def __init__(self, path: Path, access: Access) -> None:
         self._path = path
         self._access = access
 
     def sets(self) -> tuple[DerivedSet, ...]:
-        """Return all derived sets by name and trace."""
+        """Return all derived sets of relations in the store, sorted by set name and trace."""
         with self._access.reading() as connection:
             return sets_of(connection)
 
     def blocks(self, trace_id: int) -> Iterator[FrameBlock]:
-        """Yield the frames of a trace with their stored states, at most two buckets at a time.
+        """Yield the frames of a trace with the stored object states, at most 128 frames at a time.
 
         An entity is introduced at its first known state, or before a later one with a known state. So the
         generator has the same data as at ingest.
@@ -136,16 +136,16 @@ class Deriving:
             yield from reader.blocks()
 
     def seen(self, trace_id: int) -> Iterator[tuple[Ints, GraphColumns]]:
-        """Yield the ingested graphs of a trace: frame numbers, and graph columns for abstractions."""
+        """Yield frame numbers and graphs of a trace, as columns, with the edges written at ingest."""
         with self._access.reading() as connection:
             yield from Graphs().of_trace(connection, trace_id)
 
     def building(self, name: str, trace_id: int) -> Building:
-        """Return a context manager that builds a new set for a trace."""
+        """Return a context manager that writes a new derived set of relations for a trace."""
         return Building(self._path, self._access, name, trace_id)
 
     def remove(self, name: str) -> tuple[str, ...]:
-        """Delete a derived set from all traces, and return the names of these traces.
+        """Delete a derived set of relations from all traces, and return the names of these traces.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class Deriving:
         return tuple(one.trace for one in gone)
 
     def graph(self, whole: SceneGraph, name: str) -> SceneGraph:
-        """Return a frame's graph with the nodes and edges of a derived set.
+        """Return the scene graph of a frame with the nodes and edges of a derived set of relations.
 
         Parameters
         ----------
@@ -224,7 +224,7 @@ class Deriving:
 
 
 def sets_of(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
-    """Return all derived sets of a store."""
+    """Return all derived sets of relations in a store."""
     rows = run(
         connection,
         "SELECT d.name, d.trace_id, t.name AS trace, d.settings, d.digest, d.answers"
@@ -236,7 +236,7 @@ def sets_of(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
 
 
 class Building:
-    """Builder of a derived set of one trace."""
+    """Writer of a derived set of relations for one trace."""
 
     def __init__(self, path: Path, access: Access, name: str, trace_id: int) -> None:
         self._access = access
@@ -270,7 +270,7 @@ class Building:
         self._staging.close()
 
     def append(self, graph: GraphBlock) -> None:
-        """Add the graphs of the next frames."""
+        """Add the graphs of the next frames to a derived set of relations."""
         if not len(graph):
             return
         self._staging.settle(whole=int(graph.frames.seq[0]) % BUCKET_FRAMES == 0)
@@ -294,7 +294,9 @@ class Building:
         self._insert("derived_gap", packing.gap_columns(graph, self._trace_id))
 
     def append_labelled(self, seq: Ints, seen: GraphColumns, graphs: Labelled) -> None:
-        """Add the next abstracted frames. Nodes and edges that a store cannot hold are dropped.
+        """Add the next abstracted frames to a derived set.
+
+        Nodes and edges that a store cannot hold are dropped.
 
         Kept are nodes of the scene graph, and edges between them with a relation as label.
         """
@@ -343,7 +345,7 @@ class Building:
         self._staging.insert(table, columns | {"set_name": named.repeat(count)})
 
     def publish(self, settings: Mapping[str, Any], digest: str, answers: tuple[str, ...]) -> None:
-        """Write the set to the store in one transaction. It replaces a set of the same name.
+        """Write a derived set of relations to the store in one transaction. It replaces a set of the same name.
 
         Raises
         ------
@@ -389,7 +391,7 @@ def _delete(connection: DuckDBPyConnection, name: str, trace_id: int) -> None:
 
 
 class _StateReader:
-    """Reader of the states of one trace, as blocks of frames."""
+    """Reader of the stored object states of one trace, as blocks of frames."""
 
     def __init__(self, connection: DuckDBPyConnection, trace_id: int) -> None:
         self._connection = connection

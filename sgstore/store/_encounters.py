@@ -1,4 +1,4 @@
-"""Measures of later encounters: ``recorded('pet', trace_id, src, dst)`` in SQL, and a view of them.
+"""Criticality measures of object pairs over a whole trace, as an SQL function and an SQL view.
 
 A measure needs the tracks of two entities, so SQL cannot express it. DuckDB calls a Python function for each
 remaining row. A pair is computed once, and cached until the file changes. The function belongs to a database
@@ -57,7 +57,7 @@ JOIN {INSIDE}.trace t ON t.trace_id = e.trace_id
 
 
 class _Known:
-    """Cache of a store file: recently read tracks, and measures of pairs."""
+    """Cache of a store file: object tracks that were read, and criticality measures of object pairs."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -71,7 +71,7 @@ class _Known:
         self.states += 0 if track is None else len(track)
 
     def forget(self) -> None:
-        """Clear the cached tracks if they have too many states."""
+        """Clear the cached object tracks if they have too many states in total."""
         if self.states > MOST_STATES:
             self.tracks.clear()
             self.whole.clear()
@@ -79,7 +79,7 @@ class _Known:
 
 
 class _MeasuredQuestion:
-    """Connection whose statement uses recorded measures.
+    """Database connection whose SQL statement uses criticality measures of object pairs.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class _MeasuredQuestion:
         self._reader.execute(f'USE "{at}".{INSIDE}')
 
     def value(self, measure: str, trace: int, src: int, dst: int) -> float | None:
-        """Return a measure of a pair. ``None`` means unknown or undefined."""
+        """Return a criticality measure of an object pair in a trace. ``None`` means unknown or undefined."""
         if measure.removeprefix(KNOWN) not in RECORDED:
             raise ConfigError(f"no recorded measure: {measure!r}; expected {', '.join(RECORDED)}")
         key = measure, trace, src, dst
@@ -160,7 +160,7 @@ def _recorded(token: int, measure: Any, trace: Any, src: Any, dst: Any) -> float
 
 @contextmanager
 def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> Generator[None]:
-    """Provide recorded measures to a connection inside the block.
+    """Context manager that adds the SQL function ``recorded()`` to a connection, if a statement uses it.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> G
 
 
 def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
-    """Add the function and the view of recorded measures to a connection, if its statement uses them."""
+    """Add the SQL function ``recorded()`` and the view ``encounters`` to a connection, if SQL uses them."""
     path = _paths.get(id(connection))
     if path is None or _WANTED.search(sql) is None:
         return
@@ -223,6 +223,6 @@ def measured(
     src: int,
     dst: int,
 ) -> float | None:
-    """Return a measure of a pair of nodes in a trace. ``None`` means unknown."""
+    """Return a criticality measure of an object pair in a trace. ``None`` means unknown."""
     ((value,),) = ask("SELECT recorded(?, ?, ?, ?)", [f"{scope}{measure}", trace_id, src, dst])
     return value

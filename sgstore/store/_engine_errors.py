@@ -1,4 +1,4 @@
-"""Errors of the database that the query did not cause, and their messages."""
+"""DuckDB errors without a cause in the query (full disk, busy file, internal errors), and their messages."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ _HELD_HERE: Final = (
 
 
 class BusyError(StoreError):
-    """Another process or connection uses the file."""
+    """Error: another process or connection uses the store file."""
 
 
 class EngineError(StoreError):
-    """DuckDB failed with an internal error."""
+    """Error: DuckDB failed with an internal error."""
 
 
 class HeldHereError(BusyError):
-    """Another connection of this process, not made by sgstore, uses the file."""
+    """Error: a DuckDB connection of this process, not made by sgstore, uses the store file."""
 
 
 @contextmanager
 def translated(path: Path) -> Generator[None]:
-    """Convert DuckDB errors to errors of the store at ``path``, and interruptions to ``KeyboardInterrupt``.
+    """Convert DuckDB errors to store errors, and an interrupted statement to ``KeyboardInterrupt``.
 
     DuckDB converts Ctrl-C: to a RuntimeError while a statement runs, and to an error that quotes
     KeyboardInterrupt while it scans Python arrays.

@@ -1,4 +1,4 @@
-"""A store: one DuckDB file, kept open for a short time after each query.
+"""Access to a store: one DuckDB file, which stays open for a short time after each query.
 
 Imports for writing and drawing are local: they would take longer than a query.
 """
@@ -76,7 +76,7 @@ def _damage(connection: DuckDBPyConnection, path: Path) -> str:
 
 
 class StoreFile:
-    """Store, opened by its path.
+    """Store of scene graphs (a DuckDB file), opened by its path.
 
     The file stays open for a second after a query, unless a writer process waits.
 
@@ -137,7 +137,7 @@ class StoreFile:
 
     @classmethod
     def together(cls, path: str | Path) -> StoreFile:
-        """Open a store in one database shared with the other stores of its folder. This is four times faster.
+        """Open a store in the database instance of its folder; four times faster for many stores.
 
         Raises
         ------
@@ -167,11 +167,11 @@ class StoreFile:
         return cls(path, memory=memory, wait_s=wait_s, made=made)
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Keep the store open for several queries. They see the same state and run faster."""
+        """Keep the store open for several queries. The queries see the same state and run faster."""
         return self.access.reading(idle=True)
 
     def close(self) -> None:
-        """Close the file if no query is running. The next query opens it again."""
+        """Close the store file if no query is running. The next query opens it again."""
         self.access.close()
 
     def rows(
@@ -215,7 +215,7 @@ class StoreFile:
     def table(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Any:
-        """Run a trusted SQL statement, and return an Arrow table; see :func:`sgstore.store._arrow.table_of`."""
+        """Run a trusted SQL statement, and return all rows as an Arrow table."""
         with self._answered(lambda at, _: table_of(at, sql, parameters), sql, given) as found:
             return found
 
@@ -228,7 +228,7 @@ class StoreFile:
         *,
         given: Iterable[Given] = (),
     ) -> Generator[Batches]:
-        """Run a trusted SQL statement, and stream its rows in batches of ``size``."""
+        """Run a trusted SQL statement, and stream its rows in batches of ``size`` rows."""
         with self._answered(lambda at, _: Batches(at, sql, parameters, size), sql, given) as found:
             yield found
 
@@ -236,7 +236,10 @@ class StoreFile:
     def asked(
         self, step: Callable[[DuckDBPyConnection], T], given: Iterable[Given] = ()
     ) -> Generator[T]:
-        """Yield the result of a function that uses the connection, after the given tables are created."""
+        """Call a function with the database connection, and yield its result.
+
+        Temporary tables are created before.
+        """
         with self._answered(lambda x, _: rows.interruptible(x, partial(step, x)), "", given) as y:
             yield y
 
@@ -244,7 +247,7 @@ class StoreFile:
     def record_batches(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Generator[ArrowStream | None]:
-        """Stream the rows of a trusted SQL statement as Arrow batches."""
+        """Run a trusted SQL statement, and stream its rows as Arrow batches."""
         with self._answered(lambda x, _: record_batches(x, sql, parameters), sql, given) as y:
             yield y
 
@@ -256,7 +259,7 @@ class StoreFile:
         max_rows: int | None = None,
         given: UserTablesGiven | None = None,
     ) -> Rows:
-        """Run a user's SQL statement, and return all rows.
+        """Run a read-only SQL statement of a user, and return all rows.
 
         Parameters
         ----------
@@ -293,7 +296,7 @@ class StoreFile:
         max_rows: int | None = None,
         given: UserTablesGiven | None = None,
     ) -> Rows:
-        """Run a user's SQL statement like :meth:`user_sql`. Load rows beyond one batch on demand.
+        """Run an SQL statement of a user. Rows beyond the first batch are loaded on demand.
 
         Raises
         ------
@@ -323,7 +326,7 @@ class StoreFile:
         timeout_s: float | None = None,
         given: UserTablesGiven | None = None,
     ) -> int:
-        """Stream the rows of a user's SQL statement to a Parquet file, and return their number.
+        """Run an SQL statement of a user, write the rows to a Parquet file, and return the number of rows.
 
         Raises
         ------
@@ -351,7 +354,7 @@ class StoreFile:
         step: Callable[[DuckDBPyConnection], T],
         given: UserTablesGiven | None,
     ) -> T:
-        """Run a user's SQL statement whose result is read at once."""
+        """Run an SQL statement of a user on a restricted connection, and return the result."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
             rows.give_to_user(connection, given, sql, timeout_s)
@@ -370,7 +373,7 @@ class StoreFile:
         size: int = BATCH,
         given: UserTablesGiven | None = None,
     ) -> Generator[Batches]:
-        """Stream the rows of a user's SQL statement; see :meth:`user_sql`."""
+        """Run an SQL statement of a user, and stream its rows in batches."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> Batches:
             rows.give_to_user(connection, given, sql, timeout_s)
@@ -381,12 +384,12 @@ class StoreFile:
             yield found
 
     def joined(self) -> dict[str, JoinedTable]:
-        """Return the joins of user tables with frames by table name."""
+        """Return the row counts of user tables that are joined with frames, by table name."""
         with self.access.reading() as connection:
             return {} if self.tables is None else self.tables.joined(connection)
 
     def catalog(self) -> Catalog:
-        """Return the catalog for the query compiler. It is cached until the file changes."""
+        """Return names, types and counts of the store for the query compiler. Cached until the file changes."""
         if self._known is not None and self._known[0] == stamp_of(self.path):
             return self._known[1]  # opening the store takes longer than compiling a query
         from sgstore.store._catalog import catalog_of
@@ -399,12 +402,12 @@ class StoreFile:
             return catalog
 
     def traces(self) -> tuple[StoredTrace, ...]:
-        """Return all traces by name in natural order (``run2`` before ``run10``)."""
+        """Return all traces of the store, by name in natural order (``run2`` before ``run10``)."""
         with self.access.reading() as connection:
             return stored_traces(connection, self.path, self.access.root)
 
     def trace(self, ref: int | str) -> StoredTrace:
-        """Return a trace by name, by id, or by a unique prefix of its name.
+        """Return a trace of the store by name, by id, or by a unique prefix of its name.
 
         Raises
         ------
@@ -438,7 +441,7 @@ class StoreFile:
             return frame_named(connection, ref)
 
     def graph(self, ref: int | str) -> SceneGraph:
-        """Return the scene graph of a frame, with all data of the public views.
+        """Return the scene graph of a frame, with all nodes, edges and attributes in the store.
 
         Raises
         ------
@@ -455,13 +458,13 @@ class StoreFile:
             return next(self._reader.scenes(connection, np.array([frame_id]), known=True))
 
     def graphs(self, frame_id: NDArray[np.int64]) -> Iterator[SceneGraph]:
-        """Yield scene graphs of one trace for ascending frame ids. All columns are in memory together."""
+        """Yield the scene graphs of one trace for ascending frame ids. All columns are in memory together."""
         with self.access.reading() as connection:
             yield from self._reader.scenes(connection, frame_id)
 
     @property
     def _reader(self) -> Graphs:
-        """Reader of scene graphs with a cache of maps."""
+        """Reader of scene graphs with a cache of road maps."""
         if self._graphs is None:
             from sgstore.store._graphs import Graphs
 
@@ -469,7 +472,7 @@ class StoreFile:
         return self._graphs
 
     def states(self, trace: int | str, first: int, last: int) -> tuple[Columns, Columns]:
-        """Return a range of frames of a trace, and their states, as plain columns.
+        """Return a range of frames of a trace, and the object states in these frames, as plain columns.
 
         Returns
         -------
@@ -489,14 +492,14 @@ class StoreFile:
             return frame_times(connection, trace_id, first, last), states
 
     def states_at(self, frames: Sequence[tuple[int, int]]) -> Columns:
-        """Return states in frames given as (trace id, number). Column ``at`` is the index of the frame."""
+        """Return object states in given frames. Column ``at`` is the index of the frame in the input."""
         from sgstore.store._state_columns import states_at
 
         with self.access.reading() as connection:
             return states_at(connection, frames)
 
     def scenery(self, trace: int | str) -> Columns:
-        """Return the static entities of a trace, without its road map, as plain columns."""
+        """Return the static objects of a trace as plain columns. Elements of the road map are excluded."""
         from sgstore.store._state_columns import scenery
 
         with self.access.reading() as connection:
@@ -505,7 +508,7 @@ class StoreFile:
     def series(
         self, trace: int | str, attribute: str, node: int, other: int | None = None
     ) -> Columns:
-        """Return a node attribute or a pair value over a trace: ``seq``, ``t`` and ``value``.
+        """Return an attribute of a node, or of a node pair, over a trace: ``seq``, ``t`` and ``value``.
 
         Raises
         ------
@@ -520,21 +523,21 @@ class StoreFile:
             return series(connection, trace_id, attribute, node, other)
 
     def entity_names(self, trace: int | str) -> dict[int, tuple[str, ...]]:
-        """Return kind, simulator id and type name of each entity of a trace, by node id."""
+        """Return kind, simulator id and type name of each object of a trace, by node id."""
         from sgstore.store._state_columns import names_of_nodes
 
         with self.access.reading() as connection:
             return names_of_nodes(connection, trace_named(connection, str(trace))[0])
 
     def places(self) -> dict[str, tuple[float, float, str, list[str]]]:
-        """Return origin, map digest and cameras of each trace; see ``_state_columns``."""
+        """Return coordinate origin, map digest and camera topics of each trace, by trace name."""
         from sgstore.store._state_columns import places
 
         with self.access.reading() as connection:
             return places(connection)
 
     def log_times(self, trace: int | str, first: int, last: int) -> NDArray[np.int64]:
-        """Return the log times of a range of frames; ns."""
+        """Return the log times of the messages of a range of frames; ns."""
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = "SELECT log_time_ns FROM frame WHERE trace_id = ? AND seq BETWEEN ? AND ? ORDER BY seq"
@@ -542,14 +545,14 @@ class StoreFile:
             return found["log_time_ns"].astype(np.int64)
 
     def codes(self) -> dict[str, list[str]]:
-        """Return the names of kinds and light states, indexed by their code in plain columns."""
+        """Return the names of object kinds and light states, indexed by their code in plain columns."""
         from sgstore.store._state_columns import kinds_of
 
         with self.access.reading() as connection:
             return kinds_of(connection)
 
     def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
-        """Return name and OpenDRIVE text of a trace's map, or ``None`` without such a text."""
+        """Return name and OpenDRIVE text of a trace's road map, or ``None`` without such a text."""
         with self.access.reading() as connection:
             trace_id, _ = trace_named(connection, str(trace))
             sql = (
@@ -569,7 +572,7 @@ class StoreFile:
             return tuple(Channel(*row) for row in connection.execute(sql, [trace_id]).fetchall())
 
     def context(self, trace: int | str) -> MessageRefs:
-        """Return the positions of messages that later messages depend on.
+        """Return the file positions of recorded messages that are needed to read later messages of a trace.
 
         ``channel`` is an index into :meth:`channels`.
         """
@@ -586,7 +589,7 @@ class StoreFile:
             return MessageRefs(*(column.astype(np.int64) for column in columns.values()))
 
     def payload(self, ref: int | str, channel: str) -> bytes:
-        """Return the raw message of a channel at a frame, read from the recording.
+        """Return the raw bytes of a channel's message at a frame, read from the recording.
 
         Parameters
         ----------
@@ -608,7 +611,7 @@ class StoreFile:
         return read_message(path, **place)
 
     def carried(self, ref: int | str, channel: str) -> Media:
-        """Return the content of a channel's message at a frame: a picture, a video, or the raw message.
+        """Return a channel's message at a frame as a picture, as a video, or as raw bytes.
 
         Parameters
         ----------
@@ -633,7 +636,7 @@ class StoreFile:
         return read_carried(path, channel=channel_id, **place)
 
     def recorded(self, ref: int | str, channel: str) -> tuple[McapChannel, Schema | None, bytes]:
-        """Return channel, schema and data of a channel's message at a frame.
+        """Return channel, schema and raw bytes of a channel's message at a frame, read from the recording.
 
         Parameters and errors are those of :meth:`payload`.
         """
@@ -664,7 +667,7 @@ class StoreFile:
     def _unchanged(
         self, uri: str, place: str | None, size: int, mtime_ns: int, digest: str
     ) -> Path:
-        """Return the path of the ingested recording. If its timestamp changed, check its hash once."""
+        """Return the path of an ingested recording. If its timestamp has changed, its hash is checked once."""
         from sgstore.mcap import digest_of, mark_of
 
         path = located(uri, place, size, self.path, self.access.root)
@@ -685,7 +688,7 @@ class StoreFile:
         road_map: RoadMap | None,
         part: tuple[float | None, float | None] = (None, None),
     ) -> str | None:
-        """Return the trace name of a recording that is already stored, or ``None``.
+        """Return the stored trace name of a recording, or ``None`` if the store does not have the recording.
 
         Parameters
         ----------
@@ -711,7 +714,7 @@ class StoreFile:
         road_map: RoadMap | None = None,
         answers: tuple[str, ...] = (),
     ) -> Segment:
-        """Return a segment to build the graphs of a trace outside the store, before publication.
+        """Return a writer for the graphs of a new trace. The graphs stay outside the store until publication.
 
         Parameters
         ----------
@@ -729,7 +732,7 @@ class StoreFile:
         return Segment(self.path, info, identity, OnMap(road_map), answers)
 
     def publish(self, sealed: Sealed, *, replace: bool = False) -> str:
-        """Add a sealed trace to the store in one transaction.
+        """Add a complete trace to the store in one transaction, and return its name in the store.
 
         Parameters
         ----------
@@ -756,7 +759,7 @@ class StoreFile:
     def publish_each(
         self, sealed: Sequence[Sealed], *, replace: bool = False
     ) -> list[str | SgstoreError]:
-        """Add sealed traces to the store, one transaction per trace. The file is opened once.
+        """Add complete traces to the store, one transaction per trace. The file is opened once.
 
         Returns
         -------
@@ -768,7 +771,7 @@ class StoreFile:
         return publish_each(self.access, sealed, replace=replace)
 
     def has(self, sealed: Sealed, *, as_it_is: bool = True) -> str | None:
-        """Return the stored name of a segment's trace, or ``None`` if it is not stored.
+        """Return the store's name of a new trace that is already stored, or ``None`` if it is not stored.
 
         Parameters
         ----------
@@ -822,7 +825,7 @@ class StoreFile:
 
     @property
     def abstracted(self) -> Abstracted:
-        """Frames in abstractions, and their classes."""
+        """Abstracted graphs of the store's frames, and the frame classes."""
         if self._abstracted is None:
             from sgstore.store._classes import Abstracted
 
@@ -831,13 +834,13 @@ class StoreFile:
 
     @property
     def deriving(self) -> Deriving:
-        """Derived sets of relations."""
+        """Derived sets of relations: edges computed after ingest."""
         from sgstore.store._derive import Deriving
 
         return Deriving(self.path, self.access)
 
     def verify(self, *, recordings: bool = False) -> Verification:
-        """Check that the store still contains all published data.
+        """Check the store's rows against the checksums of the published rows. Return the faults.
 
         Parameters
         ----------
@@ -849,7 +852,7 @@ class StoreFile:
         return verify_store(self.access, recordings=recordings)
 
     def settle(self) -> None:
-        """Merge the log of a killed writer into the store file.
+        """Merge the write-ahead log of a killed writer process into the store file.
 
         Without a log, or if another process uses the store for too long, nothing happens.
         """
@@ -874,7 +877,7 @@ class StoreFile:
         compact(self.path, self.access, self.memory)
 
     def refuse_others(self) -> None:
-        """Raise a StoreError if the store has user tables or views, which compaction would lose."""
+        """Raise an error if the store has user tables or views, which compaction would delete."""
         from sgstore.store._rebuild import refuse_others
 
         refuse_others(self.path, self.access)
@@ -888,7 +891,7 @@ class StoreFile:
         *,
         public: bool = False,
     ) -> Generator[T]:
-        """Yield the result of a query while the store is open.
+        """Context manager that keeps the store open, and yields the result of a query.
 
         After an internal DuckDB fault, the query runs again. The exit stack of the query is closed at its end.
         """

@@ -1,4 +1,4 @@
-"""Gate of a store: the lock that gives a waiting writer precedence over new readers."""
+"""Gate of a store: a lock file that gives a waiting writer precedence over new readers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _PAUSE: Final = 0.005, 0.1
 
 
 class Deadline:
-    """Retry timer with growing pauses and an overall limit."""
+    """Timer for retries, with growing pauses and an overall time limit."""
 
     def __init__(self, wait_s: float) -> None:
         self._start = time.monotonic()
@@ -43,7 +43,7 @@ class Deadline:
         return max(self._end - time.monotonic(), 0)
 
     def pause(self, error: StoreError) -> None:
-        """Sleep briefly, or raise the error after the time limit."""
+        """Sleep before the next retry. After the time limit, raise the given error."""
         if isinstance(error, HeldHereError):
             if time.monotonic() - self._start > _HELD_HERE_S:
                 raise error
@@ -55,7 +55,7 @@ class Deadline:
 
 
 def pass_gate(path: Path, deadline: Deadline) -> None:
-    """Wait while a writer process holds the gate. This is a courtesy: the DuckDB lock decides."""
+    """Wait while a writer process holds the lock file. This is a courtesy: the DuckDB lock decides."""
     if fcntl is None:
         return
     try:
@@ -70,7 +70,7 @@ def pass_gate(path: Path, deadline: Deadline) -> None:
 
 @contextmanager
 def closed_gate(path: Path, deadline: Deadline) -> Generator[None]:
-    """Keep new readers of other processes out."""
+    """Context manager that holds the lock file of a store, so that new readers in other processes wait."""
     if fcntl is None:
         yield
         return
@@ -85,7 +85,7 @@ def closed_gate(path: Path, deadline: Deadline) -> Generator[None]:
 
 
 class _Gate:
-    """Gate of a store, closed by this process."""
+    """Lock file of a store, held by this process so that new readers wait."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -93,7 +93,7 @@ class _Gate:
         self._begun = False
 
     def close(self, deadline: Deadline) -> None:
-        """Wait until the gate is free, and close it."""
+        """Wait until no other process holds the lock file of the store, and take it."""
         self._begun = True
         while True:
             try:
@@ -115,7 +115,7 @@ class _Gate:
             return False
 
     def remove(self) -> None:
-        """Open the gate, unless another process holds it now."""
+        """Delete the lock file of the store, unless another process holds it now."""
         if fcntl is None or not self._begun:
             return
         with suppress(OSError):

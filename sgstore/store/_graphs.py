@@ -1,4 +1,4 @@
-"""Readers of stored graphs for many frames: as columns for abstractions, else as scene graphs."""
+"""Readers of the stored graphs of many frames: as columns for abstractions, or as scene graphs."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class Graphs:
     def of_trace(
         self, connection: DuckDBPyConnection, trace_id: int
     ) -> Iterator[tuple[NDArray[np.int64], GraphColumns]]:
-        """Yield frame numbers and graphs of a whole trace, window by window."""
+        """Yield frame numbers and graphs of a whole trace, 512 frames at a time."""
         row = connection.execute(
             "SELECT min(bucket), max(bucket) FROM bucket WHERE trace_id = ?", [trace_id]
         ).fetchone()
@@ -180,7 +180,7 @@ class Graphs:
         ids: NDArray[np.int64],
         trace_id: int | None = None,
     ) -> tuple[list[tuple[NDArray[np.int64], GraphColumns]], int]:
-        """Return graphs grouped by map, and the number of edges. Frames without a map form one group.
+        """Return the graphs of some frames, grouped by road map, and the number of edges.
 
         Without frames, the result is an empty graph if ``trace_id`` is given.
         """
@@ -225,7 +225,7 @@ class Graphs:
     def scenes(
         self, connection: DuckDBPyConnection, frame_id: NDArray[np.int64], *, known: bool = False
     ) -> Iterator[SceneGraph]:
-        """Yield scene graphs of one trace for ascending frame ids, with all data of the public views.
+        """Yield the scene graphs of one trace for ascending frame ids, with all nodes, edges and attributes.
 
         Memory holds the columns of all frames, and the records of one graph. ``known``: include the data
         outside the graphs.
@@ -291,7 +291,7 @@ _OF_GRAPHS: Final = re.compile(r"\bFROM (node|edge|lane_state|lane_gap)\b")
 
 
 def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -> T:
-    """Return a map by its digest from a cache of the most recently used maps."""
+    """Return a road map by its digest, from a cache of the most recently used maps."""
     if digest not in maps:
         maps[digest] = read()
         while len(maps) > _MAPS:
@@ -303,7 +303,7 @@ def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -
 def _asked(
     frame_id: NDArray[np.int64], otherwise: int = 0
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the SQL parameters for frame ids, and those for bucket masks.
+    """Return two dicts of SQL parameters for some frames: as frame ids, and as bit masks of 64 frames.
 
     ``otherwise``: bounds without any frame.
     """
@@ -323,7 +323,7 @@ def _asked(
 def _records(
     connection: DuckDBPyConnection, sql: str, values: dict[str, Any]
 ) -> Iterator[tuple[tuple[int, ...], dict[str, Any]]]:
-    """Yield rows of a statement as frame and node ids, and their non-null attributes."""
+    """Run SQL, and yield each row as (frame id, node ids) and a dict of its non-null attributes."""
     found = run(connection, sql, values)
     ids = sum(name in {"frame_id", "node_id", "src", "dst"} for name in found.columns)
     names = found.columns[ids:]
@@ -393,7 +393,7 @@ def _map_columns(connection: DuckDBPyConnection, map_id: int) -> MapColumns:
 
 @dataclass(frozen=True, slots=True)
 class _Traces:
-    """Origins and maps of the traces of a store. Map -1 means no map."""
+    """Coordinate origin and map id of each trace in a range. Map id -1 means no road map."""
 
     trace_id: NDArray[np.int64]
     origin: dict[str, NDArray[np.float64]]
@@ -406,7 +406,7 @@ class _Traces:
         return cls(found["trace_id"].astype(np.int64), origin, found["map_id"].astype(np.int64))
 
     def rows(self, frame_id: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the trace row of each frame."""
+        """Return the index of the trace of each frame, in the table of traces."""
         return np.searchsorted(self.trace_id, trace_of(frame_id)).astype(np.int64)
 
 
@@ -416,7 +416,7 @@ def _each_frame(of: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _by_map(of: dict[str, NDArray[Any]], number: Numbers, maps: int) -> list[dict[str, Any]]:
-    """Split rows by the map of their frame. Each part numbers its frames from 0."""
+    """Split table rows by the road map of their frame. Frames are numbered from 0 in each part."""
     if maps == 1:
         return [of]
     frame = np.empty(len(number), np.int64)

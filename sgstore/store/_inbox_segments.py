@@ -1,4 +1,4 @@
-"""Sealed segments in the inbox of a collection. Each road map is stored once, apart from the segments."""
+"""Complete traces in the inbox of a collection, not yet in a store. Road maps are stored separately, once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAP_TABLES: Final = frozenset(SHARED["map"])
 
 
 def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
-    """Split a sealed segment into trace and road map, and return the map digest, or an empty string.
+    """Split an unpublished trace into trace and road map files. Return the map digest; empty without a map.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
 
 
 def whole_segment(segment: Path, of_map: Path | None, to: Path) -> Sealed:
-    """Combine a segment without a map and its map to a sealed segment in a new folder.
+    """Combine the files of an unpublished trace and of its road map in a new folder.
 
     Raises
     ------

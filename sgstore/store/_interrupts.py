@@ -1,4 +1,4 @@
-"""Database calls that a signal interrupts at once.
+"""Calls of DuckDB that a signal, such as Ctrl+C, interrupts at once.
 
 Python runs signal handlers only in the main thread, between bytecodes. DuckDB allows this only between its
 tasks, and a task may take minutes. So another thread runs the call, and the main thread waits. A signal
@@ -27,7 +27,7 @@ _AGAIN_S: Final = 0.01
 
 
 def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
-    """Run a database call. An exception from a signal handler interrupts it.
+    """Run a database call. An exception from a signal handler, such as Ctrl+C, interrupts the call.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ interrupted: Final[set[int]] = set()
 
 
 def interrupt(connection: DuckDBPyConnection) -> None:
-    """Interrupt the statement of a connection."""
+    """Interrupt the running SQL statement of a connection."""
     interrupted.add(id(connection))
     connection.interrupt()
 
@@ -85,7 +85,7 @@ class _Task(Generic[T]):
         self._error: BaseException | None = None
 
     def take(self) -> bool:
-        """Claim the task. False if it is already claimed."""
+        """Return True if the caller may run the task; False if the task is already taken."""
         try:
             self._turns.pop()
         except IndexError:
@@ -93,13 +93,13 @@ class _Task(Generic[T]):
         return True
 
     def is_over(self) -> bool:
-        """True if the task has ended, or can no longer start."""
+        """Return True if the task has ended, or can no longer start."""
         if self.take():
             self.ended.set()
         return self.ended.is_set()
 
     def result(self) -> T:
-        """Return the result of the call, or raise its exception."""
+        """Return the result of the database call, or raise its exception."""
         try:
             if self._error is not None:
                 raise self._error
@@ -108,12 +108,12 @@ class _Task(Generic[T]):
             self.forget()
 
     def forget(self) -> None:
-        """Drop the result and the error, whose traceback would keep the connection alive."""
+        """Delete the stored result and error. The traceback of the error would keep the connection alive."""
         self._error = None
         self._found.clear()
 
     def run(self) -> None:
-        """Run the call, unless it was cancelled."""
+        """Run the database call, unless it was cancelled."""
         if not self.take():
             return
         try:
@@ -135,7 +135,7 @@ class _StepThread:
         self._thread: threading.Thread | None = None
 
     def begin(self, task: _Task[Any]) -> bool:
-        """Queue a task. False if the thread cannot start."""
+        """Queue a database call for the thread. Return False if the thread cannot start."""
         # A forked process lacks this thread, and its queue may be locked forever.
         if self._thread is None or not self._thread.is_alive():
             self._tasks = SimpleQueue()

@@ -1,4 +1,4 @@
-"""User tables joined to the frames of a store: labels, outcomes, splits.
+"""User tables (such as labels or splits) that are joined to the frames of a store.
 
 A table is a file (Parquet, CSV, JSON) or a data frame. A separate database reads it once and writes it as
 Parquet into a folder of this process. Store connections can read files only there, and see each table as a
@@ -84,7 +84,7 @@ _NANOSECONDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class UserTable:
-    """Table provided by a user.
+    """Table provided by a user, such as labels of frames, saved as a Parquet file.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class UserTable:
 
     @property
     def view(self) -> str:
-        """SQL of the rows of the table, with their ``frame_id``."""
+        """SQL that selects the rows of the user table, with their ``frame_id``."""
         rows = f"read_parquet({literal(str(self.place))})"
         match self.key:
             case "frame_id":
@@ -142,7 +142,7 @@ class JoinedTable:
 
 
 class UserTables:
-    """User tables next to a store.
+    """Tables provided by a user, for queries together with a store.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class UserTables:
         self.tables = tuple(_kept(name, table, folder) for name, table in given.items())
 
     def show(self, connection: DuckDBPyConnection) -> None:
-        """Make the tables visible to a connection that reads a store.
+        """Create views of the user tables on a database connection that reads a store.
 
         Raises
         ------
@@ -198,7 +198,7 @@ class UserTables:
             connection.execute(f'CREATE TEMP VIEW "{table.name}" AS {table.view}')
 
     def known(self, connection: DuckDBPyConnection, catalog: Catalog) -> Catalog:
-        """Return the catalog with facts about user tables. Patterns can use tables with one row per frame."""
+        """Return the catalog with the columns of user tables that patterns can use (one row per frame)."""
         single = {
             name: None
             if one.frames == one.matched
@@ -224,7 +224,7 @@ class UserTables:
         return frozenset(row[0] for row in connection.execute(sql).fetchall())
 
     def joined(self, connection: DuckDBPyConnection) -> dict[str, JoinedTable]:
-        """Return the joins of all tables that have a frame key."""
+        """Return the row counts of all user tables that are joined by a frame key: table name → counts."""
         found: dict[str, JoinedTable] = {}
         for table in self.tables:
             if table.key:
@@ -237,7 +237,7 @@ class UserTables:
 
 
 def type_of(declared: str) -> Type:
-    """Return the query type for a database column type: number, boolean, else text."""
+    """Return the query type (number, boolean or text) for a database column type."""
     if declared == "BOOLEAN":
         return Type.boolean
     numeric = declared.removeprefix("U").startswith(("TINYINT", "SMALLINT", "INT", "BIGINT"))
@@ -251,7 +251,7 @@ def tables_folder() -> Path:
 
 
 def _kept(name: str, given: object, folder: Path) -> UserTable:
-    """Read a user table, and write it as Parquet."""
+    """Read a table of a user, write it as a Parquet file, and return its description."""
     source = str(given) if isinstance(given, str | Path) else type(given).__name__
     place = folder / f"{name}.parquet"
     with _told(name, source), duckdb.connect(":memory:", config=_config(folder)) as connection:
@@ -265,7 +265,7 @@ def _kept(name: str, given: object, folder: Path) -> UserTable:
 
 
 def _reading(connection: DuckDBPyConnection, name: str, given: object) -> str:
-    """Return the SQL that reads a user table."""
+    """Return the SQL that reads a user table from a file, or from an object in memory."""
     if not isinstance(given, str | Path):
         connection.register("given", given)
         return "SELECT * FROM given"
@@ -309,7 +309,7 @@ def _key_of(columns: Mapping[str, Any]) -> str:
 
 @contextmanager
 def _told(name: str, source: str) -> Generator[None]:
-    """Convert database and disk errors to store errors that name the table."""
+    """Context manager that converts database and disk errors to store errors with the table name."""
     try:
         yield
     except (duckdb.Error, OSError) as error:

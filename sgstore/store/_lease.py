@@ -1,4 +1,4 @@
-"""Store files that stay open between queries and close when a writer waits.
+"""Store files that stay open between queries, and close when a writer process waits.
 
 Opening a file takes a hundred times as long as a small query. So the database instance of a file stays open for
 a while after a query. It closes
@@ -50,7 +50,7 @@ LOOK_S: Final = 0.05
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Return identity, size and times of a store file and its log. They change with every write."""
+    """Return identity, size and times of a store file and its log. Every write changes this value."""
     found: list[tuple[int, ...]] = []
     for file in (path, _beside(path, ".wal")):
         with suppress(OSError):
@@ -60,7 +60,7 @@ def stamp_of(path: Path) -> Stamp:
 
 
 def gate_of(path: Path) -> Path:
-    """Return the lock file that a writer process holds while it waits for readers, or writes."""
+    """Return the path of the lock file that a writer process holds while it waits or writes."""
     return _beside(path, ".gate")
 
 
@@ -70,7 +70,7 @@ def _beside(path: Path, ending: str) -> Path:
 
 
 def _wanted(path: Path) -> bool:
-    """True if a writer process has closed the gate of a store."""
+    """Return True if a writer process holds the lock file of a store."""
     if fcntl is None:
         return True
     try:
@@ -87,7 +87,7 @@ def _wanted(path: Path) -> bool:
 
 
 class AttachedFile:
-    """Read-only store file, attached to the database instance of its folder.
+    """Read-only store file, attached to a DuckDB instance that the stores of one folder share.
 
     Parameters
     ----------
@@ -116,14 +116,14 @@ class AttachedFile:
         self._instance.cursor().execute(told)
 
     def cursor(self, schema: str = "") -> DuckDBPyConnection:
-        """Return a connection to the file that resolves names in the given schema."""
+        """Return a connection to the store file that resolves names in the given schema."""
         connection = self._instance.cursor()
         if schema:
             connection.execute(f"USE {quoted(self.name)}.{schema}")
         return connection
 
     def close(self) -> None:
-        """Detach the file from the database instance."""
+        """Detach the store file from the shared DuckDB instance."""
         self._instance.cursor().execute(f"DETACH {quoted(self.name)}")
 
 
@@ -136,7 +136,7 @@ _instances_lock = threading.Lock()
 def shared_instance(
     key: tuple[object, ...], make: Callable[[], DuckDBPyConnection]
 ) -> DuckDBPyConnection:
-    """Return the shared database instance of a key, created at the first call. Use its cursors only."""
+    """Return the DuckDB instance for a key, created at the first call. Callers use only cursors of it."""
     with _instances_lock:
         if key not in _instances:
             _instances[key] = make()
@@ -145,7 +145,7 @@ def shared_instance(
 
 @dataclass(slots=True, eq=False)
 class OpenFile:
-    """State of one store file in this process. Changes require the lock ``changed``.
+    """One store file in this process: its DuckDB instance, readers and locks.
 
     Attributes
     ----------
@@ -195,7 +195,7 @@ class OpenFile:
 
     @property
     def mine(self) -> int:
-        """Number of open readings of the current thread."""
+        """Number of open read connections of the current thread."""
         return getattr(self.held, "count", 0)
 
     @mine.setter
@@ -203,14 +203,14 @@ class OpenFile:
         self.held.count = max(count, 0)  # a reading may end in another thread
 
     def close(self) -> None:
-        """Close the database instance if it has no readers."""
+        """Close the DuckDB instance of the store file if it has no readers."""
         if not self.readers and self.instance is not None:
             instance, self.instance = self.instance, None  # cleared even if close() is interrupted
             self.spoiled = False
             instance.close()
 
     def rest(self) -> None:
-        """Keep the database instance open after a reading, unless another process needs the file."""
+        """Keep the DuckDB instance open for the next query, unless another process needs the file."""
         if self.readers:
             return
         self.changed.notify_all()
@@ -222,7 +222,7 @@ class OpenFile:
             self.close()
 
     def refresh(self, settings: tuple[object, ...], folder: Path | None) -> None:
-        """Close an unused instance if the file or its settings have changed."""
+        """Close an unused DuckDB instance if the store file or its settings have changed."""
         if self.instance is None or self.readers:
             return
         other = self.settings != settings or folder not in {None, self.folder}
@@ -230,7 +230,7 @@ class OpenFile:
             self.close()
 
     def let_go(self, token: object) -> None:
-        """Unregister a user object of the file. Close the file after the last object."""
+        """Unregister an object that uses the store file. Close the file after the last object."""
         self.holders.discard(token)
         # An object may be deleted at any time and in any thread, so this code must not wait. The watcher also
         # checks.
@@ -242,19 +242,19 @@ class OpenFile:
 
 
 class _Watch:
-    """Idle open files, and the thread that closes them."""
+    """Thread that closes idle store files, with the list of these files."""
 
     def __init__(self) -> None:
         self.begin()
 
     def begin(self) -> None:
-        """Reset the watcher: no files and no thread."""
+        """Reset the thread that closes idle files: no files and no thread."""
         self.kept: set[OpenFile] = set()
         self.running = False
         self._lock = threading.Lock()
 
     def over(self, file: OpenFile) -> bool:
-        """Watch a file. False if the watcher thread cannot start."""
+        """Add a file to the list of idle files. Return False if the closing thread cannot start."""
         if file in self.kept:
             return True
         with self._lock:
@@ -278,7 +278,7 @@ class _Watch:
                 self.running = bool(self.kept)
 
     def _look(self, file: OpenFile) -> None:
-        """Close an idle connection if a writer waits or the timeout passed."""
+        """Close an idle store file if a writer waits or the timeout has passed."""
         if not file.changed.acquire(blocking=False):
             return  # a reading starts or ends right now
         try:
@@ -299,7 +299,7 @@ files: Final[dict[Path, OpenFile]] = {}
 
 
 def give_back(patience_s: float = 0.0) -> None:
-    """Close all files without readers."""
+    """Close all store files without readers."""
     for file in tuple(_watch.kept):
         if file.changed.acquire(timeout=patience_s):
             try:
@@ -321,7 +321,7 @@ _of_parents: Final[list[object]] = []
 
 
 def _begin_anew() -> None:
-    """Reset the state that a forked process inherits from its parent."""
+    """Reset the list of open store files in a forked process, which inherits it from its parent."""
     _watch.begin()
     _of_parents.extend(_instances.values())
     _instances.clear()

@@ -1,4 +1,4 @@
-"""Shared access of readers and writers to the DuckDB file, within and among processes.
+"""Shared access of readers and writers to a store file, within one process and among processes.
 
 DuckDB lets one process write a file, or many read it, and rejects other processes at once. Here, a process
 waits for a limited time instead. The file is open during reading and publication, and for a short time after
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 
 def shut_in(connection: DuckDBPyConnection, path: Path, folders: tuple[Path, ...]) -> None:
-    """Limit a connection to the store file and the given folders, permanently."""
+    """Restrict a database connection permanently to the store file and the given folders."""
     if not connection.execute("SELECT current_setting('enable_external_access')").fetchall()[0][0]:
         return
     whole = str(path.absolute())
@@ -128,7 +128,7 @@ SPILL: Final = 10 * 10**9
 
 
 def memory_setting(memory: int) -> str:
-    """Format an amount of memory for DuckDB."""
+    """Format a number of bytes as a DuckDB memory setting."""
     return f"{memory // 1024}KiB"
 
 
@@ -136,7 +136,7 @@ _files_lock = threading.Lock()
 
 
 def _file_at(path: Path) -> OpenFile:
-    """Return the state of a file. At first access, remove the leftovers of killed processes."""
+    """Return the shared state of a store file. The first call removes leftovers of killed processes."""
     place = path.resolve()
     with _files_lock:
         known = files.get(place)
@@ -147,7 +147,7 @@ def _file_at(path: Path) -> OpenFile:
 
 
 def trust(path: Path, made: os.stat_result) -> None:
-    """Mark a file as checked if this process has just created it."""
+    """Record that this process has just created a store file, so its schema needs no check."""
     stamp = stamp_of(path)
     if len(stamp) != 1:
         return  # another process has left a log
@@ -156,7 +156,7 @@ def trust(path: Path, made: os.stat_result) -> None:
 
 
 class Access:
-    """Access to a DuckDB file, which stays open for a short time after each reading.
+    """Access to a store file, which stays open for a short time after each query.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ class Access:
 
     @contextmanager
     def reading(self, *, public: bool = False, idle: bool = False) -> Generator[DuckDBPyConnection]:
-        """Yield a read-only connection. Nested and overlapping readings see the same state.
+        """Yield a read-only database connection. Nested and overlapping uses see the same state of the store.
 
         Parameters
         ----------
@@ -252,12 +252,12 @@ class Access:
                 self._leave(connection, failed=failed)
 
     def close(self) -> None:
-        """Close the file if it has no readers. The next query opens it again."""
+        """Close the store file if it has no readers. The next query opens it again."""
         with self._file.changed:
             self._file.close()
 
     def _damage(self, connection: DuckDBPyConnection, error: Exception) -> str:
-        """Return the damage of the store behind an internal error. Empty means another cause."""
+        """Return the damage of the store that caused an internal DuckDB error; empty without damage."""
         if self._diagnose is None:
             return ""
         trace = error.__traceback__
@@ -273,7 +273,7 @@ class Access:
         return self._diagnose(connection, self.path)
 
     def restart(self) -> bool:
-        """Close the file after a DuckDB fault. It reopens with suspect optimizers disabled.
+        """Close the file after an internal DuckDB error. It reopens with suspect optimizers disabled.
 
         Returns
         -------
@@ -348,7 +348,7 @@ class Access:
                 file.rest()
 
     def _check(self, connection: DuckDBPyConnection, database: str, stamp: Stamp) -> None:
-        """Reject a file that is not a valid store. Files checked before are skipped."""
+        """Raise an error if a file is not a valid store. Files checked before are skipped."""
         if stamp and stamp == self._file.good:
             return
         with translated(self.path):
@@ -356,7 +356,7 @@ class Access:
         self._file.good = stamp
 
     def _open(self, deadline: Deadline) -> DuckDBPyConnection | AttachedFile:
-        """Open the file for all readers of this process."""
+        """Open the store file for all readers of this process, and return the database instance."""
         file = self._file
         while True:
             stamp = stamp_of(self.path)
@@ -407,7 +407,7 @@ class Access:
 
     @contextmanager
     def writing(self, connection: DuckDBPyConnection, *folders: Path) -> Generator[None]:
-        """Run one transaction on the file; see :meth:`attached`. An exception rolls it back.
+        """Context manager of one write transaction on the store. An exception rolls it back.
 
         Raises
         ------
@@ -419,7 +419,7 @@ class Access:
 
     @contextmanager
     def attached(self, connection: DuckDBPyConnection, *folders: Path) -> Generator[None]:
-        """Attach the file as ``store`` to the caller's connection, with exclusive access.
+        """Attach the store to the caller's connection under the name ``store``, with exclusive access.
 
         From then on, the connection can access only the store and the named folders, and its settings are
         locked.
@@ -444,7 +444,7 @@ class Access:
 
     @contextmanager
     def _alone(self) -> Generator[Deadline]:
-        """Exclude all other threads of this process from the file."""
+        """Context manager that excludes all other threads of this process from the store file."""
         file, deadline = self._file, Deadline(self._wait_s)
         if file.mine:
             raise StoreError(f"{self.path}: cannot be written while the same thread reads it")
@@ -483,7 +483,7 @@ class Access:
 
 @contextmanager
 def transaction(connection: DuckDBPyConnection) -> Generator[None]:
-    """Run one transaction on the attached store. An exception rolls it back."""
+    """Context manager of one transaction on the attached store. An exception rolls it back."""
     connection.execute("BEGIN TRANSACTION")
     try:
         yield
@@ -498,5 +498,5 @@ def transaction(connection: DuckDBPyConnection) -> Generator[None]:
 
 
 def spill_folder() -> Path:
-    """Return an unused folder path. DuckDB creates it when memory is full, and removes it."""
+    """Return an unused folder path. DuckDB creates the folder when memory is full, and removes it."""
     return new_place("spill")

@@ -1,4 +1,4 @@
-"""Partial results of a collection, from Parquet files or memory, as tables of one statement.
+"""Query results of the stores of a collection, combined by one SQL statement over all stores' results.
 
 The statement comes from :mod:`sgstore.lang.sql.collection_parts`: it sorts rows, or combines the groups of the
 parts. Data beyond the memory limit spill to disk.
@@ -60,7 +60,7 @@ _PLAIN: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class PartFile:
-    """Rows of a partial result of a collection query.
+    """Rows of a query result from one part (store) of a collection, in memory or in a Parquet file.
 
     Attributes
     ----------
@@ -81,22 +81,22 @@ class PartFile:
 
     @property
     def written(self) -> bool:
-        """True if the rows are in the file."""
+        """True if the rows of the query result are in a file, not in memory."""
         return bool(self.rows) and not self.few
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the partial result as plain values."""
+        """Return the partial query result as a dict of plain values, for another process."""
         about = {"columns": list(self.columns), "types": list(self.types), "rows": self.rows}
         return {"path": str(self.path) if self.written else "", "few": self.few} | about
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PartFile:
-        """Restore a partial result from plain values."""
+        """Restore a partial query result from a dict of plain values."""
         columns, types = tuple(values["columns"]), tuple(values["types"])
         return cls(Path(values["path"]), columns, types, values["rows"], values["few"])
 
     def moved(self, folder: Path) -> PartFile:
-        """Move the file into another folder, until all parts are complete."""
+        """Move the file of a partial query result into another folder, and return the moved result."""
         if not self.written:
             return self
         return replace(self, path=self.path.replace(folder / self.path.name))
@@ -109,7 +109,7 @@ class PartFile:
         given: Iterable[Given],
         to: Path,
     ) -> PartFile:
-        """Run a trusted SQL statement on a store, and let DuckDB write the rows to a Parquet file.
+        """Run a trusted SQL statement on a store, and write its rows to a Parquet file.
 
         Parameters
         ----------
@@ -134,7 +134,7 @@ class PartFile:
     def of_classes(
         file: StoreFile, abstraction: str, traces: Sequence[int], table: str, to: Path
     ) -> PartFile:
-        """Write the frame classes of an abstraction for some traces, or for a user table.
+        """Write the frame classes of an abstraction to a file, for some traces or for a user table.
 
         Parameters
         ----------
@@ -156,19 +156,19 @@ class PartFile:
 
     @staticmethod
     def of_coded(file: StoreFile, abstraction: str, to: Path) -> PartFile:
-        """Write the class of each frame in an abstraction, for :meth:`merged_classes`."""
+        """Write the class of each frame in an abstraction to a file, for :meth:`merged_classes`."""
         columns = {"class": "VARCHAR", "bucket": "BIGINT", "mask": "BIGINT"}
         return PartFile.of_rows(columns, file.abstracted.masks(abstraction), to)
 
     @staticmethod
     def of_rows(columns: Mapping[str, str], rows: Iterable[Sequence[Any]], to: Path) -> PartFile:
-        """Write rows from Python in the format of :meth:`of_statement`. ``columns`` maps names to types."""
+        """Write rows of Python values to a file, as a partial query result."""
         names, types = [f"c{number}" for number in range(len(columns))], (*columns.values(),)
         return PartFile(to, tuple(columns), types, ParquetTable.write_rows(names, rows, to, types))
 
     @staticmethod
     def merged_classes(parts: Sequence[PartFile]) -> CodedClasses:
-        """Return the frame classes of partial results with columns ``class``, ``bucket``, ``mask``."""
+        """Return the class of each frame, as a number, from the results of several stores."""
         from sgstore.store._coded_classes import classes_coded
 
         with _tables({"parts": [*parts]}, {}) as connection:
@@ -178,7 +178,7 @@ class PartFile:
     def merged_arrays(
         parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
     ) -> dict[str, NDArray[np.generic]]:
-        """Return the columns of a statement over partial results as arrays. NULL values are masked."""
+        """Run SQL over the query results of several stores, and return its columns as arrays."""
         with _tables(parts, words) as connection:
             return arrays(connection, sql, _numbered(values))
 
@@ -187,7 +187,7 @@ class PartFile:
     def merged_rows(
         parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
     ) -> Generator[Batches]:
-        """Stream the rows of a statement over partial results.
+        """Run SQL over the query results of several stores, and stream its rows.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class PartFile:
         columns: Sequence[str],
         to: Path,
     ) -> PartFile:
-        """Write the rows of a statement over partial results as a new partial result.
+        """Run SQL over the query results of several stores, and write its rows as a new partial result.
 
         Parameters
         ----------
@@ -246,7 +246,7 @@ def _making(sql: str, columns: int) -> str:
 
 
 def _written(connection: DuckDBPyConnection) -> Written:
-    """Write the table of a part to a file in the allowed folder. A small table stays in memory."""
+    """Write a partial query result to a Parquet file. A small result stays in memory."""
     described = connection.execute(f"DESCRIBE {_PART}").fetchall()
     kinds = {str(row[0]): str(row[1]) for row in described}
     # A column with only NULL has no type, which a table does not support.
@@ -284,7 +284,7 @@ def _numbered(values: Sequence[Any]) -> dict[str, Any]:
 
 @contextmanager
 def _tables(parts: Parts, words: Mapping[str, Sequence[str]]) -> Generator[DuckDBPyConnection]:
-    """Yield a database connection with partial results as tables."""
+    """Yield a database connection that has the query results of several stores as tables."""
     kinds = {
         enum: tuple(dict.fromkeys([*shape.own_labels(enum), *words.get(enum, ())]))
         for enum in NAMES
@@ -301,7 +301,7 @@ def _tables(parts: Parts, words: Mapping[str, Sequence[str]]) -> Generator[DuckD
 def _told(
     connection: DuckDBPyConnection, table: str, files: Sequence[PartFile]
 ) -> dict[tuple[str, ...], str]:
-    """Create tables for the parts held in memory. Return column types → table name."""
+    """Create tables for the query results held in memory. Return column types → table name."""
     alike: dict[tuple[str, ...], list[Sequence[Any]]] = {}
     for one in files:
         if one.few:
@@ -326,7 +326,7 @@ def _merging(kinds: Mapping[str, Sequence[str]]) -> DuckDBPyConnection:
 
 
 def _rows_of(files: Sequence[PartFile], told: Mapping[tuple[str, ...], str]) -> str:
-    """Return SQL for the rows of some files and tables, with their original types."""
+    """Return SQL for the rows of several query results in files and tables, with their original types."""
     if not files:
         raise StoreError("nothing was answered")
     first = files[0]
@@ -360,7 +360,7 @@ _WIDTHS: Final = (
 
 
 def _common(kinds: set[str]) -> str:
-    """Return the common type for several types of one column."""
+    """Return the common database type for several types of one column."""
     enums = {_enum_of(kind) for kind in kinds if kind.startswith("ENUM")}
     if enums:
         return enums.pop() if len(enums) == 1 and len(kinds - {_NOTHING}) >= 1 else "VARCHAR"
@@ -373,7 +373,7 @@ def _common(kinds: set[str]) -> str:
 
 
 def _enum_of(kind: str) -> str:
-    """Return the schema enumeration that a database type extends, matched by its first values."""
+    """Return the name of the ``schema.sql`` enumeration that a database type extends."""
     for enum in NAMES:
         head = ", ".join(map(literal, shape.own_labels(enum)))
         if kind.startswith(f"ENUM({head}"):

@@ -1,4 +1,4 @@
-"""Conversion of graph blocks to columns of store tables: codes and masks.
+"""Conversion of graphs to columns of store tables: names become codes, frames become bit masks.
 
 A mask covers the 60 frames of a bucket. An edge in many of these frames is one row, and so is a static node.
 """
@@ -52,19 +52,19 @@ LONGEST_STEP: Final = f"{GAP} * period_ns + {TOLERANCE}"
 
 @dataclass(slots=True)
 class NodeKinds:
-    """Kinds of the nodes of a trace by node id: entities (growing) and map elements."""
+    """Kind (such as car or lane) of each node of a trace, by node id. New objects can be added."""
 
     entities: Codes
     map: Codes
 
     def learn(self, entities: Entities) -> None:
-        """Append the kinds of new entities, ordered by node id."""
+        """Append the kinds of new objects, ordered by node id."""
         if len(entities) and entities.first != len(self.entities):
             raise ValueError(f"new entities begin at {entities.first}, not {len(self.entities)}")
         self.entities = np.concatenate([self.entities, entities.kind])
 
     def of(self, nodes: Whole) -> Codes:
-        """Return the kind codes of nodes."""
+        """Return the kind codes (such as car or lane) of nodes."""
         kinds = np.empty(len(nodes), np.int8)
         kinds[nodes >= 0] = self.entities[nodes[nodes >= 0]]
         kinds[nodes < 0] = self.map[-1 - nodes[nodes < 0]]
@@ -72,7 +72,7 @@ class NodeKinds:
 
 
 def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints]:
-    """Merge rows with equal keys, and combine their bits into masks.
+    """Merge rows with equal keys into one row, and combine their bit numbers into a bit mask.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints
 
 
 def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
-    """Combine key columns into one integer with the same sort order. ``None`` means that they do not fit.
+    """Combine key columns into one integer with the same sort order. ``None`` means that this is impossible.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
 
 
 def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
-    """Return the rows of table ``frame`` as columns."""
+    """Return the rows of the store table ``frame`` as columns."""
     frames = graph.frames
     return {
         "frame_id": frame_ids(trace_id, frames.seq),
@@ -143,7 +143,7 @@ def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
 def state_columns(
     graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds, origin: Origin
 ) -> Columns:
-    """Return the variable states of each frame. Kinds and light states are codes."""
+    """Return the variable states of objects in each frame as columns. Kinds and light states are codes."""
     frames, states = graph.frames, graph.frames.states
     row = frames.frame_of
     plain = {name: getattr(states, name) for name in KEPT}
@@ -168,7 +168,7 @@ def state_columns(
 
 
 def node_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds) -> Columns:
-    """Return the rows of table ``node`` as columns. Kinds are codes."""
+    """Return the rows of the store table ``node`` as columns. Kinds are codes."""
     seq = graph.frames.seq[graph.presence.frame]
     kind, bucket, node = (
         kinds.of(graph.presence.node),
@@ -182,7 +182,7 @@ def node_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
 def edge_columns(
     graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
 ) -> Iterator[Columns]:
-    """Yield table ``edge`` in pieces of about :data:`EDGE_ROWS` rows. Relations and kinds are codes."""
+    """Yield rows of the store table ``edge`` as columns, about :data:`EDGE_ROWS` rows at a time."""
     edges = graph.edges
     count = -(-len(edges) // EDGE_ROWS)
     if count <= 1:
@@ -221,7 +221,7 @@ def _edge_columns(
 
 
 def lane_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds) -> Columns:
-    """Return the lane positions of entities in each frame. Kinds are codes."""
+    """Return the positions of objects on lanes in each frame as columns. Kinds are codes."""
     lanes = graph.lanes
     seq = graph.frames.seq[lanes.frame]
     return {
@@ -241,7 +241,7 @@ def lane_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
 
 
 def gap_columns(graph: GraphBlock | WorldBlock, trace_id: int) -> Columns:
-    """Return the gaps along the lanes in each frame."""
+    """Return the distances along lanes between objects in each frame, as columns."""
     gaps = graph.gaps
     seq = graph.frames.seq[gaps.frame]
     return {
@@ -254,7 +254,7 @@ def gap_columns(graph: GraphBlock | WorldBlock, trace_id: int) -> Columns:
 
 
 def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
-    """Return the rows of table ``entity`` as columns. Kinds are codes."""
+    """Return the rows of the store table ``entity`` (objects of a trace) as columns. Kinds are codes."""
     entities, scenery = graph.frames.entities, graph.frames.scenery
     rows = scenery.node - entities.first
     if len(rows) and not 0 <= rows.min() <= rows.max() < len(entities):
@@ -283,18 +283,18 @@ def entity_columns(graph: GraphBlock, origin: Origin) -> Columns:
 
 
 def message_columns(messages: MessageRefs, channel_ids: Ints) -> Columns:
-    """Return message positions with the channel ids of the file."""
+    """Return the file positions of messages as columns, with the channel ids of the recording."""
     columns = {f.name: getattr(messages, f.name) for f in fields(messages)}
     return columns | {"channel": channel_ids[messages.channel]}
 
 
 def unless(values: Whole, missing: Bools) -> Ints:
-    """Replace missing values by :data:`MISSING`."""
+    """Replace masked values of an array by :data:`MISSING`, and return int64 values."""
     return np.where(missing, np.int64(MISSING), values)
 
 
 def texts(values: Iterable[str]) -> NDArray[Any]:
-    """Return texts as a column with valid Unicode for the database."""
+    """Return texts as an array. Characters that are not valid Unicode become ``?``."""
     told = list(values)
     return np.array(told if "".join(told).isascii() else [plain(value) for value in told], object)
 
@@ -305,5 +305,5 @@ def plain(text: str) -> str:
 
 
 def as_json(values: dict[str, Any]) -> str:
-    """Return values as canonical JSON: equal values give equal texts."""
+    """Return values as canonical JSON text. Equal values give equal texts."""
     return plain(json.dumps(values, sort_keys=True, ensure_ascii=False))

@@ -1,4 +1,4 @@
-"""Sensor messages and events of frames.
+"""Sensor messages and events, each assigned to a frame.
 
 The tables hold the message of each channel at a frame, and its file position.
 """
@@ -34,7 +34,7 @@ _SAMPLE: Final = 8192
 
 @dataclass(slots=True)
 class Periods:
-    """Median periods of channels, estimated from their first messages.
+    """Median time between messages of each channel, estimated from the first messages.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Periods:
     counts: dict[int, int] = field(default_factory=dict[int, int])
 
     def see(self, channel: int, log_time_ns: Ints) -> None:
-        """Add message times to the estimate of periods."""
+        """Add message times of a channel to the estimate of its period."""
         count = self.counts.get(channel, 0)
         if count <= _SAMPLE and len(log_time_ns):
             piece = log_time_ns[: _SAMPLE + 1 - count]
@@ -56,7 +56,7 @@ class Periods:
             self.counts[channel] = count + len(piece)
 
     def of(self, channel: int) -> float:
-        """Return the median difference of log times; ns. Fewer than two messages give 0."""
+        """Return the median time between messages of a channel; ns. Fewer than two messages give 0."""
         times = np.sort(np.concatenate(self.times.get(channel, [np.zeros(0, np.int64)])))
         return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
 
@@ -77,7 +77,7 @@ def joined(
     periods: Periods,
     settings: Payloads,
 ) -> Iterator[Columns]:
-    """Yield table ``payload`` of a trace without the trace id, channel by channel, in order.
+    """Yield rows of the store table ``payload``: the message of each channel at each frame.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def joined(
 
 
 class FrameTimes:
-    """Log times of the frames of a trace, and their ascending order.
+    """Log times of the frames of a trace, with their ascending order.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def _messages_of(
 def _own(
     frames: FrameTimes, messages: Callable[[], Iterable[Columns]], leading: list[int]
 ) -> Columns:
-    """Return the messages from which the frames were read. Frames of equal time keep the message order."""
+    """Return the ground-truth message from which each frame was read."""
     parts = list(_messages_of(messages, leading))
     if not parts:
         return {name: np.zeros(0, np.int64) for name in ("frame", "channel", *_PLACE)}
@@ -158,7 +158,7 @@ def _own(
 def _chosen(
     frames: FrameTimes, messages: Iterable[Columns], allowed: int, *, nearest: bool
 ) -> Columns:
-    """Return the nearest or the latest message of each frame, by log time.
+    """Return the sensor message of each frame: the nearest or the latest by log time.
 
     Among messages of equal time, the last one in the file counts.
     """
@@ -188,7 +188,7 @@ def _none(count: int) -> Ints:
 
 
 def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
-    """Return the later or the earlier message for each frame. At equal times, the later file position wins."""
+    """Choose between two messages for each frame: the later or the earlier by log time."""
     further = np.zeros(one.shape[1], np.bool_)
     same = np.ones(one.shape[1], np.bool_)
     for mine, theirs in zip(one[1:], other[1:], strict=True):
@@ -200,7 +200,7 @@ def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
 
 
 def tolerance_ns(periods: Periods, channel: int, settings: Payloads) -> int:
-    """Return the largest log time difference between a frame and its message; ns."""
+    """Return the largest accepted log time difference between a frame and its sensor message; ns."""
     if settings.tolerance:
         return round(settings.tolerance * 1e9)
     period = max(periods.of(channel), periods.of(FRAMES))
@@ -249,7 +249,7 @@ MOST_WAITING: Final = 100_000
 
 
 class Happenings:
-    """Events of one trace, added block by block.
+    """Events of one trace (such as collisions), assigned to the nearest frames block by block.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ class Happenings:
         )  # the last frame so far: simulation time, log time, id
 
     def of(self, frames: FrameBlock) -> Columns:
-        """Return the rows of table ``event`` that these frames complete. Later frames may complete others."""
+        """Assign events to the frames of a block, and return rows of the store table ``event``."""
         ids = frame_ids(self._trace_id, frames.seq)
         known = np.hstack([self._last, np.stack([frames.time_ns, frames.log_time_ns, ids])])
         self._last = known[:, -1:]
@@ -282,7 +282,7 @@ class Happenings:
         return _columns(told, known[2][frame[~waits]])
 
     def rest(self) -> Columns:
-        """Return the remaining rows of table ``event`` after the last frame."""
+        """Return the rows of the store table ``event`` that remain after the last frame."""
         events, self._waiting = self._waiting, []
         return _columns(events, self._last[2][np.zeros(len(events), np.intp)])
 

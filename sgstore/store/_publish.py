@@ -1,4 +1,4 @@
-"""Publication and removal of traces, and additions to published traces, each in one transaction.
+"""Addition of complete traces to a store, and removal of traces, each in one transaction.
 
 Each function is part of one transaction on the store.
 """
@@ -63,7 +63,7 @@ SHARED: Final = {
 
 
 class PresentError(StoreError):
-    """The store already has this trace with the same settings and map.
+    """Error: the store already has this trace with the same settings and map.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class PresentError(StoreError):
 def publish_each(
     access: Access, sealed: Sequence[Sealed], *, replace: bool = False
 ) -> list[str | SgstoreError]:
-    """Add sealed traces to a store that is opened once; see :meth:`StoreFile.publish_each`."""
+    """Add complete traces to a store, one transaction per trace. The store is opened once."""
     found: list[str | SgstoreError] = []
     while len(found) < len(sealed):
         try:
@@ -98,7 +98,7 @@ def publish_each(
 
 
 def _publish(connection: DuckDBPyConnection, path: Path, sealed: Sealed, *, replace: bool) -> str:
-    """Add a sealed trace to the attached store, and return its stored name."""
+    """Add a complete trace to the attached store, and return its name in the store."""
     tables = TableFile(sealed.folder / FILE, path)
     try:
         return _put(connection, path, sealed, tables, replace=replace)
@@ -140,7 +140,7 @@ def _put(
 
 
 def widen(connection: DuckDBPyConnection, words: Mapping[str, Iterable[str]]) -> None:
-    """Add missing enumeration values to the attached store."""
+    """Add missing values to the enumerations of the attached store."""
     # Every store has the values of ``schema.sql``. Reading other values takes time.
     new = {
         enum: [name for name in names if name not in shape.own_labels(enum)]
@@ -157,7 +157,7 @@ def _publish_shared(
     owner: str,
     digest: str,
 ) -> None:
-    """Insert a recording, settings or a map if missing. Update the path of a stored recording.
+    """Insert a recording, settings or a map if the store lacks it. Update the path of a known recording.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def insert(
     table: str,
     given: Mapping[str, object] | None = None,
 ) -> None:
-    """Insert the staged rows of a table, with values that only the store can assign."""
+    """Insert the prepared rows of a table into the store. Some columns get values from the store."""
     given = given or {}
     # The arrays are reused, because a transaction keeps all arrays until its end.
     staged = _buffers(tables, table)
@@ -220,7 +220,7 @@ def insert(
 
 
 def _buffers(tables: TableFile, table: str) -> Columns:
-    """Return empty columns for the largest number of rows inserted at once."""
+    """Return uninitialised columns for the largest group of rows that is inserted at once."""
     pieces, types = tables.pieces(table), types_of(table)
     size = min(sum(piece.rows for piece in pieces), PIECE_ROWS)
     return {
@@ -230,7 +230,7 @@ def _buffers(tables: TableFile, table: str) -> Columns:
 
 
 def _filled(tables: TableFile, table: str, staged: Columns) -> Iterator[int]:
-    """Fill the columns with the next rows of a table until the end. Yield the number of rows each time."""
+    """Write rows of a table into given arrays, group by group. Yield the number of rows of each group."""
     size, count = len(next(iter(staged.values()))), 0
     for piece in tables.pieces(table):
         first = 0
@@ -247,7 +247,7 @@ def _filled(tables: TableFile, table: str, staged: Columns) -> Iterator[int]:
 
 
 def _value(table: str, name: str, values: NDArray[Any]) -> str:
-    """Return SQL of a staged column: enumeration values from codes, and NULL for missing values."""
+    """Return SQL of a prepared column: enumeration values from codes, and NULL for missing values."""
     if values.dtype.kind == "O":
         return f"nullif(\"{name}\", '')" if values.any() else "NULL"
     enum = shape.enums_of(table).get(name)
@@ -266,7 +266,7 @@ def _value(table: str, name: str, values: NDArray[Any]) -> str:
 def _note(
     connection: DuckDBPyConnection, owner: str, number: int, checksums: Mapping[str, Checksum]
 ) -> None:
-    """Store the checksums of inserted rows."""
+    """Store the checksums of inserted rows, for a later verification of the store."""
     values = [
         (owner, number, table, checksum.rows, checksum.value)
         for table, checksum in checksums.items()
@@ -300,7 +300,7 @@ ORPHANS: Final = "".join(
 
 
 def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, str]]:
-    """Yield the tables with trace rows, each with the SQL condition for the rows of ``$trace_id``."""
+    """Yield each table with rows of a trace, and the SQL condition for the rows of ``$trace_id``."""
     rows = connection.execute(
         """
         SELECT table_name, list(column_name) FROM duckdb_columns()
@@ -336,7 +336,7 @@ _SCATTERED: Final = (*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "d
 
 
 def copy_sorted(connection: DuckDBPyConnection) -> None:
-    """Copy the store attached as ``store`` into the empty store attached as ``fresh``, sorted."""
+    """Copy the attached database ``store`` into the empty database ``fresh``, with sorted rows."""
     tables = connection.execute(
         "SELECT table_name FROM duckdb_tables() WHERE database_name = 'fresh'"
     ).fetchall()
@@ -356,13 +356,13 @@ STEP: Final = 64
 
 @contextmanager
 def writing(access: Access) -> Generator[DuckDBPyConnection]:
-    """Run one transaction on a store, attached as ``store``."""
+    """Context manager of one transaction on a store. Yield a connection with the store as ``store``."""
     with scratch(spill_folder()) as connection, access.writing(connection):
         yield connection
 
 
 def add(connection: DuckDBPyConnection, path: Path, staging: Staging) -> None:
-    """Insert all sealed tables of a staging into the attached store."""
+    """Insert all prepared tables of a trace into the attached store."""
     tables = TableFile(staging.folder / FILE, path)
     try:
         for table in staging.checksums:

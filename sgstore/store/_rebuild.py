@@ -1,4 +1,4 @@
-"""Rebuild of a store: reads the content of an old store, and replaces its file.
+"""Rebuild of a store that an older version wrote: keep names and settings, and replace the file.
 
 The reader works with old and altered stores, and returns enough data to rebuild them.
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class OldTrace:
-    """Trace of an old store; see :class:`sgstore.store._traces.StoredTrace`.
+    """Trace of a store that is to be rebuilt, with name, recording and settings.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class OldTrace:
 
 @dataclass(frozen=True, slots=True)
 class OldMap:
-    """Road map of an old store. A map of named parts has no text."""
+    """Road map of a store that is to be rebuilt. A map of named parts has no text."""
 
     name: str
     digest: str
@@ -71,7 +71,7 @@ class OldMap:
 
 @dataclass(frozen=True, slots=True)
 class OldSet:
-    """Derived set of relations of some traces in an old store."""
+    """Derived set of relations (edges computed after ingest) in a store that is to be rebuilt."""
 
     name: str
     settings: dict[str, Any]
@@ -80,7 +80,7 @@ class OldSet:
 
 @dataclass(frozen=True, slots=True)
 class Remains:
-    """Content of an old store that a rebuild needs.
+    """Content of an old store that its rebuild needs: traces, maps and derived sets.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class Remains:
 
     @staticmethod
     def of(path: Path) -> Remains:
-        """Return the content of an old store that a rebuild needs.
+        """Return the content of an old store that its rebuild needs: traces, maps and derived sets.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class Remains:
         self,
         path: Path,
     ) -> None:
-        """Rename traces and maps of a store to their names in an old store."""
+        """Rename the traces and maps of a rebuilt store to their names in the old store."""
         access = Access(path)
         with scratch(spill_folder()) as connection, access.writing(connection):
             for trace in self.traces:
@@ -144,7 +144,7 @@ class Remains:
         fresh: Path,
         path: Path,
     ) -> None:
-        """Replace an old store by a new one, with exclusive access to the old store.
+        """Replace an old store file by the rebuilt store, with exclusive access to the old file.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class Remains:
 
 
 def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Remains:
-    """Return the content that a rebuild needs from a store that is already open."""
+    """Return the traces, maps and derived sets that a rebuild needs, from a store that is already open."""
     objects = shape.objects_of(connection, database)
     if shape.about_store(connection, database, objects) is None:
         raise StoreError(f"{path}: a DuckDB database, but not a store")
@@ -191,7 +191,7 @@ def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Rem
 
 
 class _TableReader:
-    """Reader of plain tables. Views and macros of the store are ignored."""
+    """Reader of the tables of an old store. Views and macros of the store are ignored."""
 
     def __init__(
         self, connection: DuckDBPyConnection, database: str, path: Path, objects: Objects
@@ -203,15 +203,15 @@ class _TableReader:
         self._tables = {one[2] for one in objects if one[:2] == ("table", self._schema)}
 
     def has(self, table: str) -> bool:
-        """True if the table exists."""
+        """True if the store has the table."""
         return table in self._tables
 
     def rows(self, table: str, columns: str, *, needed: bool = False) -> list[dict[str, Any]]:
-        """Return all rows of a table. A missing optional table has no rows."""
+        """Return some columns of a table, as one dict per row. A missing optional table has no rows."""
         return self._asked(table, columns, "SELECT", needed=needed)
 
     def distinct(self, table: str, columns: str) -> list[dict[str, Any]]:
-        """Return the distinct rows of a table."""
+        """Return the distinct rows of some columns of a table, as one dict per row."""
         return self._asked(table, columns, "SELECT DISTINCT", needed=False)
 
     def _asked(self, table: str, columns: str, how: str, *, needed: bool) -> list[dict[str, Any]]:
@@ -315,7 +315,7 @@ def _object(text: object) -> dict[str, Any]:
 
 
 def compact(path: Path, access: Access, memory: int) -> None:
-    """Rewrite a store with sorted tables; see :meth:`StoreFile.compact`."""
+    """Rewrite a store with sorted tables, and replace its file."""
     refuse_others(path, access)
     database = scratch(spill_folder(), memory=memory, threads=os.cpu_count() or 1)
     with (
@@ -331,7 +331,7 @@ def compact(path: Path, access: Access, memory: int) -> None:
 
 
 def settle(path: Path, access: Access, memory: int) -> None:
-    """Merge the log of a killed writer into a store; see :meth:`StoreFile.settle`."""
+    """Merge the write-ahead log of a killed writer process into the store file."""
     left = [path.with_name(f"{path.name}{ending}") for ending in (".wal", ".gate")]
     if any(one.exists() for one in left):
         database = scratch(spill_folder(), memory=memory)
@@ -340,7 +340,7 @@ def settle(path: Path, access: Access, memory: int) -> None:
 
 
 def refuse_others(path: Path, access: Access) -> None:
-    """Raise an error if a store has user tables or views, which a rewrite would lose.
+    """Raise an error if a store has user tables or views, which a rewrite would delete.
 
     Raises
     ------
@@ -356,7 +356,7 @@ def refuse_others(path: Path, access: Access) -> None:
 
 
 def _replace(path: Path, fresh: Path) -> None:
-    """Replace a store file whose log is already merged.
+    """Replace a store file by a new file. The write-ahead log must be merged already.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Statements and their results: rows in memory, arrays, or a stream of rows."""
+"""SQL statements and their results: rows in memory, arrays, or a stream of rows."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _READS: Final = {"SELECT", "EXPLAIN"}
 
 
 class Tabular:
-    """Source of rows that converts to tables of other packages and to files."""
+    """Base class of query results, with conversion to data frames, Arrow tables and files."""
 
     _joined_tables = staticmethod(as_told)  # for subclasses in other packages
 
@@ -113,7 +113,7 @@ class Tabular:
         return polars.DataFrame([polars.Series(name, of, strict=False) for name, of in columns])
 
     def _by_values(self) -> Any:
-        """Return an Arrow table with types inferred from Python values, or ``None`` if unavailable."""
+        """Return an Arrow table with types inferred from Python values. ``None`` means impossible."""
         with suppress(MissingExtraError):
             package("pyarrow")
             table = self._table()
@@ -142,7 +142,7 @@ class Tabular:
         return write_csv(self._described()[0], self, Path(path))
 
     def relation(self) -> duckdb.DuckDBPyRelation:
-        """Return all rows as a DuckDB relation, for filters, joins, aggregates and plots.
+        """Return all rows as a DuckDB relation (SQL table object), for filters, joins, aggregates and plots.
 
         ::
 
@@ -161,7 +161,7 @@ class Tabular:
 
 
 class Rows(Tabular):
-    """Result of a statement.
+    """Result of an SQL statement: column names and rows.
 
     Attributes
     ----------
@@ -197,7 +197,7 @@ class Rows(Tabular):
         return f"<{len(self):,} rows{more} of {', '.join(self.columns)}>"
 
     def _repr_html_(self) -> str:
-        """Return the first rows as an HTML table, for notebooks."""
+        """Return the first rows of a result as an HTML table, for notebooks."""
         from sgstore.base.display import IN_NOTEBOOK, html_table
 
         some = self._values[:IN_NOTEBOOK]
@@ -214,12 +214,12 @@ class Rows(Tabular):
         return self.columns, self.types
 
     def dicts(self) -> list[dict[str, Any]]:
-        """Return each row as a dict: column → value."""
+        """Return each row of a result as a dict: column → value."""
         return [dict(zip(self.columns, row, strict=True)) for row in self.values]
 
 
 class LaterRows(Rows):
-    """Large result with its first rows loaded. The rest is loaded on demand.
+    """Large query result. The first rows are in memory; the others are loaded on demand.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ class LaterRows(Rows):
 
 
 class Batches:
-    """Result of a statement as a stream of batches; each batch is :class:`Rows`.
+    """Result of an SQL statement as a stream of batches. Each batch has some thousand rows.
 
     Attributes
     ----------
@@ -302,7 +302,7 @@ class Batches:
         self._single = [i for i, kind in enumerate(self.types) if kind == "FLOAT" and shortened]
 
     def _told(self, values: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """Round float32 values in the rows to the float64 with the shortest text."""
+        """Convert float32 values in rows to the float64 values with the same shortest text."""
         if not self._single:
             return values
         columns = list(zip(*values, strict=True))
@@ -335,7 +335,7 @@ def _described(result: DuckDBPyConnection) -> tuple[tuple[str, ...], tuple[str, 
 def arrays(
     connection: DuckDBPyConnection, sql: str, parameters: Parameters | None, *, plain: bool = False
 ) -> dict[str, NDArray[np.generic]]:
-    """Return all columns as arrays with NULL masked. Enumerations become texts unless ``plain`` is true."""
+    """Run a trusted SQL statement, and return its columns as arrays. NULL values are masked."""
     given = parameters or None
     described = [] if plain else connection.execute(f"DESCRIBE {sql}", given).fetchall()
     listed = [quoted(str(row[0])) for row in described if "ENUM" in str(row[1])]
@@ -353,7 +353,7 @@ def arrays(
 def user_statement(
     connection: DuckDBPyConnection, sql: str, timeout_s: float | None, ask: Callable[[], T]
 ) -> Generator[T]:
-    """Run a user's SQL statement on a connection that can read only the store and its views.
+    """Run an SQL statement of a user on a connection that can read only the store and its views.
 
     ``ask`` starts the statement. Read the result inside the block.
 
@@ -384,7 +384,7 @@ def _check(connection: DuckDBPyConnection, sql: str) -> None:
 
 @contextmanager
 def _refused(sql: str, timeout_s: float | None) -> Generator[None]:
-    """Convert DuckDB errors to errors of the user's statement."""
+    """Context manager that converts DuckDB errors to errors of the user's SQL statement."""
     try:
         yield
     except duckdb.InterruptException as error:
@@ -410,7 +410,7 @@ def _shown(sql: str) -> str:
 
 @contextmanager
 def _interrupted_after(connection: DuckDBPyConnection, timeout_s: float | None) -> Generator[None]:
-    """Interrupt the connection after a timeout, repeatedly, until the block ends."""
+    """Context manager that interrupts a database connection after a timeout."""
     if timeout_s is None:
         yield
         return
@@ -467,7 +467,7 @@ def give_to_user(
     sql: str,
     timeout_s: float | None,
 ) -> None:
-    """Create temporary tables for a user's SQL statement, by trusted statements.
+    """Create temporary tables for an SQL statement of a user, by trusted SQL statements.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Check of a store's tables and views against ``schema.sql``. The store may be from an untrusted source.
+"""Comparison of a store's tables and views with ``schema.sql``. The store may be from an untrusted source.
 
 An untrusted file may have a view instead of a table, a macro with the name of a function, or a trigger. So
 before the first read, the catalogue of a store is compared with ``schema.sql``: the text of tables, types and
@@ -48,7 +48,7 @@ _SYSTEM: Final = frozenset({"information_schema", "pg_catalog", "system", "temp"
 
 
 def schema_version() -> str:
-    """Return the version in the header of ``schema.sql``."""
+    """Return the version number in the header of ``schema.sql``."""
     found = _HEAD.match(schema_sql())
     if found is None:
         raise ValueError("the head of schema.sql says no version")
@@ -64,25 +64,25 @@ TEXT: Final = (
 
 @cache
 def schema_digest() -> str:
-    """Return the SHA-256 of the statements of ``schema.sql``. Comments do not change it."""
+    """Return the SHA-256 of the SQL statements of ``schema.sql``. Comments do not change it."""
     text, known = TEXT
     return known if text_digest() == text else statements_digest()
 
 
 def text_digest() -> str:
-    """Return the SHA-256 of the text of ``schema.sql``."""
+    """Return the SHA-256 of the whole text of ``schema.sql``."""
     return hashlib.sha256(schema_sql().encode()).hexdigest()
 
 
 def statements_digest() -> str:
-    """Compute the SHA-256 of the statements of ``schema.sql``, without comments."""
+    """Compute the SHA-256 of the SQL statements of ``schema.sql``, without comments."""
     made = ["\0".join(words) for words in statements() if words[0] != "COMMENT"]
     return hashlib.sha256("\n".join(made).encode()).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Tables, views and types of ``schema.sql`` by name.
+    """Tables, views and enumeration types of ``schema.sql``, by name.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Shape:
 
 @cache
 def expected(*wider: tuple[str, Tokens]) -> Shape:
-    """Return the shape that ``schema.sql`` creates, optionally with extended enumerations."""
+    """Return tables, views and types as ``schema.sql`` creates them. Enumerations can be extended."""
     tables: dict[str, Tokens] = {}
     types: dict[str, Tokens] = {}
     views: dict[str, dict[str, str]] = {"main": {}, INSIDE: {}}
@@ -134,7 +134,7 @@ def _expected_views(connection: DuckDBPyConnection) -> dict[str, Tokens]:
 
 
 def check(connection: DuckDBPyConnection, database: str, path: Path) -> None:
-    """Reject a database that is not a store, has another version, or was altered.
+    """Raise an error if a database is not a store, has another version, or was altered.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ _REMEDY: Final = "'sgstore rebuild' makes it anew from its recordings"
 
 
 def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tuple[str, ...]]:
-    """Return all faults that :func:`check` rejects, and the names of user tables and views.
+    """Return all faults of a store's schema, and the names of user tables and views.
 
     Raises
     ------
@@ -179,7 +179,7 @@ def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tu
 
 
 def database_of(connection: DuckDBPyConnection) -> str:
-    """Return the database name of the file that a connection has open."""
+    """Return the database name of the file that a DuckDB connection has open."""
     sql = "SELECT database_name FROM system.main.duckdb_databases() WHERE internal = false"
     ((name,),) = connection.execute(sql).fetchall()
     return name
@@ -214,12 +214,12 @@ def about_store(
 
 
 def schema_of(objects: Objects) -> str:
-    """Return the schema with a store's tables. Old stores have tables and views in one schema."""
+    """Return the name of the database schema that has the store's tables."""
     return INSIDE if INSIDE in _info_of(objects) else "main"
 
 
 def _info_of(objects: Objects) -> dict[str, str]:
-    """Return the CREATE statement of table ``store_info`` for each schema that contains it."""
+    """Return the CREATE statement of the table ``store_info`` for each database schema that has it."""
     return {
         schema: str(told)
         for what, schema, name, told in objects
@@ -228,7 +228,7 @@ def _info_of(objects: Objects) -> dict[str, str]:
 
 
 def other_version(about: dict[str, str]) -> str:
-    """Return the message for a store with another schema version, or an empty string."""
+    """Return the error message for a store of another schema version; empty for the same version."""
     held, maker = (
         about.get("schema_version", "unknown"),
         about.get("created_by", "an unknown version"),
@@ -245,7 +245,7 @@ def other_version(about: dict[str, str]) -> str:
 
 
 def altered(connection: DuckDBPyConnection, database: str) -> list[str]:
-    """Return faults: tables, views and types that differ from ``schema.sql``, and objects that shadow them.
+    """Return faults of a store: objects that differ from ``schema.sql``, or hide its objects.
 
     A store can have additional kinds, relations and light states. They are registered here.
     """
@@ -276,7 +276,7 @@ Objects of other versions are compared token by token.
 
 
 def digest_of(objects: Objects) -> str:
-    """Return the SHA-256 of ``schema.sql`` and of a store's objects together."""
+    """Return the SHA-256 of ``schema.sql`` together with a store's tables, views and types."""
     return hashlib.sha256(repr((schema_sql(), sorted(objects))).encode()).hexdigest()
 
 
@@ -286,7 +286,7 @@ def _is_known(objects: Objects) -> bool:
 
 
 def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
-    """Yield faults: objects that differ from ``schema.sql``, or are in the wrong place."""
+    """Yield faults of a store: tables, views or types that differ from ``schema.sql`` or are misplaced."""
     made = _made(objects)
     types = made["type", "main"]
     shape = expected(
@@ -309,7 +309,7 @@ def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
 
 @cache
 def own_labels(enum: str) -> tuple[str, ...]:
-    """Return the values of an enumeration in ``schema.sql``."""
+    """Return the values of an enumeration type in ``schema.sql``."""
     return _labels(expected().types[enum])
 
 
@@ -318,7 +318,7 @@ def _labels(words: Tokens) -> tuple[str, ...]:
 
 
 def labels_of(connection: DuckDBPyConnection, database: str, enum: str) -> tuple[str, ...]:
-    """Return the values of a store's enumeration in code order. A missing type has no values."""
+    """Return the values of a store's enumeration type, in code order. A missing type has no values."""
     rows = connection.execute(
         "SELECT labels FROM system.main.duckdb_types() WHERE database_name = ?"
         " AND schema_name = ? AND type_name = ? AND internal = false",
@@ -328,13 +328,13 @@ def labels_of(connection: DuckDBPyConnection, database: str, enum: str) -> tuple
 
 
 def others_of(connection: DuckDBPyConnection, enum: str) -> tuple[str, ...]:
-    """Return the values of an open store's enumeration that ``schema.sql`` lacks."""
+    """Return the values of a store's enumeration type that ``schema.sql`` lacks."""
     ((labels,),) = connection.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
     return tuple(labels[len(own_labels(enum)) :])
 
 
 def codes_of(connection: DuckDBPyConnection, enum: str) -> NDArray[np.int8]:
-    """Return a lookup table: enumeration code in the store → code in this process."""
+    """Return a lookup array for an enumeration type: code in the store → code in this process."""
     ((labels,),) = connection.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
     return np.array([learn(enum, label) for label in labels], np.int8)
 
@@ -342,7 +342,7 @@ def codes_of(connection: DuckDBPyConnection, enum: str) -> NDArray[np.int8]:
 def widen(
     connection: DuckDBPyConnection, database: str, names: Mapping[str, Iterable[str]]
 ) -> None:
-    """Add values to the enumerations of an attached database."""
+    """Add values to the enumeration types of an attached database."""
     inside = f"{quoted(database)}.{INSIDE}"
     for enum, wanted in names.items():
         labels = labels_of(connection, database, enum)
@@ -369,7 +369,7 @@ def enums_of(table: str) -> Mapping[str, str]:
 
 
 def code_sql(column: str, enum: str) -> str:
-    """Return SQL that maps an enumeration value to the same number in every store."""
+    """Return an SQL expression that maps an enumeration value to the same number in every store."""
     code, words = f"enum_code({column}::{enum})", tuple(tokens_of(enum))
     own = next(own for own in expected().types.values() if words[: len(own) - 1] == own[:-1])
     if words == own:
@@ -380,7 +380,7 @@ def code_sql(column: str, enum: str) -> str:
 
 
 def _strange(objects: Objects) -> Iterator[str]:
-    """Yield faults: enumeration values that this process cannot register."""
+    """Yield faults of a store: enumeration values that this process cannot register."""
     labels = {
         name: told for what, schema, name, told in objects if (what, schema) == ("type", "main")
     }
@@ -420,7 +420,7 @@ def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:
 
 
 def _made(objects: Objects) -> Mapping[tuple[str, str], dict[str, Tokens]]:
-    """Return the store's objects by (kind, schema): name → tokens of the statement."""
+    """Return the tables, views and types of a store: (kind, schema) → name → tokens of the statement."""
     found: dict[tuple[str, str], dict[str, Tokens]] = defaultdict(dict)
     for what, schema, name, told in objects:
         if schema not in {"main", INSIDE}:
@@ -439,7 +439,7 @@ def _enum(labels: Iterable[str]) -> str:
 def _differing(
     what: str, wanted: dict[str, Tokens], there: dict[str, Tokens], instead: dict[str, Tokens]
 ) -> Iterator[str]:
-    """Yield faults: objects that are missing, of the wrong kind, or different."""
+    """Yield faults: tables, views or types that are missing, of the wrong kind, or different."""
     for name, words in wanted.items():
         found = there.get(name)
         if found is None:
@@ -450,7 +450,7 @@ def _differing(
 
 
 def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:
-    """Yield faults: user tables and views whose names hide objects of the schema."""
+    """Yield faults of a store: user tables and views whose names hide objects of ``schema.sql``."""
     for schema, name in sorted(
         (schema, name) for what, schema, name, _ in objects if what != "type"
     ):
@@ -461,7 +461,7 @@ def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:
 
 
 def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
-    """Yield faults: macros and schemas with the names of built-in database objects."""
+    """Yield faults of a store: macros and schemas with the names of built-in DuckDB objects."""
     macros = connection.execute(
         "SELECT function_name FROM system.main.duckdb_functions() WHERE database_name = ?",
         [database],
@@ -484,7 +484,7 @@ def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
 
 
 def _attached(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
-    """Yield faults: triggers and indexes on tables of the schema."""
+    """Yield faults of a store: triggers and indexes on tables of ``schema.sql``."""
     for what in ("trigger", "index"):
         plural = {"trigger": "triggers", "index": "indexes"}[what]
         try:

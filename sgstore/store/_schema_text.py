@@ -1,4 +1,4 @@
-"""Text of ``schema.sql``, and SQL statements as tokens, for the comparison of schemas."""
+"""Text of ``schema.sql``, and SQL statements as lists of tokens, for the comparison of schemas."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _between(text: str, before: str, behind: str) -> str:
 
 @cache
 def statements() -> tuple[Tokens, ...]:
-    """Return the statements of ``schema.sql`` as tokens."""
+    """Return the SQL statements of ``schema.sql`` as lists of tokens."""
     found: list[list[str]] = [[]]
     for word in tokens_of(schema_sql()):
         if word == ";":
@@ -88,7 +88,7 @@ def statements() -> tuple[Tokens, ...]:
 
 
 def tokens_of(sql: str) -> list[str]:
-    """Split a statement into tokens, without comments, quotes of plain names, and casts of constants."""
+    """Split an SQL statement into tokens, without comments, quotes of plain names and casts of constants."""
     found: list[str] = []
     for match in _TOKEN.finditer(sql):
         word = match[0]
@@ -115,7 +115,7 @@ def statement(sql: str) -> Tokens:
 
 
 def with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
-    """Yield the tokens of a table, with enumerations expanded to their values, as DuckDB prints them."""
+    """Yield the tokens of a CREATE TABLE statement, with each enumeration type replaced by its values."""
     before = ""
     for number, word in enumerate(words):
         # A type follows the name of a column. Both can be equal.

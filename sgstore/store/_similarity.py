@@ -1,4 +1,4 @@
-"""Search for frames like an example: first frames with equal graphs, then the most similar frames."""
+"""Search for frames whose graphs are similar to the graph of an example frame, most similar first."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SimilarFrames:
-    """Consecutive frames of a trace with the same similarity to an example, for the same reasons.
+    """Run of consecutive frames of a trace that are equally similar to the example frame of a search.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class SimilarFrames:
 
 @dataclass(slots=True)
 class _FrameRun:
-    """Consecutive frames with equal features. If they match all features, their class is equal too."""
+    """Run of consecutive frames of a trace with equal graph features and equal similarity to the example."""
 
     key: tuple[Any, ...]
     similarity: float
@@ -88,7 +88,7 @@ class _FrameRun:
 
 @dataclass(frozen=True, slots=True)
 class Example:
-    """Example frame for a similarity search, as plain values that work in any store.
+    """Example frame for a similarity search, as label counts of its graph. It works in any store.
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class Example:
 
     @staticmethod
     def of(file: StoreFile, ref: int | str, name: str, ignored: Sequence[str]) -> Example:
-        """Return a frame as a search example.
+        """Return a frame of a store as the example of a similarity search.
 
         Parameters
         ----------
@@ -147,7 +147,7 @@ class Example:
     def find(
         file: StoreFile, example: Example, limit: int, *, each_trace: bool = False
     ) -> list[SimilarFrames]:
-        """Return runs of similar frames, most similar first, then by trace name and time.
+        """Return runs of consecutive frames similar to the example: most similar first, then by trace and time.
 
         Memory does not grow with the store: graphs are read window by window.
 
@@ -176,7 +176,7 @@ class Example:
 
     @staticmethod
     def best(found: Iterable[SimilarFrames], limit: int) -> list[SimilarFrames]:
-        """Return the best results of several stores, in the order of a single combined store."""
+        """Return the most similar runs of frames from several stores, as from one combined store."""
 
         def place(one: SimilarFrames) -> tuple[Any, ...]:
             likeness = one.similarity + (one.same is True)
@@ -197,14 +197,14 @@ def _blocks(
 
 
 def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
-    """Return the numbers of the first and last frame near a given frame in time."""
+    """Return the numbers of the first and last frame close in time to a given frame."""
     sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
     found = connection.execute(sql, [frame.trace_id, frame.t, BESIDE_S]).fetchone()
     return found or (0, -1)
 
 
 class _RunSearch:
-    """Search for the best runs, overall or per trace."""
+    """Collector of the frame runs most similar to an example frame, overall or per trace."""
 
     def __init__(self, example: Example, limit: int, *, each_trace: bool) -> None:
         self.example = Counter(example.features)
@@ -218,7 +218,7 @@ class _RunSearch:
     def look(
         self, trace: int, seq: NDArray[np.int64], graphs: Labelled, left_out: range = range(0)
     ) -> None:
-        """Add the next frames of a trace, except some frame numbers."""
+        """Compare the next frames of a trace with the example frame. Some frame numbers can be excluded."""
         features = GraphFeatures.of(graphs)
         likeness, digest = features.likeness(self.example), features.digests()
         same: list[bool | None] = [False] * graphs.frames
@@ -256,7 +256,7 @@ class _RunSearch:
             )
 
     def close(self) -> None:
-        """Close the last run, and keep it if it is good enough."""
+        """End the current run of frames. Keep it if it is among the most similar runs so far."""
         run, self._last = self._last, None
         if run is None or not self._wanted(run.trace, run.similarity):
             return
@@ -279,7 +279,7 @@ class _RunSearch:
         return bool(self._limit) and similarity + (similarity == 1) > self._heap[0][0]
 
     def best(self) -> list[_FrameRun]:
-        """Return the best runs in descending order."""
+        """Return the runs of frames most similar to the example, in descending order of similarity."""
         every = self._heap if self._each is None else self._each.values()
         ordered = sorted(every, key=lambda e: e[:-1], reverse=True)
         return [entry[-1] for entry in ordered[: self._limit]]
@@ -308,7 +308,7 @@ def _sorted(counts: Counter[str]) -> dict[str, int]:
 
 
 def _check(ignored: Sequence[str], graphs: Labelled) -> None:
-    """Reject a name to ignore that occurs neither in the vocabulary nor in the example."""
+    """Raise an error for an ignored name that is neither in the vocabulary nor in the example graph."""
     known = {*RELATIONS, *RELATION_ALIASES, *graphs.labels, *labels()}
     folds = {name.replace("_", "").lower() for name in known}
     for name in ignored:

@@ -1,4 +1,4 @@
-"""Staged tables of a trace: arrays in a file next to the store, until publication.
+"""Table rows of a new trace: arrays in a file next to the store, until the trace is published.
 
 Large tables are cut into parts of some ten thousand rows. Each part is sorted in store order and appended to
 the file, so memory does not grow. In the end, one file has all tables, with a checksum of each.
@@ -77,7 +77,7 @@ _RUNS: Final = {
 
 
 class StagedRows(NamedTuple):
-    """Rows of whole tables, written by a :class:`Staging`.
+    """Rows of whole tables in the file format of :class:`Staging`, for use in several traces.
 
     ``words``: enumeration → values that ``schema.sql`` lacks.
     """
@@ -88,7 +88,7 @@ class StagedRows(NamedTuple):
 
 
 class Staging:
-    """Staged tables of one trace.
+    """Writer of the table rows of one new trace, in memory and in a file next to the store.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class Staging:
             raise
 
     def close(self) -> None:
-        """Discard the tables in memory. Remove the folder if this object created it."""
+        """Discard the table rows in memory, and remove the folder if this object created it."""
         self._waiting.clear()
         self._file.close()
         if self._own is not None:
@@ -155,7 +155,7 @@ class Staging:
         return np.array(found, np.int32)
 
     def _learn(self, enum: str, codes: NDArray[Any]) -> None:
-        """Collect enumeration values that ``schema.sql`` lacks."""
+        """Collect the enumeration values in a column that ``schema.sql`` lacks."""
         own = len(own_labels(enum))
         if codes.max() < own:
             return
@@ -164,24 +164,24 @@ class Staging:
         noted += [name for name in found if name not in noted]
 
     def words(self, answers: Iterable[str]) -> dict[str, list[str]]:
-        """Return the enumeration values that the store must support: enumeration → values."""
+        """Return the values that each enumeration type of the store must have: enumeration → values."""
         relations = sorted({*answers, *self._new.get("relation", ())})
         return {**self._new, "relation": relations}
 
     def shared(self) -> StagedRows:
-        """Write all tables, and return their rows for other stagings. These tables must not grow afterwards."""
+        """Write all tables, and return their rows for other traces. These tables must not grow afterwards."""
         for table in [*self._waiting]:
             self.write(table)
         return StagedRows(self._file.behind(0), dict(self.checksums), dict(self._new))
 
     def adopt(self, rows: StagedRows) -> None:
-        """Take the shared tables of another staging, before any other rows."""
+        """Add table rows that another trace has already written. This must precede all other rows."""
         self._file.adopt(rows.pieces)
         self.checksums.update(rows.checksums)
         self._new.update({enum: [*names] for enum, names in rows.words.items()})
 
     def mark(self, table: str, name: str, values: NDArray[Any]) -> None:
-        """Add a column to the rows of a complete table."""
+        """Add a column to all rows of a table. The table must not grow afterwards."""
         first = 0
         for staged in self._waiting[table]:
             rows = len(next(iter(staged.values())))
@@ -189,7 +189,7 @@ class Staging:
             first += rows
 
     def settle(self, *, whole: bool) -> None:
-        """Write large tables to the file to free memory. Called between blocks.
+        """Write large tables to the file to free memory. Called between blocks of frames.
 
         Parameters
         ----------
@@ -204,7 +204,7 @@ class Staging:
             self._texts[True] = {"": -1}
 
     def _merge(self, table: str) -> None:
-        """Merge rows that differ only in their masks. Write them to the file if many remain."""
+        """Combine rows that differ only in their bit mask of frames. Write them to the file if many remain."""
         merged = self._gathered(table)
         rows = len(merged["mask"])
         self._waiting[table], self._rows[table] = [merged], rows
@@ -220,7 +220,7 @@ class Staging:
         return list(self._texts[table in _CUT])[1:]
 
     def write(self, table: str) -> None:
-        """Write the waiting rows of a table to the file, and free their memory."""
+        """Move the rows of a table from memory to the file."""
         texts = self._texts_of(table)
         if self._runs[table]:
             if self._waiting[table]:
@@ -256,7 +256,7 @@ class Staging:
             self._file.append(table, some, said)
 
     def _merged_runs(self, table: str, runs: list[Piece]) -> Iterator[Columns]:
-        """Merge sorted runs. Yield the rows of one value of the first column at a time."""
+        """Merge several sorted groups of rows of a table. Yield the rows by value of the first column."""
         name, texts = _RUNS[table], self._texts_of(table)
         firsts = [self._file.column(run, name) for run in runs]
         for value in np.unique(np.concatenate([np.unique(first) for first in firsts])).tolist():
@@ -270,13 +270,13 @@ class Staging:
             yield in_order(table, chained(table, found), texts)
 
     def messages(self) -> Iterator[Columns]:
-        """Yield all messages in groups."""
+        """Yield the rows of all recorded messages in groups."""
         for piece in self._file.pieces("message"):
             yield self._file.read(piece)
         yield from self._waiting["message"]
 
     def seal(self) -> None:
-        """Write all tables to the file, and close it for additions."""
+        """Write all tables to the file. No rows can be added afterwards."""
         for table in [*self._waiting, *self._runs]:
             self.write(table)
         self._file.close()
@@ -289,7 +289,7 @@ MEMORY: Final = 48 << 20
 
 
 def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnection:
-    """Open an in-memory database that can attach files. It spills to a folder, which it creates if needed.
+    """Open an in-memory database that can attach files. Data beyond the memory limit go to a folder.
 
     Parameters
     ----------
@@ -319,7 +319,7 @@ _SAID: Final = "sealed.json"
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """Complete segment. It does not depend on the process that built it.
+    """Complete trace in files outside the store. Any process can add it to the store.
 
     Attributes
     ----------
@@ -344,7 +344,7 @@ class Sealed:
     words: dict[str, list[str]]
 
     def write(self) -> None:
-        """Write the metadata for :meth:`read` into the folder.
+        """Write the description of a complete trace into its folder, for :meth:`read`.
 
         Raises
         ------
@@ -359,7 +359,7 @@ class Sealed:
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read a sealed segment from its folder.
+        """Read the description of a complete, unpublished trace from its folder.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Entity states of frames as plain columns, for drawing in a viewer.
+"""Object states (such as position and speed) of frames as plain columns, for a viewer.
 
 Positions are relative to the origin of the trace, so they fit into 32 bits. NaN means unknown. Kinds and light
 states are codes; :func:`kinds_of` returns their names.
@@ -57,7 +57,7 @@ def frame_times(connection: DuckDBPyConnection, trace_id: int, first: int, last:
 
 
 def states_between(connection: DuckDBPyConnection, trace_id: int, first: int, last: int) -> Columns:
-    """Return the states of all non-static entities in a range of frames, with the frame numbers.
+    """Return the states of all non-static objects in a range of frames, with the frame numbers.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def states_between(connection: DuckDBPyConnection, trace_id: int, first: int, la
 
 
 def states_at(connection: DuckDBPyConnection, frames: Sequence[tuple[int, int]]) -> Columns:
-    """Return states in frames given as (trace id, number). Column ``at`` is the index of the frame."""
+    """Return object states in given frames. Column ``at`` is the index of the frame in the input."""
     if len(frames) > MOST_FRAMES:
         raise StoreError(f"{len(frames)} frames are asked for; {MOST_FRAMES} are given at once")
     ids = [int(frame_ids(trace, np.array([seq]))[0]) for trace, seq in frames]
@@ -92,7 +92,7 @@ def states_at(connection: DuckDBPyConnection, frames: Sequence[tuple[int, int]])
 
 
 def scenery(connection: DuckDBPyConnection, trace_id: int) -> Columns:
-    """Return the static entities of a trace, without its road map."""
+    """Return the static objects of a trace as columns. Elements of the road map are excluded."""
     found = connection.execute(
         'SELECT node_id AS node, enum_code(kind) AS kind, x, y, heading, "length", width FROM entity'
         " WHERE trace_id = ? AND is_static ORDER BY node_id",
@@ -102,7 +102,7 @@ def scenery(connection: DuckDBPyConnection, trace_id: int) -> Columns:
 
 
 def names_of_nodes(connection: DuckDBPyConnection, trace_id: int) -> dict[int, tuple[str, ...]]:
-    """Return kind, simulator id and type name of each entity of a trace. Unknown texts are empty."""
+    """Return kind, simulator id and type name of each object of a trace, by node id; empty if unknown."""
     rows = connection.execute(
         "SELECT node_id, kind::VARCHAR, coalesce(ident, ''), coalesce(type_name, '') FROM entity"
         " WHERE trace_id = ? ORDER BY node_id",
@@ -112,7 +112,7 @@ def names_of_nodes(connection: DuckDBPyConnection, trace_id: int) -> dict[int, t
 
 
 def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str, list[str]]]:
-    """Return origin (m, in map axes), map digest and camera topics of each trace.
+    """Return coordinate origin (m), map digest and camera topics of each trace: trace name → values.
 
     One statement reads all traces, because there may be thousands. Cameras are the sorted topics of pictures.
     """
@@ -126,7 +126,7 @@ def places(connection: DuckDBPyConnection) -> dict[str, tuple[float, float, str,
 
 
 def kinds_of(connection: DuckDBPyConnection) -> dict[str, list[str]]:
-    """Return the names of kinds and light states in code order."""
+    """Return the names of object kinds and of light states, as lists in the order of their codes."""
     row = connection.execute(
         "SELECT enum_range(NULL::kind)::VARCHAR[], enum_range(NULL::light_state)::VARCHAR[]"
     ).fetchone()
@@ -137,7 +137,7 @@ def kinds_of(connection: DuckDBPyConnection) -> dict[str, list[str]]:
 def series(
     connection: DuckDBPyConnection, trace_id: int, attribute: str, node: int, other: int | None
 ) -> Columns:
-    """Return an attribute of a node, or of a pair of nodes, over a trace.
+    """Return an attribute of a node, or of a node pair, in each frame of a trace.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def _ids(trace_id: int, first: int, last: int) -> tuple[int, int]:
 
 
 def _typed(found: Mapping[str, NDArray[Any]], types: Mapping[str, Any]) -> Columns:
-    """Convert columns to their types. NULL becomes NaN or 0."""
+    """Convert columns to given types. NULL becomes NaN or 0."""
     told: Columns = {}
     for name, values in found.items():
         type_ = np.dtype(types[name])

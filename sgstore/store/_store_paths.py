@@ -1,4 +1,4 @@
-"""Valid paths of stores, and the folders of unpublished segments next to a store, ``STORE.segment-…``."""
+"""Checks of store paths, and the folders of unpublished traces next to a store, ``STORE.segment-…``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NO_NAME: Final = frozenset("?\\")
 
 
 def refuse_special(path: Path) -> None:
-    """Reject pipes and devices, which would block on open.
+    """Raise an error for pipes and devices, which would block when opened.
 
     Raises
     ------
@@ -59,7 +59,7 @@ _NAME: Final = ".segment-"
 
 
 class Folder(HeldFolder):
-    """Folder next to a store, locked while its process lives.
+    """Folder of unpublished data next to a store. A lock shows that its process still runs.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Folder(HeldFolder):
 
     @staticmethod
     def refuse_name(path: Path) -> None:
-        """Reject a path with characters that DuckDB misinterprets.
+        """Raise an error for a path with characters that DuckDB misinterprets.
 
         Raises
         ------
@@ -103,7 +103,7 @@ def remove_left_behind(store: Path) -> None:
 
 
 def refuse_odd_name(store: Path) -> None:
-    """Reject a path that is not valid UTF-8 or contains a null character.
+    """Raise an error for a path that is not valid UTF-8 or contains a null character.
 
     Raises
     ------

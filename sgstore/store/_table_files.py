@@ -1,4 +1,4 @@
-"""Rows and columns as Parquet and CSV files, and as DuckDB relations.
+"""Table rows and columns as Parquet and CSV files, and as DuckDB relations (SQL table objects).
 
 DuckDB writes Parquet without another package.
 """
@@ -68,7 +68,7 @@ _TYPES: Final = ((bool, "BOOLEAN"), (int, "BIGINT"), ((int, float), "DOUBLE"))
 
 
 class ParquetTable:
-    """Parquet file, written in blocks of rows. Use it as a context manager.
+    """Writer of a Parquet file, in blocks of rows. It is a context manager.
 
     Rows wait in a temporary file, not in memory. Equal blocks give equal bytes.
 
@@ -132,7 +132,7 @@ class ParquetTable:
                 )
 
     def add(self, columns: Mapping[str, NDArray[Any] | Sequence[Any]]) -> None:
-        """Append rows. The data are given as columns.
+        """Append rows to the Parquet file. The rows are given as columns.
 
         Parameters
         ----------
@@ -147,13 +147,13 @@ class ParquetTable:
         self._add([columns[name] for name in self._columns])
 
     def add_rows(self, rows: Iterable[Sequence[Any]]) -> None:
-        """Append rows of Python values; ``None`` means missing. See :meth:`add`."""
+        """Append rows of Python values to the Parquet file; ``None`` means missing."""
         rows = iter(rows)
         while batch := list(islice(rows, ROWS_AT_ONCE)):
             self._add([[row[i] for row in batch] for i in range(len(self._columns))])
 
     def add_arrow(self, block: Any) -> None:
-        """Append the rows of a ``pyarrow.Table`` with distinct column names; see :meth:`add`."""
+        """Append the rows of a ``pyarrow.Table`` to the Parquet file. Column names must be distinct."""
         self._insert(block, len(block))
 
     def _add(self, columns: Sequence[NDArray[Any] | Sequence[Any]]) -> None:
@@ -189,7 +189,7 @@ class ParquetTable:
         to: Path,
         types: Sequence[str] | None = None,
     ) -> int:
-        """Write rows to a Parquet file. An existing file is replaced.
+        """Write rows of Python values to a Parquet file. An existing file is replaced.
 
         Parameters
         ----------
@@ -226,7 +226,7 @@ class ParquetTable:
 
     @staticmethod
     def write_batches(stream: ArrowStream, to: Path, names: Sequence[str] | None = None) -> int:
-        """Write Arrow batches to a Parquet file like :meth:`write_rows`, and return the number of rows.
+        """Write Arrow batches to a Parquet file, and return the number of rows.
 
         Parameters
         ----------
@@ -290,7 +290,7 @@ def _type_of(values: list[Any]) -> str:
 
 
 def relation_of(write: Callable[[Path], object]) -> duckdb.DuckDBPyRelation:
-    """Load the output of a Parquet writer function as the table ``answer`` of a new database."""
+    """Call a function that writes a Parquet file, and return its rows as a DuckDB table ``answer``."""
     with working_folder("relation") as folder:
         file = folder / "answer.parquet"
         write(file)

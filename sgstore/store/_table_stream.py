@@ -1,4 +1,4 @@
-"""File of tables: consecutive pieces, each with a header line and its columns."""
+"""File with the rows of several tables, in pieces. A piece is a header line and the columns of some rows."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _PLAIN: Final = frozenset({"|b1", "|i1", "<i2", "<i4", "<i8", "<f4", "<f8"})
 
 
 class Piece(NamedTuple):
-    """Group of rows of a table in a staging file.
+    """Position and size of a group of table rows in a file of tables.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Piece(NamedTuple):
 
 
 class TableFile:
-    """Private file of table rows. Its content is never run as code.
+    """Private file with the rows of several tables. Its content is never run as code.
 
     Parameters
     ----------
@@ -77,13 +77,13 @@ class TableFile:
         return StoreError(f"{self._store}: what waits beside it {what}{reason}")
 
     def close(self) -> None:
-        """Close the file. Its content stays."""
+        """Close the file of tables. Its content stays on disk."""
         self._file.close()
 
     def append(
         self, table: str, columns: Columns, texts: Mapping[str, list[str]] | None = None
     ) -> Piece:
-        """Append rows. ``texts`` maps each text column to the texts behind its indices."""
+        """Append rows of a table to the file, and return their position."""
         rows = len(next(iter(columns.values())))
         about: dict[str, dict[str, Any]] = {}
         body: list[NDArray[Any]] = []
@@ -122,28 +122,28 @@ class TableFile:
 
     @property
     def size(self) -> int:
-        """Size of the file in bytes."""
+        """Size of the file of tables in bytes."""
         return self._size
 
     def behind(self, at: int) -> bytes:
-        """Return the bytes of the file from an offset to the end."""
+        """Return the raw bytes of the file from an offset to the end."""
         return self._bytes(at, self._size - at)
 
     def adopt(self, pieces: bytes) -> None:
-        """Append raw pieces of another file. This object does not list them; a new reader does."""
+        """Append raw bytes of another file of tables. Only a new reader of the file lists their rows."""
         self._write(pieces)
         self._size += len(pieces)
 
     def pieces(self, table: str) -> list[Piece]:
-        """Return the pieces of a table in writing order."""
+        """Return the positions of a table's row groups in the file, in writing order."""
         return [piece for piece in self._pieces if piece.table == table]
 
     def all(self) -> list[Piece]:
-        """Return all pieces in writing order."""
+        """Return the positions of all row groups in the file, in writing order."""
         return list(self._pieces)
 
     def read(self, piece: Piece, first: int = 0, end: int | None = None) -> Columns:
-        """Return the columns of a range of rows in a piece.
+        """Return all columns for a range of rows in a row group of the file.
 
         Raises
         ------
@@ -155,7 +155,7 @@ class TableFile:
     def column(
         self, piece: Piece, name: str, first: int = 0, end: int | None = None
     ) -> NDArray[Any]:
-        """Return one column of a range of rows in a piece."""
+        """Return one column for a range of rows in a row group of the file."""
         about, end = piece.columns[name], piece.rows if end is None else end
         if about["type"] not in _PLAIN:
             raise self._wrong("is none of ours")
@@ -171,7 +171,7 @@ class TableFile:
         return values.astype(np.int64) + about["base"] if "base" in about else values
 
     def values(self, piece: Piece, name: str, first: int, end: int) -> NDArray[Any]:
-        """Return one column with texts in place of indices. A column that the piece lacks is all missing."""
+        """Return one column with texts in place of text indices. An absent column has only missing values."""
         if name not in piece.columns:
             texts = types_of(piece.table)[name] in TEXTS
             count = end - first
@@ -182,7 +182,7 @@ class TableFile:
         return np.array([*self._texts(piece, name), ""], object)[values]
 
     def texts(self, piece: Piece) -> dict[str, list[str]]:
-        """Return the texts behind the indices of a piece, by column."""
+        """Return the texts of a row group: text column → list of texts, indexed by the stored numbers."""
         return {
             name: self._texts(piece, name)
             for name in piece.columns
@@ -206,7 +206,7 @@ class TableFile:
         return data
 
     def _look(self) -> None:
-        """Read the headers of an existing file."""
+        """Read the header lines of an existing file, which list its row groups."""
         at = 0
         while at < self._size:
             length = int.from_bytes(self._bytes(at, _HEAD), "little")
@@ -221,7 +221,7 @@ class TableFile:
 
 
 def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None]:
-    """Encode values in few bytes. Return the description and the array to write."""
+    """Convert an array to a smaller integer type, or to its single value, to save disk space."""
     kind = values.dtype.newbyteorder("<").str
     values = np.ascontiguousarray(values)
     if values.dtype.kind == "f":

@@ -1,4 +1,4 @@
-"""Temporary tables with rows from outside the store, for the duration of one statement.
+"""Temporary SQL tables of rows from outside the store, which exist during one statement.
 
 Rows come block by block. DuckDB moves data beyond the memory limit to temporary files.
 """
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class GivenTable:
-    """Temporary table with rows from outside the store.
+    """Temporary SQL table of rows from outside the store: name, columns and rows.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ Given = GivenTable | tuple[str, Mapping[str, object]]
 
 
 def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
-    """Create temporary tables that only this connection sees."""
+    """Create temporary SQL tables that are visible only on one database connection."""
     for table in given:
         if isinstance(table, tuple):
             show_recorded(connection, table[0])
@@ -65,7 +65,7 @@ _BLOCK: Final = ":block"
 def _insert(
     connection: DuckDBPyConnection, name: str, block: Sequence[list[Any]], kinds: Sequence[str]
 ) -> None:
-    """Insert the rows of a block, as arrays if their types allow it."""
+    """Insert rows into a temporary table, as arrays if their types allow it."""
     arrays = _arrays_of(block, kinds)
     if arrays is None:
         values = ", ".join(f"unnest(CAST(? AS {kind}[]))" for kind in kinds)

@@ -1,4 +1,4 @@
-"""Traces of a store: identity, attributes, and the names of traces and frames."""
+"""Traces of a store (one recording seen from one ego): attributes, and search by name or frame."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TRACE_BITS: Final = 63 - BUCKET_BITS - FRAME_BITS
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Identity of a trace and of its graphs.
+    """Digests and ids that identify a trace: recording, ego vehicle, settings and road map.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Identity:
         road_map: RoadMap | None,
         part: tuple[float | None, float | None] = (None, None),
     ) -> Identity:
-        """Return the identity of a recording, or a part of it, for a config and a map."""
+        """Return the identity of a trace, from a recording (or a part of it), settings and road map."""
         settings = as_json(replace(config, ego="", egos=()).as_dict())
         return cls(
             trace_id=Identity.id_of(info.digest, info.ego),
@@ -90,18 +90,18 @@ class Identity:
 
     @property
     def shared(self) -> dict[str, str]:
-        """Digests of the data that traces can share: table → digest. Without a map, ``map`` is absent."""
+        """Digests of the recording, settings and map of a trace, by table. Traces can share these rows."""
         found = {"recording": self.digest, "config": self.settings_digest}
         return found | ({"map": self.map_digest} if self.map_digest else {})
 
     @property
     def numbers(self) -> dict[str, int]:
-        """Reference columns of a trace: ``recording_id``, ``config_id`` and ``map_id``."""
+        """Ids of the recording, settings and map of a trace: column name → id."""
         return {f"{table}_id": id_of(digest) for table, digest in self.shared.items()}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Identity:
-        """Restore an identity from plain values."""
+        """Restore the identity of a trace from a dict of plain values."""
         from sgstore.model.config import Payloads  # slow import, not needed to read a store
 
         payloads: Any = Payloads(**values["payloads"])
@@ -109,13 +109,13 @@ class Identity:
 
     @staticmethod
     def id_of(digest: str, ego: str) -> int:
-        """Return the trace id: 39 bits of a hash of recording digest and ego id. It is equal in every store."""
+        """Return a trace id that is equal in every store: 39 bits of a hash of recording digest and ego id."""
         both = f"{digest}\0{ego}".encode("utf-8", "surrogatepass")
         return int.from_bytes(hashlib.sha256(both).digest()[:8], "big") >> (64 - _TRACE_BITS)
 
     @staticmethod
     def among(known: Mapping[str, int], ref: str) -> tuple[int, str]:
-        """Find a trace like :func:`trace_named`, among known names and ids, sorted by name."""
+        """Find a trace by name, id or unique name prefix, among given names and ids. Return (id, name)."""
         if ref in known:
             return known[ref], ref
         found = [name for name, trace_id in known.items() if str(trace_id) == ref]
@@ -130,7 +130,7 @@ class Identity:
 
     @staticmethod
     def free_name(stem: str, taken: set[str]) -> str:
-        """Return an unused name: the stem, or the stem with a suffix ``~2``, ``~3`` and so on."""
+        """Return an unused trace name: the stem, or the stem with a suffix ``~2``, ``~3`` and so on."""
         name, count = stem, 1
         while name in taken:
             count += 1
@@ -139,13 +139,13 @@ class Identity:
 
 
 def id_of(digest: str) -> int:
-    """Return the first 60 bits of a hexadecimal digest: the id of a recording, map or config."""
+    """Return the id of a recording, map or config: the first 60 bits of its hexadecimal digest."""
     return int(digest[:15], 16)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class StoredTrace:
-    """Trace in a store.
+    """Trace in a store: its name, recording, settings and number of frames.
 
     Attributes
     ----------
@@ -210,13 +210,13 @@ class StoredTrace:
         return f"<StoredTrace {self.name!r}: {about}>"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all attributes of the trace as plain values."""
+        """Return all attributes of the trace as a dict of plain values."""
         return asdict(self) | {"path": place_named(self.path)}
 
 
 @dataclass(frozen=True, slots=True)
 class FrameRef:
-    """Reference to a frame in a store.
+    """Reference to a frame in a store: frame id, trace, number and time.
 
     Attributes
     ----------
@@ -255,7 +255,7 @@ ROOT: Final = "SGSTORE_ROOT"
 
 
 def uri_of(path: Path) -> str:
-    """Return the stored location of a recording: its URL or its absolute path."""
+    """Return the location text of a recording for the store: its URL or its absolute path."""
     return url_named(path) or plain(str(path.resolve()))
 
 
@@ -271,7 +271,7 @@ def place_below(store: Path, path: Path) -> str:
 def located(
     uri: str, place: str | None, size: int, store: Path | None, root: str | Path | None = None
 ) -> Path:
-    """Find a recording: below the root, below the store's folder, or at its original path.
+    """Return the current path of a stored recording: below a root, below the store's folder, or as before.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def located(
 def stored_traces(
     connection: DuckDBPyConnection, store: Path | None = None, root: str | Path | None = None
 ) -> tuple[StoredTrace, ...]:
-    """Return all traces of a store by name in natural order. :func:`located` finds the recordings."""
+    """Return all traces of a store, sorted by name in natural order (``run2`` before ``run10``)."""
     found = run(connection, _TRACES).dicts()
     texts = connection.execute("SELECT config_id, settings FROM config").fetchall()
     try:
@@ -334,7 +334,7 @@ def _object(text: str) -> dict[str, Any]:
 def stored_name(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
-    """Return the stored name of a trace, read with any settings. ``None`` means not stored.
+    """Return the stored name of a trace, whatever its settings. ``None`` means not stored.
 
     Raises
     ------
@@ -360,7 +360,7 @@ def stored_name(
 def already_stored(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
-    """Return the stored name of a trace with exactly this identity. ``None`` means not stored.
+    """Return the stored name of a trace with the same settings and map. ``None`` means not stored.
 
     Raises
     ------
@@ -398,7 +398,7 @@ _SECONDS: Final = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*s?\s*")
 
 
 def trace_named(connection: DuckDBPyConnection, ref: str) -> tuple[int, str]:
-    """Return id and name of a trace from its name, its id, or a unique prefix of its name.
+    """Find a trace by its name, its id, or a unique prefix of its name. Return (id, name).
 
     Raises
     ------
@@ -480,7 +480,7 @@ def _frame(
 
 
 def _extent(connection: DuckDBPyConnection, trace_id: int) -> tuple[int, int, int, int]:
-    """Return first number, last number, start time and latest time of a trace."""
+    """Return first frame number, last frame number, start time and latest time of a trace."""
     row = connection.execute(
         """
         SELECT min(f.seq), max(f.seq), any_value(t.start_ns), max(f.time_ns)

@@ -1,4 +1,4 @@
-"""Verification of a store: rows against checksums, masks, and references between rows.
+"""Verification of a store: row checksums, bit masks of frames, and references between rows.
 
 Reading a table also verifies DuckDB's block checksums.
 """
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Fault in a store.
+    """Fault found by the verification of a store, with the trace and a description.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Fault:
 
 @dataclass(slots=True)
 class Verification:
-    """Result of the verification of a store.
+    """Result of the verification of a store: faults, and numbers of checked traces and rows.
 
     Attributes
     ----------
@@ -267,7 +267,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
 
 
 def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
-    """Verify a store file, even one that is too altered to open.
+    """Verify the content of a store file. The schema may be too altered for normal opening.
 
     If the schema was altered, only that fault is returned, and the tables are not read.
 
@@ -294,7 +294,7 @@ def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
 
 
 def verify_store(access: Access, *, recordings: bool = False) -> Verification:
-    """Verify a store; see :meth:`StoreFile.verify`."""
+    """Verify the content of an open store, and return the faults."""
     from sgstore.mcap import digest_of
 
     with access.reading() as connection:
@@ -307,7 +307,7 @@ def verify_store(access: Access, *, recordings: bool = False) -> Verification:
 
 
 def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
-    """Verify an open store.
+    """Verify the content of an open store, and return the faults.
 
     An unreadable table becomes a fault.
 
@@ -339,7 +339,7 @@ def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
 
 
 def damage(connection: DuckDBPyConnection, path: Path) -> str:
-    """Return the first fault of a store, or an empty string."""
+    """Return the first fault of a store as text; empty without a fault."""
     try:
         found = verify(connection, path)
     except SgstoreError as error:
@@ -348,7 +348,7 @@ def damage(connection: DuckDBPyConnection, path: Path) -> str:
 
 
 def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
-    """Yield faults: unreadable settings, duplicate names or ids, and a wrong table of mask bits."""
+    """Yield faults of a store: unreadable settings, duplicate names or ids, and a wrong table of mask bits."""
     for number, text in connection.execute("SELECT config_id, settings FROM config").fetchall():
         try:
             from_dict(json.loads(text))
@@ -373,7 +373,7 @@ def verify_recordings(
     store: Path | None = None,
     root: str | Path | None = None,
 ) -> Verification:
-    """Compare the recordings of all traces with their stored hashes."""
+    """Compare the recording files of all traces with the stored hashes. Return the faults."""
     found = Verification()
     known: dict[Path, str | SgstoreError] = {}
     traces = stored_traces(connection, store, root)
@@ -397,7 +397,7 @@ _Published = dict[tuple[str, int], dict[str, Checksum]]
 
 
 def _published(connection: DuckDBPyConnection) -> _Published:
-    """Return the manifest: (owner kind such as "trace" or "map", id) → table → checksum."""
+    """Return the stored checksums: (owner kind such as "trace" or "map", id) → table → checksum."""
     sql = 'SELECT owner, id, "table", rows, checksum FROM manifest'
     published: _Published = {}
     for owner, number, table, rows, value in connection.execute(sql).fetchall():
@@ -408,7 +408,7 @@ def _published(connection: DuckDBPyConnection) -> _Published:
 def _rows(
     connection: DuckDBPyConnection, trace: StoredTrace, published: _Published, found: Verification
 ) -> Iterator[Fault]:
-    """Yield faults: tables of a trace whose rows differ from the published rows."""
+    """Yield faults of a trace: tables whose rows differ from the published rows."""
     manifest = published.get(("trace", trace.trace_id), {})
     if not manifest:
         yield Fault(trace.name, "rows", "nothing is noted of what was published of it")
@@ -435,7 +435,7 @@ _NAMED: Final = {"recording": "uri", "config": "config_id", "map": "name"}
 def _shared(
     connection: DuckDBPyConnection, published: _Published, found: Verification
 ) -> Iterator[Fault]:
-    """Yield faults: recordings, settings and road maps that differ from the published ones."""
+    """Yield faults of a store: recordings, settings and road maps that differ from the published ones."""
     database = _database(connection)
     for owner, tables in SHARED.items():
         sql = f"SELECT {owner}_id, {_NAMED[owner]} FROM {owner}"

@@ -1,4 +1,4 @@
-"""Writer of a trace: builds it outside the store, and publishes it in one transaction.
+"""Writer of a trace: builds the graphs outside the store, and prepares them for one transaction.
 
 Only the publication changes the store: it adds a complete trace, or nothing.
 """
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class OnMap:
-    """Data shared by the segments on one road map: frame classes, and the rows of the map.
+    """Data that the traces on one road map share: frame classes, and the table rows of the map.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class OnMap:
         self.classes = IngestedClasses(road_map)
 
     def insert_into(self, staging: Staging, map_id: int) -> None:
-        """Insert the map tables as the first rows of a staging."""
+        """Insert the table rows of the road map as the first rows of a new trace."""
         if self.road_map is None:
             return
         if (rows := _ROWS.get(self.road_map)) is not None:
@@ -70,7 +70,7 @@ _ROWS: Final[WeakKeyDictionary[RoadMap, StagedRows]] = WeakKeyDictionary()
 
 
 class Segment:
-    """Graphs of one trace before publication.
+    """Writer of the graphs of one new trace, in files outside the store until publication.
 
     Parameters
     ----------
@@ -134,11 +134,11 @@ class Segment:
         self.close()
 
     def close(self) -> None:
-        """Discard the segment. Published data stay in the store."""
+        """Discard the unpublished graphs of the trace. Published data stay in the store."""
         self._staging.close()
 
     def as_kept(self, frames: FrameBlock) -> FrameBlock:
-        """Return the next frames with values rounded as in the store.
+        """Return a block of frames with values rounded to the precision of the store.
 
         Positions are float32 relative to an origin; other values are float32. The generator uses these rounded
         values, so the store can reproduce its graphs exactly.
@@ -147,7 +147,7 @@ class Segment:
         return quantize(frames, self._origin or Origin(0.0, 0.0, 0.0))
 
     def append(self, graph: GraphBlock) -> None:
-        """Add the next frames of the trace.
+        """Add the graphs of the next frames of the trace.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class Segment:
         self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
 
     def name_frames(self, seq: Ints, graphs: list[str], places: Ints, images: Ints) -> None:
-        """Store the graph names of an imported file for its frames: table ``imported``.
+        """Store the graph names from an imported file for the frames of the trace.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class Segment:
     def keep_attributes(
         self, seq: Ints, own: Sequence[tuple[int, int, int, int, str, str]]
     ) -> None:
-        """Add user-defined attributes: table ``attribute``.
+        """Add user-defined attributes of nodes and edges to the trace.
 
         Parameters
         ----------
@@ -226,7 +226,7 @@ class Segment:
         more: Mapping[str, Any] | None = None,
         parked: Sequence[Codes] = (),
     ) -> Sealed:
-        """Complete the files of the trace. Any process can then publish them, but not extend them.
+        """Complete the files of the trace. Any process can publish the result, but not extend it.
 
         Parameters
         ----------
@@ -287,7 +287,7 @@ class Segment:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the data that the settings have excluded so far, for the report. An import excludes none."""
+        """Return counts of the object states that the settings have excluded so far, for the report."""
         counts, settings = self._left_out, json.loads(self._identity.settings)
         if not counts.states:
             return {}
@@ -316,7 +316,7 @@ class Segment:
         self._staging.write("payload")
 
     def _bucket_columns(self, time_ns: Ints, period_ns: int) -> Columns:
-        """Return table ``bucket``: masks of each bucket's frames, and of the frames without a gap before."""
+        """Return rows for each 64 frames: bit masks of the frames, and of those without a time gap before."""
         seq = np.arange(len(time_ns))
         one = np.left_shift(1, seq % BUCKET_FRAMES)
         step = np.diff(time_ns, prepend=time_ns[0])
@@ -331,7 +331,7 @@ class Segment:
         return columns if number is None else columns | {"map_id": np.full(len(starts), number)}
 
     def _insert_about(self) -> None:
-        """Insert the data known before the first frame: recording, settings, channels, context and map."""
+        """Insert the table rows known before the first frame: recording, settings, channels and map."""
         insert, info, identity = self._staging.insert, self._info, self._identity
         self._on_map.insert_into(self._staging, identity.numbers.get("map_id", 0))
         recording = {
@@ -408,13 +408,13 @@ class Segment:
 
 
 def _period_ns(time_ns: Ints) -> int:
-    """Return the lower median time between frames; ns. A single frame gives 0."""
+    """Return the median time between frames (the lower of two medians); ns. One frame gives 0."""
     steps = np.sort(np.diff(time_ns))
     return int(steps[(len(steps) - 1) // 2]) if len(steps) else 0
 
 
 def _map_tables(road_map: RoadMap) -> dict[str, Columns]:
-    """Return the tables of a road map, which are equal for all its traces."""
+    """Return the table rows of a road map: table → columns. All traces on the map share these rows."""
     nodes = road_map.nodes
     count = len(nodes)
     is_lane = np.array([bool(kind) for kind in nodes.lane_type], np.bool_)
