@@ -8,6 +8,10 @@ BIN    := $(VENV)/bin
 FOLDERS := $(subst $() ,:,$(addprefix $(CURDIR)/,. tests/core tests/edges tests/worlds tests/reference tools))
 TOOL   := PYTHONPATH=$(FOLDERS) $(BIN)/python
 
+# Keep compiled files, also where the machine's setting forbids it: tests start a thousand processes, and each would
+# compile all packages again.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster
 
 help:
