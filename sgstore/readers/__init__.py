@@ -1,4 +1,4 @@
-"""Readers of recordings: one package per flavour, and their common base."""
+"""Readers of driving recordings: one package per recording type (CARLA, OSI, …), and base classes."""
 
 from sgstore.readers._base import FramesTrace, MessageTrace, TraceMessage, channels_of
 from sgstore.readers._blocks import NAN, POSE, EntityTable, FrameRows, MessageDecoder

@@ -1,4 +1,4 @@
-"""Base of all readers: the first reading of a recording, and the open trace.
+"""Base classes of all readers of recordings: the first pass over the messages, and the open recording.
 
 A flavour (a format of recordings) has three classes. Its :class:`Survey` reads a recording once and collects
 the facts that are needed before the first frame. Its :class:`~sgstore.readers._blocks.MessageDecoder` converts
@@ -50,7 +50,7 @@ Ref = tuple[int, int, int, int, int]
 
 
 def ref_of(run: Messages, row: int) -> Ref:
-    """Return the reference to one message of a run."""
+    """Return the file position of one message: channel id, log time, chunk offset, offset and length."""
     return (
         int(run.channel[row]),
         int(run.log_time_ns[row]),
@@ -61,7 +61,7 @@ def ref_of(run: Messages, row: int) -> Ref:
 
 
 def refs_of(refs: Iterable[Ref], channels: tuple[Channel, ...]) -> MessageRefs:
-    """Return message references as columns, in file order, without duplicates."""
+    """Return file positions of messages as columns, in file order, without duplicates."""
     index = {channel.id: i for i, channel in enumerate(channels)}
     ordered = sorted(set(refs), key=lambda ref: (ref[2] if ref[2] >= 0 else ref[3], ref[3]))
     columns = np.array(ordered, np.int64).reshape(-1, 5).T
@@ -70,7 +70,7 @@ def refs_of(refs: Iterable[Ref], channels: tuple[Channel, ...]) -> MessageRefs:
 
 
 def channels_of(recording: Recording, role: Callable[[int], str]) -> tuple[Channel, ...]:
-    """Return the channels of a recording, sorted by id. ``role`` returns the role for a channel id."""
+    """Return the channels of a recording with their roles, sorted by channel id."""
     counts = recording.counts or {}
     channels: list[Channel] = []
     for number, record in sorted(recording.channels.items()):
@@ -92,7 +92,7 @@ def channels_of(recording: Recording, role: Callable[[int], str]) -> tuple[Chann
 def frame_refs(
     channels: tuple[Channel, ...], window: tuple[int, int]
 ) -> Callable[[Messages], MessageRefs]:
-    """Return a function that selects the references of a run's messages that belong to frames.
+    """Return a function that selects the file positions of the messages that belong to frames.
 
     Parameters
     ----------
@@ -123,21 +123,21 @@ BEGINNING: Final = 1_000_000_000
 
 
 def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int = 1) -> int:
-    """Increase a counter, and remember its first message. Return the previous count."""
+    """Increase the counter of a key, and remember its first message. Return the previous count."""
     before, first = told.get(key, (0, ref))
     told[key] = before + times, first
     return before
 
 
 def listing(things: Sequence[str]) -> str:
-    """Return a list of possible egos for an error message."""
+    """Return a text that lists the possible egos of a recording, for an error message."""
     more = f" and {len(things) - LISTED} more" if len(things) > LISTED else ""
     return f"there are: {', '.join(things[:LISTED]) or 'none'}{more}"
 
 
 @dataclass(slots=True)
 class Lead:
-    """Channel whose messages may be frames.
+    """Channel whose messages may be the frames of a trace, with counts of its content.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ AnyLead = TypeVar("AnyLead", bound=Lead)
 
 
 class Survey(Generic[AnyLead]):
-    """First reading of a recording, which collects the facts needed for its frames.
+    """First pass over the messages of a recording, which collects the facts that its frames need.
 
     Unreadable messages are reported later, during the reading of the frames.
 
@@ -204,14 +204,14 @@ class Survey(Generic[AnyLead]):
         self._window = recording.window
 
     def meet(self, channel: int) -> bool:
-        """True if a channel contains frames or facts that stay valid for later frames.
+        """Return True if a channel contains frames, or facts (such as actor lists) for later frames.
 
         It is called once per channel, before its first message is examined.
         """
         raise NotImplementedError
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """True if the messages of a channel must be examined.
+        """Return True if the first pass must examine the messages of a channel.
 
         ``met`` is the result of :meth:`meet`. The method is called for each run of messages. A result of
         ``False`` is final.
@@ -220,19 +220,19 @@ class Survey(Generic[AnyLead]):
         return met
 
     def keeps(self, channel: int) -> bool:
-        """True if the reading of the frames needs the messages of a channel again."""
+        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
         raise NotImplementedError
 
     def look(self, run: Messages, row: int) -> None:
-        """Examine one message."""
+        """Collect facts from one message in the first pass over a recording."""
         raise NotImplementedError
 
     def rank(self, lead: AnyLead) -> tuple[int, ...]:
-        """Return the sort key of a possible leading channel. The greatest key wins."""
+        """Return the sort key of a channel for the choice of the frame channel. The greatest key wins."""
         return lead.weight, lead.frames
 
     def read(self) -> Self:
-        """Read the whole recording, and return the survey.
+        """Read all messages of the recording once, collect the facts, and return this object.
 
         Raises
         ------
@@ -261,7 +261,7 @@ class Survey(Generic[AnyLead]):
     def _look_through(
         self, run: Messages, watched: NDArray[np.bool_], firsts: list[tuple[int, int]]
     ) -> None:
-        """Examine the watched messages of a run. Each new channel is classified at its first message."""
+        """Collect facts from a group of messages. Each new channel is classified at its first message."""
         start = 0
         for stop, channel in [*firsts, (len(run), -1)]:
             for row in np.flatnonzero(watched[run.channel[start:stop]]).tolist():
@@ -272,13 +272,13 @@ class Survey(Generic[AnyLead]):
                 watched[channel] = self.watches(channel, met=met)
 
     def see_stamp(self, run: Messages, row: int, stamp_ns: int | None) -> None:
-        """Record the time in a message of a possible leading channel, if its log time is in the window."""
+        """Record the time stamp of a message that may be a frame, if it is inside the time window."""
         log_time, (start, end) = int(run.log_time_ns[row]), self._window
         if start <= log_time <= end:
             self.leads[int(run.channel[row])].stamps.see(log_time, stamp_ns)
 
     def count(self, run: Messages, row: int, weight: int) -> None:
-        """Count a frame of a possible leading channel, if its log time is in the window."""
+        """Count a message as a frame of its channel, if it is inside the time window."""
         log_time, (start, end) = int(run.log_time_ns[row]), self._window
         if start <= log_time <= end:
             lead = self.leads[int(run.channel[row])]
@@ -287,7 +287,7 @@ class Survey(Generic[AnyLead]):
             lead.first_ns = min(lead.first_ns, log_time)
 
     def first_lead(self) -> int:
-        """Return the leading channel, which contains the frames; -1 if all channels lack frames."""
+        """Return the id of the channel whose messages become the frames; -1 without such a channel."""
         ranked = [
             ([-number for number in self.rank(lead)], self.topic(channel), channel)
             for channel, lead in self.leads.items()
@@ -296,7 +296,7 @@ class Survey(Generic[AnyLead]):
         return min(ranked)[-1] if ranked else -1
 
     def alike(self, channel: int) -> list[int]:
-        """Return the channels with the same topic and definition, sorted by id. They count as one channel."""
+        """Return the ids of all channels with the same topic and schema as a channel. They count as one."""
         channels = self.recording.channels
         return [number for number in sorted(channels) if self._key(number) == self._key(channel)]
 
@@ -307,17 +307,17 @@ class Survey(Generic[AnyLead]):
         return record.topic, record.message_encoding, *named
 
     def shared_stamps(self, channel: int, stamps: Stamps) -> Stamps:
-        """Return the stamps of a channel with the same topic and definition, else ``stamps``."""
+        """Return the time stamps of a channel with the same topic and schema, else the given time stamps."""
         leads = self.leads
         return next((leads[one].stamps for one in self.alike(channel) if one in leads), stamps)
 
     def no_frames(self) -> str:
-        """Return the reason for a recording without a leading channel."""
+        """Return the text that explains why a recording has no frames."""
         lost = self.lost.losses()
         return lost[0].reason if lost else "no list of objects can be read"
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego for a name. ``None`` means that a new reading may find it.
+        """Return the id of the ego vehicle for a name. ``None`` means that a new pass may find it.
 
         Raises
         ------
@@ -329,7 +329,7 @@ class Survey(Generic[AnyLead]):
         return asked.find_ego()
 
     def find_ego(self) -> str:
-        """Return the id of the ego; empty without an ego.
+        """Return the id of the ego vehicle; empty without an ego.
 
         Raises
         ------
@@ -339,21 +339,21 @@ class Survey(Generic[AnyLead]):
         raise NotImplementedError
 
     def role(self, channel: int) -> str:
-        """Return the role of a channel."""
+        """Return the role of a channel: ``ground_truth`` (frames) or ``payload`` (sensor data)."""
         return "ground_truth" if channel in self.alike(self.leading) else "payload"
 
     def context(self) -> Iterable[Ref]:
-        """Return the messages that later messages depend on."""
+        """Return the file positions of messages that are needed to read later messages."""
         return self.once(self.leads[self.leading].first_ns)
 
     def tell(self, report: TraceReport) -> None:
-        """Add the findings of the first reading to a report."""
+        """Add the warnings and lost messages of the first pass to a report."""
         report.warnings += [*self.notes, *self.about_ego]
         report.about_ego += self.about_ego
         report.losses += self.lost.losses()
 
     def once(self, first_ns: int) -> list[Ref]:
-        """Return the messages near the first frame whose channels have no other message.
+        """Return the messages near the first frame that are the only message of their channel.
 
         Such a message, for example a camera calibration, is valid for the whole recording.
         """
@@ -361,7 +361,7 @@ class Survey(Generic[AnyLead]):
         return [ref for count, ref in self._others.values() if count == 1 and ref[1] <= latest]
 
     def topic(self, channel: int) -> str:
-        """Return the topic of a channel."""
+        """Return the topic name of a channel."""
         return self.recording.channels[channel].topic
 
 
@@ -369,7 +369,7 @@ class Survey(Generic[AnyLead]):
 
 
 class MessageTrace:
-    """Open recording, a context manager that closes its file.
+    """Open recording, which yields blocks of frames. It is a context manager that closes the file.
 
     Parameters
     ----------
@@ -432,11 +432,11 @@ class MessageTrace:
         self.close()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file of the recording."""
         self.recording.close()
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego for a name. ``None`` means that the recording must be opened again.
+        """Return the id of the ego vehicle for a name. ``None``: the recording must be opened again.
 
         Raises
         ------
@@ -447,11 +447,11 @@ class MessageTrace:
         return None
 
     def decoder(self, report: TraceReport) -> MessageDecoder[Any]:
-        """Return a new decoder, and add the known findings to the report of its reading."""
+        """Return a new decoder of messages, and add the known warnings to its report."""
         raise NotImplementedError
 
     def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
-        """Yield the frames of the trace in blocks of ``size`` frames. Block i begins at frame ``i * size``.
+        """Yield the frames of the recording in blocks of ``size`` frames.
 
         Raises
         ------
@@ -471,7 +471,7 @@ class MessageTrace:
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
 
     def _first_steps(self) -> list[int]:
-        """Return the time differences between the first frames; ns."""
+        """Return the time differences between the first frames of the recording; ns."""
         decoder = self.decoder(TraceReport())
         times: list[int] = []
         for run in self.recording.walk(TraceReport(), rank=self._rank):
@@ -488,7 +488,7 @@ AnySurvey = TypeVar("AnySurvey", bound=Survey[Any])
 
 
 class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
-    """Open recording whose first reading is complete.
+    """Open recording whose first pass (collection of facts) is complete.
 
     Parameters
     ----------
@@ -534,16 +534,16 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """True if a channel of the recording contains frames of this flavour."""
+        """Return True if the recording has a channel that this reader can read as frames."""
         return any(cls.has_frames(recording, channel) for channel in recording.channels)
 
     @staticmethod
     def has_frames(recording: Recording, channel: int) -> bool:
-        """True if a channel contains frames of this flavour, by its schema."""
+        """Return True if the schema of a channel shows messages that this reader can read as frames."""
         raise NotImplementedError
 
     def decoder(self, report: TraceReport) -> MessageDecoder[Any]:
-        """Return a new decoder, and add the findings of the first reading to the report."""
+        """Return a new decoder of messages, and add the warnings of the first pass to its report."""
         self._survey.tell(report)
         return self._decoder(report)
 
@@ -555,12 +555,12 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
         return stamps.steps[:FIRST_STEPS] or super()._first_steps()
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego for a name, from the results of the first reading."""
+        """Return the id of the ego vehicle for a name, from the results of the first pass."""
         return self._survey.ego_named(name)
 
 
 class SurveyedDecoder(MessageDecoder[Raw], Generic[Raw, AnySurvey]):
-    """Converter of messages into frames, after a first reading.
+    """Decoder of messages into frames, which uses the facts of a first pass over the recording.
 
     Parameters
     ----------
@@ -577,7 +577,7 @@ class SurveyedDecoder(MessageDecoder[Raw], Generic[Raw, AnySurvey]):
         super().__init__(self._leading, survey.recording.window, report)
 
     def settle(self) -> None:
-        """Report the losses, after all frames are read."""
+        """Add the lost messages to the report, after all frames are read."""
         self._untimed = self._stamps.untimed
         super().settle()
 
@@ -592,7 +592,7 @@ _NO_EGO: Final = "no frame has an ego"
 
 
 class TraceMessage(NamedTuple):
-    """Message of a recording.
+    """Message of a recording: channel, log time and raw bytes.
 
     Attributes
     ----------
@@ -609,7 +609,7 @@ class TraceMessage(NamedTuple):
 
 
 class FramesTrace(MessageTrace):
-    """Base class of a reader whose messages are complete frames.
+    """Base class of a reader for recordings in which each message is a complete frame.
 
     A subclass defines ``name``, :meth:`role` (the channels to read) and :meth:`frame` (the conversion of a
     message). It is then a reader for an entry point of the group ``sgstore.readers``.
@@ -661,12 +661,12 @@ class FramesTrace(MessageTrace):
         )
 
     def ego_named(self, name: str) -> str:
-        """Return the name unchanged, because frames contain only ids."""
+        """Return the name of the ego unchanged, because frames contain only ids."""
         return name
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """Return the role of a channel.
+        """Return the role of a channel, such as ``ground_truth`` (frames), ``map`` or ``payload``.
 
         Parameters
         ----------
@@ -682,7 +682,7 @@ class FramesTrace(MessageTrace):
         raise NotImplementedError
 
     def frame(self, message: TraceMessage) -> Frame | None:
-        """Convert a message into a frame.
+        """Convert a message into a frame. ``None`` means that the message is not a frame.
 
         Parameters
         ----------
@@ -701,28 +701,28 @@ class FramesTrace(MessageTrace):
         raise NotImplementedError
 
     def start(self) -> None:
-        """Reset the state before the messages are read again from the first one.
+        """Reset the reader, before the messages are read again from the first one.
 
         Only readers that combine several messages need it.
         """
 
     def map_text(self, message: TraceMessage) -> str:
-        """Return the OpenDRIVE text in a message of a channel with the role ``map``."""
+        """Return the OpenDRIVE text (road map) in a message of a channel with the role ``map``."""
         return message.data.decode("utf-8")
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """True if a channel of the recording contains frames of this flavour."""
+        """Return True if the recording has a channel that this reader can read as frames."""
         return any(channel.role == "ground_truth" for channel in _channels(cls, recording))
 
     def decoder(self, report: TraceReport) -> _FramesDecoder:
-        """Return a new decoder."""
+        """Return a new decoder of messages into frames."""
         self.start()
         report.losses += self._map_losses.losses()
         return _FramesDecoder(self, self._channels, self._ego, self.recording.window, report)
 
     def _beginning(self) -> tuple[str, list[Ref], str]:
-        """Return the ego of the first frame, the context messages, and the road map.
+        """Return the ego of the first frame, the messages needed by later messages, and the road map.
 
         The recording is read only as far as necessary.
         """
@@ -753,7 +753,7 @@ class FramesTrace(MessageTrace):
 
 
 class _FramesDecoder(MessageDecoder[FrameRows]):
-    """Decoder of messages that are complete frames.
+    """Decoder of messages that are complete frames, and check of the frames.
 
     Attributes
     ----------
@@ -781,7 +781,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         self._begun = self._has_ego = False
 
     def decode(self, run: Messages, row: int) -> FrameRows | None:
-        """Return the frame of a message. An unreadable or contradictory frame is a loss."""
+        """Return the frame of a message. A frame that is unreadable or contradictory is counted as lost."""
         try:
             frame = self._trace.frame(_message(self._named, run, row))
             if frame is None:
@@ -807,7 +807,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         return frames
 
     def settle(self) -> None:
-        """Report unreadable messages, and a missing ego."""
+        """Add unreadable messages and a missing ego to the report, after all frames are read."""
         super().settle()
         if self._has_ego or not self._report.frames:
             return
@@ -816,7 +816,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         self._warn_of_egos(_NO_EGO)
 
     def _check(self, frame: object) -> None:
-        """Raise if a frame contradicts earlier ones. The state of the decoder does not change."""
+        """Raise an error if a frame contradicts earlier frames of the recording."""
         if not isinstance(frame, Frame):
             raise TypeError(f"{type(frame).__name__} is no Frame")
         if abs(frame.time_ns) >= _LATEST:
@@ -827,7 +827,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         return self._known[ident][1].static if ident in self._known else None
 
     def _stand(self, entity: Entity) -> None:
-        """Add a static entity.
+        """Add a static object of a frame to the table of objects.
 
         Scenery is valid in all frames of its block. A static entity after the first frame therefore gets a row
         in each frame instead. Otherwise, the result would depend on the start of a block.
@@ -875,7 +875,7 @@ def _meaning(entity: Entity) -> TypeMeaning:
 
 
 def _driven(moving: dict[int, Entity]) -> dict[int, tuple[float, ...]]:
-    """Return the control inputs by node id, for entities with at least one known input."""
+    """Return the control inputs (steering, throttle, brake, …) of objects with a known input, by node id."""
     told = ((node, entity.numbers[len(POSE) :]) for node, entity in moving.items())
     return {node: inputs for node, inputs in told if not np.isnan(inputs).all()}
 

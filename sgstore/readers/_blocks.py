@@ -1,4 +1,4 @@
-"""Construction of frame blocks from decoded messages, with entities and derived numbers.
+"""Construction of blocks of frames from decoded messages: node ids, object states and derived values.
 
 The :class:`MessageDecoder` of a flavour converts messages into :class:`FrameRows` and adds entities to an
 :class:`EntityTable`. :func:`assemble` makes blocks of them and reads ahead, for two reasons. A missing velocity
@@ -76,7 +76,7 @@ NO_INPUTS: Final = (NAN,) * len(INPUTS)
 
 @dataclass(slots=True)
 class FrameRows:
-    """Decoded frame.
+    """Decoded frame: time, ego, and one row of pose and motion per object.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class FrameRows:
         return len(self.node)
 
     def with_heads(self, heads: tuple[Ints, Floats, Ints]) -> FrameRows:
-        """Return the frame with additional rows of traffic lights: node ids, columns :data:`POSE`, states."""
+        """Return the frame with additional rows of traffic lights: node ids, poses and light states."""
         node, values, light_state = heads
         if not len(node):
             return self
@@ -131,7 +131,7 @@ class FrameRows:
 
 
 class EntityRow(NamedTuple):
-    """Entity as one row of the entity table."""
+    """Object of a trace (such as a vehicle or sign) as one row of the object table."""
 
     ident: str
     kind: int
@@ -146,7 +146,7 @@ class EntityRow(NamedTuple):
 
 @dataclass(slots=True)
 class EntityTable:
-    """Entities of a trace in order of appearance, indexed by node id; also its events.
+    """Objects of a trace (such as vehicles and signs) in order of appearance, and the events of the trace.
 
     Attributes
     ----------
@@ -196,7 +196,7 @@ class EntityTable:
         pose: tuple[float, ...] | None = None,
         trailer: str = "",
     ) -> int:
-        """Add an entity and return its node id.
+        """Add an object (such as a vehicle) to the table, and return its node id.
 
         Parameters
         ----------
@@ -235,11 +235,11 @@ class EntityTable:
         return node
 
     def entered(self, number: int) -> EntityRow:
-        """Return the entity with the given number."""
+        """Return the table row of the object with the given number."""
         return self._rows[number]
 
     def enter_again(self, row: EntityRow, before: int) -> int:
-        """Add another entity with a known id, and return its node id.
+        """Add a new object that reuses the id of an earlier object, and return its node id.
 
         Parameters
         ----------
@@ -251,30 +251,30 @@ class EntityTable:
         return before + len(self._returned) - 1
 
     def turn(self, number: int, lifetime: int, seq: int) -> None:
-        """Record which entity an id refers to from a frame on, by its lifetime number."""
+        """Record that an id refers to a certain object (lifetime number) from a frame on."""
         self._turns.setdefault(self._rows[number].ident, []).append((seq, lifetime))
 
     @property
     def returned(self) -> int:
-        """Number of entities with a reused id."""
+        """Number of objects that reuse the id of an earlier object."""
         return len(self._returned)
 
     def nodes_of(self, numbers: Ints) -> Ints:
-        """Return the node ids for entity numbers. Negative numbers stay unchanged."""
+        """Convert object numbers to node ids. Negative numbers stay unchanged."""
         if not self._returned:
             return numbers
         places = np.array([place for place, _ in self._returned], np.int64)
         return numbers + np.searchsorted(places, numbers, side="right")
 
     def happen(self, event: Event) -> None:
-        """Add an event."""
+        """Add an event (such as a collision) to the trace."""
         self.happened += 1
         self._events.append(event)
         if self.happened <= MOST_EVENTS:
             self.report.events.append(event)
 
     def take_events(self) -> tuple[Event, ...]:
-        """Remove and return the events since the last call."""
+        """Remove and return the events added since the last call."""
         events, self._events = self._events, []
         if self._turns:
             events = [
@@ -288,13 +288,13 @@ class EntityTable:
         return tuple(events)
 
     def _lifetime(self, ident: str, seq: int) -> int:
-        """Return the lifetime number of the entity that an id refers to in a frame."""
+        """Return the lifetime number (1, 2, …) of the object that uses an id in a frame."""
         turns = self._turns.get(ident, ())
         at = bisect_right(turns, seq, key=itemgetter(0))
         return turns[at - 1][1] if at else 1
 
     def settle(self) -> None:
-        """Add the warnings about implausible numbers to the report, at the end of the reading."""
+        """Add warnings about implausible values to the report, after all frames are read."""
         warn = self.report.warnings.append
         if self.absurd:
             warn(f"{self.absurd} numbers of {FAR:g} and more are taken as missing")
@@ -308,7 +308,7 @@ class EntityTable:
             warn(f"of {self.happened} events the report lists the first {MOST_EVENTS}")
 
     def plausible(self, values: Floats, nodes: Sequence[int] | Ints) -> Floats:
-        """Replace implausible sizes and speeds of entities by NaN, and count them.
+        """Replace implausible sizes and speeds of objects by NaN, and count them.
 
         Parameters
         ----------
@@ -323,12 +323,12 @@ class EntityTable:
         return values
 
     def count_unknown(self, type_name: str) -> None:
-        """Count an entity with an unmapped type name."""
+        """Count an object whose type name has no known kind."""
         unknown = self.report.unknown_types
         unknown[type_name] = unknown.get(type_name, 0) + 1
 
     def take(self, upto: int, returned: int) -> tuple[Entities, States]:
-        """Return the entities since the last call, and the poses of the static ones.
+        """Return the objects added since the last call, and the poses of the static ones.
 
         Parameters
         ----------
@@ -364,7 +364,7 @@ class EntityTable:
 
 
 class LossTally:
-    """Counter of losses by reason.
+    """Counter of lost messages, by the reason of the loss.
 
     A repeated reason adds to the existing loss. After :attr:`MOST` reasons, further ones are counted together.
     """
@@ -375,7 +375,7 @@ class LossTally:
         self._found: dict[str, Loss] = {}
 
     def add(self, reason: str, log_time_ns: int, size: int = 0) -> None:
-        """Add a loss of ``size`` bytes."""
+        """Count a lost message of ``size`` bytes under a reason."""
         if reason not in self._found and len(self._found) >= self.MOST:
             reason = "and more of the same kinds"
         last = self._found.get(reason) or Loss(reason, 0, 0, log_time_ns, log_time_ns)
@@ -388,12 +388,12 @@ class LossTally:
         )
 
     def losses(self) -> list[Loss]:
-        """Return one loss per reason, with its number of messages."""
+        """Return one record per reason, with the number of lost messages."""
         return list(self._found.values())
 
 
 class MessageDecoder(Generic[Raw]):
-    """Converter of messages into frames, in two steps, to process the numbers of many frames at once.
+    """Decoder of messages into frames, in two steps, to convert the values of many frames at once.
 
     Parameters
     ----------
@@ -427,11 +427,11 @@ class MessageDecoder(Generic[Raw]):
         self._untimed = 0
 
     def decode(self, run: Messages, row: int) -> Raw | None:
-        """Return the frame of a message. ``None`` means that the message is not a frame."""
+        """Return the raw frame of a message. ``None`` means that the message is not a frame."""
         raise NotImplementedError
 
     def complete(self, frames: list[Raw]) -> list[FrameRows]:
-        """Return the frames with all their numbers.
+        """Convert raw frames to frames with all numbers (poses, speeds, sizes).
 
         It is called for a frame only after the next frame or the end of the recording, because other messages
         about the same instant may follow the leading message.
@@ -439,7 +439,7 @@ class MessageDecoder(Generic[Raw]):
         raise NotImplementedError
 
     def settle(self) -> None:
-        """Report the losses, after all frames are read."""
+        """Add the lost messages to the report, after all frames are read."""
         losses = self._report.losses
         losses += self._unreadable.losses()
         for loss in self._unusable.losses():  # These losses are states, not messages.
@@ -450,7 +450,7 @@ class MessageDecoder(Generic[Raw]):
             self._report.warnings.append(words)
 
     def is_inside(self, log_time_ns: int) -> bool:
-        """True if a message with this log time can be a frame. Clips also contain earlier messages."""
+        """Return True if a message with this log time can be a frame. Clips also contain earlier messages."""
         return self._window[0] <= log_time_ns <= self._window[1]
 
     def lose(self, reason: str, run: Messages, row: int) -> None:
@@ -458,7 +458,7 @@ class MessageDecoder(Generic[Raw]):
         self._unreadable.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
 
     def _warn_of_egos(self, words: str) -> None:
-        """Add a warning about a missing ego. It is dropped if the user names the egos."""
+        """Add a warning about a missing ego to the report. It is removed if the user names the egos."""
         self._report.warnings.append(words)
         self._report.about_ego.append(words)
 
@@ -470,7 +470,7 @@ def assemble(
     refs: Callable[[Messages], MessageRefs],
     first_steps: Iterable[int] = (),
 ) -> Iterator[FrameBlock]:
-    """Yield blocks of frames from the messages of a recording.
+    """Decode the messages of a recording, and yield blocks of consecutive frames.
 
     Parameters
     ----------
@@ -542,7 +542,7 @@ def assemble(
 
 @dataclass(slots=True)
 class _Between:
-    """Buffer of message references between two frames. Of very many, it stores only the first and last.
+    """Buffer of message positions between two frames. Of very many, only the first and last are kept.
 
     A recording may contain hours of pictures without ground truth. Messages far from every frame are not
     needed.
@@ -563,7 +563,7 @@ class _Between:
             self._total = 2 * NEAR_REFS
 
     def split(self, log_time_ns: int) -> tuple[list[MessageRefs], list[MessageRefs]]:
-        """Remove all references. Return those of other log times, and those of the given log time."""
+        """Empty the buffer. Return message positions of other log times, and those of the given log time."""
         if not self._total:
             return self.take(), []
         whole = chained(self.take())
@@ -571,13 +571,13 @@ class _Between:
         return [taken(whole, np.flatnonzero(~same))], [taken(whole, np.flatnonzero(same))]
 
     def take(self) -> list[MessageRefs]:
-        """Remove and return all references, in order."""
+        """Empty the buffer, and return its message positions in order."""
         parts, self._parts, self._total = self._parts, [], 0
         return parts
 
 
 def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[FrameBlock]:
-    """Yield the blocks unchanged, and add their frames, states and clock steps to the report."""
+    """Yield blocks of frames unchanged, and count their frames, states and clock faults in the report."""
     last: int | None = None
     back, still = 0, 0
     for block in blocks:
@@ -603,7 +603,7 @@ def _block(
     roster: EntityTable,
     known: int,
 ) -> FrameBlock:
-    """Return the block of ``size`` frames in a window. The window also contains the neighbouring frames.
+    """Return a block of ``size`` frames, built from these frames and the frames next to them.
 
     ``known``: number of entities before the first frame of the next block.
     """
@@ -651,7 +651,7 @@ FIRST_STEPS: Final = 64
 
 
 class LifetimeTracker:
-    """Tracker that assigns node ids to frames, also for ids that another entity uses later.
+    """Assigns node ids to the objects of frames. An id that returns as another object gets a new node id.
 
     Node ids depend on lifetimes, by the rule of :class:`~sgstore.model.world.Lives`. Most ids have the same
     entity in all frames. They are compared as arrays; only the rows of possibly different entities are
@@ -687,7 +687,7 @@ class LifetimeTracker:
         self._warnings: list[str] = []
 
     def follow(self, frames: list[FrameRows], sizes: list[int]) -> list[FrameRows]:
-        """Return the next frames with their final node ids. ``sizes``: number of known ids at each frame."""
+        """Return the next frames with final node ids, also for ids reused by other objects."""
         runs: list[int] = []
         for frame in frames:
             seconds = self._seconds(frame.time_ns)
@@ -716,7 +716,7 @@ class LifetimeTracker:
             )
 
     def _seconds(self, time_ns: int) -> float:
-        """Return the time since the last frame; s. NaN means that numbers must not be derived across it."""
+        """Return the time since the last frame; s. NaN means a gap or a backward step of the clock."""
         last, self._time = self._time, time_ns
         step = 0 if last is None else time_ns - last
         if step < 0:
@@ -732,7 +732,7 @@ class LifetimeTracker:
         return step / 1e9 if joined else NAN
 
     def _earlier(self, frames: list[FrameRows], runs: list[int]) -> list[dict[int, Sight | None]]:
-        """Return, for each frame, the rows whose id may have a new entity, with the id's last position.
+        """Return, for each frame, the rows whose id may now be another object, with its last position.
 
         These are ids with a jump, and ids with a different kind in some frame.
         """
@@ -782,7 +782,7 @@ class LifetimeTracker:
     def _entered(
         self, frame: FrameRows, run: int, earlier: dict[int, Sight | None], size: int
     ) -> FrameRows:
-        """Return a frame with the node ids of its entities. Entities with a reused id are added."""
+        """Return a frame with the node ids of its objects. Objects with a reused id are added."""
         numbers, nodes = frame.node.tolist(), self._roster.nodes_of(frame.node).tolist()
         for row, number in enumerate(numbers):
             if row not in earlier and number not in self._lives:
@@ -806,7 +806,7 @@ class LifetimeTracker:
         )
 
     def _follow(self, number: int, kind: int, here: Sight, called: Called | None, size: int) -> int:
-        """Return the node id of the entity that an id refers to in a frame."""
+        """Return the node id of the object that uses an id in a frame."""
         lives = self._lives[number]
         before = lives.last
 
@@ -821,7 +821,7 @@ class LifetimeTracker:
         return node
 
     def _enter(self, number: int, called: Called | None, size: int, why: str) -> tuple[int, int]:
-        """Add another entity with the same id, and return its node id and lifetime number."""
+        """Add a new object that reuses an id, and return its node id and lifetime number."""
         row = self._roster.entered(number)
         if called is not None:
             meaning, type_name = called
@@ -840,7 +840,7 @@ class LifetimeTracker:
 
 
 def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
-    """Replace impossible numbers of frames by NaN, and count them."""
+    """Replace impossible values of frames (too large numbers) by NaN, and count them."""
     values = np.concatenate([frame.values for frame in frames] or [np.zeros((0, len(POSE)))])
     absurd = np.abs(values) >= FAR
     if absurd.any():
@@ -858,7 +858,7 @@ def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
 
 
 def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> dict[str, Floats]:
-    """Return the columns of control inputs, of the ego and other vehicles; empty if all are unknown."""
+    """Return the control inputs of the ego and of other vehicles as columns; empty if all are unknown."""
     inputs = np.array([frame.controls for frame in frames], np.float64)
     others = [frame.driven for frame in frames]
     if np.isnan(inputs).all() and not any(others):
@@ -881,7 +881,7 @@ def _states(node: Ints, values: Floats, **more: NDArray[np.generic]) -> States:
 def derive(
     node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
 ) -> tuple[Floats, Ints, Ints]:
-    """Derive missing velocities, accelerations and yaw rates from differences.
+    """Compute missing velocities, accelerations and yaw rates from differences between frames.
 
     Parameters
     ----------
@@ -939,7 +939,7 @@ def derive(
 
 
 def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
-    """Return the rows of the same node one frame before and after, and the time steps (NaN if absent)."""
+    """Return the rows of the same node in the previous and next frame, and the time steps; s (NaN: absent)."""
     span = int(node.max()) + 1
     keys = frame * span + node
     order = np.argsort(keys)
@@ -957,7 +957,7 @@ def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
 
 
 def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
-    """Return the time steps without those of implausible speed, and a mask of the changed rows."""
+    """Return the time steps without implausible speeds between positions, and a mask of the changed rows."""
     before, behind, since, until = steps
     position = values[:, _X : _X + 3]
     lost = np.zeros(len(since), np.bool_)
@@ -971,7 +971,7 @@ def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
 
 
 def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floats:
-    """Return the slope at each row, over both steps or the only available one.
+    """Return the rate of change of values at each row, from the previous and next frame if available.
 
     ``turn``: period of the values, for example 2π; differences are then the smallest possible.
     """
@@ -988,7 +988,7 @@ def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floa
 
 
 def _accelerations(values: Floats, rows: slice, steps: Steps, moving: Steps) -> Floats:
-    """Return the accelerations. ``moving`` contains the time steps with plausible speeds."""
+    """Return accelerations from velocities, only over time steps with plausible speeds."""
     velocity = values[:, _VELOCITY : _VELOCITY + 3]
     position = values[:, _X : _X + 3]
     before, behind, since, until = moving

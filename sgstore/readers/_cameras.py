@@ -1,4 +1,4 @@
-"""Camera pictures for recent frames, from a recording or a running simulator."""
+"""Camera pictures of the latest frames, from a recording or a running simulator."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_BYTES: Final = 64 << 20
 
 
 class Cameras(Protocol):
-    """Protocol of cameras with recent pictures.
+    """Interface of a source of camera pictures for the latest frames.
 
     Attributes
     ----------
@@ -35,12 +35,12 @@ class Cameras(Protocol):
     topics: tuple[str, ...]
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Return the picture of a camera at a frame. ``None`` means missing or no longer stored."""
+        """Return a camera's picture at a frame. ``None`` means missing or no longer stored."""
         ...
 
 
 class RecordedCameras:
-    """Cameras of a recording whose blocks are read in order.
+    """Camera pictures of a recording, for the frames that were read last.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class RecordedCameras:
         self._known: tuple[int, Ints, Ints] = 0, np.zeros(0, np.int64), np.zeros((5, 0), np.int64)
 
     def followed(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
-        """Yield the blocks unchanged, and remember the positions of their pictures."""
+        """Yield blocks of frames unchanged, and remember the file positions of the camera pictures."""
         mine = [row for row, _ in self._rows.values()]
         for block in blocks:
             _, times, places = self._known
@@ -76,7 +76,7 @@ class RecordedCameras:
             yield block
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Return the picture of a camera nearest to a frame in log time, like the default of an ingest.
+        """Return a camera's picture nearest to a frame in log time, as at ingest with default settings.
 
         Raises
         ------
@@ -97,7 +97,7 @@ class RecordedCameras:
 
 
 class LiveCameras:
-    """Cameras on the ego of a running CARLA simulator.
+    """Camera pictures of the ego in a running CARLA simulator.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ class LiveCameras:
         self._bytes = 0
 
     def take(self, seq: int, time_ns: int) -> None:
-        """Record a frame, and the pictures that arrived up to it."""
+        """Record a frame and the camera pictures that arrived before it."""
         self._times.append((seq, time_ns))
         for reading in self._attached.waiting():
             if reading.sensor in self.topics:
@@ -125,7 +125,7 @@ class LiveCameras:
             self._bytes -= self._pictures.popleft()[2].nbytes
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Return the last picture of a camera at or before a frame. ``None`` means missing."""
+        """Return the latest picture of a camera at or before a frame. ``None`` means missing."""
         time_ns = next((time for number, time in tuple(self._times) if number == seq), None)
         if time_ns is None:
             return None

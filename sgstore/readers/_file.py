@@ -1,4 +1,4 @@
-"""Base of files in other formats, with the interface of an MCAP file."""
+"""Base class of files in other formats, which offers their content like an MCAP file (log of messages)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class MessageFile:
-    """File with messages only, without the other record types of MCAP.
+    """File of another format, with the interface of an MCAP file: only channels and messages.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class MessageFile:
     def add_channel(
         self, topic: str, schema: Schema, encoding: str, about: dict[str, str] | None = None
     ) -> None:
-        """Add a channel with the id of its schema. ``about``: its metadata."""
+        """Add a channel (topic, schema, encoding, metadata) to the file object."""
         self.schemas[schema.id] = schema
         self.channels[schema.id] = Channel(
             id=schema.id,
@@ -66,13 +66,13 @@ class MessageFile:
         self.close()
 
     def close(self) -> None:
-        """Do nothing, because no file stays open."""
+        """Do nothing, because the file object keeps no file open."""
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Do nothing, because the order of such a file is fixed."""
+        """Do nothing, because the message order of such a file is fixed."""
         del rank
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """Return an empty iterator, because such a file has no attachments."""
+        """Return an empty iterator, because files of this format have no attachments."""
         del place
         return iter(())

@@ -1,4 +1,4 @@
-"""Pictures and video in sensor messages.
+"""Pictures and video frames in sensor messages.
 
 Messages contain pictures in a field ``data``, with another field for the format:
 ``sensor_msgs/CompressedImage``, ``foxglove.CompressedImage``, ``foxglove.CompressedVideo`` and similar types.
@@ -72,7 +72,7 @@ _PICTURES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Codec:
-    """Video codec, with the meaning of its NAL unit types."""
+    """Video codec (such as H.264), with the meaning of its NAL unit types."""
 
     name: str
     named: re.Pattern[str]
@@ -99,7 +99,7 @@ _UNIT: Final = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Media:
-    """Media content of a message.
+    """Picture, video frame or raw bytes of a sensor message, with the format.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class Media:
 
 
 def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, length: int) -> Media:
-    """Return the media content of one message, by its channel id and position.
+    """Return the picture or video in one message, from its channel id and file position.
 
     Raises
     ------
@@ -144,14 +144,14 @@ def read_carried(path: Path, *, channel: int, chunk_offset: int, offset: int, le
 
 
 def picture_form(data: bytes) -> str:
-    """Return the format of a picture file by its first bytes; empty if unknown."""
+    """Return the format of a picture file (such as PNG) from its first bytes; empty if unknown."""
     return next((name for name, start in _PICTURES.items() if re.match(start, data, re.DOTALL)), "")
 
 
 def record_reader(
     channel: Channel, schema: Schema | None
 ) -> Callable[[bytes], Mapping[str, Any] | None]:
-    """Return a function that converts a message of a channel into a record of its fields.
+    """Return a function that decodes a channel's message into a record of its fields.
 
     The field ``data`` contains bytes or an array of them; the function returns ``None`` without such a field.
     For an OSI sensor view, ``data`` is the picture file of its first camera, with an empty ``format``.
@@ -200,7 +200,7 @@ def _of_json(message: bytes) -> Mapping[str, Any] | None:
 
 
 def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[bytes, str]]:
-    """Return a function that extracts the data and format of a message; both empty without a picture."""
+    """Return a function that extracts picture data and format from a message; empty without a picture."""
     if channel not in recording.channels:
         # Without a summary, channels are known only after a walk.
         for _ in recording.walk(Findings()):
@@ -260,7 +260,7 @@ MAX_SIDE: Final = 1 << 16
 
 
 def _of_sensor_view(made: type[Any], message: bytes) -> Mapping[str, Any] | None:
-    """Return the picture file of the first camera with a picture."""
+    """Return picture data and format of the first camera with a picture in an OSI message."""
     try:
         cameras = getattr(made.FromString(message), "camera_sensor_view", ())
         seen = next((camera for camera in cameras if camera.image_data), None)
@@ -271,7 +271,7 @@ def _of_sensor_view(made: type[Any], message: bytes) -> Mapping[str, Any] | None
 
 
 def _camera_picture(camera: Any) -> bytes:
-    """Return the picture of a ``CameraSensorView``: its embedded file, or a file made of its pixels."""
+    """Return the picture of an OSI camera message: its embedded file, or a file made of its pixels."""
     data, told = bytes(camera.image_data), camera.view_configuration
     if picture_form(data) in {"jpeg", "png"}:
         return data
@@ -297,7 +297,7 @@ _COLOURS: Final = {1: 0, 2: 4, 3: 2, 4: 6}
 
 
 def png(pixels: NDArray[Any]) -> bytes:
-    """Return a picture as the bytes of a PNG file.
+    """Encode pixels as the bytes of a PNG file.
 
     Each row is stored as its difference from the row above (filter 2). This is fast, and most files become a
     third smaller.
@@ -336,7 +336,7 @@ def png(pixels: NDArray[Any]) -> bytes:
 def _decodable(
     codec: _Codec, last: bytes, before: Iterator[tuple[bytes, str]]
 ) -> tuple[list[bytes], list[bytes]]:
-    """Return the frames from the key frame to the last frame, and the parameter sets for their start.
+    """Return the video frames from the last key frame on, and the codec parameters needed before them.
 
     Parameters
     ----------
@@ -374,7 +374,7 @@ def _is_key(codec: _Codec, data: bytes) -> bool:
 
 
 def _parameters(codec: _Codec, data: bytes) -> dict[int, bytes]:
-    """Return the parameter sets in the data of a frame by type, each with its start code."""
+    """Return the codec parameter sets in a video frame: type → bytes with the start code."""
     units = list(_UNIT.finditer(data))
     ends = [unit.start() for unit in units[1:]] + [len(data)]
     found: dict[int, bytes] = {}
@@ -394,7 +394,7 @@ _Row = tuple[int, int, int, "Callable[[], bytes]"]
 
 @dataclass(frozen=True, slots=True)
 class _FilmSource:
-    """Source of video messages: a chunk of a file, or all its messages outside chunks.
+    """Part of a file with video messages: one chunk, or all messages outside chunks.
 
     ``base``: position of the file in its bag. ``chunk``: byte offset, -1 outside chunks. ``end_ns``: maximum
     log time of the messages.
@@ -407,7 +407,7 @@ class _FilmSource:
     end_ns: int
 
     def rows(self) -> list[_Row]:
-        """Return the messages of the channel."""
+        """Return time and position of each video message in this part of the file."""
         if self.chunk < 0:
             return _outside_chunks(self.path, self.channel, self.base)
         with open_regular(self.path) as file:
@@ -425,7 +425,7 @@ class _FilmSource:
 
 
 def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterator[bytes]:
-    """Yield the messages of a channel that are earlier than a given one, latest first."""
+    """Yield the messages of a video channel before a given message, latest first."""
     chunked = chunk_offset >= 0
     at = chunk_offset if chunked else offset
     parts = [*_parts(path, channel)]
@@ -458,7 +458,7 @@ def _copied(messages: Messages, row: int) -> bytes:
 
 
 def _parts(path: Path, channel: int) -> Iterator[tuple[Path, int, int]]:
-    """Yield the files of a recording, their positions, and the channel id in each file."""
+    """Yield each file of a recording with its byte position and the channel's id in this file."""
     folder = bag_folder(path)
     if folder is None:
         yield path, 0, channel
@@ -473,7 +473,7 @@ def _parts(path: Path, channel: int) -> Iterator[tuple[Path, int, int]]:
 
 
 def _chunks(path: Path) -> list[tuple[int, int, int]]:
-    """Return byte offset, first and last log time of the chunks of a file."""
+    """Return byte offset, first and last log time of each chunk in an MCAP file."""
     with open_regular(path) as file:
         offsets: list[int] = read_summary(file, file.seek(0, 2)).chunk_offsets.tolist()
     if not offsets:

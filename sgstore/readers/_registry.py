@@ -1,4 +1,4 @@
-"""Selection of the reader for a recording, and access to its messages.
+"""Choice of the reader for a recording, and access to single messages.
 
 A flavour is a class like :class:`~sgstore.readers.osi._trace.OsiTrace`. It is listed in :data:`READERS`, or an
 installed package provides it as an entry point of the group ``sgstore.readers``. It recognises a recording by
@@ -46,16 +46,16 @@ RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile
 
 
 class RecordingReader(Protocol):
-    """Protocol of a reader: the class of its traces. The argument ``mapping`` is optional."""
+    """Interface of a reader: a callable that opens a recording of one type, such as CARLA or OSI."""
 
     name: str
 
     def __call__(self, recording: Recording, *, ego: str, digest: str) -> MessageTrace:
-        """Open a recording of this flavour."""
+        """Open a recording, and return a trace that yields frames."""
         ...
 
     def recognises(self, recording: Recording) -> bool:
-        """True if a recording has this flavour, by the schemas of its channels."""
+        """Return True if the reader can read a recording, according to the schemas of its channels."""
         ...
 
 
@@ -66,7 +66,7 @@ READERS: Final[tuple[RecordingReader, ...]] = tuple(
 
 
 def readers() -> Iterator[RecordingReader]:
-    """Yield all readers in the order of their tests: :data:`READERS`, then those of other packages.
+    """Yield all readers: first those of sgstore, then those of other packages.
 
     Raises
     ------
@@ -78,14 +78,14 @@ def readers() -> Iterator[RecordingReader]:
 
 
 def is_recording(path: Path) -> bool:
-    """True if a file is a recording, by its suffix. XML files are also checked by their first bytes."""
+    """Return True if a file is a recording, by its suffix; XML files also by their first bytes."""
     name = path.name.lower()
     xml = name.endswith((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS))
     return name.endswith(ENDINGS) and (not xml or is_scenario(path) or is_fcd(path))
 
 
 def open_recording(path: str | Path) -> RecordingFile:
-    """Open a file of messages: an MCAP file, bag, OSI file, CommonRoad scenario or SUMO file.
+    """Open a log of messages: an MCAP file, ROS bag, OSI file, CommonRoad scenario or SUMO file.
 
     OSI files are recognised by their suffix. A CommonRoad scenario or SUMO floating-car data is one XML
     document; its contents are converted into messages.
@@ -106,7 +106,7 @@ def open_recording(path: str | Path) -> RecordingFile:
 def open_trace(
     path: str | Path, *, ego: str = "", digest: str = "", mapping: str | Path = ""
 ) -> MessageTrace:
-    """Open a recording with the first reader that recognises it.
+    """Open a recording with the first reader that can read it.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def open_trace(
 
 
 def on_map(trace: MessageTrace, road_map: RoadMap | None) -> None:
-    """Pass the road map to a trace whose flavour needs it.
+    """Pass the road map to an open recording, if its reader needs the map.
 
     Such a flavour has a method ``on_map``, which is called before the frames are read.
     """
@@ -169,7 +169,7 @@ def _is_single_channel(path: Path) -> bool:
 
 
 def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
-    """Return the data of one message of a recording, by its position as in ``MessageRefs``.
+    """Return the raw bytes of one message of a recording, from its file position.
 
     See :class:`~sgstore.model.world.MessageRefs`.
 
@@ -186,7 +186,7 @@ def read_message(path: str | Path, *, chunk_offset: int, offset: int, length: in
 def read_messages(
     path: Path, places: Iterable[tuple[int, int, int]]
 ) -> Iterator[bytes | memoryview]:
-    """Yield the data of messages, in the order of ``places``.
+    """Yield the raw bytes of several messages, in the order of the given file positions.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ _HELP: Final = "docs/flavours.md says how a flavour of your own reads them, in o
 
 
 def _no_reader(recording: Recording) -> str:
-    """Return the error text for an unrecognised recording: its probable format, and its channels.
+    """Return the error text for a recording that no reader supports, with its format and channels.
 
     Channels that may contain objects come first.
     """

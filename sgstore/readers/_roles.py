@@ -1,4 +1,4 @@
-"""Order of channels for messages with equal log time and publish time.
+"""Reading order of messages with equal times: the rank of the channel decides.
 
 A frame needs the map, static entities, transforms and signals of its instant first. Messages that refer to a
 frame, such as the controls of the ego, come after it.
@@ -67,7 +67,7 @@ _ROLES: Final = {"map": MAP, "ground_truth": STATES}
 def channel_rank(
     recording: Recording, roles: Mapping[int, str] | None = None
 ) -> Callable[[int], int]:
-    """Return a function that maps a channel id to its rank.
+    """Return a function: channel id → rank. Of messages with equal times, lower ranks are read first.
 
     ``roles``: role by channel id, for channels whose schema has no rank.
     """

@@ -1,4 +1,4 @@
-"""ROS 2 messages: parser of their definitions, and CDR decoder into records or columns.
+"""Decoder of ROS 2 messages (CDR format) into records or columns, from their text definitions.
 
 A schema with the encoding ``ros2msg`` is the text of the message definition, followed by the texts of all types
 in it, each after a line of ``=`` and a line ``MSG: package/Type``. A layout is always built from the text in
@@ -51,7 +51,7 @@ LENGTH: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """Number or boolean of ``size`` bytes. ``code`` is the type code of :mod:`struct` and numpy."""
+    """ROS type: number or boolean of ``size`` bytes."""
 
     code: str
     size: int
@@ -59,14 +59,14 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """String type. ``bound`` is the maximum number of bytes; -1 means unlimited."""
+    """ROS type: string, with an optional maximum number of bytes."""
 
     bound: int
 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """Array type with ``count`` elements; -1 means that the message contains the length.
+    """ROS type: array of fixed length, or sequence whose length is in the message.
 
     ``bound``: maximum length in a message; -1 means unlimited.
     """
@@ -78,7 +78,7 @@ class Sequence:
 
 @dataclass(frozen=True, slots=True)
 class Struct:
-    """Structure type, with its fields in message order.
+    """ROS type: structure of named fields in message order.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ _LINE: Final = re.compile(
 
 
 def parse_definition(name: str, text: bytes) -> Struct:
-    """Return the structure of the messages of a schema.
+    """Parse the text definition of a ROS message, and return its structure type.
 
     Parameters
     ----------
@@ -170,13 +170,13 @@ def parse_definition(name: str, text: bytes) -> Struct:
 
 
 def short_name(name: str) -> str:
-    """Return ``package/Type`` for ``package/msg/Type``."""
+    """Shorten a ROS type name: ``package/Type`` for ``package/msg/Type``."""
     package, _, rest = name.partition("/")
     return f"{package}/{rest.removeprefix('msg/')}" if rest else name
 
 
 def ros_schema(recording: Recording, channel: int) -> Schema | None:
-    """Return the schema of a ROS 2 channel; ``None`` for other channels."""
+    """Return the schema of a ROS 2 channel; ``None`` for channels of other formats."""
     record = recording.channels[channel]
     schema = recording.schemas.get(record.schema_id)
     is_ros = schema and record.message_encoding == "cdr" and schema.encoding == "ros2msg"
@@ -184,13 +184,13 @@ def ros_schema(recording: Recording, channel: int) -> Schema | None:
 
 
 def ros_name(recording: Recording, channel: int) -> str:
-    """Return the short name of a ROS 2 channel's schema; empty for other channels."""
+    """Return the short schema name of a ROS 2 channel; empty for channels of other formats."""
     schema = ros_schema(recording, channel)
     return "" if schema is None else short_name(schema.name)
 
 
 def _texts(name: str, text: str) -> dict[str, list[str]]:
-    """Return the lines of each type's definition by type name. The first definition of a name counts."""
+    """Split a ROS message definition: type name → lines. Only the first definition of a name counts."""
     texts: dict[str, list[str]] = {name: []}
     lines = texts[name]
     separated = False
@@ -217,7 +217,7 @@ def _texts(name: str, text: str) -> dict[str, list[str]]:
 
 @dataclass(slots=True)
 class _Parser:
-    """Parser of type definitions. Each type is parsed once; ``open`` contains the types in progress."""
+    """Parser of ROS type definitions. Each type is parsed once."""
 
     texts: dict[str, list[str]]
     made: dict[str, Struct] = field(default_factory=dict[str, Struct])
@@ -254,7 +254,7 @@ class _Parser:
         return struct
 
     def _fields(self, owner: str, line: str) -> tuple[tuple[str, Type], ...]:
-        """Return the field of a line; empty for a constant. Default values are ignored."""
+        """Parse one line of a ROS definition into a field; empty for a constant. Default values are ignored."""
         found = _LINE.fullmatch(line)
         if found is None:
             raise TraceError(f"{owner}: a line that defines no field: {line[:80]!r}")
@@ -286,7 +286,7 @@ def _array(owner: str, found: re.Match[str], element: Type) -> Sequence:
 
 
 def least(kind: Type) -> int:
-    """Return the minimum size of a value of a type, without padding; bytes."""
+    """Return the minimum size of a value of a ROS type, without padding; bytes."""
     match kind:
         case Number(size=size) | Struct(least=size):
             return size
@@ -297,7 +297,7 @@ def least(kind: Type) -> int:
 
 
 def members(kind: Type) -> int:
-    """Return the number of values of a type on all levels. A sequence counts as one."""
+    """Return the number of values in a ROS type, with nested structures. A sequence counts as one."""
     return kind.members if isinstance(kind, Struct) else 1
 
 
@@ -354,7 +354,7 @@ _MAX_PREFIXES: Final = 64
 
 
 def decode(kind: Struct, data: Data) -> dict[str, Any]:
-    """Decode a message into a record of numbers, texts, arrays, lists and nested records.
+    """Decode a ROS message into a record of numbers, texts, arrays, lists and nested records.
 
     Raises
     ------
@@ -378,7 +378,7 @@ def text(record: dict[str, Any], path: str) -> str:
 
 
 def records(record: dict[str, Any], path: str) -> list[dict[str, Any]]:
-    """Return the list of records at a path of a record; empty if it is missing."""
+    """Return the list of nested records at a path of a record; empty if it is missing."""
     value = _at(record, path)
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
@@ -404,7 +404,7 @@ def _unpacker(code: str) -> Callable[..., tuple[Any, ...]]:
 
 @dataclass(slots=True)
 class _MessageReader:
-    """Cursor over the bytes of a message.
+    """Read position in the bytes of a ROS message.
 
     ``values``: bytes after the head; ``order``: byte order of numbers; ``place``: position of the next byte;
     ``left``: number of further values allowed.
@@ -428,7 +428,7 @@ class _MessageReader:
         return cls(memoryview(data)[HEAD:], _ORDERS[kind])
 
     def take(self, size: int, align: int) -> int:
-        """Skip ``size`` bytes after alignment, and return their start."""
+        """Skip padding and ``size`` bytes of a message, and return the start of these bytes."""
         start = self.place + -self.place % align
         if start + size > len(self.values):
             raise TraceError(
@@ -442,7 +442,7 @@ class _MessageReader:
         return _unpacker(self.order + kind.code)(self.values, start)[0]
 
     def length(self, least_size: int, bound: int, what: str) -> int:
-        """Read and check a length. Each element has at least ``least_size`` bytes."""
+        """Read the length of a sequence or string, and check that the message is long enough."""
         count = _unpacker(self.order + "I")(self.values, self.take(LENGTH, LENGTH))[0]
         left = len(self.values) - self.place
         if count * least_size > left:
@@ -452,7 +452,7 @@ class _MessageReader:
         return count
 
     def text(self, kind: Text) -> str:
-        """Read a string. Invalid UTF-8 bytes become U+FFFD."""
+        """Read a string from a message. Invalid UTF-8 bytes become U+FFFD."""
         count = self.length(1, kind.bound + 1 if kind.bound >= 0 else -1, "string")
         start = self.take(count, 1)
         return (
@@ -474,7 +474,7 @@ class _MessageReader:
         return {name: self.value(inner) for name, inner in kind.fields}
 
     def count(self, kind: Sequence) -> int:
-        """Read the number of elements of a sequence."""
+        """Read the number of elements of a sequence from a message."""
         smallest = least(kind.element)
         if kind.count < 0:
             return self.length(smallest, kind.bound, "sequence")
@@ -492,7 +492,7 @@ class _MessageReader:
         return [self.value(element) for _ in range(count)]
 
     def spend(self, values: int) -> None:
-        """Count the values of a message, and raise above the limit."""
+        """Count decoded values of a message. Raise an error above the limit."""
         self.left -= values
         if self.left < 0:
             raise TraceError(f"a message of more than {MAX_VALUES} values")
@@ -504,7 +504,7 @@ def _dtype(order: str, kind: Number) -> np.dtype[Any]:
 
 @dataclass(slots=True)
 class _StructLayout:
-    """Byte positions of the numbers in an element, for one alignment of its start.
+    """Byte positions of the numbers in one element of a ROS sequence.
 
     ``size``: bytes from its start to the next element; ``prefixes``: position and value of each length in it;
     ``runs``: first column, position, number and type of adjacent numbers.
@@ -515,7 +515,7 @@ class _StructLayout:
     runs: list[tuple[int, int, int, np.dtype[Any]]]
 
     def agreeing(self, values: memoryview, order: str, place: int, most: int) -> int:
-        """Return the number of consecutive elements with this layout, from a position on."""
+        """Return the number of consecutive sequence elements that have the same byte positions of numbers."""
         for offset, expected in self.prefixes:
             if most < 1:
                 break
@@ -526,7 +526,7 @@ class _StructLayout:
         return most
 
     def copy(self, values: memoryview, place: int, to: Floats) -> None:
-        """Copy the numbers of consecutive elements into ``to``, one element per row."""
+        """Copy the numbers of consecutive sequence elements into an array, one element per row."""
         for column, offset, count, dtype in self.runs:
             numbers: Any = np.ndarray(
                 (len(to), count), dtype, values, place + offset, (self.size, dtype.itemsize)
@@ -535,7 +535,7 @@ class _StructLayout:
 
 
 class ColumnReader:
-    """Reader of selected numbers of messages of one type, as columns. Other fields are skipped.
+    """Fast reader of selected numbers in ROS messages of one type, as columns. Other fields are skipped.
 
     Parameters
     ----------
@@ -569,7 +569,7 @@ class ColumnReader:
         self._layouts: dict[tuple[str, int], list[_StructLayout]] = {}
 
     def head(self, data: Data) -> dict[str, Any]:
-        """Return the fields before the sequence.
+        """Return the fields of a ROS message that precede its sequence of elements.
 
         Raises
         ------
@@ -580,7 +580,7 @@ class ColumnReader:
         return {name: reader.value(kind) for name, kind in self._head}
 
     def read(self, data: Data) -> tuple[dict[str, Any], Floats]:
-        """Return the fields before the sequence, and the numbers.
+        """Return the leading fields of a ROS message, and selected numbers of its elements (n, columns).
 
         Returns
         -------
@@ -606,7 +606,7 @@ class ColumnReader:
         return head, numbers
 
     def _some(self, reader: _MessageReader, to: Floats) -> int:
-        """Read the next element and those after it with the same layout. Return their number."""
+        """Read the next element and all following ones with equal byte positions. Return their number."""
         values, order, place = reader.values, reader.order, reader.place
         layouts = self._layouts.setdefault((order, place % self._align), [])
         for layout in layouts:
@@ -628,14 +628,14 @@ class ColumnReader:
 
 
 def _learned(reader: _MessageReader, kind: Struct, columns: dict[str, int]) -> _StructLayout:
-    """Read the next value, and return its layout."""
+    """Decode the next sequence element, and return the byte positions of its numbers."""
     walk = _ElementWalk(reader, columns, reader.place)
     walk.step(kind, "")
     return _StructLayout(reader.place - walk.start, walk.prefixes, _side_by_side(walk.found))
 
 
 class _ElementWalk:
-    """Walk through one element that records the positions of its values."""
+    """Decoder of one sequence element that records the byte positions of its numbers."""
 
     def __init__(self, reader: _MessageReader, columns: dict[str, int], start: int) -> None:
         self.start = start
@@ -645,7 +645,7 @@ class _ElementWalk:
         self._columns = columns
 
     def step(self, kind: Type, path: str) -> None:
-        """Walk over a value, and record the positions of its numbers."""
+        """Decode a value, and record the byte positions of its numbers."""
         reader = self._reader
         match kind:
             case Number(_, size):
@@ -690,7 +690,7 @@ class _ElementWalk:
 def _side_by_side(
     found: dict[int, tuple[int, np.dtype[Any]]],
 ) -> list[tuple[int, int, int, np.dtype[Any]]]:
-    """Group numbers into runs that are adjacent both in columns and in bytes."""
+    """Group numbers that are adjacent both in the output columns and in the message bytes."""
     runs: list[tuple[int, int, int, np.dtype[Any]]] = []
     for column, (place, dtype) in sorted(found.items()):
         if runs:

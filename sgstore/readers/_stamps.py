@@ -1,4 +1,4 @@
-"""Times of frames: the time stamps of messages, and replacements for missing ones.
+"""Simulation time of each frame: the time stamp of its message, or a replacement for a missing stamp.
 
 All readers use the same rules, so that a trace never mixes two clocks:
 
@@ -36,7 +36,7 @@ Known = tuple[int, int]
 
 @dataclass(slots=True)
 class _Unstamped:
-    """Run of messages without a stamp or with a stamp of 0, and the stamped messages around it."""
+    """Consecutive messages without a time stamp, and the nearest messages with one."""
 
     first: int
     last: int
@@ -46,7 +46,7 @@ class _Unstamped:
 
 @dataclass(slots=True)
 class Stamps:
-    """Time stamps of a channel, collected by the first reading.
+    """Time stamps in the messages of a channel, collected by the first pass over the recording.
 
     Attributes
     ----------
@@ -73,11 +73,11 @@ class Stamps:
     _more: bool = False
 
     def next(self) -> None:
-        """Count a message. It must be called for every message of the channel."""
+        """Count a message of the channel. Every message must be counted, also without a time stamp."""
         self._number += 1
 
     def see(self, log_time_ns: int, stamp_ns: int | None) -> None:
-        """Record the time stamp of the last counted message."""
+        """Record the time stamp of the message counted last."""
         if stamp_ns == 0:
             self._zero = self._zero or (log_time_ns, 0)
         if stamp_ns:
@@ -95,24 +95,24 @@ class Stamps:
             self._runs.append(self._open)
 
     def is_near(self, known: Known | None) -> bool:
-        """True if a time stamp is near 0."""
+        """Return True if a time stamp is close to 0."""
         steps = sorted(self.steps)
         period = steps[len(steps) // 2] if steps else 0
         return known is not None and abs(known[1]) <= max(NEAR, 3 * period)
 
     @property
     def clock(self) -> Known | None:
-        """Log time and time stamp of one message. ``None`` means that the log time is the clock."""
+        """Log time and time stamp of one message. ``None`` means that frames use the log time."""
         alone = self._number == 0
         return self.first or (self._zero if self.explicit or alone else None)
 
     def reading(self) -> StampReader:
-        """Return a reader of the message times, for the second reading of the recording."""
+        """Return a reader of the message times, for the second pass over the recording."""
         return StampReader(self, self._runs)
 
 
 class StampReader:
-    """Reader of the times of a channel's messages, one after another.
+    """Reader of the simulation time of each message of a channel, one message after another.
 
     Parameters
     ----------
@@ -133,11 +133,11 @@ class StampReader:
         self._offset = 0 if self._clock is None else self._clock[0] - self._clock[1]
 
     def next(self) -> None:
-        """Count a message. It must be called for every message of the channel."""
+        """Count a message of the channel. Every message must be counted, also without a time stamp."""
         self._number += 1
 
     def time(self, log_time_ns: int, stamp_ns: int | None) -> int | None:
-        """Return the time of the last counted message; ns. ``None`` means unknown."""
+        """Return the simulation time of the message counted last; ns. ``None`` means unknown."""
         if self._clock is None:
             self.untimed += 1
             return log_time_ns
@@ -147,7 +147,7 @@ class StampReader:
         return time_ns
 
     def beside(self, log_time_ns: int, stamp_ns: int | None) -> int:
-        """Return the time of the next message of another channel; ns."""
+        """Return the simulation time of a message on another channel; ns."""
         expected = log_time_ns - self._offset
         if self._clock is None:
             return log_time_ns
@@ -157,7 +157,7 @@ class StampReader:
         return stamp_ns if stamp_ns is not None and same_clock else expected
 
     def _unstamped(self, log_time_ns: int, stamp_ns: int | None) -> int | None:
-        """Return the time of a message without a stamp or with a stamp of 0; ns."""
+        """Return the simulation time of a message without a time stamp or with a stamp of 0; ns."""
         while self._at < len(self._runs) and self._runs[self._at].last < self._number:
             self._at += 1
         run = self._runs[self._at] if self._at < len(self._runs) else None
@@ -173,7 +173,7 @@ class StampReader:
         return _between(log_time_ns, before, behind)
 
     def _placed(self, run: _Unstamped, log_time_ns: int) -> int | None:
-        """Return the time of a message in a file without log times, by its position between two stamps."""
+        """Return the time of a message between two stamps, by its position in a file without log times."""
         before, behind = run.before, run.behind
         if before is None:
             return None
@@ -183,7 +183,7 @@ class StampReader:
         return before[1] + (behind[1] - before[1]) * share[0] // share[1]
 
     def _is_time(self, before: Known | None, behind: Known | None) -> bool:
-        """True if time stamps of 0 are real times. False if they mean a missing time."""
+        """Return True if a time stamp of 0 is a real time, and False if it means a missing time."""
         stamps = self._stamps
         if before is None and behind is None:
             return True  # Without another clock, 0 is a time.
@@ -195,7 +195,7 @@ class StampReader:
 
 
 def _between(log_time_ns: int, before: Known | None, behind: Known | None) -> int:
-    """Return the simulation time for a log time, from the times of the neighbouring messages; ns."""
+    """Convert a log time to a simulation time by the time stamps of neighbouring messages; ns."""
     log, stamp = before or behind or (log_time_ns, log_time_ns)
     time_ns = log_time_ns - (log - stamp)
     if before is None or behind is None or before[1] <= time_ns <= behind[1]:

@@ -1,4 +1,4 @@
-"""Derived sets of relations: edges computed later from stored frames, beside the edges from ingest.
+"""Derived sets of relations: edges of graphs that are computed after ingest, from the stored states.
 
 The module returns the stored states as generator input, and stores the result of other settings.
 """

@@ -145,7 +145,7 @@ def shared_instance(
 
 @dataclass(slots=True, eq=False)
 class OpenFile:
-    """One store file in this process: its DuckDB instance, readers and locks.
+    """Store file in this process: the DuckDB instance, the readers and the locks of the file.
 
     Attributes
     ----------
