@@ -311,7 +311,7 @@ class Aggregate:
 
 @dataclass(frozen=True, slots=True)
 class GroupKey:
-    """Value by which a query groups matches, if it also aggregates them.
+    """Grouping value of a query with aggregates: matches with equal values form a group.
 
     ``name`` is the name of its result column.
     """
@@ -1062,7 +1062,7 @@ class StepLink:
 
 @dataclass(frozen=True, slots=True)
 class StepWay:
-    """One of the step sequences that a query with alternative steps allows.
+    """Alternative order of the steps of a query, such as ``A THEN B`` of ``A THEN (B | C)``.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Truth of bindings in a frame: one bit per atom and test of a plan."""
+"""Truth values of many bindings in one frame: one bit for each condition of an evaluation plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decision frame of a formula: the first frame after which its value is certain."""
+"""Decision frame of a formula: the first frame of a trace after which its truth value cannot change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recent scene graphs of an online run, and the matches and attribute curves followed in them."""
+"""Graphs of the last frames of an online run, with the matches and attribute curves in these frames."""
 
 from __future__ import annotations
 

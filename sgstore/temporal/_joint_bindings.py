@@ -1,4 +1,4 @@
-"""Joint bindings of several steps that agree on their shared variables."""
+"""Join of the bindings of several steps of a sequence, on the variables that they share."""
 
 from __future__ import annotations
 

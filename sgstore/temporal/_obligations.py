@@ -1,4 +1,7 @@
-"""Open obligations of a check, as states that bindings share."""
+"""Open obligations of a check: conditions that later frames must satisfy.
+
+Bindings with equal obligations share one state.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Evaluation plans: temporal formulas over the results of single-frame queries, and their text.
+"""Evaluation plans: temporal formulas whose conditions are single-frame queries.
 
 A :class:`Plan` contains all single-frame data that the expressions of a statement need, without duplicates:
 

@@ -1,4 +1,4 @@
-"""Progression: obligations of a formula after each frame, in bounded memory."""
+"""Formula progression: after each frame, the formula that the remaining frames must satisfy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quantifiers of a check: their entities in a trace, and the values for all or some of them."""
+"""Quantifiers of a check (``FORALL``, ``FORSOME``): their entities in a trace, and the combined values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values over time in the monitor, frame by frame."""
+"""Temporal values of the online monitor (durations, changes, sums, means), updated frame by frame."""
 
 from __future__ import annotations
 

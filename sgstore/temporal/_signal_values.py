@@ -1,4 +1,4 @@
-"""Values of signals over whole traces: durations, changes, sums and means."""
+"""Temporal values over whole traces, as arrays: durations, changes, sums and means."""
 
 from __future__ import annotations
 

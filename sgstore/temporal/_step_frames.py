@@ -1,4 +1,4 @@
-"""Frames of a step, online: its pattern, conditions and duration."""
+"""Frames in which one step of a sequence is true, found online from pattern, conditions and duration."""
 
 from __future__ import annotations
 

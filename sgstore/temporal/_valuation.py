@@ -1,4 +1,4 @@
-"""Bindings of the monitor, and the single-frame queries that find them.
+"""Bindings of the online monitor in a frame, found by single-frame queries.
 
 A binding maps each variable to a node, or to ``None``: any node without known values. A binding without an
 entry uses the entry of its most specific stored generalisation. So a check over a hundred vehicles with five

@@ -67,7 +67,7 @@ def pack(
     *,
     out: PrintedRows,
 ) -> int:
-    """Bring the traces of a store into a collection, which is made if there is none."""
+    """Copy the traces of a store into a collection; a missing collection is created."""
     from sgstore.collection import pack as pack_store
 
     with count_bar("packing", "bundles") as on_bundle:

@@ -358,7 +358,7 @@ def show(
     drawn: DrawOptions,
     bounds: QueryLimits,
 ) -> int:
-    """Draw a frame from above, or a clip as an animation; with a QUERY, what it matches is marked."""
+    """Draw a frame from above, or a clip as an animation; a QUERY marks its matches."""
     from sgstore.draw import draw_clip, draw_stored
     from sgstore.model.frame_ids import range_of
 

@@ -263,7 +263,7 @@ def like(
     out: RowOptions,
     bounds: QueryLimits,
 ) -> int:
-    """Find frames like another: of the same class, or the most like by what they have in common.
+    """Find frames that resemble a frame: frames of the same class, or the most similar frames.
 
     One row for each trace: its best run of consecutive frames that are as like as each other. It says how
     many, how like, whether the graphs are the same, and what only the example has, or only they.
@@ -442,7 +442,7 @@ def list_patterns(
     *,
     out: RowOptions,
 ) -> int:
-    """Name the patterns of the library, with what they find.
+    """List the patterns of the library with their meanings.
 
     Predicates are conditions that every query may use; concepts and scenarios are found by their
     names; properties are rules that a trace keeps or violates.
@@ -522,7 +522,7 @@ def run_pattern(
     *,
     ask: AskOptions,
 ) -> int:
-    """Find a pattern of the library in a store: when it holds, and who takes part.
+    """Find a pattern of the library in a store: times of the matches, and their entities.
 
     Of a property: whether each trace keeps it, and where it does not.
     """

@@ -235,7 +235,7 @@ MAX_WAYS: Final = 100
 def _ways(
     written: _WrittenSteps, before: list[_Way], span: TextSpan, session: Session
 ) -> list[_Way]:
-    """Return all step sequences without groups that a sequence with groups stands for.
+    """Return all step sequences without groups (repetitions, alternatives) that equal a sequence with groups.
 
     Each one is appended to each of the given beginnings.
     """

@@ -198,7 +198,7 @@ class ScopeBuilder:
         return key
 
     def the_ego(self, span: TextSpan) -> str:
-        """Return the key of the ego node of the pattern. Add an ego node if there is none."""
+        """Return the key of the ego node of the pattern, and add a missing ego node."""
         for node in self.nodes.values():
             if not node.kinds.other:
                 return node.key

@@ -145,7 +145,7 @@ class _Found:
     where: list[str] = field(default_factory=list[str])
 
     def text(self) -> str:
-        """Return the query text that stands inside the braces of ``EXISTS {…}`` for a set of nodes."""
+        """Return a set of nodes as query text: the paths and conditions inside ``EXISTS {…}``."""
         paths = self.paths or [f"({self.node}{self.label})"]
         return ", ".join(paths) + (f" WHERE {' AND '.join(self.where)}" if self.where else "")
 

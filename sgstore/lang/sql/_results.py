@@ -353,7 +353,7 @@ class _RowStatement:
         return self._of_group(leaf.name) if isinstance(leaf, GroupKey) else _column(leaf)
 
     def _of_group(self, name: str) -> str:
-        """Return the SQL of a value by which the query groups. Each use gets the same text."""
+        """Return the SQL of a grouping value of a query; each use gets the same text."""
         if name not in self.texts:
             value = next(c.value for c in self.result.columns if c.name == name)
             self.texts[name] = self._text(value)
