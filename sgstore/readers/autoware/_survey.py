@@ -1,4 +1,4 @@
-"""First reading of an Autoware recording: leading channel, classes of objects, and the ego's pose.
+"""First pass over an Autoware recording: find the object channel, object classes and ego pose channel.
 
 Topics are arbitrary, so only the schemas count. The class of an object may change between messages; the most
 frequent one is used.
@@ -91,19 +91,19 @@ CLASS_COLUMNS: Final = (*_UUID, *_CLASSES)
 
 @dataclass(slots=True)
 class ObjectLead(Lead):
-    """Channel of objects. ``order``: priority of its list type; ``objects``: total number of objects."""
+    """Channel with lists of objects in an Autoware recording, as a candidate for the frames of the trace."""
 
     order: int = 0
     objects: int = 0
 
 
 def content_of(recording: Recording, channel: int) -> str:
-    """Return the content type of a channel's messages; empty if the reader does not support them."""
+    """Return the content type of an Autoware channel (such as objects or poses); empty if unsupported."""
     return CONTENTS.get(ros_name(recording, channel), "")
 
 
 def idents_of(table: Floats) -> list[str]:
-    """Return the ids of objects as hexadecimal digits; empty without an id.
+    """Return the ids of Autoware objects as hexadecimal digits; empty without an id.
 
     The columns begin with :data:`CLASS_COLUMNS`.
     """
@@ -114,7 +114,7 @@ def idents_of(table: Floats) -> list[str]:
 
 
 def labels_of(table: Floats) -> list[str]:
-    """Return the most probable class of each object. The columns are as in :func:`idents_of`."""
+    """Return the most probable class of each Autoware object."""
     classes = table[:, len(_UUID) : len(CLASS_COLUMNS)].reshape(len(table), _MOST_CLASSES, 2)
     likely = np.argmax(np.nan_to_num(classes[:, :, 1], nan=-1.0), axis=1)
     label = np.nan_to_num(classes[np.arange(len(table)), likely, 0]).astype(np.int64)
@@ -122,14 +122,14 @@ def labels_of(table: Floats) -> list[str]:
 
 
 def stamp_at(told: dict[str, Any], path: str) -> int | None:
-    """Return the time at a path of a message; ns. ``None`` means missing or out of range."""
+    """Return the time stamp at a path of a decoded message; ns. ``None`` means missing or out of range."""
     seconds, nanos = (number(told, f"{path}.{part}") for part in ("sec", "nanosec"))
     there = 0 <= seconds < 1 << 32 and 0 <= nanos < 1 << 32
     return int(seconds) * 1_000_000_000 + int(nanos) if there else None
 
 
 class AutowareSurvey(Survey[ObjectLead]):
-    """First reading of an Autoware recording.
+    """First pass over an Autoware recording, which collects the facts that the frames need.
 
     Attributes
     ----------
@@ -158,16 +158,16 @@ class AutowareSurvey(Survey[ObjectLead]):
         self._looks = 0
 
     def rank(self, lead: ObjectLead) -> tuple[int, ...]:
-        """Return the sort key of a possible leading channel: non-empty, list type, number of frames."""
+        """Return the sort key of a channel for the choice of the frame channel. The greatest key wins."""
         return lead.objects > 0, lead.order, lead.frames
 
     def label_of(self, ident: str, first: str) -> str:
-        """Return the most frequent class of an object; ``first`` if it is unknown."""
+        """Return an object's most frequent class in the recording; the first class if it is unknown."""
         counts = self._classes.get(ident)
         return max(counts, key=counts.__getitem__) if counts else first
 
     def find_ego(self) -> str:
-        """Find the channel of the ego's pose and the axes, and return the ego's id."""
+        """Find the channel and coordinate axes of the ego pose, and return the id of the ego."""
         found = [
             (parent != MAP, child != "base_link", -count, self.topic(channel), channel)
             for channel, (parent, child, count) in self._poses.items()
@@ -190,20 +190,20 @@ class AutowareSurvey(Survey[ObjectLead]):
         return self.wanted or (EGO if there else "")
 
     def role(self, channel: int) -> str:
-        """Return the role of a channel, ``lasting`` for static transforms."""
+        """Return the role of a channel: frames, sensor data, or ``lasting`` for static transforms."""
         static = self.contents.get(channel) == TRANSFORMS and self.topic(channel).endswith(STATIC)
         return "lasting" if static else super().role(channel)
 
     def context(self) -> list[Ref]:
-        """Return the messages that later ones depend on: static transforms and calibrations."""
+        """Return the file positions of static transforms and calibrations, which later messages need."""
         return [*self._static, *super().context()]
 
     def meet(self, channel: int) -> bool:
-        """True if the messages of a channel are objects, poses or transforms."""
+        """Return True if the messages of a channel are objects, poses or transforms."""
         return self._content(channel) in {OBJECTS, POSE_OF_EGO, TRANSFORMS}
 
     def keeps(self, channel: int) -> bool:
-        """True if the reading of the frames needs the messages of a channel again."""
+        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
         return bool(self._content(channel))
 
     def _content(self, channel: int) -> str:
@@ -228,7 +228,7 @@ class AutowareSurvey(Survey[ObjectLead]):
             self.leads[channel] = ObjectLead(order=order, stamps=stamps)
 
     def look(self, run: Messages, row: int) -> None:
-        """Examine one message. Unreadable messages are reported during the reading of the frames."""
+        """Collect facts from one Autoware message. Unreadable messages are reported in the second pass."""
         channel = int(run.channel[row])
         content = self.contents[channel]
         if content == OBJECTS:

@@ -97,7 +97,7 @@ _CIRCLE, _OFF, _FLASHING = 1, 1, 3
 
 
 def _columns(predicted: bool) -> tuple[str, ...]:  # noqa: FBT001 (one of two definitions)
-    """Return the paths of the used numbers of an object."""
+    """Return the field paths of the numbers that the reader needs from an Autoware object."""
     pose = f"{_TOLD[predicted]}.pose"
     twist = f"kinematics.{_TURNED[predicted]}.twist"
     pushed = f"kinematics.{_PUSHED[predicted]}.accel.linear"
@@ -117,7 +117,7 @@ def _columns(predicted: bool) -> tuple[str, ...]:  # noqa: FBT001 (one of two de
 
 @dataclass(slots=True)
 class AutowareRawFrame:
-    """Frame with the objects in their original axes, and the other facts of its time.
+    """Frame of an Autoware recording before conversion, with objects in their original coordinate axes.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class AutowareRawFrame:
 
 @dataclass(slots=True)
 class _Detection:
-    """Detected object without an id, as in the last list."""
+    """Detected object without an id, from the previous list of objects."""
 
     ident: str
     label: str
@@ -164,7 +164,7 @@ class _Detection:
 
 
 class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
-    """Converter of Autoware messages into frames.
+    """Decoder of Autoware messages into frames.
 
     The class of an object is a guess of the perception. The most frequent class is used.
 
@@ -209,7 +209,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         self._followed = 0
 
     def decode(self, run: Messages, row: int) -> AutowareRawFrame | None:
-        """Return the frame of a message. ``None`` means not a frame, unreadable or outside the window."""
+        """Return the raw frame of an Autoware message. ``None`` means not a frame, or unreadable."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()
@@ -227,13 +227,13 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return None
 
     def complete(self, frames: list[AutowareRawFrame]) -> list[FrameRows]:
-        """Return the frames with their numbers, in fixed axes."""
+        """Convert raw Autoware frames to frames with poses and speeds in fixed map axes."""
         if frames and frames[-1] is self._open:  # The last frame.
             self._settle_open()
         return [self._rows(frame) for frame in frames]
 
     def settle(self) -> None:
-        """Report the losses, after all frames are read."""
+        """Add the lost messages to the report, after all frames are read."""
         super().settle()
         warn = self._report.warnings.append
         if self._unplaced:
@@ -250,7 +250,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return "Predicted" in self._survey.structures[self._survey.leading].name
 
     def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
-        """Return the function that processes the messages of each channel."""
+        """Return the function that processes messages, for each channel other than the frame channel."""
         takers = {
             TRANSFORMS: self._take_transforms,
             LIGHTS: self._take_lights,
@@ -270,7 +270,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return decode(self._survey.structures[channel], data)
 
     def _stamp(self, told: dict[str, Any], path: str, log_time: int) -> int:
-        """Return the time of a message outside the leading channel; ns."""
+        """Return the simulation time of a message outside the frame channel; ns."""
         return self._stamps.beside(log_time, stamp_at(told, path))
 
     def _take_transforms(self, channel: int, log_time: int, data: memoryview) -> None:
@@ -383,7 +383,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return state if abs(stamp - told) <= _LIT_NS else LIGHT_STATE_CODE["unknown"]
 
     def _reported(self, stamp: int) -> tuple[int, float]:
-        """Return the light mask and the gear of the ego at a time."""
+        """Return the light mask and the gear of the ego at a time, from recent vehicle messages."""
         now = {
             what: value
             for what, (told, value) in self._reports.items()
@@ -398,7 +398,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return mask, _gear_of(now.get(GEAR, 0))
 
     def _follow(self, stamp: int, labels: list[str], table: Floats, told: list[str]) -> list[str]:
-        """Return the ids of detections: that of the nearest previous detection, else a new id."""
+        """Return ids for detections without ids: that of the nearest previous detection, else a new id."""
         before_ns, before = self._seen
         lapse = min(max(stamp - before_ns, 0), _LIT_NS) / 1e9
         places = table[:, _BOX_BEGINS : _BOX_BEGINS + 2]
@@ -444,7 +444,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
             table[row, _BOX_BEGINS : _BOX_BEGINS + 3] += np.nan_to_num(turn @ middle)
 
     def _settle_open(self) -> None:
-        """Compute the poses of the last frame from all messages so far."""
+        """Compute the ego pose and motion of the last frame from all messages read so far."""
         frame, self._open = self._open, None
         if frame is None:
             return
@@ -476,7 +476,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return place + rotated(turn, motion[:3]) * (late / 1e9), product(turn, further)
 
     def _base_at(self, frame: AutowareRawFrame) -> Pose | None:
-        """Return the pose, in fixed axes, of the axes that the objects are given in, or ``None``."""
+        """Return the pose, in map axes, of the coordinate axes of a frame's objects; ``None`` if unknown."""
         survey = self._survey
         if frame.axes == survey.world:
             return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
@@ -538,7 +538,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
 
 
 def _numbers(objects: Floats, base: Pose | None) -> tuple[Floats, Bools]:
-    """Return the poses (n, 16) of objects, and a mask of the usable ones.
+    """Return the poses (n, 16) of Autoware objects, and a mask of the usable ones.
 
     The columns are :data:`sgstore.model.world.POSE`. ``objects``: columns of the objects after their classes;
     ``base``: the pose of their axes.
@@ -570,7 +570,7 @@ def _numbers(objects: Floats, base: Pose | None) -> tuple[Floats, Bools]:
 
 
 def _rotations(turns: Floats) -> tuple[Floats, Floats]:
-    """Return the matrices (n, 3, 3) and angles (n, 3) of quaternions (x, y, z, w); NaN if invalid."""
+    """Convert quaternions (n, 4) to rotation matrices (n, 3, 3) and angles (n, 3); NaN if invalid."""
     with np.errstate(invalid="ignore", over="ignore"):
         norm = np.sqrt((turns * turns).sum(axis=1))
         norm[~((norm > 0.5) & (norm < 2))] = np.nan
@@ -585,7 +585,7 @@ def _rotations(turns: Floats) -> tuple[Floats, Floats]:
 
 
 def _angles(matrices: Floats) -> Floats:
-    """Return heading, pitch (positive with the nose down) and roll (n, 3) of rotations (n, 3, 3); rad."""
+    """Convert rotation matrices to heading, pitch (positive with the nose down) and roll (n, 3); rad."""
     heading = np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0])
     pitch = np.arcsin(np.clip(-matrices[:, 2, 0], -1.0, 1.0))
     roll = np.arctan2(matrices[:, 2, 1], matrices[:, 2, 2])
@@ -600,7 +600,7 @@ def _pose_at(told: dict[str, Any], place: str, turn: str) -> Pose | None:
 
 
 def _state_of(elements: Iterable[dict[str, Any]]) -> str:
-    """Return the state of a group of lights: of its round lights, else of its arrows."""
+    """Return the state of a group of traffic lights: of its round lights, else of its arrows."""
     told = [{key: number(one, key) for key in ("color", "shape", "status")} for one in elements]
     told = [one for one in told if one["shape"] == _CIRCLE] or told
     if any(one["status"] == _FLASHING for one in told):
@@ -621,7 +621,7 @@ def _gear_of(report: int) -> float:
 
 
 class AutowareTrace(SurveyedTrace[AutowareSurvey]):
-    """Recording of Autoware.
+    """Open Autoware recording, which yields frames.
 
     Parameters
     ----------
@@ -660,11 +660,11 @@ class AutowareTrace(SurveyedTrace[AutowareSurvey]):
 
     @staticmethod
     def has_frames(recording: Recording, channel: int) -> bool:
-        """True if a channel contains lists of objects."""
+        """Return True if an Autoware channel contains lists of objects."""
         return content_of(recording, channel) == OBJECTS
 
     def on_map(self, road_map: RoadMap | None) -> None:
-        """Find the positions of traffic lights in the road map of the ingest."""
+        """Find the positions of the traffic lights in the road map."""
         if road_map is None:
             return
         nodes = road_map.nodes

@@ -1,4 +1,4 @@
-"""Access to a running CARLA: frames of a ``carla.World`` and its sensors, in the axes of sgstore.
+"""Access to a running CARLA simulator: frames of the world and sensor data, in the axes of sgstore.
 
 ::
 
@@ -107,7 +107,7 @@ _NO_BOX: Final = (0.0, 0.0, 0.0, _NAN, _NAN, _NAN, 0.0)
 
 
 def connect(host: str = "localhost", port: int = 2000, timeout_s: float = TIMEOUT_S) -> Any:
-    """Return a ``carla.Client`` with a connection to a server.
+    """Connect to a CARLA server, and return a ``carla.Client``.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def connect(host: str = "localhost", port: int = 2000, timeout_s: float = TIMEOU
 
 @dataclass(frozen=True, slots=True)
 class _Actor:
-    """Constant properties of an actor.
+    """Constant properties of a CARLA actor, such as type and bounding box.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class _Actor:
 
 
 class LiveWorld:
-    """World of a running CARLA, read frame by frame.
+    """Reader of frames from the world of a running CARLA simulator.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ class LiveWorld:
 
     @cached_property
     def road_map(self) -> RoadMap:
-        """Road map of the world, parsed at the first use.
+        """Road map of the CARLA world, parsed at the first use.
 
         Raises
         ------
@@ -208,13 +208,13 @@ class LiveWorld:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings so far, about traffic lights with a wrong signal of the map."""
+        """Warnings so far about traffic lights that may be assigned to a wrong signal of the map."""
         if self._at_once is None:
             return []
         return [*shared_signals(self._heads, self.road_map), *self._at_once.warnings]
 
     def frame(self, snapshot: Any = None) -> Frame:
-        """Return the current frame of the world.
+        """Return the current frame of the CARLA world: all objects with pose and motion.
 
         Parameters
         ----------
@@ -237,7 +237,7 @@ class LiveWorld:
             raise TraceError(f"the CARLA server does not answer: {error}") from error
 
     def find_ego(self) -> Any:
-        """Return the ego as a ``carla.Vehicle`` without a new frame, or ``None``."""
+        """Return the ego as a ``carla.Vehicle`` without reading a new frame, or ``None``."""
         try:
             here = self._here({state.id for state in self.world.get_snapshot()})
         except RuntimeError as error:
@@ -246,7 +246,7 @@ class LiveWorld:
         return None if ego is None else here[ego].handle
 
     def _here(self, present: set[int]) -> dict[int, _Actor]:
-        """Return the present actors that are entities."""
+        """Return the present CARLA actors that are objects of the scene, by actor id."""
         self._look(present)
         return {i: a for i in sorted(present) if (a := self._actors[i]) is not None}
 
@@ -265,7 +265,7 @@ class LiveWorld:
         return frame
 
     def _look(self, present: set[int]) -> None:
-        """Request the properties of new actors, and drop removed actors."""
+        """Request the properties of new CARLA actors, and drop removed actors."""
         for ident in self._actors.keys() - present:
             del self._actors[ident]
             self._heads.pop(ident, None)
@@ -291,7 +291,7 @@ class LiveWorld:
         return None
 
     def _signals(self, actors: Mapping[int, Any]) -> dict[int, str]:
-        """Return the ids of the map signals for lights and signs.
+        """Return the id of the map signal for each traffic light and sign, by actor id.
 
         A light may know its signal. Otherwise, it is matched as in a recording
         (:mod:`sgstore.readers.carla._signals`), by position or by the lanes of its stop waypoints.
@@ -313,7 +313,7 @@ class LiveWorld:
         return found | self._heads
 
     def _watch(self, here: Mapping[int, _Actor]) -> None:
-        """Check the states of the lights for contradictions."""
+        """Check the traffic lights for contradictions: red and green for the same lane."""
         heads = [ident for ident, actor in here.items() if actor.type_name == TRAFFIC_LIGHT]
         if not heads:
             return
@@ -334,7 +334,7 @@ class LiveWorld:
         return np.flatnonzero(np.isin(self.road_map.nodes.kind, codes))
 
     def _sign_at(self, x: float, y: float) -> str:
-        """Return the name of the map's sign at a position; empty without one."""
+        """Return the name of the map's traffic sign at a position; empty without a sign."""
         nodes, rows = self.road_map.nodes, self._sign_rows
         if not len(rows):
             return ""
@@ -343,7 +343,7 @@ class LiveWorld:
         return nodes.name[rows[nearest]] if apart[nearest] <= SAME_PLACE else ""
 
     def _add_scenery(self, frame: Frame) -> None:
-        """Add the objects of the CARLA level: static ones once, vehicles and people in every frame."""
+        """Add the objects of the CARLA level to a frame: static ones once, vehicles and people always."""
         for ident, kind, place, more in self._level:
             moves = kind in MOVING
             if moves or not self._told:
@@ -378,7 +378,7 @@ class LiveWorld:
 
 
 def _described(handle: Any, map_ref: str) -> _Actor:
-    """Request the constant properties of an actor."""
+    """Request the constant properties of a CARLA actor from the server."""
     type_name = str(handle.type_id)
     return _Actor(
         handle=handle,
@@ -391,7 +391,7 @@ def _described(handle: Any, map_ref: str) -> _Actor:
 
 
 def _box(box: Any) -> tuple[float, ...]:
-    """Return centre, half extents and yaw of an actor's box. A light or a box of size 0 gives NaN."""
+    """Return centre, half extents and yaw of a CARLA actor's bounding box; NaN without a box."""
     if box is None or not (box.extent.x or box.extent.y or box.extent.z):
         return _NO_BOX
     place, half = box.location, box.extent
@@ -427,7 +427,7 @@ def _add_actor(
 
 
 def _motion(state: Any) -> dict[str, Any]:
-    """Return velocity, acceleration and yaw rate of an actor."""
+    """Return velocity, acceleration and yaw rate of a CARLA actor."""
     velocity, acceleration = state.get_velocity(), state.get_acceleration()
     return {
         "vx": velocity.x,
@@ -464,7 +464,7 @@ def in_world(point: tuple[float, float, float], transform: Any) -> tuple[float, 
 
 
 def _controls(actor: _Actor) -> dict[str, Any]:
-    """Return the control inputs of a vehicle. The sign of the steering is inverted."""
+    """Return the control inputs (steering, throttle, brake, …) of a CARLA vehicle."""
     if not actor.type_name.startswith("vehicle."):
         return {}
     control = actor.handle.get_control()
@@ -482,7 +482,7 @@ def _shown(light: Any) -> str:
 
 
 def _light(actor: Any) -> Light:
-    """Return the pose of a traffic light and its stop positions, for the search of its signal."""
+    """Return the pose and stop positions of a CARLA traffic light, for the search of its map signal."""
     transform = actor.get_transform()
     place, heading = transform.location, math.radians(-transform.rotation.yaw)
     stops: list[tuple[float, ...]] = []
@@ -525,7 +525,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class SensorPicture:
-    """Camera picture: (height, width, 3) uint8, RGB. ``fov`` is the horizontal field of view; degrees."""
+    """Camera picture of a CARLA sensor: (height, width, 3) uint8, RGB, with the field of view."""
 
     pixels: np.ndarray[Any, np.dtype[np.uint8]]
     fov: float
@@ -533,14 +533,14 @@ class SensorPicture:
 
 @dataclass(frozen=True, slots=True)
 class SensorCloud:
-    """Point cloud: rows of :data:`LIDAR`, :data:`SEMANTIC_LIDAR` or :data:`RADAR`."""
+    """Point cloud of a CARLA lidar or radar: one row per point."""
 
     points: np.ndarray[Any, np.dtype[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class SensorReading:
-    """Measurement of a sensor.
+    """Measurement of a CARLA sensor: name, time and data.
 
     Attributes
     ----------
@@ -559,7 +559,7 @@ class SensorReading:
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Configuration of a sensor on the ego.
+    """Configuration of a CARLA sensor on the ego: type, pose and settings.
 
     Attributes
     ----------
@@ -587,7 +587,7 @@ class Sensor:
 
 
 def load_sensors(path: Path) -> list[Sensor]:
-    """Return the sensors of a TOML file, each in a table ``[[sensor]]``.
+    """Read sensor configurations from a TOML file, each in a table ``[[sensor]]``.
 
     Raises
     ------
@@ -640,7 +640,7 @@ def _sensor(where: str, table: Any) -> Sensor:
 
 
 class Sensors:
-    """Sensors attached to an ego until they are closed.
+    """CARLA sensors attached to the ego until they are closed.
 
     Parameters
     ----------
@@ -684,14 +684,14 @@ class Sensors:
         self.close()
 
     def close(self) -> None:
-        """Stop the sensors and remove them from the world."""
+        """Stop the CARLA sensors, and remove them from the world."""
         for actor in self._actors:
             actor.stop()
             actor.destroy()
         self._actors.clear()
 
     def waiting(self, timeout_s: float = 0.0) -> Iterator[SensorReading]:
-        """Yield the measurements since the last call.
+        """Yield the sensor measurements that arrived since the last call.
 
         Parameters
         ----------
@@ -727,7 +727,7 @@ class Sensors:
         actor.listen(partial(self._take, sensor.name))
 
     def _take(self, name: str, data: Any) -> None:
-        """CARLA callback. It runs on a client thread, which swallows exceptions."""
+        """Store a sensor measurement. CARLA calls this on a client thread, which swallows exceptions."""
         try:
             self._queue.put(reading_of(name, data), timeout=PATIENCE_S)
         except queue.Full:
@@ -738,7 +738,7 @@ class Sensors:
 
 
 def reading_of(name: str, data: Any) -> SensorReading:
-    """Convert a ``carla.SensorData`` of any type into a measurement."""
+    """Convert a ``carla.SensorData`` of any type into a measurement of sgstore."""
     time_ns = round(data.timestamp * 1e9)
     kind = type(data).__name__
     if hasattr(data, "fov") and hasattr(data, "raw_data"):
@@ -757,7 +757,7 @@ def reading_of(name: str, data: Any) -> SensorReading:
 
 
 def _radar(data: Any) -> np.ndarray[Any, np.dtype[Any]]:
-    """Convert radar detections (velocity, altitude, clockwise azimuth, depth; rad, m) into points."""
+    """Convert CARLA radar detections (velocity, angles, depth) into points."""
     told = np.frombuffer(data.raw_data, "<f4").reshape(-1, 4).astype(np.float64)
     velocity, altitude, azimuth, depth = told.T
     points = np.zeros(len(told), RADAR)
@@ -769,7 +769,7 @@ def _radar(data: Any) -> np.ndarray[Any, np.dtype[Any]]:
 
 
 def _values(data: Any) -> dict[str, Any]:
-    """Return the public values of an IMU, GNSS or event measurement by name."""
+    """Return the values of an IMU, GNSS or event measurement of CARLA, by name."""
     found: dict[str, Any] = {"type": type(data).__name__}
     for name in dir(data):
         if name.startswith("_") or name in {"transform", "frame_number", "raw_data", "timestamp"}:

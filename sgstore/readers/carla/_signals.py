@@ -1,4 +1,4 @@
-"""Assignment of CARLA's traffic lights to the signals of the road map.
+"""Assignment of CARLA's traffic lights to the signals of the road map, by position.
 
 A light has at most one signal, and a signal at most one light. The steps are:
 
@@ -74,7 +74,7 @@ _RED, _GREEN = LIGHT_STATE_CODE["red"], LIGHT_STATE_CODE["green"]
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Traffic light with its pose and trigger boxes.
+    """CARLA traffic light with its pose and trigger boxes (areas where vehicles obey it).
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Light:
 def signals_of(
     lights: Mapping[int, Light], road_map: RoadMap, told: Mapping[int, str] | None = None
 ) -> dict[int, str]:
-    """Return the map signal of each light by light id. Without a signal, return names of its lanes.
+    """Return the map signal of each traffic light: light id → signal name, or names of lanes without a signal.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def signals_of(
 
 
 class _Rule(NamedTuple):
-    """Usual pose of a light relative to its signal: rotation, and offset in the axes of the signal."""
+    """Usual pose of a traffic light relative to its map signal: rotation and offset."""
 
     turn: float
     ahead: float
@@ -134,7 +134,7 @@ class _Rule(NamedTuple):
 
 
 class _Near(NamedTuple):
-    """Pairs of a light and a signal that may belong together, with their distances.
+    """Candidate pairs of a traffic light and a map signal, with their distances.
 
     ``ahead``, ``left``: in the signal's axes, minus the offset of the rule; ``up``: minus the usual height; m.
     """
@@ -154,7 +154,7 @@ class _Near(NamedTuple):
 
 
 def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
-    """Return the signal row for each light row, by position. Columns: ``x, y, z, heading``."""
+    """Assign traffic lights to map signals by position: row of the light → row of the signal."""
     found: dict[int, int] = {}
     best = _Rule(TURNS[0], FORWARD, 0.0)
     first = True
@@ -181,7 +181,7 @@ def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
 def _near(
     lights: Floats, signals: Floats, rule: _Rule, reach: float, found: Mapping[int, int]
 ) -> _Near:
-    """Return the pairs of unassigned lights and signals with similar heading and small distance."""
+    """Return pairs of unassigned traffic lights and map signals with similar heading and small distance."""
     light = np.setdiff1d(np.arange(len(lights)), list(found))
     signal = np.setdiff1d(np.arange(len(signals)), list(found.values()))
     rows, columns = [light[:0]], [signal[:0]]
@@ -206,7 +206,7 @@ def _near(
 
 
 def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, int]) -> _Rule | None:
-    """Return the usual offset between lights and signals. ``None`` means that the lights disagree."""
+    """Return the usual offset between traffic lights and map signals. ``None`` means that lights disagree."""
     near = _near(lights, signals, _Rule(turn, 0.0, 0.0), LEARNT_WITHIN, found)
     sure = near.take(_only(near.light) & _only(near.signal))
     if len(sure.light) < LEARNT_FROM:
@@ -217,18 +217,18 @@ def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, in
 
 
 def _alone(near: _Near) -> dict[int, int]:
-    """Return the pairs of a light and a signal that have only each other as possible partner."""
+    """Return the pairs of a traffic light and a map signal that are the only candidates of each other."""
     sure = near.take(_only(near.light) & _only(near.signal))
     return dict(zip(sure.light.tolist(), sure.signal.tolist(), strict=True))
 
 
 def _only(rows: Rows) -> Bools:
-    """Return a mask of the values that occur once."""
+    """Return a mask of the array values that occur once."""
     return np.bincount(rows)[rows] == 1 if len(rows) else np.zeros(0, np.bool_)
 
 
 def _assigned(near: _Near) -> dict[int, int]:
-    """Assign the most lights possible to signals, with the smallest sum of squared distances."""
+    """Assign as many traffic lights as possible to map signals, with minimal sum of squared distances."""
     cost = near.ahead**2 + near.left**2 + (_OF_HEIGHT * near.up) ** 2
     found: dict[int, int] = {}
     for rows in _heaps(near):
@@ -253,7 +253,7 @@ def _assigned(near: _Near) -> dict[int, int]:
 
 
 def _heaps(near: _Near) -> Iterator[Rows]:
-    """Yield groups of pairs that share no light and no signal with other groups."""
+    """Yield groups of candidate pairs. A light or signal of one group occurs in no other group."""
     if not len(near.light):
         return
     light, signal = near.light, near.signal
@@ -282,7 +282,7 @@ def _nearest_in_turn(near: _Near, rows: Rows) -> dict[int, int]:
 
 
 def least_sum(cost: Floats) -> Rows:
-    """Return a different column for each row, so that the sum of the costs is minimal.
+    """Return a different column of a cost matrix for each row, so that the sum of costs is minimal.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ def least_sum(cost: Floats) -> Rows:
 def _by_boxes(
     lights: Mapping[int, Light], road_map: RoadMap, columns: Iterable[int]
 ) -> dict[int, str]:
-    """Assign the remaining signals to lights by the lanes that run through the lights' trigger boxes.
+    """Assign the remaining map signals to traffic lights, by the lanes through the trigger boxes of the lights.
 
     Of several signals, the one with the most of these lanes is used, then the nearest. Without a free signal,
     the lanes of the boxes are returned by name.
@@ -378,7 +378,7 @@ def _lanes_after(road_map: RoadMap) -> dict[int, set[int]]:
 
 
 def _lanes_of_boxes(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int, set[int]]:
-    """Return the driving lanes (node ids) in the trigger boxes of each light."""
+    """Return the driving lanes in the trigger boxes of each traffic light: light id → node ids."""
     told = [(ident, box) for ident, light in lights.items() for box in light.boxes]
     boxes = np.array([box for _, box in told], np.float64).reshape(-1, 6)
     hits = road_map.lanes_of(boxes[:, [0, 1, 3, 4, 5]], np.full(len(boxes), np.nan))
@@ -392,14 +392,14 @@ def _lanes_of_boxes(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int,
 
 
 def _through(hits: Any, boxes: Floats) -> Bools:
-    """Return a mask of the lanes whose centre line passes through the box."""
+    """Return a mask of the lanes whose centre line passes through a trigger box."""
     error, box = hits.heading_error, boxes[hits.row]
     reach = (np.abs(np.sin(error)) * box[:, 4] + np.abs(np.cos(error)) * box[:, 5]) / 2
     return np.abs(hits.offset) <= reach
 
 
 def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
-    """Return a warning for each map signal with several lights."""
+    """Return a warning for each map signal that is assigned to several traffic lights."""
     if len(set(signals.values())) == len(signals):
         return []
     known = set(road_map.nodes.name)
@@ -415,7 +415,7 @@ def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
 
 
 class AtOnce:
-    """Detector of lanes that are red and green at the same time, which reveals wrong assignments.
+    """Detector of lanes with red and green lights at the same time, a sign of wrongly assigned lights.
 
     Parameters
     ----------
@@ -459,7 +459,7 @@ class AtOnce:
         self.frames: dict[str, int] = {} if before is None else before.frames
 
     def see(self, states: Ints) -> None:
-        """Check the light states of a frame: codes of :data:`sgstore.model.vocabulary.LIGHT_STATES`."""
+        """Check the traffic light states of a frame for contradictions."""
         if states is not self._last:
             self._last = states
             self._bad = self._contradicting(states)
@@ -480,7 +480,7 @@ class AtOnce:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings, one for each pair of contradicting lights."""
+        """Warnings about contradictions, one for each pair of a red and a green light."""
         by_lights: dict[tuple[int, int], list[str]] = {}
         for lane, who in sorted(self.who.items()):
             by_lights.setdefault(who, []).append(lane)
@@ -512,12 +512,12 @@ _STATES: Final = ("red", "yellow", "green", "off", "unknown")
 
 
 def light_state(number: int) -> str:
-    """Return the name of a light state for its number in CARLA and its bridge."""
+    """Return the name of a traffic light state from its number in CARLA."""
     return _STATES[number] if 0 <= number < len(_STATES) else "unknown"
 
 
 def read_places(message: dict[str, Any]) -> dict[int, Light]:
-    """Return the lights of a ``CarlaTrafficLightInfoList`` by id, without those lacking a valid position."""
+    """Return the traffic lights of a CARLA message, by id. Lights without a valid position are dropped."""
     lights: dict[int, Light] = {}
     for told in records(message, "traffic_lights"):
         x, y, z = (number(told, f"transform.position.{axis}") for axis in "xyz")
@@ -537,7 +537,7 @@ def read_places(message: dict[str, Any]) -> dict[int, Light]:
 
 
 def heading_of(x: float, y: float, z: float, w: float) -> float:
-    """Return the heading of a quaternion of any length; rad. NaN if it is invalid."""
+    """Return the heading of a rotation quaternion of any length; rad. NaN if it is invalid."""
     norm = x * x + y * y + z * z + w * w
     if not 0.25 < norm < 4:
         return NAN
@@ -545,7 +545,7 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
 
 
 class Lights:
-    """Traffic lights of a trace, with a row in every frame.
+    """Traffic lights of a CARLA trace, with their latest states.
 
     Parameters
     ----------
@@ -581,21 +581,21 @@ class Lights:
 
     @property
     def unplaced(self) -> int:
-        """Number of lights with a state but without a position."""
+        """Number of traffic lights with a state but without a position."""
         return len(self._unplaced)
 
     @property
     def aimless(self) -> int:
-        """Number of lights without known lanes."""
+        """Number of traffic lights without known lanes."""
         return len(self._row.keys() - self._signals.keys())
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings so far about lights with a wrong signal."""
+        """Warnings so far about traffic lights that may be assigned to a wrong map signal."""
         return [*self._shared, *self._at_once.warnings]
 
     def of_frame(self) -> Ints:
-        """Return the states of the lights in the next frame: codes of ``LIGHT_STATES``.
+        """Return the states of all traffic lights in the next frame, as codes.
 
         Frames share this array; do not change it.
         """
@@ -603,7 +603,7 @@ class Lights:
         return self._states
 
     def update(self, message: dict[str, Any]) -> None:
-        """Update the states from a ``CarlaTrafficLightStatusList``. Other lights keep their states."""
+        """Update the states of traffic lights from a CARLA message. Other lights keep their states."""
         states = self._states.copy()  # Frames share the old array.
         for told in records(message, "traffic_lights"):
             ident, state = ident_of(told, "id"), ident_of(told, "state")

@@ -1,4 +1,4 @@
-"""First reading of a CARLA recording: actors, channels, egos, lights and map.
+"""First pass over a CARLA recording: find actors, channels, egos, traffic lights and the map.
 
 The list of actors contains the type of each object. It may occur only once and late, like the positions of
 lights and the map. All of them are collected at the opening of a recording.
@@ -61,7 +61,7 @@ _CLASSES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """Actor in the list of actors.
+    """Actor (vehicle, walker, sensor, …) in a CARLA list of actors.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Actor:
 
 
 def meaning_of(type_name: str) -> TypeMeaning:
-    """Return the meaning of a blueprint id, or of its longest known prefix before a dot.
+    """Return kind and subkind for a CARLA blueprint id, such as ``vehicle.audi.tt``.
 
     An unmapped vehicle has the general kind ``vehicle``.
     """
@@ -90,7 +90,7 @@ def meaning_of(type_name: str) -> TypeMeaning:
 
 
 def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning:
-    """Return the meaning of an object from its blueprint, else from the class in the ROS bridge.
+    """Return kind and subkind of a CARLA object, from its blueprint, else from its class number.
 
     The class ``car`` is the bridge's default, so it is ignored for an unmapped blueprint.
     """
@@ -105,7 +105,7 @@ def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning
 
 @dataclass(slots=True)
 class Egos:
-    """Choice of the ego: the requested vehicle, or a vehicle with a role name of the bridge.
+    """Choice of the ego in a CARLA recording: the requested vehicle, or a vehicle with a usual role name.
 
     Attributes
     ----------
@@ -128,12 +128,12 @@ class Egos:
     later: dict[int, list[Actor]] = field(default_factory=dict[int, list[Actor]])
 
     def id_of(self, role: str) -> int | None:
-        """Return the id of the vehicle with a role name, or ``None``."""
+        """Return the id of the vehicle with a role name (such as ``hero``), or ``None``."""
         ids = self._with(role)
         return ids[0] if ids else self.by_role.get(role)
 
     def settle(self, driven: Iterable[str]) -> tuple[int | None, list[str]]:
-        """Return the id of the ego, and warnings about the choice.
+        """Choose the ego of a CARLA recording. Return its id, and warnings about the choice.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class Egos:
 
 
 def _listing(egos: Egos) -> str:
-    """Return a list of the possible actors for an error message."""
+    """Return a text that lists the possible egos of a CARLA recording, for an error message."""
     things = [
         f"{ident} ({actor.role or actor.type_name})"
         for ident, actor in _vehicles(egos.actors).items()
@@ -187,7 +187,7 @@ def _listing(egos: Egos) -> str:
 
 
 def _vehicles(actors: Mapping[int, Actor]) -> dict[int, Actor]:
-    """Return the moving actors; actors with a role other than ``autopilot`` come first."""
+    """Return the moving actors of a CARLA recording; actors with a special role come first."""
     moving = {
         ident: actor
         for ident, actor in actors.items()
@@ -258,7 +258,7 @@ _MAX_SECONDS: Final = 1 << 32
 
 
 def content_of(recording: Recording, channel: int) -> str:
-    """Return the content type of a channel's messages; empty if the reader does not support them.
+    """Return the content type of a CARLA channel (such as objects or controls); empty if unsupported.
 
     The bridge has no messages for vehicle lights. They are read from JSON messages ``{"t": s, "lights": {id:
     carla.VehicleLightState}}`` of a schema whose name ends in ``VehicleLights``.
@@ -271,7 +271,7 @@ def content_of(recording: Recording, channel: int) -> str:
 
 
 def structure(recording: Recording, channel: int) -> Struct | None:
-    """Return the structure of a channel's messages from the recording. ``None`` means other than ROS.
+    """Return the ROS structure of a channel's messages. ``None`` means another format.
 
     Raises
     ------
@@ -283,18 +283,18 @@ def structure(recording: Recording, channel: int) -> Struct | None:
 
 
 def role_in(topic: str) -> str:
-    """Return the role name in a topic: ``hero`` in ``/carla/hero/vehicle_status``; empty without one."""
+    """Return the role name in a CARLA topic: ``hero`` in ``/carla/hero/vehicle_status``; empty without one."""
     parts = topic.split("/")
     return parts[-2] if len(parts) > 2 else ""
 
 
 def stamp_of(message: dict[str, Any]) -> int | None:
-    """Return the time in a message's header; ns. ``None`` means missing or out of range."""
+    """Return the time stamp in a message header; ns. ``None`` means missing or out of range."""
     return stamp_from([number(message, f"header.stamp.{part}") for part in ("sec", "nanosec")])
 
 
 def stamp_from(told: Floats | list[float]) -> int | None:
-    """Return the time for seconds and nanoseconds; ns. ``None`` means missing or out of range."""
+    """Convert seconds and nanoseconds to a time stamp; ns. ``None`` means missing or out of range."""
     seconds, nanos = told
     there = abs(seconds) < _MAX_SECONDS and abs(nanos) < _MAX_SECONDS
     return int(seconds) * 1_000_000_000 + int(nanos) if there else None
@@ -311,7 +311,7 @@ _MARKINGS: Final = {0: "other", 1: "broken", 2: "solid"}
 def event_of(
     content: str, message: dict[str, Any], place: tuple[int, int, int], ident: str
 ) -> Event:
-    """Return the event of a message.
+    """Return the event (collision or lane invasion) in a CARLA message.
 
     ``place``: simulation time, log time, number of the previous frame; ``ident``: id of the vehicle.
     """
@@ -346,7 +346,7 @@ _MOST_NOTES: Final = 100
 
 
 class CarlaSurvey(Survey[Lead]):
-    """First reading of a CARLA recording.
+    """First pass over a CARLA recording, which collects the facts that the frames need.
 
     Attributes
     ----------
@@ -379,12 +379,12 @@ class CarlaSurvey(Survey[Lead]):
         self._lasting: list[Ref] = []
 
     def rank(self, lead: Lead) -> tuple[int, ...]:
-        """Return the sort key of a possible leading channel: the number of frames, then their bytes."""
+        """Return the sort key of a channel for the choice of the frame channel: frames, then bytes."""
         return lead.frames, lead.weight
 
     @property
     def driven(self) -> dict[int, str]:
-        """Role name of the vehicle by channel id, for channels of a single vehicle."""
+        """Role name of the vehicle (such as ``hero``) for each channel about a single vehicle."""
         return {
             channel: role_in(self.topic(channel))
             for channel, content in self.contents.items()
@@ -392,7 +392,7 @@ class CarlaSurvey(Survey[Lead]):
         }
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego for a name. ``None`` means that a new reading may find it."""
+        """Return the id of the ego for a name. ``None`` means that a new pass may find it."""
         egos = self.egos
         if name.isdecimal() and int(name) not in egos.actors.keys() | egos.seen:
             return None
@@ -400,36 +400,36 @@ class CarlaSurvey(Survey[Lead]):
         return str(found)
 
     def find_ego(self) -> str:
-        """Find the vehicle with the role of the ego, and return its id."""
+        """Find the vehicle with the role name of the ego, and return its id."""
         self.ego, self.about_ego = self.egos.settle(self.driven.values())
         return "" if self.ego is None else str(self.ego)
 
     def role(self, channel: int) -> str:
-        """Return the role of a channel. Channels whose facts stay valid for later frames are ``lasting``."""
+        """Return the role of a channel: frames, sensor data, or ``lasting`` facts such as actor lists."""
         lasts = channel != self.leading and self.contents.get(channel) in LASTING
         return "lasting" if lasts else super().role(channel)
 
     def context(self) -> list[Ref]:
-        """Return the messages that later ones depend on, for example maps, actor lists and calibrations."""
+        """Return the file positions of maps, actor lists and calibrations, which later messages need."""
         return [*self._lasting, *super().context()]
 
     def meet(self, channel: int) -> bool:
-        """True if the messages of a channel are frames or facts that stay valid for later frames."""
+        """Return True if the messages of a channel are frames, or facts for later frames."""
         return self._content(channel) in LASTING | {OBJECTS}
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """True if the messages of a channel must be examined, for example texts with a map."""
+        """Return True if the first pass must examine the messages of a channel."""
         content = self.contents[channel]
         if content == TEXT:
             return channel not in self._last  # A text other than a map is examined only once.
         return met or (content == ODOMETRY and self._is_lost(channel))
 
     def keeps(self, channel: int) -> bool:
-        """True if the reading of the frames needs the messages of a channel again."""
+        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
         return self._content(channel) in FOR_FRAMES
 
     def _content(self, channel: int) -> str:
-        """Return the content type of a channel's messages; empty if they are not needed."""
+        """Return the content type of a CARLA channel (such as objects); empty if it is not needed."""
         if channel not in self.contents:
             self.contents[channel] = content = content_of(self.recording, channel)
             try:
@@ -444,7 +444,7 @@ class CarlaSurvey(Survey[Lead]):
         return self.contents[channel]
 
     def _learn(self, channel: int, content: str) -> None:
-        """Parse the structure of a channel's messages, if they are ROS messages."""
+        """Parse the ROS structure of a channel's messages."""
         found = structure(self.recording, channel)
         if found is None:
             return
@@ -455,7 +455,7 @@ class CarlaSurvey(Survey[Lead]):
             self.leads[channel] = Lead(stamps=stamps)
 
     def look(self, run: Messages, row: int) -> None:
-        """Examine one message. Unreadable messages are counted."""
+        """Collect facts from one CARLA message. Unreadable messages are counted."""
         channel = int(run.channel[row])
         if self.contents[channel] in {TEXT, ODOMETRY} and not self.watches(channel, met=False):
             return
@@ -488,7 +488,7 @@ class CarlaSurvey(Survey[Lead]):
 
     @property
     def _take(self) -> dict[str, Callable[[dict[str, Any]], bool]]:
-        """Functions that store the facts of a message, by content type. They return True for new facts."""
+        """Functions that collect facts from a message, by content type. They return True for new facts."""
         return {
             ACTORS: self._take_actors,
             LIGHT_PLACES: self._take_lights,
@@ -512,7 +512,7 @@ class CarlaSurvey(Survey[Lead]):
         return "<OpenDRIVE" in told[:_MAP_BEGINS] and self._take_map(told, "")
 
     def _take_actors(self, message: dict[str, Any]) -> bool:
-        """Add a list of actors. Return True if an actor is new."""
+        """Add a CARLA list of actors to the known facts. Return True if an actor is new."""
         actors = self.egos.actors
         known = len(actors)
         for told in records(message, "actors"):
@@ -541,13 +541,13 @@ class CarlaSurvey(Survey[Lead]):
         return True
 
     def _note(self, note: str) -> None:
-        """Add a warning once, up to the maximum number of warnings."""
+        """Add a warning to the report once, up to the maximum number of warnings."""
         if note not in self.notes and len(self.notes) <= _MOST_NOTES:
             more = "and more that is as odd"
             self.notes.append(note if len(self.notes) < _MOST_NOTES else more)
 
     def _is_lost(self, channel: int) -> bool:
-        """True if the vehicle of an odometry channel is unknown."""
+        """Return True if the vehicle of an odometry channel (own position) is unknown."""
         role = role_in(self.topic(channel))
         tried = self._tries >= _MOST_TRIES
         return bool(role) and not tried and self.egos.id_of(role) is None
@@ -564,7 +564,7 @@ class CarlaSurvey(Survey[Lead]):
             self._find_egos()
 
     def _find_egos(self) -> None:
-        """Find the object of each role by its odometry: the only object at this position and time."""
+        """Find the vehicle of each role name: the only object at the position of its odometry."""
         stamp, table = self._objects
         self._tries += 1
         for role, (when, place) in self._odometry.items():

@@ -1,4 +1,4 @@
-"""Reader of recordings of CARLA's ROS bridge (``derived_object_msgs`` and ``carla_msgs``).
+"""Reader of recordings of CARLA's ROS bridge: decoder of the messages into frames.
 
 They are recorded with ``ros2 bag record -s mcap``, and recognised only by the schema of a channel. A frame is
 one list of objects, in file order; its time is the simulation time. The road map is the OpenDRIVE text of
@@ -105,7 +105,7 @@ Controls = tuple[float, ...]
 
 @dataclass(slots=True)
 class CarlaRawFrame:
-    """Frame with the numbers of CARLA, not converted yet.
+    """Frame of a CARLA recording with the original numbers, before conversion.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class CarlaRawFrame:
 
 
 class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
-    """Converter of messages of the CARLA bridge into frames.
+    """Decoder of CARLA ROS bridge messages into frames.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
-        """Return the frame of a message. ``None`` means not a frame, unreadable or outside the window."""
+        """Return the raw frame of a CARLA message. ``None`` means not a frame, or unreadable."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()
@@ -195,7 +195,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return None
 
     def settle(self) -> None:
-        """Report the losses, after all frames are read."""
+        """Add the lost messages to the report, after all frames are read."""
         warn = self._report.warnings.append
         if self._lights.unplaced:
             warn(
@@ -250,7 +250,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return frame
 
     def _enter(self, ident: int, classification: float) -> None:
-        """Add a new object."""
+        """Add a new object of a CARLA message to the object table."""
         actor = self._survey.egos.actors.get(ident)
         meaning = meaning_of_object(actor, classification)
         type_name = actor.type_name if actor else f"class {classification:.0f}"
@@ -264,7 +264,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
             self._people.add(node)
 
     def _other(self, ident: int, classification: float) -> dict[int, Called]:
-        """Return the changed kind of an object by node id, if its class differs from the first one."""
+        """Return the new kind of an object whose class differs from its first class: node id → kind."""
         node = self._nodes[ident]
         if np.isnan(self._classes[ident]):
             self._classes[ident] = classification
@@ -280,7 +280,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return {} if vague or meaning.kind == first else {node: (meaning, type_name)}
 
     def complete(self, frames: list[CarlaRawFrame]) -> list[FrameRows]:
-        """Return the frames with their numbers, converted for all frames at once."""
+        """Convert raw CARLA frames to frames with poses, speeds and sizes, many frames at once."""
         if not frames:
             return []
         nodes = np.concatenate([frame.nodes for frame in frames])
@@ -300,7 +300,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return done
 
     def _rows(self, frame: CarlaRawFrame, values: Floats, usable: Bools) -> FrameRows:
-        """Convert a frame into its final columns, without unusable rows."""
+        """Convert a raw CARLA frame into its final columns, without unusable rows."""
         node = frame.nodes
         if not usable.all():
             for row in np.flatnonzero(~usable).tolist():
@@ -342,7 +342,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._unusable.add(reason.format(self._idents[node]), frame.log_time_ns)
 
     def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
-        """Return the function that processes the messages of each channel."""
+        """Return the function that processes messages, for each channel other than the frame channel."""
         found = self._survey
         takers: dict[int, Callable[[int, int, memoryview], None]] = {}
         own = {
@@ -409,7 +409,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._see_odometry()
 
     def _see_odometry(self) -> None:
-        """Set the position of the ego from its odometry, if it is not among the objects."""
+        """Set the ego position of a frame from the ego's odometry, if the ego is not among the objects."""
         frame, (stamp, numbers), ego = self._frame, self._odometry, self._ego
         if frame is None or numbers is None or ego is None:
             return
@@ -422,7 +422,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
 
 
 def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
-    """Return the poses of objects.
+    """Return the poses (n, 16) of CARLA objects, and a mask of the usable ones.
 
     Parameters
     ----------
@@ -453,7 +453,7 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
 
 
 def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
-    """Return heading, pitch and roll of quaternions (x, y, z, w), and their upright axes; NaN if invalid.
+    """Convert quaternions (x, y, z, w) to heading, pitch and roll, and vertical axes; NaN if invalid.
 
     The length of a quaternion may differ slightly from 1. At a pitch of ±90°, heading and roll have the same
     axis; the roll is then 0.
@@ -473,7 +473,7 @@ def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
 
 
 def _boxes(shape: Floats, size: Floats) -> Floats:
-    """Return length, width and height of shapes. Round shapes are defined by their radius."""
+    """Return length, width and height of object shapes. Round shapes have a radius."""
     boxes = size.copy()
     sphere = shape == _SPHERE
     boxes[sphere] = 2 * size[sphere, :1]
@@ -483,7 +483,7 @@ def _boxes(shape: Floats, size: Floats) -> Floats:
 
 
 def _pose_of(odometry: Floats) -> Floats:
-    """Return the pose columns of an odometry, at the vehicle's origin because it has no box."""
+    """Return pose columns from an odometry message: the vehicle's origin, because its box is unknown."""
     values = np.full(len(POSE), np.nan)
     angles, _ = _turned(odometry[None, 3:7])
     values[:3], values[3:6] = odometry[:3], angles[0]
@@ -498,7 +498,7 @@ def _pose_of(odometry: Floats) -> Floats:
 
 
 def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:
-    """Return the stamp of a JSON message, and its light states by vehicle id.
+    """Return the time stamp of a JSON message, and the light states of vehicles by id.
 
     Raises
     ------
@@ -525,12 +525,12 @@ def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:
 
 @lru_cache(maxsize=4096)  # Vehicles keep the same lights for a long time.
 def _our_lights(bits: int) -> int:
-    """Convert CARLA's bits of vehicle lights into the light mask of sgstore."""
+    """Convert CARLA's bit mask of vehicle lights into the light mask of sgstore."""
     return sum((bits >> theirs & 1) << ours for ours, theirs in enumerate(_CARLA_LIGHTS))
 
 
 class CarlaTrace(SurveyedTrace[CarlaSurvey]):
-    """Recording of CARLA's ROS bridge.
+    """Open recording of CARLA's ROS bridge, which yields frames.
 
     Parameters
     ----------
@@ -563,20 +563,20 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
 
     @staticmethod
     def has_frames(recording: Recording, channel: int) -> bool:
-        """True if a channel contains lists of objects."""
+        """Return True if a CARLA channel contains lists of objects."""
         return content_of(recording, channel) == OBJECTS
 
     def _decoder(self, report: TraceReport) -> CarlaDecoder:
         return CarlaDecoder(self._survey, self._signals, self._road_map, report)
 
     def on_map(self, road_map: RoadMap | None) -> None:
-        """Find the lanes of traffic lights in the road map of the ingest."""
+        """Find the lanes of the traffic lights in the road map."""
         if self._survey.lights and road_map is not None:
             self._road_map = road_map
             self._signals = signals_of(self._survey.lights, road_map)
 
     def _own_map(self) -> RoadMap | None:
-        """Return the recording's own map, if lights must be found in it."""
+        """Return the road map in the recording, if traffic lights must be located on it."""
         if not (self._survey.lights and self._survey.map_text):
             return None
         try:
@@ -586,7 +586,7 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
 
 
 def _inputs(told: Sequence[float], *, applied: bool) -> Controls:
-    """Convert CARLA's controls into the control inputs of sgstore.
+    """Convert CARLA's vehicle controls into the control inputs of sgstore.
 
     An applied control contains the actual gear. A requested control contains a gear only for manual shifting.
     Otherwise, the simulator chooses the gear, and only the reverse direction is known.

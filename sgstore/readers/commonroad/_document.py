@@ -43,7 +43,7 @@ Place = tuple[float, float, float]
 
 
 class State(NamedTuple):
-    """State of an obstacle at a step; NaN means unknown. m, rad, m/s, m/s², rad/s."""
+    """State of a CommonRoad obstacle at a time step: position, heading, speed, …; NaN means unknown."""
 
     x: float
     y: float
@@ -56,7 +56,7 @@ class State(NamedTuple):
 
 
 class ObstacleBox(NamedTuple):
-    """Bounding box of a shape in the obstacle's axes: size, centre and rotation."""
+    """Bounding box of an obstacle shape, in the obstacle's axes: size, centre and rotation."""
 
     length: float
     width: float
@@ -67,7 +67,7 @@ class ObstacleBox(NamedTuple):
 
 @dataclass(slots=True)
 class Obstacle:
-    """Obstacle with its states and its active lights by step."""
+    """Obstacle (vehicle, pedestrian, …) of a CommonRoad scenario, with its states by time step."""
 
     ident: str
     type: str
@@ -79,7 +79,7 @@ class Obstacle:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioLight:
-    """Traffic light with a cycle of states: (steps, state)."""
+    """Traffic light of a CommonRoad scenario, with its cycle: (number of steps, state)."""
 
     ident: str
     place: Place | None
@@ -88,7 +88,7 @@ class ScenarioLight:
     active: bool = True
 
     def shows(self, step: int) -> str:
-        """Return the state at a step; empty if it is unknown."""
+        """Return the traffic light state at a time step; empty if it is unknown."""
         if not self.active:
             return "inactive"
         total = sum(steps for steps, _ in self.cycle)
@@ -104,7 +104,7 @@ class ScenarioLight:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioSign:
-    """Traffic sign with its plates: (code, value)."""
+    """Traffic sign of a CommonRoad scenario, with its plates: (code, value)."""
 
     ident: str
     place: Place | None
@@ -114,7 +114,7 @@ class ScenarioSign:
 
 @dataclass(frozen=True, slots=True)
 class Lanelet:
-    """Lanelet with its borders (x, y, z) in driving direction, and its references."""
+    """Lanelet (lane segment) of a CommonRoad map, with its borders (x, y, z) in driving direction."""
 
     ident: str
     left: tuple[Place, ...]
@@ -135,7 +135,7 @@ class Lanelet:
 
 @dataclass(slots=True)
 class TrafficScenario:
-    """Contents of a CommonRoad scenario.
+    """Contents of a CommonRoad scenario: obstacles, traffic lights, signs and lanelets.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class TrafficScenario:
     states: int = 0
 
     def lose(self, what: str) -> None:
-        """Add a loss."""
+        """Record an unreadable part of the scenario."""
         if len(self.lost) < MAX_LOST:
             self.lost.append(what)
         else:
@@ -173,7 +173,7 @@ class TrafficScenario:
 
 
 def read_scenario(data: bytes) -> TrafficScenario:
-    """Parse a document into a scenario.
+    """Parse a CommonRoad XML document into a scenario.
 
     Raises
     ------
@@ -207,7 +207,7 @@ class _Node:
         return [child for child in self.children if child.tag == tag]
 
     def get(self, *path: str) -> _Node | None:
-        """Return the first element at a path of tags, or ``None``."""
+        """Return the first XML element at a path of tags, or ``None``."""
         found: _Node | None = self
         for tag in path:
             found = next((child for child in found.children if child.tag == tag), None)
@@ -216,7 +216,7 @@ class _Node:
         return found
 
     def word(self, *path: str) -> str:
-        """Return the text at a path of tags; empty if it is missing."""
+        """Return the text at a path of XML tags; empty if it is missing."""
         found = self.get(*path)
         return found.text.strip() if found else ""
 
@@ -224,12 +224,12 @@ class _Node:
         return tuple(child.text.strip() for child in self.all(tag))
 
     def refs(self, tag: str) -> tuple[str, ...]:
-        """Return the ids that child elements with a tag refer to."""
+        """Return the ids in the attribute ``ref`` of child elements with a tag."""
         return tuple(_ident(child, "ref") for child in self.all(tag))
 
 
 class _Reader:
-    """Handler of XML events that builds a scenario."""
+    """Handler of XML parser events that builds a CommonRoad scenario."""
 
     def __init__(self) -> None:
         self.scenario = TrafficScenario()
@@ -237,7 +237,7 @@ class _Reader:
         self._part = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """Handle the start of an element."""
+        """Handle the start tag of an XML element."""
         self._part += 1
         if self._part > MAX_PART:
             raise TraceError(f"<{self._open[1].tag}> has more than {MAX_PART:,} elements")
@@ -251,13 +251,13 @@ class _Reader:
         self._open.append(node)
 
     def end(self, _tag: str) -> None:
-        """Handle the end of an element."""
+        """Handle the end tag of an XML element."""
         node = self._open.pop()
         if len(self._open) == 1:
             _take(self.scenario, node)
 
     def characters(self, text: str) -> None:
-        """Add text to the current element."""
+        """Add text to the current XML element."""
         node = self._open[-1]
         if text.strip():
             node.text += text
@@ -284,7 +284,7 @@ def _begin(scenario: TrafficScenario, root: _Node) -> None:
 
 
 def _take(scenario: TrafficScenario, node: _Node) -> None:
-    """Read a part of the document. An invalid part becomes a loss."""
+    """Read one obstacle, light, sign or lanelet of a scenario. An invalid one is reported as lost."""
     if node.tag not in _PARTS:
         return
     try:
@@ -318,7 +318,7 @@ def _whole(text: str, what: str) -> int:
 
 
 def _value(node: _Node | None) -> float:
-    """Return an exact value, or the middle of an interval; NaN if it is missing."""
+    """Return the number in an XML element, or the middle of its interval; NaN if it is missing."""
     if node is None:
         return math.nan
     if node.get("exact"):
@@ -344,7 +344,7 @@ def _point(node: _Node) -> Place:
 
 
 def _position(node: _Node | None) -> Place | None:
-    """Return a position, or the centre of an area. ``None`` means that it is missing."""
+    """Return the position in an XML element, or the centre of its area. ``None`` means missing."""
     if node is None or not node.children:
         return None
     point = node.get("point")
@@ -355,7 +355,7 @@ def _position(node: _Node | None) -> Place | None:
 
 
 def _corners(shapes: _Node) -> Iterator[tuple[float, float]]:
-    """Yield points whose bounding box contains all shapes of an element."""
+    """Yield points whose bounding box contains all shapes of an XML element."""
     for shape in shapes.children:
         if shape.tag == "polygon":
             yield from (_point(point)[:2] for point in shape.all("point"))
@@ -421,7 +421,7 @@ _LIGHTS: Final = {
 
 
 def _state(node: _Node) -> State | None:
-    """Return a state, or ``None`` without a position."""
+    """Read the state of an obstacle from XML. ``None`` means without a position."""
     place = _position(node.get("position"))
     if place is None:
         return None
@@ -465,7 +465,7 @@ def _obstacle(scenario: TrafficScenario, node: _Node) -> None:
 
 
 def _follow(scenario: TrafficScenario, node: _Node, found: Obstacle) -> None:
-    """Add the valid states of a trajectory. Invalid states are losses."""
+    """Add the states of a trajectory to an obstacle. Invalid states are reported as lost."""
     trajectory = node.get("trajectory")
     if node.get("occupancySet") is not None:
         told = "it has a set of places where it may be, and no trajectory: its first state counts"
@@ -497,7 +497,7 @@ def _signal(node: _Node, found: Obstacle) -> None:
 
 
 def _surroundings(scenario: TrafficScenario, node: _Node) -> None:
-    """Add an environment obstacle, defined only by its shape in map axes."""
+    """Add an environment obstacle (such as a building), defined only by its shape in map axes."""
     ident = _ident(node)
     if ident in scenario.obstacles:
         raise ValueError("there are two of this id; the first one counts")

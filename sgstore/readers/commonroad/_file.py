@@ -1,4 +1,4 @@
-"""CommonRoad scenarios with the interface of an MCAP file: one message for the map, one per step.
+"""CommonRoad scenarios with the interface of an MCAP file: one map message, and one message per time step.
 
 A scenario contains each obstacle with all of its states. The file is therefore read as a whole at the first
 access. Its messages are JSON and always the same. The first one is the road map as a text of lanes; each
@@ -47,7 +47,7 @@ _RUN: Final = 256
 
 
 def is_scenario(path: Path) -> bool:
-    """True if a file is a CommonRoad scenario, by its suffix and first element."""
+    """Return True if a file is a CommonRoad scenario, by its suffix and first XML element."""
     if not path.name.lower().endswith(ENDINGS):
         return False
     try:
@@ -58,7 +58,7 @@ def is_scenario(path: Path) -> bool:
 
 
 class CommonRoadFile(MessageFile):
-    """CommonRoad scenario with the interface of an MCAP file, for one or more readings.
+    """CommonRoad scenario with the interface of an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class CommonRoadFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """Yield all messages: the map, then the steps. Losses are added to ``report``.
+        """Yield all messages of the scenario: the map, then one per time step.
 
         The ``offset`` of a message is its number. ``keep`` has no effect, because messages are already in
         memory.
@@ -135,7 +135,7 @@ class CommonRoadFile(MessageFile):
             start = stop
 
     def message(self, number: int) -> bytes:
-        """Return the data of a message by number. Number 0 is the map; the steps follow.
+        """Return the bytes of a message by number: 0 is the map, followed by the time steps.
 
         Raises
         ------
@@ -147,7 +147,7 @@ class CommonRoadFile(MessageFile):
         return _step_message(self._scenario, self._steps[number - 1], self._first(number))
 
     def _first(self, number: int) -> list[Obstacle]:
-        """Return the static obstacles for the first step; empty for other steps."""
+        """Return the static obstacles for the message of the first time step; empty for later steps."""
         return self._standing if number == 1 else []
 
     def _messages(self, numbers: range) -> Messages:
@@ -173,7 +173,7 @@ class CommonRoadFile(MessageFile):
 
 
 def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[bytes]:
-    """Yield the data of messages of a scenario, by offset and length as in a walk.
+    """Yield the bytes of messages of a scenario, by their offsets and lengths.
 
     See :meth:`CommonRoadFile.walk`.
 
@@ -195,7 +195,7 @@ def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[byt
 
 
 def _steps(scenario: TrafficScenario) -> list[int]:
-    """Return the steps with states, in order. A scenario with only static obstacles has one step."""
+    """Return the time steps of a scenario with obstacle states, in order."""
     moving = {step for one in scenario.obstacles.values() if not one.static for step in one.states}
     if not moving and scenario.obstacles:
         return [0]
@@ -203,7 +203,7 @@ def _steps(scenario: TrafficScenario) -> list[int]:
 
 
 def _step_message(scenario: TrafficScenario, step: int, standing: list[Obstacle]) -> bytes:
-    """Return all facts of a step as JSON, without unknown values."""
+    """Return the obstacle and light states of a time step as JSON, without unknown values."""
     told = {
         "time": round(step * scenario.step, 9),
         "step": step,
@@ -275,7 +275,7 @@ def _about(meaning: Any) -> dict[str, str]:
 
 @cache
 def _schema(name: str) -> bytes:
-    """Return a JSON schema of the messages, for viewers."""
+    """Return the JSON schema of the messages made from a scenario, for viewers."""
     number, text = {"type": "number"}, {"type": "string"}
     box = dict.fromkeys(("x", "y", "z", "heading", "length", "width"), number)
     motion = dict.fromkeys(("vx", "vy", "ax", "ay", "yaw_rate"), number)

@@ -82,7 +82,7 @@ _CODES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class SignMeaning:
-    """Kind of a sign, a short text, and the speed limit of a speed limit sign; m/s."""
+    """Kind of a traffic sign, a short text, and the speed limit of a speed limit sign; m/s."""
 
     kind: str
     subkind: str
@@ -90,7 +90,7 @@ class SignMeaning:
 
 
 def meaning_of(sign: ScenarioSign) -> SignMeaning:
-    """Return the meaning of a sign: that of its first plate with a known kind, else its codes."""
+    """Return the meaning of a traffic sign, from its first plate of a known kind, else from its codes."""
     for code, value in sign.plates:
         kind = _CODES.get(code)
         if kind == "speed_limit" and 0 < value < 200:
@@ -104,7 +104,7 @@ def meaning_of(sign: ScenarioSign) -> SignMeaning:
 
 
 def light_place(scenario: TrafficScenario, light: ScenarioLight) -> Place | None:
-    """Return the position of a light; by default, the end of the right border of its first lanelet."""
+    """Return the position of a traffic light; by default, the right end of its first lanelet."""
     if light.place is not None:
         return light.place
     lanes = (one for one in scenario.lanelets.values() if light.ident in one.lights)
@@ -112,7 +112,7 @@ def light_place(scenario: TrafficScenario, light: ScenarioLight) -> Place | None
 
 
 def map_text(scenario: TrafficScenario) -> str:
-    """Return the text of the road map; empty without lanelets.
+    """Convert the lanelets of a scenario to a road map, and return its text; empty without lanelets.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def map_text(scenario: TrafficScenario) -> str:
 
 
 def _evened(left: Floats, right: Floats) -> tuple[Floats, Floats]:
-    """Return both borders with the same number of points, evenly spaced along their lengths."""
+    """Return both borders of a lanelet with the same number of evenly spaced points."""
     count = max(len(left), len(right))
     shares = np.linspace(0.0, 1.0, count)
 
@@ -191,7 +191,7 @@ def _line(scenario: TrafficScenario, lanelet: Lanelet, left: Floats, right: Floa
 
 
 def _lane_type(lanelet: Lanelet) -> str:
-    """Return the type of a lane from its lanelet types, else from its permitted users."""
+    """Return the lane type of a lanelet, from its own types, else from its permitted users."""
     for word in lanelet.types:
         if word in _TYPES:
             return _TYPES[word]
@@ -202,14 +202,14 @@ def _lane_type(lanelet: Lanelet) -> str:
 
 
 def _limit(scenario: TrafficScenario, lanelet: Lanelet) -> float:
-    """Return the lowest speed limit of a lanelet; NaN without one; m/s."""
+    """Return the lowest speed limit of a lanelet; m/s; NaN without a limit."""
     signs = (scenario.signs[name] for name in lanelet.signs if name in scenario.signs)
     limits = [lanelet.speed_limit, *(meaning_of(sign).limit for sign in signs)]
     return min((one for one in limits if 0 < one < 1000), default=math.nan)
 
 
 def _signals(scenario: TrafficScenario, lanes: Sequence[PlainLane]) -> Iterator[PlainSignal]:
-    """Yield the signs and lights of the lanes that refer to them, and the stop lines."""
+    """Yield the traffic signs and lights of the lanes that refer to them, and the stop lines."""
     row_of = {lane.name: row for row, lane in enumerate(lanes)}
     stops = _stops(scenario, lanes, row_of)
     users: dict[str, list[int]] = {}
@@ -238,7 +238,7 @@ def _signals(scenario: TrafficScenario, lanes: Sequence[PlainLane]) -> Iterator[
 def _stops(
     scenario: TrafficScenario, lanes: Sequence[PlainLane], row_of: dict[str, int]
 ) -> dict[int, float]:
-    """Return the position of the stop line along each lane that has one; m."""
+    """Return the position of the stop line along each lane that has a stop line; m."""
     found: dict[int, float] = {}
     told: dict[int, Floats] = {}
     for lanelet in scenario.lanelets.values():

@@ -1,4 +1,4 @@
-"""Reader of CommonRoad scenarios (``.xml``), and of clips of them.
+"""Reader of CommonRoad scenarios (``.xml``), and of clips of scenarios.
 
 Source: CommonRoad: XML format documentation, versions 2018b and 2020a (Technical University of Munich).
 """
@@ -51,7 +51,7 @@ _STILL: Final = dict.fromkeys(("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"), 
 
 
 class CommonRoadTrace(FramesTrace):
-    """CommonRoad scenario, or a clip of one.
+    """CommonRoad scenario, or a clip of a scenario, which yields frames.
 
     Parameters and attributes are those of :class:`~sgstore.readers.FramesTrace`.
     """
@@ -67,11 +67,11 @@ class CommonRoadTrace(FramesTrace):
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """Return the role of a channel: ``ground_truth`` for steps, ``map``, else ``payload``."""
+        """Return the role of a channel: ``ground_truth`` for time steps, ``map``, else ``payload``."""
         return {STEP: "ground_truth", MAP: "map"}.get(channel.schema, "payload")
 
     def frame(self, message: TraceMessage) -> Frame:
-        """Return the frame of a step, without an ego because scenarios do not define one."""
+        """Return the frame of a time step, without an ego because scenarios do not define one."""
         told = json.loads(message.data)
         frame = Frame(round(told["time"] * 1e9))
         for one in told["obstacles"]:

@@ -1,4 +1,4 @@
-"""Mapping of a Foxglove scene: a TOML file that names the fields for kind, id, speed and ego.
+"""Mapping of a Foxglove scene: a TOML file with the names of the fields for kind, id, speed and ego.
 
 A ``foxglove.SceneUpdate`` is made for drawing. Its boxes lack types, speeds and the ego. Every producer stores
 these facts in its own way, so a mapping describes them. ``docs/flavours.md`` explains the file. The included
@@ -41,14 +41,14 @@ METADATA: Final = "metadata."
 
 @dataclass(frozen=True, slots=True)
 class Recognise:
-    """Condition for an included mapping: the recording contains all these topics."""
+    """Condition of a mapping shipped with sgstore: topics that the recording must have."""
 
     topics: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class SceneMapping:
-    """Choice of the messages that form the scene.
+    """Topics of the messages that form the scene, in a mapping file for Foxglove scenes.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class SceneMapping:
 
 @dataclass(frozen=True, slots=True)
 class EntityMapping:
-    """Names of the fields with an entity's values: ``id`` or ``metadata.KEY``; empty for an unused value.
+    """Names of the message fields with an object's id, type, speed and so on; empty for an unused value.
 
     Attributes
     ----------
@@ -91,11 +91,11 @@ class EntityMapping:
     light_state: str = ""
 
     def ident_of(self, box: Box) -> str:
-        """Return the id of an entity from its mapped field, else the entity's own id."""
+        """Return the id of an object from its mapped field, else from the scene message."""
         return _text(self.id, box) or box.id
 
     def type_of(self, box: Box) -> str:
-        """Return the type of an entity, or an empty string."""
+        """Return the type name of an object from its mapped field, or an empty string."""
         if self.type:
             told = _text(self.type, box)
             if told or self.type != "metadata.type":
@@ -104,20 +104,20 @@ class EntityMapping:
         return next((lowered[key] for key in _TYPE_KEYS if lowered.get(key)), "")
 
     def number_of(self, place: str, box: Box) -> float:
-        """Return the number in a mapped field of an entity; NaN if it is missing."""
+        """Return the number in a mapped field of an object; NaN if it is missing."""
         try:
             return float(_text(place, box) or math.nan)
         except ValueError:
             return math.nan
 
     def shown(self, box: Box) -> str:
-        """Return the state of a traffic light as in the recording; empty if it is missing."""
+        """Return the state text of a traffic light from its mapped field; empty if it is missing."""
         return _text(self.light_state, box)
 
 
 @dataclass(frozen=True, slots=True)
 class Ego:
-    """Choice of the ego: an entity, or a box in axes that move with it.
+    """Choice of the ego in a mapping file: an object of the scene, or moving coordinate axes with a box.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class Ego:
 
 @dataclass(frozen=True, slots=True)
 class Mapping:
-    """Contents of a mapping file.
+    """Contents of a mapping file for Foxglove scenes.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class Mapping:
     types: Map[str, TypeMeaning] = field(default_factory=dict[str, TypeMeaning])
 
     def meaning(self, type_name: str) -> TypeMeaning:
-        """Return the meaning of a type name; kind ``unknown`` or ``vehicle`` without a mapping."""
+        """Return the kind for an object's type name; ``unknown`` or ``vehicle`` without a mapping."""
         name = type_name.lower()
         if name in self.types:
             return self.types[name]
@@ -192,7 +192,7 @@ _SECTIONS: Final[dict[str, type[Any]]] = {
 
 
 def _text(place: str, box: Box) -> str:
-    """Return the text in a mapped field of an entity; empty if it is missing."""
+    """Return the text in a mapped field of an object; empty if it is missing."""
     if place.startswith(METADATA):
         return box.metadata.get(place.removeprefix(METADATA), "")
     return box.id if place == "id" else ""
@@ -200,7 +200,7 @@ def _text(place: str, box: Box) -> str:
 
 @cache
 def shipped() -> Map[str, Mapping]:
-    """Return the included mappings by name."""
+    """Return the mapping files that sgstore includes: name → mapping."""
     return {
         file.name.removeprefix(PREFIX).removesuffix(".toml"): _read(file.name, file.read_bytes())
         for file in sorted(resources.files("sgstore.readers").iterdir(), key=lambda f: f.name)
@@ -209,7 +209,7 @@ def shipped() -> Map[str, Mapping]:
 
 
 def mapping_for(given: str | Path, topics: Iterable[str]) -> Mapping:
-    """Return the requested mapping, or the one that fits a recording.
+    """Return the requested mapping file, or the shipped one that fits the topics of a recording.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def _section(name: str, values: Any) -> Any:
 
 
 def _value(name: str, kind: str, value: Any) -> Any:
-    """Check a value of a mapping file, and convert it to the type of its field."""
+    """Check a value of a mapping file, and convert it to the required type."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
     match kind:
         case "str" if isinstance(value, str):

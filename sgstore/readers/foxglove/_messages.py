@@ -1,4 +1,4 @@
-"""Decoder of Foxglove messages in protobuf and JSON, and the tree of coordinate axes.
+"""Decoder of Foxglove messages in protobuf and JSON, and the tree of coordinate axes (transforms).
 
 The tree of ``foxglove.FrameTransform`` contains axes that move in other axes. It returns the pose of any axes
 at any time. Between two transforms, a pose is interpolated: positions linearly, rotations along the shorter
@@ -43,7 +43,7 @@ ORIGIN: Final = np.zeros(3)
 
 @dataclass(slots=True)
 class _Track:
-    """Poses of axes in their parent over time, in order of time."""
+    """Poses of coordinate axes relative to their parent axes, sorted by time."""
 
     parent: str
     times: list[int] = field(default_factory=list[int])
@@ -64,7 +64,7 @@ class _Track:
 
 @dataclass(slots=True)
 class Axes:
-    """Coordinate axes of a recording, as a tree.
+    """Tree of the coordinate axes of a recording, with their poses over time.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Axes:
     _tracks: dict[str, _Track] = field(default_factory=dict[str, _Track])
 
     def tell(self, child: str, parent: str, time_ns: int, pose: Pose) -> bool:
-        """Add a transform. Return False if it contradicts earlier ones or exceeds a limit."""
+        """Add the pose of coordinate axes in parent axes. Return False if the pose is rejected."""
         track = self._tracks.get(child)
         if track is None:
             if len(self._tracks) >= MAX_AXES or child == parent:
@@ -100,7 +100,7 @@ class Axes:
         return True
 
     def pose(self, axes: str, root: str, time_ns: int) -> Pose | None:
-        """Return the pose of axes in an ancestor, or ``None`` without a connection."""
+        """Return the pose of coordinate axes in other axes at a time, or ``None`` without a connection."""
         place, turn = ORIGIN, STILL
         for _ in range(MAX_DEPTH):
             if axes == root:
@@ -115,12 +115,12 @@ class Axes:
         return None
 
     def root(self) -> str:
-        """Return the only axes without a parent; empty if there are several or none."""
+        """Return the name of the only coordinate axes without parent axes; empty without exactly one."""
         roots = set(self.parents.values()) - set(self.parents)
         return roots.pop() if len(roots) == 1 else ""
 
     def forget(self, before_ns: int) -> None:
-        """Drop the transforms that are not needed for poses from a time on."""
+        """Delete old poses that are not needed for times from ``before_ns`` on."""
         for track in self._tracks.values():
             keep = bisect_right(track.times, before_ns) - 1
             if keep > 0:
@@ -128,7 +128,7 @@ class Axes:
 
 
 def normed(turn: Floats) -> Floats:
-    """Return a quaternion scaled to length 1; the identity for length 0."""
+    """Scale a quaternion to length 1. A quaternion of length 0 becomes the identity rotation."""
     largest = float(np.abs(turn).max())
     if not 0 < largest < np.inf:
         return STILL
@@ -137,7 +137,7 @@ def normed(turn: Floats) -> Floats:
 
 
 def product(a: Floats, b: Floats) -> Floats:
-    """Return the rotation b followed by the rotation a."""
+    """Multiply two quaternions: the result is the rotation b followed by the rotation a."""
     ax, ay, az, aw = a.tolist()
     bx, by, bz, bw = b.tolist()
     return np.array(
@@ -151,7 +151,7 @@ def product(a: Floats, b: Floats) -> Floats:
 
 
 def rotated(turn: Floats, vectors: Floats) -> Floats:
-    """Return vectors (3,) or (n, 3) after a rotation."""
+    """Rotate vectors (3,) or (n, 3) by a quaternion."""
     x, y, z, w = turn.tolist()
     matrix = np.array(
         [
@@ -164,7 +164,7 @@ def rotated(turn: Floats, vectors: Floats) -> Floats:
 
 
 def angles(turn: Floats) -> tuple[float, float, float]:
-    """Return heading, pitch and roll of a quaternion; rad. Pitch is positive with the nose down, as in OSI.
+    """Convert a quaternion to heading, pitch and roll; rad. Pitch is positive with the nose down.
 
     At a pitch of ±90°, heading and roll have the same axis; the roll is then 0.
     """
@@ -215,7 +215,7 @@ _DELETE_ALL: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Entity of a scene that has a body.
+    """Object of a Foxglove scene that has a body: id, pose, size and metadata.
 
     Attributes
     ----------
@@ -246,7 +246,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Deletion:
-    """``SceneEntityDeletion`` of the entity ``id``, or of all (``None``), that are older than ``time_ns``.
+    """Foxglove message part that deletes one or all objects that are older than a given time.
 
     ``time_ns`` is ``None`` for a deletion without a time, which applies to any age.
     """
@@ -257,7 +257,7 @@ class Deletion:
 
 @dataclass(frozen=True, slots=True)
 class SceneUpdate:
-    """``SceneUpdate`` message with new and deleted entities.
+    """Foxglove message with new and deleted objects of a scene.
 
     ``bodiless``: number of entities with only lines, texts or arrows.
     """
@@ -269,7 +269,7 @@ class SceneUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Pose of child axes in their parent axes."""
+    """Pose of coordinate axes relative to their parent axes, from a Foxglove message."""
 
     parent: str
     child: str
@@ -282,7 +282,7 @@ DERIVED: Final = {"sgstore": "derived"}
 
 
 def encoding_of(recording: Recording, channel: int) -> str:
-    """Return ``protobuf`` or ``json`` for a channel with supported messages, else an empty string."""
+    """Return ``protobuf`` or ``json`` for a channel with Foxglove messages, else an empty string."""
     record = recording.channels[channel]
     if DERIVED.items() <= record.metadata.items():
         return ""
@@ -293,7 +293,7 @@ def encoding_of(recording: Recording, channel: int) -> str:
 
 
 class ChannelReader:
-    """Decoder of the messages of a channel.
+    """Decoder of the Foxglove messages of a channel.
 
     Parameters
     ----------
@@ -313,7 +313,7 @@ class ChannelReader:
         self._class = message_class(schema, fields) if encoding == "protobuf" else None
 
     def scene(self, data: bytes) -> SceneUpdate:
-        """Decode a ``SceneUpdate``.
+        """Decode a Foxglove message with new and deleted objects of a scene.
 
         Raises
         ------
@@ -332,7 +332,7 @@ class ChannelReader:
         )
 
     def transforms(self, data: bytes) -> list[Transform]:
-        """Decode a message with one or more ``FrameTransform``.
+        """Decode a Foxglove message with one or more poses of coordinate axes.
 
         Raises
         ------
@@ -366,7 +366,7 @@ class ChannelReader:
 
 
 def _get(part: Any, name: str, otherwise: Any) -> Any:
-    """Return a field of a message or JSON object, or ``otherwise`` for a missing one."""
+    """Return a field of a protobuf message or JSON object, or a default value for a missing field."""
     if isinstance(part, dict):
         return part.get(name, otherwise)
     if part is None:
@@ -407,7 +407,7 @@ def _box(entity: Any) -> Box | None:
 
 
 def _body(entity: Any) -> tuple[Pose | None, tuple[float, float, float]] | None:
-    """Return pose and size of an entity's largest box, else of another solid, else of a model."""
+    """Return the pose and size of a scene object: its largest box, else another solid, else a model."""
     for name in ("cubes", "cylinders", "spheres"):
         solids = _list(entity, name)
         if solids:
@@ -448,7 +448,7 @@ def _deletion(gone: Any) -> Deletion:
 
 
 def _time(part: Any) -> int | None:
-    """Return a timestamp or duration; ns. ``None`` means missing or out of range.
+    """Return a timestamp or duration of a Foxglove message; ns. ``None`` means missing or out of range.
 
     Protobuf has ``seconds`` and ``nanos``, JSON ``sec`` and ``nsec``.
     """

@@ -1,4 +1,4 @@
-"""Reader of Foxglove scenes: ``foxglove.SceneUpdate`` and ``FrameTransform`` (protobuf or JSON) in MCAP.
+"""Reader of Foxglove scenes: messages ``SceneUpdate`` and ``FrameTransform`` (protobuf or JSON) in MCAP.
 
 A recording is recognised by the schemas of its channels. A scene is made for drawing. A mapping therefore
 defines the types and speeds of its boxes, and the ego (:mod:`sgstore.readers.foxglove._mapping`). A frame is
@@ -79,7 +79,7 @@ _HEADING, _VELOCITY, _ACCELERATION, _SIZE = 3, 6, 9, 13
 
 
 class FoxgloveSurvey(Survey[Lead]):
-    """First reading of a Foxglove recording.
+    """First pass over a Foxglove recording, which collects the facts that the frames need.
 
     The weight of a frame is 1 if it has boxes.
 
@@ -104,20 +104,20 @@ class FoxgloveSurvey(Survey[Lead]):
         self._axes = Axes()
 
     def root(self) -> str:
-        """Return the fixed axes."""
+        """Return the name of the fixed coordinate axes of the scene."""
         if self.mapping.scene.axes:
             return self.mapping.scene.axes
         most = [axes for axes, _ in self._entity_axes.most_common(1)]
         return self._axes.root() or (most or [""])[0]
 
     def no_frames(self) -> str:
-        """Return the reason for a recording without a leading channel."""
+        """Return the text that explains why a Foxglove recording has no frames."""
         named = ", ".join(self.mapping.scene.topics)
         where = f" on the topics of the mapping: {named}" if named else ""
         return f"no {SCENE} can be read{where}"
 
     def find_ego(self) -> str:
-        """Find the entity or axes of the ego, and return the name."""
+        """Find the scene object or coordinate axes of the ego, and return the name."""
         self.ego = self._named(self.wanted) if self.wanted else self._meant()
         return self.ego[0] or self.ego[1]
 
@@ -153,7 +153,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return "", axes
 
     def context(self) -> list[Ref]:
-        """Return the messages that later ones depend on: single messages, and entities that stay valid."""
+        """Return the file positions of messages with objects that stay valid, which later messages need."""
         lasting = self._transforms
         if not self.mapping.scene.snapshot:
             lasting = self._entities | self._transforms
@@ -161,11 +161,11 @@ class FoxgloveSurvey(Survey[Lead]):
         return [*self.once(first), *(ref for count, ref in lasting.values() if count == 1)]
 
     def keeps(self, channel: int) -> bool:
-        """True if the reading of the frames needs the messages of a channel again."""
+        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
         return bool(encoding_of(self.recording, channel))
 
     def meet(self, channel: int) -> bool:
-        """True if the messages of a channel are read. A new channel is prepared for reading."""
+        """Return True if the reader needs the messages of a channel. A new channel gets a decoder."""
         if channel in self.readers:
             return True
         encoding = encoding_of(self.recording, channel)
@@ -182,7 +182,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return True
 
     def look(self, run: Messages, row: int) -> None:
-        """Examine a scene or transforms."""
+        """Collect facts from one Foxglove message: scene objects or coordinate axes."""
         channel = int(run.channel[row])
         reader = self.readers[channel]
         if reader.name == SCENE:
@@ -208,13 +208,13 @@ class FoxgloveSurvey(Survey[Lead]):
 
 
 def time_of(scene: SceneUpdate) -> int | None:
-    """Return the time of a message, that of its latest entity; ``None`` without a time."""
+    """Return the time of a Foxglove scene message: that of its latest object; ``None`` without a time."""
     return max((box.time_ns for box in scene.boxes if box.time_ns is not None), default=None)
 
 
 @dataclass(slots=True)
 class FoxgloveRawFrame:
-    """Frame with the poses in their original axes.
+    """Frame of a Foxglove recording before conversion, with poses in their original axes.
 
     ``boxes``: each with its node id and the log time of its message. ``kinds``: as in
     :class:`~sgstore.readers._blocks.FrameRows`.
@@ -227,7 +227,7 @@ class FoxgloveRawFrame:
 
 
 class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
-    """Converter of Foxglove messages into frames.
+    """Decoder of Foxglove messages into frames.
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
         self._bodiless = self._odd_axes = 0
 
     def decode(self, run: Messages, row: int) -> FoxgloveRawFrame | None:
-        """Return the frame of a message in the leading scene; ``None`` for other messages."""
+        """Return the raw frame of a Foxglove message; ``None`` for messages other than the main scene."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         reader = self._readers[channel]
         if channel in self._leading:
@@ -294,7 +294,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
         return frame
 
     def _fill(self, frame: FoxgloveRawFrame) -> None:
-        """Add all current entities to a frame."""
+        """Add all current objects of the scene to a frame."""
         time_ns, frame.boxes = frame.time_ns, []
         for source, standing in self._standing.items():
             ended = [
@@ -312,14 +312,14 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
             frame.kinds = {node: told for node, told in self._kinds.items() if node in here}
 
     def complete(self, frames: list[FoxgloveRawFrame]) -> list[FrameRows]:
-        """Return the frames with the poses of their boxes in fixed axes."""
+        """Convert raw Foxglove frames to frames with the poses of boxes in fixed map axes."""
         done = [self._rows(frame) for frame in frames]
         if frames:
             self._axes.forget(frames[-1].time_ns - REMEMBERED)
         return done
 
     def settle(self) -> None:
-        """Report the losses, after all frames are read."""
+        """Add the lost messages to the report, after all frames are read."""
         super().settle()
         self._report.losses += self._left_out.losses()
         warn = self._report.warnings.append
@@ -346,7 +346,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
     def _take_scene(
         self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int, *, goes_on: bool
     ) -> None:
-        """Process a scene message. ``goes_on``: it adds to a message of another channel."""
+        """Update the current scene objects from a scene message."""
         standing = self._standing.setdefault(channel, {})
         if self._mapping.scene.snapshot and not goes_on:
             standing.clear()
@@ -374,14 +374,14 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
             standing[ident] = (told, box)
 
     def _delete(self, standing: dict[str, tuple[int, Box]], gone: Deletion, log_time: int) -> None:
-        """Delete the entities that are older than a deletion."""
+        """Delete the scene objects that are older than a deletion message."""
         before = None if gone.time_ns is None else self._stamps.beside(log_time, gone.time_ns)
         for ident in [*standing] if gone.id is None else [gone.id]:
             if ident in standing and (before is None or standing[ident][0] < before):
                 del standing[ident]
 
     def _see_kind(self, node: int, box: Box) -> None:
-        """Record the current type of an entity, if its kind differs from the first one."""
+        """Record the current type of a scene object, if its kind differs from the first one."""
         first, type_name = self.roster.entered(node), self._mapping.entity.type_of(box)
         self._kinds.pop(node, None)
         if type_name != first.type_name:
@@ -445,7 +445,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
         )
 
     def _values(self, box: Box, time_ns: int) -> list[float] | None:
-        """Return the pose columns of a box; ``None`` without a pose in fixed axes."""
+        """Return the pose columns of a scene object; ``None`` without a pose in fixed map axes."""
         at = time_ns if box.locked or box.time_ns is None else box.time_ns
         outer = self._axes.pose(box.axes or self._root, self._root, at)
         if box.pose is None or outer is None:
@@ -485,7 +485,7 @@ def _size(ego: Ego) -> tuple[float, float, float]:
 
 
 class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):
-    """Recording of Foxglove scenes.
+    """Open recording of Foxglove scenes, which yields frames.
 
     Parameters
     ----------
@@ -526,7 +526,7 @@ class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):
 
     @staticmethod
     def has_frames(recording: Recording, channel: int) -> bool:
-        """True if a channel contains Foxglove scenes."""
+        """Return True if a channel contains Foxglove scenes."""
         schema = recording.schemas.get(recording.channels[channel].schema_id)
         is_scene = schema is not None and schema.name == SCENE
         return is_scene and bool(encoding_of(recording, channel))

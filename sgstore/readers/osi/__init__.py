@@ -1,3 +1,3 @@
-"""Reader of ASAM OSI recordings."""
+"""Reader of ASAM OSI recordings (Open Simulation Interface)."""
 
 __all__ = []

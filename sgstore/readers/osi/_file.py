@@ -1,4 +1,4 @@
-"""Reader of single-channel OSI files (``.osi``, ``.osi.zst``).
+"""Reader of OSI files with one channel (``.osi``, ``.osi.zst``), which are plain sequences of messages.
 
 A compressed file is decompressed block by block. A zstd block has at most 128 KiB, so memory stays small for
 any file. The total decompressed size is limited, too.
@@ -71,14 +71,14 @@ _LITERAL, _REPEATED, _COMPRESSED = 0, 1, 2
 
 
 def is_compressed(file: BinaryIO) -> bool:
-    """True if a file starts with the magic number of zstd."""
+    """Return True if a file starts with the magic number of zstd compression."""
     file.seek(0)
     magic = file.read(4)
     return magic == ZSTD or (len(magic) == 4 and PREFIX.unpack(magic)[0] in _SKIPPABLE)
 
 
 def pieces(file: BinaryIO, start: int = -1) -> Iterator[tuple[int, bytes]]:
-    """Yield the content of a file in pieces, each with the offset of its zstd frame.
+    """Yield the decompressed content of a file in pieces, each with the offset of its zstd frame.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def pieces(file: BinaryIO, start: int = -1) -> Iterator[tuple[int, bytes]]:
 
 
 def _frame(file: BinaryIO, place: int) -> Iterator[bytes]:
-    """Yield the blocks of a zstd frame. Of a truncated frame, yield the complete blocks."""
+    """Decompress one zstd frame block by block. A truncated frame gives its complete blocks."""
     file.seek(place)
     head = file.read(_FRAME_HEAD)
     try:
@@ -146,7 +146,7 @@ def _frame(file: BinaryIO, place: int) -> Iterator[bytes]:
 
 
 def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
-    """Return the data of one message by its position.
+    """Return the raw bytes of one message of an OSI file, from its position.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> 
 
 
 def _cut(content: Iterator[tuple[int, bytes]], offset: int, length: int) -> bytes:
-    """Return ``length`` bytes of a content from ``offset`` on."""
+    """Return ``length`` bytes from ``offset`` on of a content given in pieces."""
     found = bytearray()
     position = 0
     for _, piece in content:
@@ -217,7 +217,7 @@ _VERSION, _TIMESTAMP = 1, 2
 
 
 class OsiFile(MessageFile):
-    """Single-channel OSI file with the interface of an MCAP file, for one or more readings.
+    """OSI file with one channel, with the interface of an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -255,7 +255,7 @@ class OsiFile(MessageFile):
         self.add_channel(topic, schema, "protobuf")
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the OSI file."""
         self._file.close()
 
     def walk(
@@ -265,7 +265,7 @@ class OsiFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """Yield all messages in file order. Unreadable parts are added to ``report``.
+        """Yield all messages of an OSI file in file order. Unreadable parts are added to a report.
 
         Messages are not cached: all are ground truth, which takes longer to decode than to decompress. The
         ``chunk_offset`` of a message is the offset of the zstd frame with its start.
@@ -290,7 +290,7 @@ class OsiFile(MessageFile):
             yield run.messages()
 
     def _recognise(self) -> str:
-        """Return the type of the messages, and store their common first bytes."""
+        """Return the OSI message type of the file, and store the first bytes common to all messages."""
         report = Findings()
         likeness = dict.fromkeys((GROUND_TRUTH, SENSOR_VIEW), 0)
         tried = 0
@@ -311,7 +311,7 @@ class OsiFile(MessageFile):
         raise TraceError(reason, path=self.path)
 
     def _messages(self, report: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """Yield every message: offset of the zstd frame, offset in it, and data."""
+        """Yield every message of an OSI file: offset of the zstd frame, offset inside, and bytes."""
         stream = _Stream(self._mark)
         content = pieces(self._file)
         while True:
@@ -330,7 +330,7 @@ class OsiFile(MessageFile):
 
 @dataclass(slots=True)
 class _MessageRun:
-    """Run of messages of one zstd frame, or of an uncompressed file."""
+    """Group of consecutive messages of one zstd frame, or of an uncompressed file."""
 
     last_ns: int = 0
     place: int = -1
@@ -347,7 +347,7 @@ class _MessageRun:
         self.times.append(self.last_ns)
 
     def is_full(self, place: int) -> bool:
-        """True if a message of the zstd frame at ``place`` needs a new run."""
+        """Return True if the next message does not fit into this group of messages."""
         return place != self.place or self.size > RUN_BYTES or len(self.held) >= RUN_MESSAGES
 
     def messages(self) -> Messages:
@@ -366,7 +366,7 @@ class _MessageRun:
 
 
 class _Stream:
-    """Splitter of a stream of bytes into messages. ``mark`` contains their common first bytes, if known."""
+    """Splits the bytes of an OSI file into messages, also after damaged parts."""
 
     def __init__(self, mark: bytes) -> None:
         self._mark = mark
@@ -377,13 +377,13 @@ class _Stream:
         ] = []  # Start of each frame in the stream, and its file offset.
 
     def append(self, place: int, piece: bytes) -> None:
-        """Add the next bytes of the zstd frame at ``place``."""
+        """Add the next bytes of the OSI file, with the offset of their zstd frame."""
         if not self._frames or self._frames[-1][1] != place:
             self._frames.append((self._start + len(self._buffer), place))
         self._buffer += piece
 
     def take(self, report: Findings, *, ends: bool) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the complete messages. ``ends`` is true after the last bytes."""
+        """Yield the complete messages in the bytes added so far."""
         at = 0
         while (left := len(self._buffer) - at) >= PREFIX.size or (ends and left):
             length = PREFIX.unpack_from(self._buffer, at)[0] if left >= PREFIX.size else 0
@@ -409,14 +409,14 @@ class _Stream:
             del self._frames[0]
 
     def _overruns(self, at: int, stop: int) -> bool:
-        """True if the length of a message seems wrong: another message starts inside, and none at its end."""
+        """Return True if a message's length seems wrong: another message starts inside, none at its end."""
         following = self._buffer[stop + PREFIX.size : stop + PREFIX.size + len(self._mark)]
         if self._mark.startswith(following):
             return False
         return self._resume(at + 1, stop) is not None
 
     def _resume(self, start: int, stop: int | None = None) -> int | None:
-        """Return the probable start of the next message in the buffer before ``stop``, or ``None``."""
+        """Return the probable start of the next message after a damaged part, or ``None``."""
         end = None if stop is None else stop - 1 + PREFIX.size + len(self._mark)
         while self._mark:
             found = self._buffer.find(self._mark, start + PREFIX.size, end)
@@ -445,7 +445,7 @@ class _Stream:
 
 
 def _lose(report: Findings, loss: Loss) -> None:
-    """Report a loss. It is merged with an adjacent previous loss of the same kind."""
+    """Report a damaged part of a file. Adjacent damaged parts of the same kind are merged."""
     last = report.losses[-1] if report.losses else None
     if last and last.messages == loss.messages == -1 and last.offset + last.bytes == loss.offset:
         report.losses[-1] = replace(last, bytes=last.bytes + loss.bytes)
@@ -457,7 +457,7 @@ def _lose(report: Findings, loss: Loss) -> None:
 
 
 def _beginning(data: bytes) -> bytes:
-    """Return the common first bytes of the messages: OSI version and next tag; empty without a version."""
+    """Return the first bytes common to all messages of an OSI file; empty without an OSI version."""
     try:
         number, wire, _start, stop = next(fields_of(data, 0, len(data)))
     except (ValueError, StopIteration):
@@ -466,7 +466,7 @@ def _beginning(data: bytes) -> bytes:
 
 
 def _likeness(name: str, data: bytes) -> int:
-    """Return how well a message fits a type: the number of objects with a position or an id; -1 if invalid.
+    """Return a score for an OSI message type: the number of plausible objects in the data; -1 if invalid.
 
     A ground truth decoded as a sensor view, or the other way round, is malformed or empty.
     """
@@ -494,7 +494,7 @@ def _things(placed: list[Any], lanes: Any) -> int:
 
 
 def time_of_bytes(data: bytes) -> int | None:
-    """Return the time of an OSI message; ns. ``None`` means without a valid time."""
+    """Return the time stamp of a serialised OSI message; ns. ``None`` means without a valid time."""
     seconds, nanos = 0, 0
     try:
         for number, wire, start, stop in fields_of(data, 0, len(data)):
@@ -515,6 +515,6 @@ def time_of_bytes(data: bytes) -> int | None:
 
 
 def _number(content: bytes) -> int:
-    """Return a protobuf varint as a signed number."""
+    """Decode a protobuf varint as a signed number."""
     value = sum((byte & 0x7F) << 7 * i for i, byte in enumerate(content))
     return value - (1 << 64) if value >> 63 & 1 else value

@@ -1,4 +1,4 @@
-"""Conversion of the lanes in OSI ground truth into a road map, for recordings without OpenDRIVE.
+"""Conversion of lanes in OSI ground truth messages to a road map, for recordings without an OpenDRIVE map.
 
 OSI has two kinds of lanes. *Logical* lanes are used if the recording has them. They have a border on each side
 with the position along a reference line at every point, the connected lanes at both ends, and rules for
@@ -153,7 +153,7 @@ _FAR: Final = 1e8
 
 @dataclass(frozen=True, slots=True)
 class LaneSignal:
-    """Traffic light or sign that is assigned to lanes.
+    """Traffic light or sign of an OSI recording, with the lanes that it applies to.
 
     ``pose``: columns of :data:`sgstore.model.world.POSE`; ``lanes``: ids of physical or logical lanes.
     """
@@ -165,14 +165,14 @@ class LaneSignal:
 
 
 def _paths(fields: dict[str, Any]) -> Iterator[str]:
-    """Yield the dotted paths of all required fields of a lane."""
+    """Yield the dotted paths of all fields of an OSI lane that the reader needs."""
     for name, inner in fields.items():
         if name not in _MAY_LACK:
             yield from (f"{name}.{path}" for path in _paths(inner)) if inner else (name,)
 
 
 class OsiLanes:
-    """Collector of the lanes in messages.
+    """Collects the lanes and lane boundaries from OSI messages.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ class OsiLanes:
         self.lost: list[str] = []
 
     def take(self, data: bytes) -> None:
-        """Add the new lanes and boundaries of a message."""
+        """Add the new lanes and lane boundaries of an OSI message."""
         try:
             truth = ground_truth_of(self._class.FromString(data))
         except DECODE_ERRORS as error:
@@ -231,7 +231,7 @@ class OsiLanes:
                 self._told[name].setdefault(int(thing.id.value), thing)
 
     def text(self, signals: Iterable[LaneSignal] = ()) -> tuple[str, str]:
-        """Return the text of the road map, and the map's name in the recording; empty without lanes.
+        """Return the text of the road map made from the lanes, and the map's name; empty without lanes.
 
         ``signals``: lights and signs of the lanes. Of signals with the same name, the first one counts.
 
@@ -273,7 +273,7 @@ class OsiLanes:
         return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
 
     def _rows(self, lines: Sequence[LaneLine], plain: Sequence[PlainLane]) -> dict[int, list[int]]:
-        """Return, for each lane id, the row numbers of its lanes in the road map."""
+        """Return the lane numbers in the road map for each OSI lane id."""
         row_of = {lane.name: row for row, lane in enumerate(plain)}
         rows: dict[int, list[int]] = {}
         for line in lines:
@@ -308,7 +308,7 @@ class OsiLanes:
         return f"{name}{OF_LANES}" if plain else ""
 
     def _place(self, points: Iterable[Any]) -> Floats:
-        """Return the points of a line: (n, 3); m."""
+        """Return the points of an OSI line as an array (n, 3); m."""
         line = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(-1, 3)
         self._points += len(line)
         if self._points > MAX_POINTS:
@@ -324,7 +324,7 @@ def _plain_signal(signal: LaneSignal, lanes: Iterable[int]) -> PlainSignal:
 
 
 class _LaneBoundaries:
-    """Lane boundaries by id, each read once."""
+    """OSI lane boundaries by id, each decoded once."""
 
     def __init__(
         self, told: dict[str, dict[int, Any]], place: Callable[[Iterable[Any]], Floats]
@@ -335,7 +335,7 @@ class _LaneBoundaries:
         self._logical: dict[int, tuple[Floats, Floats]] = {}
 
     def physical(self, idents: Iterable[Any]) -> tuple[Border, ...]:
-        """Return the borders with these ids. Missing ids are skipped."""
+        """Return the lane borders for the ids of physical OSI boundaries. Missing ids are skipped."""
         found: list[Border] = []
         for ident in map(_number, idents):
             boundary = self.told["lane_boundary"].get(ident)
@@ -348,7 +348,7 @@ class _LaneBoundaries:
         return tuple(found)
 
     def crossed(self, ident: int) -> bool | None:
-        """True if traffic may cross a physical boundary. ``None`` means unknown."""
+        """Return True if vehicles may cross a lane boundary. ``None`` means unknown."""
         boundary = self.told["lane_boundary"].get(ident)
         if boundary is None or not boundary.HasField("classification"):
             return None
@@ -356,7 +356,7 @@ class _LaneBoundaries:
         return None if kind in _UNKNOWN else kind in _CROSSED
 
     def logical(self, idents: Iterable[Any]) -> tuple[Floats, Floats, tuple[Border, ...]]:
-        """Return the points, s positions and borders of consecutive logical boundaries."""
+        """Return points, s positions and borders for consecutive logical OSI lane boundaries."""
         lines: list[Floats] = [np.zeros((0, 3))]
         places: list[Floats] = [np.zeros(0)]
         borders: list[Border] = []
@@ -379,7 +379,7 @@ class _LaneBoundaries:
         return points[order], s[order], tuple(borders)
 
     def _rule(self, boundary: Any) -> tuple[bool | None, bool | None]:
-        """Return the permissions to cross a logical boundary to the left and to the right.
+        """Return the permissions to cross a lane boundary to the left and to the right.
 
         Without a rule, the type of the physical line counts.
         """
@@ -408,7 +408,7 @@ def _is_area(lane: Any) -> bool:
 
 
 def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
-    """Return an intersection as an area with ways through it."""
+    """Convert an OSI intersection to a map area with lanes through it."""
     return Area(
         str(lane.id.value),
         tuple(
@@ -420,7 +420,7 @@ def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
 
 
 def _only_way(lane: Any, borders: _LaneBoundaries) -> LaneLine | None:
-    """Return an intersection as a single lane, or ``None`` if its boundaries do not form a lane."""
+    """Convert an OSI intersection to a single lane, or ``None`` if its boundaries do not form a lane."""
     about = lane.classification
     if len(about.lane_pairing) > 1 or not about.left_lane_boundary_id:
         return None
@@ -459,13 +459,13 @@ def _physical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
 
 
 def _word(message: Any, field: str) -> str:
-    """Return an enumeration value without ``TYPE_`` or ``SUBTYPE_``; empty if the field is missing."""
+    """Return the name of an OSI enumeration value without ``TYPE_``; empty if the field is missing."""
     known = field in message.DESCRIPTOR.fields_by_name
     return enum_name(message, field).partition("_")[2] if known else ""
 
 
 def _type_of(kind: str, word: str) -> str:
-    """Return the type of a lane from its subtype, else ``driving`` or ``none``."""
+    """Return the lane type for an OSI lane subtype, else ``driving`` or ``none``."""
     if word in _TYPES:
         return _TYPES[word]
     return "driving" if kind in {"TYPE_DRIVING", "TYPE_INTERSECTION"} else "none"
@@ -523,7 +523,7 @@ def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
 
 
 def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -> Floats:
-    """Return the points (n, 3) of a line at positions s. ``side`` selects the value at a jump."""
+    """Return points (n, 3) of a line at given positions s along it."""
     at = np.searchsorted(s, cuts, side)
     at = np.minimum(at, len(s) - 1) if side == "left" else np.maximum(at - 1, 0)
     between = np.column_stack([np.interp(cuts, s, column) for column in line.T])
@@ -531,7 +531,7 @@ def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -
 
 
 def _physical(lane: Any) -> set[int]:
-    """Return the ids of the physical lanes of a logical lane."""
+    """Return the ids of the physical OSI lanes that a logical OSI lane refers to."""
     return {_number(part.physical_lane_id) for part in getattr(lane, "physical_lane_reference", ())}
 
 
@@ -563,7 +563,7 @@ def _source(lane: Any) -> dict[str, Any]:
 
 
 def _sections_numbered(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Return the lanes with named roads and with sections numbered from 0 in each road."""
+    """Return lanes with named roads, and with sections numbered from 0 in each road."""
     starts: dict[str, set[float]] = {}
     for line in lines:
         if line.road:

@@ -1,4 +1,4 @@
-"""Decoding of moving objects, stationary objects and traffic lights of OSI into columns.
+"""Decoder of OSI moving objects, stationary objects and traffic lights into columns.
 
 ``osi3.MovingObject`` messages of many frames are decoded directly from their bytes.
 
@@ -101,7 +101,7 @@ TYPES: Final = 1 << 10
 
 @dataclass(slots=True)
 class _ObjectLayout:
-    """Byte positions of the fields in serialised objects with the same layout.
+    """Byte positions of the fields in serialised OSI objects, shared by objects with equal structure.
 
     ``compared``, ``mask``, ``expected``: positions of all bytes outside numbers, their relevant bits, and the
     values. ``runs``: first column, position and number of adjacent doubles. ``zero``: columns of present
@@ -119,13 +119,13 @@ class _ObjectLayout:
     parts: set[str]
 
     def agree(self, objects: Bytes) -> Bools:
-        """Return a mask of the objects with this layout; each object is a row of bytes."""
+        """Return a mask of the serialised objects whose fields have these byte positions."""
         return ((objects[:, self.compared] & self.mask) == self.expected).all(axis=1)
 
 
 @dataclass(slots=True)
 class _Learned:
-    """Intermediate results during the learning of an object's byte layout."""
+    """Intermediate results while the byte positions of a serialised object's fields are determined."""
 
     mask: Bytes
     doubles: dict[int, int] = field(default_factory=dict[int, int])
@@ -136,7 +136,7 @@ class _Learned:
 
 
 class MovingObjects:
-    """Decoder of serialised moving objects.
+    """Fast decoder of serialised OSI moving objects (vehicles, pedestrians) into columns.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ class MovingObjects:
         self._layouts: dict[int, list[_ObjectLayout]] = {}
 
     def read(self, objects: list[bytes]) -> tuple[Floats, Bools, Ints, Ints]:
-        """Return the numbers of serialised objects as columns.
+        """Decode serialised OSI moving objects into columns: poses, usable mask, lights and types.
 
         Returns
         -------
@@ -183,7 +183,7 @@ class MovingObjects:
     def _read_alike(
         self, rows: NDArray[np.intp], content: Bytes, columns: tuple[Floats, Bools, Ints, Ints]
     ) -> list[int]:
-        """Read objects of one length. Return the rows of the remaining objects."""
+        """Decode objects with equal byte length and field positions. Return the rows not decoded."""
         values, usable, lights, codes = columns
         odd: list[int] = []
         for _ in range(_ROUNDS):
@@ -205,7 +205,7 @@ class MovingObjects:
         return [*odd, *rows.tolist()]
 
     def _trees(self, found: Any) -> tuple[dict[str, Any], Tree]:
-        """Return the message descriptors of the parts of an object, and the fields to read."""
+        """Return the protobuf descriptors of an OSI object's parts, and the fields to read."""
         base = found.fields_by_name["base"]
         parts: dict[str, Any] = {}
         inner: Tree = {}
@@ -243,7 +243,7 @@ class MovingObjects:
         return parts, tree
 
     def _layout_of(self, content: Bytes) -> _ObjectLayout | None:
-        """Return the layout of an object, and learn a new one.
+        """Return the byte positions of an object's fields, determined at the first such object.
 
         ``None`` means that the object has no fixed layout.
         """
@@ -310,7 +310,7 @@ class MovingObjects:
                 found.types.append((at, end, TYPES if known == "type" else 1))
 
     def _read_one(self, content: bytes) -> tuple[Floats, bool, int, int]:
-        """Decode an object with protobuf. A malformed object is unusable."""
+        """Decode one serialised OSI object with protobuf. A malformed object is unusable."""
         values = np.full(len(POSE), np.nan)
         try:
             thing = self._message.FromString(content)
@@ -337,7 +337,7 @@ _TARGETS: Final = {
 
 
 def _meanings(told: Any, bit: int) -> NDArray[np.int64]:
-    """Return the mask bits for each state of a light; -1 for states unknown to the recording's OSI version."""
+    """Return a lookup table: OSI state of a vehicle light → bits of the light mask; -1 for unknown states."""
     table = np.full(_STATES, -1, np.int64)
     for state in told.enum_type.values_by_number if told.enum_type is not None else ():
         if 0 <= state < _STATES:
@@ -358,7 +358,7 @@ def _numbers(layout: _ObjectLayout, content: Bytes) -> tuple[Floats, Bools]:
 
 
 def _runs(doubles: dict[int, int]) -> list[tuple[int, int, int]]:
-    """Group adjacent doubles into runs. Return first column, byte position and length of each run."""
+    """Group adjacent 8-byte numbers. Return first column, byte position and length of each group."""
     runs: list[tuple[int, int, int]] = []
     for column, place in sorted(doubles.items()):
         if runs and (column, place) == (sum(runs[-1][::2]), runs[-1][1] + _DOUBLE * runs[-1][2]):
@@ -391,7 +391,7 @@ def _codes(layout: _ObjectLayout, content: Bytes) -> Ints:
 
 
 def _whole(content: Bytes, start: int, stop: int) -> NDArray[np.uint64]:
-    """Return the protobuf varint in each row."""
+    """Decode the protobuf varint in each row of a byte array."""
     found = np.zeros(len(content), np.uint64)
     for place in range(stop - 1, start - 1, -1):
         found = found << np.uint64(7) | (content[:, place] & 0x7F).astype(np.uint64)
@@ -399,14 +399,14 @@ def _whole(content: Bytes, start: int, stop: int) -> NDArray[np.uint64]:
 
 
 def code_of(thing: Any) -> int:
-    """Return the code of a ``MovingObject``, composed of its type and its vehicle type."""
+    """Return a number that combines type and vehicle type of an OSI moving object."""
     vehicle = getattr(getattr(thing, "vehicle_classification", None), "type", 0)
     told = (part if 0 <= part < TYPES else TYPES - 1 for part in (thing.type, vehicle))
     return next(told) * TYPES + next(told)
 
 
 def light_bits(thing: Any) -> int:
-    """Return the light mask of a ``MovingObject`` (bits of ``VEHICLE_LIGHTS``); -1 without light states."""
+    """Return the light mask of an OSI vehicle (indicators, brake lights, …); -1 without light states."""
     state = getattr(getattr(thing, "vehicle_classification", None), "light_state", None)
     if state is None or not state.ListFields():
         return -1
@@ -447,7 +447,7 @@ class _Static:
 
 @dataclass(slots=True)
 class Statics:
-    """Static objects of a recording, in the order of their first message.
+    """Static objects (such as signs and buildings) of an OSI recording, in order of appearance.
 
     Attributes
     ----------
@@ -459,7 +459,7 @@ class Statics:
     _found: dict[tuple[str, int], _Static] = field(default_factory=dict)  # pyright: ignore[reportUnknownVariableType]
 
     def look(self, told: Mapping[str, Any], log_time_ns: int) -> None:
-        """Add the static objects of a ground truth, given by field."""
+        """Add the static objects of an OSI ground truth message."""
         for name in _FIELDS:
             for thing in told.get(name, ()):
                 key = (name, thing.id.value)
@@ -472,7 +472,7 @@ class Statics:
                     self.unplaced.setdefault(words, log_time_ns)
 
     def enter(self, roster: EntityTable, map_text: str) -> None:
-        """Add all static objects to the entity table. Objects without a kind get the kind in the map."""
+        """Add all static objects to the object table. An object without a kind gets the kind in the map."""
         kinds: dict[str, str] | None = None
         for thing in self._found.values():
             meaning = thing.meaning
@@ -512,7 +512,7 @@ class Statics:
         )
 
     def signals(self) -> list[LaneSignal]:
-        """Return the signs that are assigned to lanes."""
+        """Return the traffic signs that are assigned to lanes."""
         return [
             LaneSignal(thing.map_ref, thing.meaning.kind, thing.pose, thing.lanes)
             for thing in self._found.values()
@@ -521,7 +521,7 @@ class Statics:
 
 
 def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:
-    """Return the meaning of a speed limit sign, with its value in the subkind: ``50``, ``35 mph``."""
+    """Return the meaning of a speed limit sign, with its value: ``50``, ``35 mph``."""
     if not has_field(type(classification), "value.value") or not classification.value.value > 0:
         return meaning
     value = classification.value
@@ -532,7 +532,7 @@ def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:
 
 @lru_cache(maxsize=1)  # A recording is read at least twice.
 def kinds_of_map(text: str) -> dict[str, str]:
-    """Return the kind of each object in an OpenDRIVE text by object id."""
+    """Return the kind of each object in an OpenDRIVE map: object id → kind."""
     kinds: dict[str, str] = {}
     for match in _MAP_OBJECT.finditer(text):
         told = {name: a or b for name, a, b in _MAP_ATTRIBUTE.findall(match[1])}
@@ -575,7 +575,7 @@ _SUBKINDS: Final = {
 
 
 def lit(mode: int, colour: int) -> int:
-    """Return the state of a bulb as a bit, from its mode and colour numbers; 0 if it is off."""
+    """Return the state of a traffic light bulb as a bit, from its OSI mode and colour; 0 if it is off."""
     if mode == _MODE_OFF:
         return 0
     if mode == _MODE_FLASHING:
@@ -584,7 +584,7 @@ def lit(mode: int, colour: int) -> int:
 
 
 def shown(bulbs: Iterable[int]) -> int:
-    """Return the state that the lit bulbs of a traffic light show together, as a code.
+    """Combine the bulbs of a traffic light into one light state, as a code.
 
     The codes are those of :data:`sgstore.model.vocabulary.LIGHT_STATES`. Flashing has priority. Red with yellow
     is ``red_yellow``. For other combinations, the most restrictive colour counts (a red light with a green
@@ -611,7 +611,7 @@ class _Head:
     top: float = -math.inf
 
     def join(self, pose: tuple[float, ...]) -> None:
-        """Extend a traffic light head by another bulb."""
+        """Extend the position and size of a traffic light by another bulb."""
         _x, _y, z, *rest = pose
         if math.isnan(z):
             return
@@ -625,7 +625,7 @@ class _Head:
 
 
 class TrafficLights:
-    """Traffic lights of a trace, with their bulbs grouped into heads.
+    """Traffic lights of an OSI trace. OSI describes each bulb; bulbs at one place form a light.
 
     Parameters
     ----------
@@ -664,11 +664,11 @@ class TrafficLights:
 
     @property
     def unplaced(self) -> int:
-        """Number of traffic light heads without a position and without a map reference."""
+        """Number of traffic lights without a position and without a map reference."""
         return len(self._heads) - len(self._rows[0])
 
     def update(self, words: list[bytes]) -> None:
-        """Update the states of the bulbs in a ground truth. Other bulbs keep their states."""
+        """Update bulb states from an OSI ground truth message. Other bulbs keep their states."""
         if words == self._words or self._class is None:
             return
         news = set(words).difference(self._words)
@@ -690,7 +690,7 @@ class TrafficLights:
         head.bulbs[bulb.id.value] = 0 if out else lit(classification.mode, classification.color)
 
     def signals(self) -> dict[int, LaneSignal]:
-        """Return the signal of each traffic light head with assigned lanes, by the id of its first bulb."""
+        """Return the traffic lights with assigned lanes: id of the first bulb → light."""
         return {
             head.first: LaneSignal(
                 head.map_ref or f"{OWN}{head.first}",
@@ -703,7 +703,7 @@ class TrafficLights:
         }
 
     def rows(self) -> tuple[Ints, Floats, Ints]:
-        """Return the rows of all traffic light heads with a position: node ids, pose columns, states."""
+        """Return one row per traffic light with a position: node ids, pose columns, states."""
         return self._rows
 
     def _fill(self) -> None:
@@ -715,7 +715,7 @@ class TrafficLights:
         )
 
     def _enter(self, bulb: Any) -> _Head:
-        """Return the traffic light head of a bulb; it may be new."""
+        """Return the traffic light that a bulb belongs to, added if it is new."""
         ident = bulb.id.value
         pose = static_pose(bulb.base) or (NAN,) * 16
         ref, lanes = map_ref(bulb), assigned_lanes(bulb.classification)
@@ -736,7 +736,7 @@ class TrafficLights:
         return head
 
     def _beside(self, pose: tuple[float, ...]) -> _Head | None:
-        """Return the traffic light head at a position, or ``None``."""
+        """Return the traffic light at the position of a bulb, or ``None``."""
         if math.isnan(pose[0]):
             return None
         column, line = _cell(pose)

@@ -1,4 +1,4 @@
-"""Message classes of ASAM OSI, reduced to the fields that the reader needs.
+"""Protobuf message classes of ASAM OSI, reduced to the fields that the reader needs.
 
 A ground truth consists mostly of lanes and boundaries, and a sensor view may contain whole pictures. Unused
 fields are removed from the descriptors, so that protobuf does not parse their bytes. Messages with much static
@@ -145,7 +145,7 @@ SENSOR_VIEW_FIELDS: Final[dict[str, Any]] = {
 def prune(
     files: list[descriptor_pb2.FileDescriptorProto], roots: dict[str, dict[str, Any]]
 ) -> None:
-    """Remove the unused fields from the descriptors of message types.
+    """Remove the unused fields from protobuf descriptors, for faster parsing.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def prune(
 
 
 def _named(messages: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Yield message types with their full names, including nested types."""
+    """Yield protobuf message types with their full names, including nested types."""
     for message in messages:
         name = prefix + message.name
         yield name, message
@@ -191,7 +191,7 @@ def _named(messages: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def check_size(data: bytes, truth: int) -> None:
-    """Raise if the ground truth of a message is too large, or has too many parts to parse.
+    """Raise an error if an OSI message is too large, or has too many parts to parse.
 
     Parameters
     ----------
@@ -274,7 +274,7 @@ _WIDTHS: Final = {1: 8, 3: 0, 4: 0, 5: 4}
 
 
 def _varint(data: bytes, position: int, stop: int) -> tuple[int, int]:
-    """Return a protobuf varint, and the position after it.
+    """Decode a protobuf varint. Return its value, and the position after it.
 
     Raises
     ------
@@ -313,7 +313,7 @@ _SCALARS: Final = {
 
 @cache
 def descriptors() -> bytes:
-    """Return a serialised ``FileDescriptorSet`` of ``osi3.GroundTruth`` and ``osi3.SensorView``."""
+    """Return the serialised protobuf descriptors of ``osi3.GroundTruth`` and ``osi3.SensorView``."""
     text = resources.files("sgstore.readers").joinpath("osi_types.toml").read_text(encoding="utf-8")
     tables = tomllib.loads(text)
     file = descriptor_pb2.FileDescriptorProto(name="osi3.proto", package="osi3", syntax="proto2")
@@ -343,7 +343,7 @@ def add_fields(
     package: str,
     elsewhere: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Add fields to a message type.
+    """Add fields to the descriptor of a protobuf message type.
 
     Parameters
     ----------
@@ -433,7 +433,7 @@ _NEEDS: Final = {
 
 
 def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[Any]:
-    """Return the message class for a schema.
+    """Return the protobuf message class for the schema of an MCAP channel.
 
     Parameters
     ----------
@@ -470,7 +470,7 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
 def _add(
     pool: descriptor_pool.DescriptorPool, files: dict[str, descriptor_pb2.FileDescriptorProto]
 ) -> None:
-    """Add files to a descriptor pool in the order of their imports."""
+    """Add protobuf files to a descriptor pool in the order of their imports."""
     own = descriptor_pb2.DESCRIPTOR
     if own.name not in files:
         files[own.name] = descriptor_pb2.FileDescriptorProto.FromString(own.serialized_pb)
@@ -496,7 +496,7 @@ def _require(found: Descriptor, paths: tuple[str, ...]) -> None:
 
 
 def object_class(message: type[Any]) -> type[Any]:
-    """Return the class of moving objects that belongs to a message class.
+    """Return the protobuf class of moving objects for an OSI message class.
 
     Messages contain these objects as bytes.
 
@@ -516,7 +516,7 @@ def object_class(message: type[Any]) -> type[Any]:
 
 
 def light_class(message: type[Any]) -> type[Any] | None:
-    """Return the class of traffic lights that belongs to a message class, or ``None`` if it is unreadable.
+    """Return the protobuf class of traffic lights for an OSI message class, or ``None`` if unreadable.
 
     Messages contain these lights as bytes.
     """
@@ -529,12 +529,12 @@ def light_class(message: type[Any]) -> type[Any] | None:
 
 
 def lights_of(ground: Any) -> list[bytes]:
-    """Return the serialised traffic lights of a ground truth."""
+    """Return the serialised traffic lights of an OSI ground truth message."""
     return list(getattr(ground, "traffic_light", ()))
 
 
 def has_field(message: type[Any], path: str) -> bool:
-    """True if a message class has the field at a dotted path."""
+    """Return True if a protobuf message class has the field at a dotted path."""
     try:
         _require(message.DESCRIPTOR, (path,))
     except KeyError:
@@ -543,7 +543,7 @@ def has_field(message: type[Any], path: str) -> bool:
 
 
 def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
-    """Parse a message of the leading channel. Return it, its ground truth, and its moving objects.
+    """Parse an OSI message. Return the message, its ground truth part, and its serialised moving objects.
 
     Raises
     ------
@@ -561,7 +561,7 @@ def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
 
 
 def time_of(message: Any, ground: Any) -> int | None:
-    """Return the time stamp of a message; ns. ``None`` means without a valid time stamp."""
+    """Return the time stamp of an OSI message; ns. ``None`` means without a valid time stamp."""
     for part in (ground, message):
         if part.HasField("timestamp"):
             time_ns = part.timestamp.seconds * 1_000_000_000 + part.timestamp.nanos
@@ -572,18 +572,18 @@ def time_of(message: Any, ground: Any) -> int | None:
 
 @lru_cache(maxsize=64)
 def _truth_in(message: type[Any]) -> int:
-    """Return the field number of the ground truth in a message class; 0 if the message is the ground truth."""
+    """Return the field number of the ground truth in an OSI message class; 0 for a ground truth class."""
     truth = message.DESCRIPTOR.fields_by_name.get("global_ground_truth")
     return truth.number if truth is not None else 0
 
 
 def ground_truth_of(message: Any) -> Any:
-    """Return the ground truth in a message, or the message itself if it is one."""
+    """Return the ground truth part of an OSI message, or the message itself if it is a ground truth."""
     return message.global_ground_truth if hasattr(message, "global_ground_truth") else message
 
 
 def enum_name(message: Any, field: str) -> str:
-    """Return the name of an enumeration value in a message, such as ``TYPE_CAR``.
+    """Return the name of an enumeration value in a protobuf message, such as ``TYPE_CAR``.
 
     A value unknown to the file's version of OSI keeps its number: ``TYPE_213``.
     """
@@ -600,7 +600,7 @@ def enum_name(message: Any, field: str) -> str:
 
 @lru_cache(maxsize=256)
 def _values_of(message: type[Any], field: str) -> tuple[dict[int, str], int]:
-    """Return the value names of an enumeration field by number, and the field number."""
+    """Return the value names of a protobuf enumeration field by number, and the field number."""
     descriptor = message.DESCRIPTOR.fields_by_name[field]
     names = descriptor.enum_type.values_by_number
     # Read one by one: if a number has several names, the first one counts.
@@ -608,7 +608,7 @@ def _values_of(message: type[Any], field: str) -> tuple[dict[int, str], int]:
 
 
 def identifiers(thing: Any) -> list[tuple[str, str]]:
-    """Return the source references of an object in order: (type of the source, identifier).
+    """Return the source references of an OSI object in order: (type of the source, identifier).
 
     Raises
     ------
@@ -627,7 +627,7 @@ def identifiers(thing: Any) -> list[tuple[str, str]]:
 
 
 def map_ref(thing: Any) -> str:
-    """Return the id of the OpenDRIVE signal or object that an object refers to, or an empty string.
+    """Return the id of the OpenDRIVE signal or object that an OSI object refers to, or an empty string.
 
     esmini writes ``traffic_light_id:3``, ``traffic_sign_id:3`` and ``object_id:3``. A plain identifier is
     returned unchanged.
@@ -640,7 +640,7 @@ def map_ref(thing: Any) -> str:
 
 
 def assigned_lanes(classification: Any) -> list[int]:
-    """Return the ids of the physical and logical lanes that a light or sign is assigned to.
+    """Return the ids of all OSI lanes that a traffic light or sign applies to.
 
     Raises
     ------
@@ -659,7 +659,7 @@ def assigned_lanes(classification: Any) -> list[int]:
 
 
 def static_pose(base: Any) -> tuple[float, ...] | None:
-    """Return the pose and size of a static object, or ``None`` without a usable position.
+    """Return the pose and size of a static OSI object, or ``None`` without a usable position.
 
     The columns are those of :data:`sgstore.model.world.POSE`. A missing orientation or dimension is NaN.
     """

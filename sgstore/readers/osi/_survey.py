@@ -1,4 +1,4 @@
-"""First reading of an OSI recording: moving objects, ego and map.
+"""First pass over an OSI recording: find moving objects, ego and road map.
 
 The id of an object is a number from the simulator, which often changes between runs. Users know an object by
 its name in the scenario. If the recording contains a unique name, it becomes the entity's ident; otherwise, the
@@ -57,7 +57,7 @@ _MOST_HOSTS: Final = 100
 
 
 def names_of(moving_object: Any) -> list[str]:
-    """Return the names of a moving object: first from ``entity_name:X``, then plain identifiers."""
+    """Return the possible names of an OSI moving object, best first, from its source references."""
     parts = [text.partition(":") for _, text in identifiers(moving_object)]
     named = [value for key, _, value in parts if key == "entity_name" and value]
     bare = [key for key, colon, _ in parts if key and not colon and key not in _SORTS]
@@ -72,14 +72,14 @@ def _names_or_none(moving_object: Any) -> list[str]:
 
 
 def hosts_of(message: Any) -> list[int]:
-    """Return the ids of the host vehicle in a message, most reliable first. 0 is a valid id."""
+    """Return the possible ids of the host vehicle (ego) in an OSI message, most reliable first."""
     told = [getattr(message, part) if part else message for part in _telling(type(message))]
     return [part.host_vehicle_id.value for part in told if part.HasField("host_vehicle_id")]
 
 
 @lru_cache(maxsize=64)
 def _telling(message: type[Any]) -> tuple[str, ...]:
-    """Return the message parts that can contain the id of the host vehicle; empty means the message itself."""
+    """Return the parts of an OSI message that can contain the id of the host vehicle (ego)."""
     inner = [
         (part, found.message_type)
         for part in ("global_ground_truth", "host_vehicle_data")
@@ -93,7 +93,7 @@ def _telling(message: type[Any]) -> tuple[str, ...]:
 
 
 def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
-    """Return the first bytes of each serialised object: its id field, if the object starts with it.
+    """Return the first bytes of each serialised OSI object, which contain its id.
 
     If the objects match ``last``, an earlier result of this function, the same list is returned.
     """
@@ -106,14 +106,14 @@ def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
 
 
 def is_key(key: bytes, thing: Any) -> bool:
-    """True if the first bytes of a serialised object are exactly its id."""
+    """Return True if the first bytes of a serialised OSI object are exactly its id."""
     ident = thing.id.SerializeToString()
     return len(ident) < 0x80 and key == b"\x0a" + bytes([len(ident)]) + ident
 
 
 @dataclass(slots=True)
 class Cast:
-    """Moving objects of a recording, with their names.
+    """Moving objects of an OSI recording, with their names and possible egos.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class Cast:
     _last: list[bytes] = field(default_factory=list[bytes])
 
     def look(self, message: Any, contents: list[bytes], objects: type[Any]) -> None:
-        """Add the objects in a message.
+        """Add the moving objects of an OSI message.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class Cast:
                 self._keys.add(key)
 
     def idents(self) -> dict[int, str]:
-        """Return the name of each moving object if it is unique, else its number."""
+        """Return the name of each moving object if the name is unique, else the object's number."""
         numbers = {str(number) for number in self.names}
         bearers: dict[str, int] = {}
         for names in self.names.values():
@@ -174,7 +174,7 @@ class Cast:
         }
 
     def ego(self, wanted: str, notes: list[str]) -> int | None:
-        """Return the id of the ego, or ``None``.
+        """Return the OSI id of the ego vehicle, or ``None``.
 
         Parameters
         ----------
@@ -245,7 +245,7 @@ STATIC_FIELDS: Final = (
 
 @dataclass(slots=True)
 class _Latch:
-    """Messages of a channel that later messages depend on, because their contents are not repeated.
+    """Messages with lanes that are recorded only once, so that later messages need them.
 
     A static object is defined by the first message that contains it. If all later messages contain it, too,
     none depends on the first. A light's state is defined by the last message before one without the light.
@@ -262,7 +262,7 @@ class _Latch:
     refs: dict[Ref, None] = field(default_factory=dict[Ref, None])
 
     def look(self, told: Mapping[str, Any], words: list[bytes], ref: Ref) -> bool:
-        """Examine a message. Return True if it contains a new lane or boundary.
+        """Examine the lanes of a message. Return True if it has a new lane or boundary.
 
         Parameters
         ----------
@@ -301,7 +301,7 @@ class _Latch:
 
 @dataclass(slots=True, kw_only=True)
 class OsiLead(Lead):
-    """Possible leading channel, with its message class and the messages that later ones depend on.
+    """Channel with OSI messages, as a candidate for the frames of the trace.
 
     ``objects``: class of its moving objects. ``latch``: its messages that others depend on. ``lanes``: its
     lanes; ``None`` if they are unreadable. The weight of a frame is 1 if it has moving objects.
@@ -323,7 +323,7 @@ def schema_name(recording: Recording, channel: int) -> str:
 
 
 class OsiSurvey(Survey[OsiLead]):
-    """First reading of an OSI recording.
+    """First pass over an OSI recording, which collects the facts that the frames need.
 
     The map is OpenDRIVE if the recording contains it. Otherwise, it is made of the lanes in the ground truth.
 
@@ -353,11 +353,11 @@ class OsiSurvey(Survey[OsiLead]):
         self._lights: dict[int, TrafficLights] = {}  # By channel.
 
     def rank(self, lead: OsiLead) -> tuple[int, ...]:
-        """Return the sort key of a possible leading channel: first the number of frames with moving objects."""
+        """Return the sort key of a channel for the choice of the frame channel: frames with objects first."""
         return lead.weight, lead.frames, lead.schema == GROUND_TRUTH
 
     def read(self) -> Self:
-        """Read the whole recording. Without an OpenDRIVE map, make a map of its lanes."""
+        """Read all messages once, collect the facts, and make a road map from lanes if it is missing."""
         super().read()
         if not self.map_text:
             leading = self.first_lead()
@@ -366,23 +366,23 @@ class OsiSurvey(Survey[OsiLead]):
         return self
 
     def no_frames(self) -> str:
-        """Return the reason for a recording without a leading channel."""
+        """Return the text that explains why an OSI recording has no frames."""
         topics = [repr(self.topic(channel)) for channel in self.leads]
         where = ", ".join(topics) or "the channels of its schema"
         return f"no ground truth message can be read from {where}"
 
     def find_ego(self) -> str:
-        """Find the ego among the moving objects, and return its ident."""
+        """Find the ego among the moving objects, and return its id text."""
         self.ego = self.cast.ego(self.wanted, self.about_ego)
         return "" if self.ego is None else self.cast.idents()[self.ego]
 
     def role(self, channel: int) -> str:
-        """Return the role of a channel, ``map`` for a channel with OpenDRIVE messages."""
+        """Return the role of a channel, for example ``map`` for OpenDRIVE messages."""
         is_map = channel != self.leading and schema_name(self.recording, channel) == ROAD_MAP
         return "map" if is_map else super().role(channel)
 
     def context(self) -> set[Ref]:
-        """Return the messages that later messages depend on.
+        """Return the file positions of messages that are needed to read later messages.
 
         For other channels than the leading one, these are the first messages with each static object.
         """
@@ -394,11 +394,11 @@ class OsiSurvey(Survey[OsiLead]):
         return refs
 
     def keeps(self, channel: int) -> bool:
-        """True if the reading of the frames needs the messages of a channel again."""
+        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
         return schema_name(self.recording, channel) in {GROUND_TRUTH, SENSOR_VIEW, HOST_DATA}
 
     def meet(self, channel: int) -> bool:
-        """True if a channel contains frames or maps. A new channel is prepared for reading."""
+        """Return True if a channel contains frames or maps. A new channel gets a decoder."""
         if channel in self.leads or channel in self._maps:
             return True
         name = schema_name(self.recording, channel)
@@ -434,7 +434,7 @@ class OsiSurvey(Survey[OsiLead]):
         )
 
     def look(self, run: Messages, row: int) -> None:
-        """Examine a map message or a frame."""
+        """Collect facts from one OSI message: a road map or a frame."""
         channel = int(run.channel[row])
         if channel in self._maps:
             self._look_at_map(self._maps[channel], run, row)
@@ -476,7 +476,7 @@ class OsiSurvey(Survey[OsiLead]):
         self.count(run, row, len(objects) > 0)
 
     def _make_map_of_lanes(self, leading: int) -> None:
-        """Make the map of the lanes. Lanes of the leading channel have priority."""
+        """Make a road map from the OSI lanes. Lanes of the frame channel have priority."""
         for _, lead in sorted(self.leads.items(), key=lambda item: item[0] != leading):
             if lead.lanes is None:
                 continue

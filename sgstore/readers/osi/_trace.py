@@ -1,4 +1,4 @@
-"""Reader of ASAM OSI recordings: ``osi3.GroundTruth`` and ``osi3.SensorView`` messages in MCAP.
+"""Reader of ASAM OSI recordings: decoder of ground truth messages into frames.
 
 A recording is recognised only by the schemas of its channels: topics are arbitrary, and most files lack the
 standard metadata. A frame is one message of the leading channel, in file order. The road map is that of an
@@ -55,7 +55,7 @@ _CLASSES: Final = (
 
 
 class Environment:
-    """Environmental conditions of a trace, reported as events.
+    """Weather and light conditions of an OSI trace, reported as events.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Environment:
             self._class = None
 
     def look(self, ground: Any, time_ns: int, log_time_ns: int, seq: int) -> None:
-        """Update the conditions from a ground truth. Missing conditions keep their values."""
+        """Update the weather and light conditions from an OSI message, and report changes as events."""
         told = getattr(ground, "environmental_conditions", b"")
         if not told or told == self._told or self._class is None:
             return
@@ -97,14 +97,14 @@ class Environment:
         self._roster.happen(Event("environment", time_ns, log_time_ns, seq, detail=detail))
 
     def settle(self) -> None:
-        """Add a warning about unreadable conditions."""
+        """Add a warning about unreadable weather and light conditions to the report."""
         if self._unread:
             words = f"weather and light cannot be read where they changed {self._unread} times"
             self._roster.report.warnings.append(words)
 
 
 def classes_of(conditions: Any) -> str:
-    """Return the known classes of conditions, such as ``precipitation=light, fog=mist``."""
+    """Return weather and light classes as text, such as ``precipitation=light, fog=mist``."""
     told = [(word, _class(conditions, field)) for word, field in _CLASSES]
     if "clouds" in conditions.DESCRIPTOR.fields_by_name and conditions.HasField("clouds"):
         told.append(("clouds", _class(conditions.clouds, "fractional_cloud_cover")))
@@ -112,7 +112,7 @@ def classes_of(conditions: Any) -> str:
 
 
 def numbers_of(conditions: Any) -> list[str]:
-    """Return time of day and temperature, if known."""
+    """Return time of day and temperature as texts, if known."""
     told: list[str] = []
     if conditions.HasField("time_of_day"):
         minutes, seconds = divmod(conditions.time_of_day.seconds_since_midnight % 86_400, 60)
@@ -123,7 +123,7 @@ def numbers_of(conditions: Any) -> list[str]:
 
 
 def _class(message: Any, field: str) -> str:
-    """Return an enumeration value in lower case without its common prefix; empty if unknown."""
+    """Return an OSI enumeration value in lower case without its common prefix; empty if unknown."""
     told = message.DESCRIPTOR.fields_by_name.get(field)
     if told is None or told.enum_type is None or not message.HasField(field):
         return ""
@@ -160,7 +160,7 @@ _MOST_AHEAD: Final = 16
 
 @dataclass(slots=True)
 class OsiRawFrame:
-    """Frame whose objects are not decoded yet.
+    """Frame of an OSI recording before conversion, with serialised objects.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ class OsiRawFrame:
 
 
 class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
-    """Converter of ground truth messages into frames.
+    """Decoder of OSI ground truth messages into frames.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         self._frames = 0
 
     def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
-        """Return the frame that a message starts, or ``None``. Other contents of the message are stored."""
+        """Return the raw frame that an OSI message starts; ``None`` for any other message."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()
@@ -253,7 +253,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         return None
 
     def settle(self) -> None:
-        """Report the losses, after all frames are read."""
+        """Add the lost messages to the report, after all frames are read."""
         self._environment.settle()
         warn = self._report.warnings.append
         if self._lights.unplaced:
@@ -274,7 +274,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
             self._warn_of_egos(NO_EGO)
 
     def complete(self, frames: list[OsiRawFrame]) -> list[FrameRows]:
-        """Return the frames with their numbers, decoded for all frames at once."""
+        """Convert raw OSI frames to frames with poses, speeds and sizes, many frames at once."""
         objects = [content for frame in frames for content in frame.objects]
         values, usable, lights, codes = self._objects.read(objects)
         turned = usable & (np.abs(values[:, _HEADING]) > math.pi)
@@ -307,7 +307,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _other_kinds(
         self, frames: list[OsiRawFrame], node: Ints, codes: Ints, objects: list[bytes]
     ) -> dict[int, dict[int, Called]]:
-        """Return, by frame and node id, the types of objects whose kind differs from the first one."""
+        """Return the objects whose kind differs from their first one: frame → node id → kind."""
         entered = np.full(self.roster.size, -1, np.int64)
         entered[[*self._codes]] = [*self._codes.values()]
         rows = np.flatnonzero((codes >= 0) & (codes != entered[node]))
@@ -328,7 +328,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _frame(
         self, told: tuple[Any, Any, list[bytes]], time_ns: int, log_time: int, channel: int
     ) -> OsiRawFrame | None:
-        """Return a new frame, or ``None`` if the message continues the last frame."""
+        """Return a new raw frame for a message, or ``None`` if the message continues the last frame."""
         message, ground, contents = told
         nodes, objects = self._met(contents, log_time)
         last, before, self._told_by = self._open, self._told_by, channel
@@ -356,7 +356,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _join(
         self, frame: OsiRawFrame, message: Any, nodes: list[int], objects: list[bytes]
     ) -> None:
-        """Add the objects and controls of a message to a frame, unless the frame already has them."""
+        """Add the objects and vehicle controls of a message to a frame that lacks them."""
         if not frame.nodes:
             frame.nodes, frame.objects = nodes, objects
         else:
@@ -377,14 +377,14 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         )
 
     def _take_controls(self, data: Any, log_time: int) -> None:
-        """Store the controls of the host vehicle. With equal log time, they belong to the last frame."""
+        """Store the vehicle controls of the ego. With equal log time, they belong to the last frame."""
         self._controls = told = controls_of(data)
         last = self._open
         if last is not None and log_time == last.log_time_ns:
             last.controls = _first_told(last.own, told)
 
     def _take_aside(self, told: tuple[Any, Any, list[bytes]], time_ns: int) -> None:
-        """Assign a message of another channel to the last frame, a later frame or no frame."""
+        """Add another channel's objects to the frame of the same time, or store them for a later frame."""
         message, ground, contents = told
         last = self._open
         self._lights.update(lights_of(ground))
@@ -401,14 +401,14 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
             self._leave_aside(contents)
 
     def _leave_aside(self, contents: list[bytes]) -> None:
-        """Count the objects of a time that has no frame."""
+        """Count the objects of a message whose time has no frame."""
         for content in contents:
             with suppress(*DECODE_ERRORS):
                 ident = int(self._class.FromString(content).id.value)
                 self._aside[ident] = self._aside.get(ident, 0) + 1
 
     def _met(self, objects: list[bytes], log_time: int) -> tuple[list[int], list[bytes]]:
-        """Return the node ids of serialised objects, without unreadable and duplicate ones, and the objects."""
+        """Return node ids and bytes of serialised objects, without unreadable and duplicate ones."""
         keys = keys_of(objects, self._last_keys)
         if keys is self._last_keys:  # The same objects as in the last frame, in the same order.
             return self._last_nodes.copy(), objects
@@ -430,7 +430,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         return list(rows), [objects[row] for row in rows.values()]
 
     def _node_of(self, content: bytes, key: bytes, log_time: int) -> int:
-        """Return the node id of an object with unknown first bytes; -1 if it is malformed.
+        """Decode the id of an object that was not seen before, and return its node id; -1 if malformed.
 
         A new object is added.
         """
@@ -448,7 +448,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         return node
 
     def _enter(self, thing: Any) -> int:
-        """Add a new moving object, and return its node id."""
+        """Add a new OSI moving object to the object table, and return its node id."""
         meaning, type_name = self._called(thing)
         if meaning.kind == "vehicle" and not meaning.subkind:
             self.roster.count_unknown(type_name)
@@ -458,7 +458,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         return node
 
     def _trailer(self, thing: Any) -> str:
-        """Return the id of the trailer of a vehicle, or an empty string."""
+        """Return the id of the trailer that a vehicle pulls, or an empty string."""
         vehicle = getattr(thing, "vehicle_classification", None)
         if vehicle is None or not has_field(type(vehicle), "trailer_id"):
             return ""
@@ -468,7 +468,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         return self._idents.get(number, str(number))
 
     def _called(self, thing: Any) -> Called:
-        """Return the meaning and type name of a moving object.
+        """Return the kind and the type name of an OSI moving object.
 
         Its vehicle type counts if the object is a vehicle or has no type.
         """
@@ -495,11 +495,11 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
             self._unusable.add(words, log_time)
 
     def _number(self, node: int) -> int:
-        """Return the id of a moving object in the recording."""
+        """Return the id of a moving object in the OSI recording, from its node id."""
         return next(ident for ident, known in self._nodes.items() if known == node)
 
     def _usable(self, frame: FrameRows, usable: Bools, ego: int) -> FrameRows:
-        """Return a frame without its unusable rows."""
+        """Return a frame without the rows of unusable objects."""
         for node in frame.node[~usable].tolist():
             words = f"moving object {self._number(node)} has no usable pose"
             self._unusable.add(words, frame.log_time_ns)
@@ -515,7 +515,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
 
 
 def controls_of(data: Any) -> tuple[float, ...]:
-    """Return the control inputs in an ``osi3.HostVehicleData``; NaN for missing ones.
+    """Return the vehicle controls in an OSI message about the host vehicle; NaN for missing ones.
 
     The columns are :data:`sgstore.model.world.INPUTS`. Steering is always NaN, because the angle of the
     steering wheel is not normalised and its range is unknown. The hand brake is always NaN, because OSI has
@@ -531,7 +531,7 @@ def controls_of(data: Any) -> tuple[float, ...]:
 
 
 def _first_told(*controls: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the first known value of each control."""
+    """Return the first known value of each vehicle control (steering, throttle, …)."""
     return tuple(
         next((value for value in values if not math.isnan(value)), NAN)
         for values in zip(*controls, strict=True)
@@ -545,7 +545,7 @@ def _number(message: Any, part: str, name: str) -> float:
 
 
 class OsiTrace(SurveyedTrace[OsiSurvey]):
-    """Recording of OSI ground truth.
+    """Open OSI recording, which yields frames.
 
     Parameters
     ----------
@@ -575,7 +575,7 @@ class OsiTrace(SurveyedTrace[OsiSurvey]):
 
     @staticmethod
     def has_frames(recording: Recording, channel: int) -> bool:
-        """True if a channel contains OSI ground truth."""
+        """Return True if a channel contains OSI ground truth."""
         return schema_name(recording, channel) in {GROUND_TRUTH, SENSOR_VIEW}
 
     def _decoder(self, report: TraceReport) -> OsiDecoder:

@@ -1,3 +1,3 @@
-"""Reader of SUMO floating-car data."""
+"""Reader of SUMO floating-car data (positions of simulated vehicles)."""
 
 __all__ = []

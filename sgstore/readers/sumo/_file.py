@@ -1,4 +1,4 @@
-"""SUMO floating-car data (``--fcd-output``) with the interface of an MCAP file: one message per step.
+"""SUMO floating-car data with the interface of an MCAP file: one message per time step.
 
 The file is one XML document of any length, plain or gzip-compressed. It is read in pieces and split at the
 start and end of each time step. The contents of a step are parsed later. A step above the size limit, or bytes
@@ -53,7 +53,7 @@ _DAMAGED: Final = (OSError, EOFError, zlib.error)
 
 
 def is_fcd(path: Path) -> bool:
-    """True if a file is SUMO floating-car data, by its suffix and first element."""
+    """Return True if a file is SUMO floating-car data, by its suffix and first XML element."""
     if not path.name.lower().endswith(ENDINGS):
         return False
     try:
@@ -64,7 +64,7 @@ def is_fcd(path: Path) -> bool:
 
 
 def opened(path: Path) -> BufferedIOBase:
-    """Open a SUMO file as plain bytes; gzip is decompressed during the reading.
+    """Open a SUMO file for reading as bytes; gzip is decompressed.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def opened(path: Path) -> BufferedIOBase:
 
 
 class _Unpacked(gzip.GzipFile):
-    """Gzip file that also closes its underlying file."""
+    """Gzip file that also closes the compressed file below."""
 
     def __init__(self, file: BufferedIOBase) -> None:
         super().__init__(fileobj=file, mode="rb")
@@ -90,14 +90,14 @@ class _Unpacked(gzip.GzipFile):
 
 
 def time_ns(step: bytes) -> int | None:
-    """Return the time of a time step; ns. ``None`` means missing. SUMO writes seconds or ``h:m:s``."""
+    """Return the time of a SUMO time step; ns. ``None`` means missing. SUMO writes seconds or ``h:m:s``."""
     found = _TIME.search(step[:1000])
     seconds = seconds_of(found and found[1].decode())
     return None if math.isnan(seconds) else round(seconds * 1e9)
 
 
 def seconds_of(text: str | None) -> float:
-    """Return the seconds of a SUMO time; NaN if it is invalid."""
+    """Convert a SUMO time text to seconds; NaN if it is invalid."""
     seconds = 0.0
     try:
         for part in (text or "none").split(":"):
@@ -108,7 +108,7 @@ def seconds_of(text: str | None) -> float:
 
 
 class SumoFile(MessageFile):
-    """SUMO floating-car data with the interface of an MCAP file, for one or more readings.
+    """SUMO floating-car data with the interface of an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class SumoFile(MessageFile):
         self.add_channel("/sumo/fcd", schema, "xml")
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the SUMO file."""
         self._file.close()
 
     def walk(
@@ -150,7 +150,7 @@ class SumoFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """Yield all time steps, in order. Losses are added to ``report``.
+        """Yield all time steps of a SUMO file as messages, in order.
 
         ``offset`` of a message is its position in the file.
         """
@@ -174,7 +174,7 @@ class SumoFile(MessageFile):
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int]]) -> Iterator[bytes]:
-    """Yield the data of time steps of a file, by offset and length as in a walk.
+    """Yield the bytes of time steps of a SUMO file, by their offsets and lengths.
 
     See :meth:`SumoFile.walk`.
 
@@ -212,7 +212,7 @@ def _messages(held: list[tuple[int, int, bytes]], number: int) -> Messages:
 
 
 def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
-    """Yield the bytes of a file in pieces, and an empty piece at its undamaged end."""
+    """Yield the bytes of a SUMO file in pieces, and an empty piece at an undamaged end."""
     while True:
         try:
             piece = file.read1(_PIECE)
@@ -225,7 +225,7 @@ def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
 
 
 def _steps(file: BufferedIOBase, report: Findings) -> Iterator[tuple[int, bytes]]:
-    """Yield position and bytes of each time step, from its start tag to its end tag."""
+    """Yield position and bytes of each SUMO time step, from its start tag to its end tag."""
     file.seek(0)
     rest, place = b"", 0  # Unused bytes, and their position in the file.
     for piece in _pieces(file, report):

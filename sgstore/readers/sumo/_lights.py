@@ -37,7 +37,7 @@ _PIECE: Final = 1 << 20
 
 
 def lights_beside(path: Path) -> Path | None:
-    """Return the file with the light states of a recording, or ``None``.
+    """Return the path of the SUMO file with light states next to a recording, or ``None``.
 
     For ``drive.fcd.xml``, this is ``drive.tls.xml``.
     """
@@ -50,7 +50,7 @@ def lights_beside(path: Path) -> Path | None:
 
 
 class LightStates:
-    """States of traffic lights over time.
+    """States of SUMO traffic lights over time.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class LightStates:
         self._depth -= 1
 
     def of(self, signal: str, time_ns: int) -> str | None:
-        """Return the state of a map signal at a time, as in the vocabulary; ``None`` means unknown."""
+        """Return the state of a traffic light (map signal) at a time; ``None`` means unknown."""
         name, link = signal, 0
         if name not in self._times:
             name, _, number = signal.rpartition("/")

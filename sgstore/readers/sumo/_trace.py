@@ -63,7 +63,7 @@ _SPECIAL: Final = (("emergency", "emergency"), ("police", "emergency"), ("taxi",
 
 
 def meaning_of(type_name: str, *, walks: bool) -> TypeMeaning:
-    """Return the meaning of a type: from the vocabulary, else from words in its name."""
+    """Return the kind for a SUMO vehicle type: from a known type name, else from words in the name."""
     name = type_name.lower().partition("@")[0]
     known = type_meanings().get(name)
     if known is not None:
@@ -76,7 +76,7 @@ def meaning_of(type_name: str, *, walks: bool) -> TypeMeaning:
 
 
 class SumoTrace(FramesTrace):
-    """Floating-car data of SUMO. Without the argument ``ego``, the frames have no ego."""
+    """Open SUMO recording, which yields frames. Without the argument ``ego``, the frames have no ego."""
 
     name: ClassVar[str] = "sumo"
 
@@ -89,11 +89,11 @@ class SumoTrace(FramesTrace):
             self.info = replace(self.info, mapping=digest_of(beside))
 
     def start(self) -> None:
-        """Reset the state before the messages are read again."""
+        """Reset the reader, before the messages are read again from the first one."""
         self._owners: dict[str, str] = {}
 
     def on_map(self, road_map: RoadMap | None) -> None:
-        """Find the positions of traffic lights in the road map of the ingest."""
+        """Find the positions of the traffic lights in the road map."""
         if road_map is None or self._lights is None:
             return
         nodes = road_map.nodes
@@ -106,11 +106,11 @@ class SumoTrace(FramesTrace):
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """Return the role of a channel."""
+        """Return the role of a channel: frames or other data."""
         return "ground_truth" if channel.schema == STEP else "payload"
 
     def frame(self, message: TraceMessage) -> Frame:
-        """Return the frame of a time step."""
+        """Convert a SUMO time step to a frame."""
         time = time_ns(message.data)
         frame = Frame(message.log_time_ns if time is None else time)
         step = _TimeStep(frame, self._owners)
@@ -136,7 +136,7 @@ class SumoTrace(FramesTrace):
 
 
 class _TimeStep:
-    """Handler of XML events that adds vehicles, persons and containers to a frame.
+    """Handler of XML parser events that adds SUMO vehicles, persons and containers to a frame.
 
     SUMO may have a vehicle and a person with the same name. ``owners``: the first element with each name.
     """
@@ -146,7 +146,7 @@ class _TimeStep:
         self._idents: set[str] = set()
 
     def start(self, tag: str, told: dict[str, str]) -> None:
-        """Handle the start of an element."""
+        """Handle the start tag of an XML element."""
         if tag not in {"vehicle", "person", "container"} or "x" not in told:
             return
         ident = told["id"]
@@ -192,11 +192,11 @@ class _TimeStep:
         )
 
     def end(self, _tag: str) -> None:
-        """Handle the end of an element."""
+        """Handle the end tag of an XML element."""
 
 
 def _lights(told: dict[str, str]) -> list[str] | None:
-    """Return the active lights from ``--fcd-output.signals``. ``None`` means unknown."""
+    """Return the names of a SUMO vehicle's active lights. ``None`` means unknown."""
     if "signals" not in told:
         return None
     mask = int(told["signals"])
