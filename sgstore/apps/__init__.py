@@ -1,1 +1,1 @@
-"""Programs around the library: command line, explorer, assistant, notebook, pytest, reports."""
+"""Programs around the library: command line, web page, AI assistant, notebook, pytest plugin, reports."""

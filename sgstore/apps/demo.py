@@ -1,4 +1,4 @@
-"""Demonstration on the sample recording: ingest, find, show, export."""
+"""Demonstration with a sample recording: ingest, find, show, export."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ MOUNTS: Final = ("ego/lidar=0,0,1.75", "ego/camera/front=0.45,0,1.42,-90,0,-90")
 
 
 def bundled() -> Path:
-    """Return the available sample recording: the complete one in a checkout, else the small one."""
+    """Return the path of the sample recording: the complete one in a source checkout, else the small one."""
     return RECORDING if RECORDING.is_file() else SMALL
 
 
 def run_demo(folder: str | Path, say: Say, recording: str | Path | None = None) -> None:
-    """Run the demonstration, and report each step.
+    """Run the demonstration in a folder, and report each step.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def _ingest(store: Path, sample: Path, say: Say) -> None:
 def _answer(
     store: Store, folder: Path, say: Say, name: str, sentence: str, pattern: str
 ) -> Path | None:
-    """Run a query, print the intervals, and draw the middle of the first one."""
+    """Run a query, report the intervals of its matches, and draw the middle frame of the first interval."""
     say("")
     say(sentence)
     say("")
@@ -154,7 +154,7 @@ def _answer(
 
 
 def _bound(interval: Interval) -> list[str]:
-    """Return ``p = person 15`` for each variable."""
+    """Return a text such as ``p = person 15`` for each variable of a match."""
     return [
         f"{name.removesuffix('.name')} = {value}"
         for name, value in interval.values.items()

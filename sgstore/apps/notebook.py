@@ -41,7 +41,7 @@ def load(ipython: Any) -> None:
 
 
 def _picture(graph: Any) -> bytes | None:
-    """Draw a graph of a generator or exporter as nodes and edges."""
+    """Return a scene graph as a PNG picture for a notebook. ``None`` means that a package is missing."""
     from sgstore.draw import graph_picture
     from sgstore.errors import MissingExtraError
 
@@ -52,7 +52,7 @@ def _picture(graph: Any) -> bytes | None:
 
 
 class SgqlCell:
-    """Cell magic ``%%sgql``: runs a pattern, rules, or SQL, and displays the result.
+    """Notebook cell magic ``%%sgql``: runs a pattern, checks or SQL, and displays the result.
 
     ``$name`` is replaced by the value of this variable.
 
@@ -67,7 +67,7 @@ class SgqlCell:
         self._last: Store | None = None
 
     def __call__(self, line: str, cell: str) -> Matches | CheckRun | Rows | None:
-        """Run the text of the cell; print errors without a traceback."""
+        """Run the text of a notebook cell as a query, and return the result. Errors have no traceback."""
         try:
             store, name = self._options(line)
             answer = self._asked(store, cell)
@@ -80,7 +80,7 @@ class SgqlCell:
         return answer
 
     def _options(self, line: str) -> tuple[Store, str]:
-        """Return the store of the query, and the variable name for the result."""
+        """Return the store for a notebook cell, and the variable name for its result."""
         try:
             words = shlex.split(line)
         except ValueError as error:
@@ -115,7 +115,7 @@ class SgqlCell:
         return store.check(text, **values) if _has_checks(text) else store.find(text, **values)
 
     def _values(self, text: str) -> dict[str, Any]:
-        """Return the session's variables in a query, except those with a value in the query itself."""
+        """Return the notebook variables that a query uses as ``$name``, without those defined in the query."""
         bare = _NO_NAMES.sub("''", text)
         own = {name for part in _SCENARIO.findall(bare) for name in _DEFAULT.findall(part)}
         wanted = dict.fromkeys(name for name in _VALUE.findall(bare) if name not in own)
@@ -123,7 +123,7 @@ class SgqlCell:
 
 
 def _has_checks(text: str) -> bool:
-    """True if a text contains rules; invalid texts are classified by the word ``CHECK``."""
+    """True if a query text contains ``CHECK`` statements; invalid texts are searched for the word."""
     from sgstore.errors import QueryError
     from sgstore.lang.syntax import parse
     from sgstore.lang.syntax.tree import CheckClause

@@ -1,4 +1,4 @@
-"""Pytest plugin for test sets: one test per clip of a query or lock, or per trace and rule.
+"""Pytest plugin for driving scenes: one test per clip of a query or lock, or per trace and check.
 
 ::
 
@@ -64,7 +64,7 @@ _KNOWN: Final = {*_SOURCES, "store", "before", "after", "parameters", "allow_emp
 
 
 class ClipScene:
-    """Clip of a test; the value of the fixture ``scene``.
+    """Clip of a recording for one pytest test; the value of the fixture ``scene``.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class ClipScene:
         return None if self._asked is None else self._asked()
 
     def verify(self, *, messages: bool = False) -> None:
-        """Verify once per session that the store agrees with the lock, or fail the test.
+        """Fail the test if the store differs from the lock file; each lock is compared once per session.
 
         Parameters
         ----------
@@ -125,26 +125,26 @@ class ClipScene:
 
     @property
     def id(self) -> str:
-        """Return the id of its test."""
+        """Return the pytest id of the test for a clip."""
         return self.name or f"{self.trace}#{self.frames[0].seq}-{self.frames[-1].seq}"
 
     @property
     def trace(self) -> str:
-        """Return the name of its trace."""
+        """Return the name of the trace that contains the clip."""
         return self.clip.trace
 
     @property
     def time(self) -> tuple[float, float]:
-        """Return start and end since the start of its trace; s."""
+        """Return the start and end of the clip in seconds since the start of the trace."""
         return self.frames[0].t, self.frames[-1].t
 
     @property
     def recording(self) -> Path:
-        """Return the path of its recording."""
+        """Return the path of the recording that contains the clip."""
         return self.store.file.trace(self.trace).path
 
     def graph(self, frame: int | FrameRef = 0, abstraction: str | None = None) -> Any:
-        """Return the scene graph of a frame.
+        """Return the scene graph of a frame of the clip.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class ClipScene:
         return self.store.graph(self._frame(frame), *asked)
 
     def graphs(self) -> Iterator[nx.MultiDiGraph[int]]:
-        """Yield the scene graphs of all frames, in order."""
+        """Yield the scene graphs of all frames of the clip, in order."""
         from sgstore.exporters import FEW, Export, graphs_of
 
         export = Export(self.store, (self.clip,))
@@ -170,17 +170,17 @@ class ClipScene:
                 yield graph.to_networkx()
 
     def payload(self, channel: str, frame: int | FrameRef = 0) -> bytes:
-        """Return the recorded message of a channel for a frame; ``frame`` as in :meth:`graph`."""
+        """Return the recorded message of a sensor channel for a frame of the clip, as bytes."""
         self.verify(messages=True)
         return self.store.payload(self._frame(frame), channel)
 
     def carried(self, channel: str, frame: int | FrameRef = 0) -> Media:
-        """Return the content of such a message: a picture file, a video up to it, or the message."""
+        """Return the sensor data of a frame: a picture file, a video up to the frame, or the message."""
         self.verify(messages=True)
         return self.store.file.carried(self._frame(frame).frame_id, channel)
 
     def found(self, query: str, /, **parameters: object) -> list[FrameRef]:
-        """Return the frames of the scene that match a pattern."""
+        """Return the frames of the clip that match a pattern."""
         own = {frame.frame_id for frame in self.frames}
         matches = self.store.find(query, **parameters)
         return [frame for frame in matches.frames() if frame.frame_id in own]
@@ -195,7 +195,7 @@ class ClipScene:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option for the store of locks."""
+    """Add the pytest option that names the store for lock files."""
     group = parser.getgroup("sgstore")
     about = "store that @pytest.mark.scenes takes its clips from, if the mark names none"
     group.addoption("--scenes-store", dest=OPTION, metavar="PATH", default=None, help=about)
@@ -203,12 +203,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the mark."""
+    """Register the mark ``scenes`` in pytest."""
     config.addinivalue_line("markers", _EXPLAINED)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Parametrise one test per scene; an invalid mark gives one failing test."""
+    """Create one test per clip of the mark ``scenes``. An invalid mark creates one failing test."""
     mark = metafunc.definition.get_closest_marker(MARK)
     if mark is None or "scene" not in metafunc.fixturenames:
         return
@@ -221,7 +221,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Fail tests with the mark but without the fixture."""
+    """Fail a test that has the mark ``scenes`` but does not use the fixture ``scene``."""
     lacks = "scene" not in getattr(item, "fixturenames", ("scene",))
     if lacks and item.get_closest_marker(MARK) is not None:
         pytest.fail(f"{item.name}: {MARK} needs the fixture `scene`", pytrace=False)
@@ -229,7 +229,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture
 def scene(request: pytest.FixtureRequest) -> ClipScene:
-    """Clip of a test with ``@pytest.mark.scenes(…)``."""
+    """Clip of a test with the mark ``@pytest.mark.scenes(…)``."""
     found = getattr(request, "param", None)
     if isinstance(found, str):
         pytest.fail(found, pytrace=False)
@@ -241,7 +241,7 @@ def scene(request: pytest.FixtureRequest) -> ClipScene:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
-    """Fail the test of a violated check, independent of its body."""
+    """Fail a test if its check is violated, also if the test function itself passes."""
     found = pyfuncitem.funcargs.get("scene")
     verdict = found.verdict if isinstance(found, ClipScene) else None
     if verdict is None:
@@ -256,7 +256,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
 
 
 def violations_text(verdict: Verdict) -> str:
-    """Return the violations of a check with their entities, one per line."""
+    """Return the violations of a check as text, one line each, with their entities."""
     lines = [f"{verdict.trace} violates {verdict.check}"]
     for one in verdict.violations:
         who = ", ".join(map(str, one.values.values()))
@@ -318,7 +318,7 @@ def _asked(store: Store, folder: Path, told: Mapping[str, Any]) -> list[ClipScen
 
 
 def scenes_of(path: Path, store: Store) -> list[ClipScene]:
-    """Return the clips of a lock in a store.
+    """Return the clips of a lock file, with their frames in a store.
 
     Raises
     ------
@@ -343,7 +343,7 @@ def scenes_of(path: Path, store: Store) -> list[ClipScene]:
 
 
 def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> list[ClipScene]:
-    """Return every trace of a store with every check of a file.
+    """Return one scene for each trace of a store and each check of a file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Recorder of a running CARLA: frames and sensor data of the ego in one MCAP file.
+"""Recorder of a running CARLA simulator: frames and sensor data of the ego in one MCAP file.
 
 A recorded and ingested run gives the same graphs as the online mode. Not tested with a server: see
 :mod:`sgstore.readers.carla._live`.
@@ -30,7 +30,7 @@ LAST_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """Result of a recorded run.
+    """Result of recording a simulator run: written messages, ego, lost sensor readings and warnings.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ def record(  # noqa: PLR0913  as many options as a recording has
     scenery: bool = True,
     on_frame: Callable[[int, float], None] | None = None,
 ) -> Recorded:
-    """Record a world of CARLA.
+    """Record a running CARLA world into an MCAP file.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def record(  # noqa: PLR0913  as many options as a recording has
 
 
 class _FrameWriter:
-    """Writer of each frame and its sensor readings."""
+    """Writer of CARLA frames and of the sensor data for each frame, into an MCAP file."""
 
     def __init__(
         self, live: LiveWorld, recorder: Recorder, on_frame: Callable[[int, float], None] | None
@@ -155,7 +155,7 @@ class _FrameWriter:
             self._on_frame(self._frames, self.seconds)
 
     def drain(self, sensors: Sensors, timeout_s: float) -> None:
-        """Write the sensor readings since the first frame."""
+        """Write the waiting sensor data, from the time of the first frame on."""
         for reading in sensors.waiting(timeout_s):
             if reading.time_ns >= self._start_ns:
                 self._recorder.reading(reading)
@@ -174,7 +174,7 @@ class _FrameWriter:
 
 
 def _snapshots(world: Any, step_s: float | None) -> Generator[Any]:
-    """Yield snapshots of the world, which runs by itself or is driven."""
+    """Yield snapshots of a CARLA world, which runs freely or is advanced by fixed steps."""
     if step_s is None:
         while True:
             try:

@@ -54,7 +54,7 @@ def report(
     around_s: float = 2.0,
     pictures: bool = False,
 ) -> tuple[int, bool]:
-    """Write the matches of a query as a page that needs no server.
+    """Write the matches of a query as one HTML page that works without a server.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def report(
 
 @dataclass(frozen=True)
 class PlayableMatches:
-    """Matches that a notebook shows as a report, in an isolated frame.
+    """Matches of a query that a notebook displays as an interactive page, in an isolated HTML frame.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ def inline(
     around_s: float = 2.0,
     pictures: bool = False,
 ) -> PlayableMatches:
-    """Return matches of a query as an object that a notebook displays as a report.
+    """Return the matches of a query as an object that a notebook displays as an interactive page.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def _made(
     around_s: float,
     pictures: bool,  # noqa: FBT001 - as report has it
 ) -> tuple[str, int, bool]:
-    """Return a page, its number of matches, and True if there are more."""
+    """Return an HTML page of matches, the number of matches, and True if the query has more matches."""
     with store.file.snapshot():
         kept, found, truncated = _kept(store, text, dict(parameters or {}), most, around_s)
         if pictures:
@@ -159,7 +159,7 @@ def _made(
 def _kept(
     store: Store, text: str, values: dict[str, Any], most: int, around_s: float
 ) -> tuple[dict[str, Any], list[Found], bool]:
-    """Return the page's data as JSON values, the matches, and True if there are more."""
+    """Return the data of a report page as JSON values, the matches, and True if the query has more matches."""
     is_check = re.match(r"\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b", text, re.IGNORECASE)
     question = {"text": text, "parameters": values}
     told = list(answer(store, {"ask": "check" if is_check else "matches", **question}, most))
@@ -192,7 +192,7 @@ def _kept(
 
 
 def _found(told: list[dict[str, Any]]) -> Iterator[Found]:
-    """Yield the matches among replies, in the page's form."""
+    """Yield matches (trace, first frame, last frame, binding) from the replies to a query."""
     names: tuple[str, ...] = ()
     for reply in told:
         names = reply.get("names", names)
@@ -218,7 +218,7 @@ def _key(*values: Any) -> str:
 
 
 def _spans(found: list[Found], traces: Mapping[str, Any], around_s: float) -> Spans:
-    """Return the frame ranges of the matches with their surroundings."""
+    """Return the frame ranges that contain the matches and the time around them, by trace."""
     spans: Spans = {}
     for trace, first, last, _ in sorted(found, key=lambda match: match[:3]):
         about = traces[trace]
@@ -233,7 +233,7 @@ def _spans(found: list[Found], traces: Mapping[str, Any], around_s: float) -> Sp
 
 
 def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dict[str, Any]:
-    """Return truth lanes by trace and nodes; matches of the same nodes share them."""
+    """Return, by trace and nodes of a match, the frames in which each part of the pattern is true."""
     parts: dict[str, Any] = {}
     for trace, first, _, binding in found:
         key = _key(trace, binding or None)
@@ -247,7 +247,7 @@ def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dic
 def _columns(
     store: Store, reads: Reads, traces: Mapping[str, Any], spans: Spans
 ) -> Iterator[tuple[str, str]]:
-    """Yield the page's columns by key: states in the ranges, static entities, maps."""
+    """Yield the binary data of a report page by request key: states in frame ranges, static entities, maps."""
     maps: set[str] = set()
     for name, about in traces.items():
         yield _key("api/static", name), _small(reads.static(name))
@@ -263,7 +263,7 @@ def _columns(
 
 
 def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[int, int]]) -> bytes:
-    """Return states of frames in the ranges; other frames are empty."""
+    """Return the states of a trace in some frame ranges as bytes; frames outside the ranges have no states."""
     frames, states = store.file.states(trace, first, last)
     seq = states.pop("seq")
     inside = np.zeros(len(seq), bool)
@@ -277,7 +277,7 @@ def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[i
 
 
 def _rounded(column: Any) -> Any:
-    """Round numbers to 1/128: trailing zero bits compress well."""
+    """Return numbers rounded to multiples of 1/128, because trailing zero bits compress well."""
     if column.dtype.kind != "f":
         return column
     return (np.round(column * 128) / 128).astype(column.dtype)
@@ -290,7 +290,7 @@ def _small(data: bytes) -> str:
 def _pictures(
     store: Store, traces: list[dict[str, Any]], matches: list[Found]
 ) -> dict[str, dict[str, str]]:
-    """Return pictures of each trace's first camera, one per second of a match; ``cameras`` has its name."""
+    """Return pictures of the first camera of each trace, one per second of a match."""
     reads, found = Reads(store), dict[str, dict[str, str]]()
     cameras = {one["name"]: one["cameras"] for one in reads.about()["traces"]}
     for about in traces:
@@ -321,7 +321,7 @@ _MINIFIED: Final = re.compile(r"export\{([^}]*)\};?\s*$")
 
 
 def script() -> str:
-    """Return the modules of a report as one script: each module becomes a function."""
+    """Return the JavaScript modules of a report page as one script: each module becomes a function."""
     parts: list[str] = []
     names: dict[Path, str] = {}
 
@@ -348,7 +348,7 @@ def _imported(found: re.Match[str], name: str) -> str:
 
 
 def _exported(text: str) -> str:
-    """Convert a module to the body of a function that returns its exports."""
+    """Return the text of a JavaScript module as the body of a function that returns its exports."""
     minified = _MINIFIED.search(text)
     if minified:
         pairs = (one.split(" as ") for one in minified[1].split(","))

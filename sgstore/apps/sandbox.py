@@ -73,7 +73,7 @@ memory; bytes."""
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Result of a query.
+    """Rows that a sandbox process returns for a query, with the traces that cannot answer it.
 
     Attributes
     ----------
@@ -99,12 +99,12 @@ class Answer:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Return the traces that cannot answer the pattern."""
+        """Return the names of the traces that cannot answer the query."""
         return tuple(self.reasons)
 
 
 class Sandbox:
-    """Process that runs queries on a store.
+    """Separate process that runs untrusted queries on a store, with limits on time and memory.
 
     Queries of several threads run one after the other. A context manager; otherwise call
     :meth:`close`.
@@ -166,17 +166,17 @@ class Sandbox:
         self.close()
 
     def close(self) -> None:
-        """Stop the process."""
+        """Stop the sandbox process."""
         with self._turn:
             self._kill()
 
     @property
     def folder(self) -> Path | None:
-        """Return the folder of the process's tables; ``None`` without a process."""
+        """Return the folder for tables of the sandbox process; ``None`` means that no process runs."""
         return self._folder
 
     def sql(self, text: str) -> Answer:
-        """Return the rows of one read-only statement.
+        """Run one read-only SQL statement in the sandbox, and return its rows.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class Sandbox:
         return _answer(self.ask({"sql": text}, SqlError))
 
     def find(self, text: str, /, **parameters: object) -> Answer:
-        """Return the rows of a pattern.
+        """Run a pattern query in the sandbox, and return its rows.
 
         Raises
         ------
@@ -203,7 +203,7 @@ class Sandbox:
     def ask(
         self, question: Mapping[str, object], error: type[SgstoreError] = QueryError
     ) -> dict[str, Any]:
-        """Return the reply of the process to a query of its worker.
+        """Send a query to the sandbox process, and return its reply.
 
         Parameters
         ----------
@@ -224,7 +224,9 @@ class Sandbox:
             return _granted(self._exchange(self._ready(), line, self._timeout_s))
 
     def replies(self, question: Mapping[str, object]) -> Iterator[dict[str, Any]]:
-        """Yield the replies to a query on arrival; ending the iteration early stops the process.
+        """Yield the replies of the sandbox process to a query on arrival.
+
+        The process is stopped if the caller ends the iteration early.
 
         All replies except the last have ``more``.
 
@@ -256,25 +258,25 @@ class Sandbox:
         yield _granted(reply)
 
     def stop(self) -> None:
-        """Stop the current query of another thread by killing the process."""
+        """Stop the current query (of another thread) by killing the sandbox process."""
         child = self._child
         if child is not None:
             self._stopped = True
             child.kill()
 
     def start(self) -> None:
-        """Start the process for the next query."""
+        """Start the sandbox process before the next query needs it."""
         with self._turn:
             self._ready()
 
     @property
     def is_ready(self) -> bool:
-        """True if a process is ready to answer."""
+        """True if the sandbox process runs."""
         child = self._child
         return child is not None and child.poll() is None
 
     def _ready(self) -> subprocess.Popen[bytes]:
-        """Return the process, and start it if necessary."""
+        """Return the sandbox process; a stopped process is started again."""
         if self._child is None or self._child.poll() is not None:
             self._kill()
             self._stopped = False
@@ -305,7 +307,9 @@ class Sandbox:
         return self._child
 
     def _exchange(self, child: subprocess.Popen[bytes], line: str | None, timeout_s: float) -> Any:
-        """Send a line, if there is one, and read one; kill the process at the deadline.
+        """Send a line (or none) to the sandbox process, and return its reply.
+
+        The process is killed after the timeout.
 
         The caller does not wait for its end, because a process with much memory exits slowly.
         """
@@ -336,7 +340,7 @@ class Sandbox:
         raise SqlError("stopped: it took more memory than is allowed")
 
     def _abandon(self) -> None:
-        """Kill the process, and clean up after it in the background."""
+        """Kill the sandbox process, and remove its folder in the background."""
         child, folder = self._child, self._folder
         self._child = self._folder = None
         if child is not None:
@@ -352,7 +356,7 @@ class Sandbox:
 
 
 def _bury(child: subprocess.Popen[bytes], folder: Path | None) -> None:
-    """Wait for the end of a process, and remove its folder."""
+    """Wait for the end of a sandbox process, and remove its folder."""
     with child:  # closes the pipes, too
         pass
     if folder is not None:
@@ -365,7 +369,10 @@ def _sent_and_read(
     replies: queue.SimpleQueue[bytes],
     most: int,
 ) -> None:
-    """Put the reply line of a process into the queue; incomplete if it died or exceeded the limit."""
+    """Send a line to a sandbox process, and put its reply line into a queue.
+
+    The line is incomplete if the process ended or the reply is too long.
+    """
     reply = b""
     # A thread that kills the process may close its pipes during their use here.
     with suppress(OSError, ValueError):
@@ -385,7 +392,7 @@ def _line(question: Mapping[str, object], error: type[SgstoreError]) -> str:
 
 
 def _granted(reply: Any) -> dict[str, Any]:
-    """Return a reply, or raise the error in it."""
+    """Return the reply of a sandbox process, or raise the error that it contains."""
     if "query" in reply or "error" in reply:
         raise error_of(reply)
     return reply
@@ -399,13 +406,13 @@ def _answer(reply: dict[str, Any]) -> Answer:
 
 
 class Workshop(Sandbox):
-    """Sandbox for internal tasks that write files, with immediate cancelling."""
+    """Sandbox process for tasks of the program itself that write files; a task can be cancelled at once."""
 
     may_write: ClassVar[bool] = True
 
 
 class Errand:
-    """Longer task in its own :class:`Workshop`, with the interface of :class:`SandboxPool`.
+    """Long task in a separate process (:class:`Workshop`), with the interface of :class:`SandboxPool`.
 
     Parameters
     ----------
@@ -420,13 +427,13 @@ class Errand:
         self._gone = False
 
     def ask(self, question: Mapping[str, object], _key: str) -> Iterator[dict[str, Any]]:
-        """Yield the replies on arrival; none after an early cancel."""
+        """Start the long task, and yield its replies on arrival. A cancelled task has no replies."""
         with self._make() as self._box:
             if not self._gone:
                 yield from self._box.replies(question)
 
     def cancel(self, _key: str = "") -> bool:
-        """Stop the task."""
+        """Stop the long task, also before its start."""
         self._gone = True
         if self._box is not None:
             self._box.stop()
@@ -434,7 +441,7 @@ class Errand:
 
 
 class SandboxPool:
-    """Pool of sandboxes of one store for parallel queries, with a spare one.
+    """Pool of sandbox processes for parallel queries on one store, with a spare process.
 
     A query that is stopped, or takes too long, loses its process. The spare process takes its
     place, and a new spare one is started in the background. A context manager; otherwise call
@@ -489,7 +496,7 @@ class SandboxPool:
         self.close()
 
     def close(self) -> None:
-        """Stop all processes and running queries."""
+        """Stop all sandbox processes of the pool, also during a query."""
         with self._changed:
             self._closed = True
             boxes = [*self._free, *(box for box in self._asked.values() if box is not None)]
@@ -502,7 +509,7 @@ class SandboxPool:
             box.close()
 
     def ask(self, question: Mapping[str, object], key: str) -> Iterator[dict[str, Any]]:
-        """Yield the replies to a query, as :meth:`Sandbox.replies`.
+        """Run a query in a free sandbox process, and yield its replies on arrival.
 
         Parameters
         ----------
@@ -526,7 +533,7 @@ class SandboxPool:
                 self._asked.pop(key, None)
 
     def cancel(self, key: str) -> bool:
-        """Stop a query; return False if no running query has this key."""
+        """Stop the query with a key, and return True. False means that no running query has this key."""
         with self._changed:
             box = self._asked.pop(key, None)
             known = box is not None or key in self._asked
@@ -560,7 +567,7 @@ class SandboxPool:
         self._ready(box)
 
     def _ready(self, box: Sandbox) -> None:
-        """Add a newly started process to the pool."""
+        """Add a newly started sandbox process to the pool."""
         with suppress(SgstoreError):
             if self._first is not None:
                 box.ask(self._first)
@@ -577,7 +584,7 @@ class SandboxPool:
 
 
 def serve(answering: Answering) -> None:
-    """Answer the queries on stdin until it ends, then exit the process.
+    """Answer queries from stdin in the sandbox process until the input ends, then exit the process.
 
     Parameters
     ----------
@@ -622,12 +629,12 @@ def _serve(answering: Answering) -> None:
 
 
 def tell(reply: Mapping[str, Any]) -> None:
-    """Send a partial reply from the sandbox process."""
+    """Send a partial reply from the sandbox process to its parent process."""
     _send(sys.stdout.buffer, {**reply, "more": True})
 
 
 def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
-    """Return rows of a statement ``sql``, or of a pattern ``find`` with ``parameters``."""
+    """Return the rows of an SQL statement or a pattern query as JSON values, with a flag for more rows."""
     graphs, notes = False, ()
     if "sql" in question:
         rows = store.sql(question["sql"], max_rows=most)
@@ -645,7 +652,7 @@ def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, A
 
 
 def plain(value: Any) -> Any:
-    """Convert a value to JSON values."""
+    """Return a value as JSON values: lists, dictionaries, numbers and texts."""
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]  # pyright: ignore[reportUnknownVariableType]
     if isinstance(value, dict):
@@ -662,7 +669,7 @@ def _refusal(error: SgstoreError) -> dict[str, Any]:
 
 
 def _spilled(error: SgstoreError) -> bool:
-    """True if an error comes from temporary files, which :func:`_limit` forbids."""
+    """True if an error comes from temporary files of the database, which the sandbox forbids."""
     text = str(error)
     return os.strerror(errno.EFBIG) in text and "duckdb_temp" in text
 
@@ -673,7 +680,7 @@ def _send(to: IO[bytes], reply: object) -> None:
 
 
 def _limit(memory: int, *, files: int | None) -> None:
-    """Limit the resources of this process permanently, if the system supports it.
+    """Limit the memory and the files of the sandbox process permanently, if the system supports it.
 
     ``files``: largest file that it may write; bytes. ``None`` means no limit.
     """

@@ -1,4 +1,4 @@
-"""Truth values of temporal formulas on whole traces: true, false or unknown, with the deciding frames.
+"""Truth values of temporal formulas on whole traces, also for each possible last frame of a trace.
 
 At a frame, a forward formula has a *course*: its value if the trace ends there, and the later ends at which the
 value changes. Logic combines courses. An *until* with monotonic sides is true from one end on. At the requested

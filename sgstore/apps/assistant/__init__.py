@@ -1,4 +1,4 @@
-"""Server of the Model Context Protocol for a store; its tools run queries in a sandbox.
+"""Server that lets an AI assistant query a store, by the Model Context Protocol (MCP).
 
 ``_worker`` runs the queries in its own process. ``_tools`` has the tools, ``_vocabulary`` the texts
 for prompts, and ``_server`` connects them to the protocol.

@@ -1,4 +1,4 @@
-"""Server of the Model Context Protocol with the tools, over stdin and stdout."""
+"""Connection of the assistant's tools to the Model Context Protocol, over stdin and stdout."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WRITING: Final = frozenset({"export_clips"})
 
 
 def serve(tools: StoreTools) -> None:
-    """Serve an assistant over stdin and stdout until the input ends.
+    """Serve the tools of a store to an AI assistant over stdin and stdout, until the input ends.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def serve(tools: StoreTools) -> None:
 
 
 def server_of(tools: StoreTools) -> MCPServer[Any]:
-    """Return a server with all tools of a store, and with resources for their use."""
+    """Return an MCP server with all tools of a store, and with texts that explain their use."""
     server = MCPServer[Any](
         "sgstore",
         version=version("sgstore"),
@@ -74,7 +74,7 @@ def _tool(name: str, tool: Callable[..., ToolAnswer]) -> Tool:
 
 
 def _untitled(schema: Any) -> Any:
-    """Return a schema without titles, which only repeat names."""
+    """Return a JSON schema without its titles, because they only repeat the names."""
     if isinstance(schema, dict):
         every: dict[str, Any] = schema
         kept = {n: v for n, v in every.items() if not (n == "title" and isinstance(v, str))}
@@ -86,7 +86,7 @@ def _untitled(schema: Any) -> Any:
 
 
 def _told(tool: Callable[..., ToolAnswer]) -> Callable[..., CallToolResult]:
-    """Wrap a tool for the protocol; an error becomes a result, so that the model can correct its call."""
+    """Wrap a tool as a function of the MCP server. An error becomes a result that the assistant can read."""
 
     @wraps(tool)
     def told(*values: Any, **named: Any) -> CallToolResult:

@@ -1,4 +1,4 @@
-"""Tools of an assistant: each runs one query on a store, or makes one picture.
+"""Tools of an AI assistant: each runs one query on a store, or makes one picture.
 
 Patterns, rules and SQL of an assistant run only in the sandbox: a process that sees only the store
 and has a deadline. This process itself draws named frames, reads camera pictures, and, with a
@@ -66,7 +66,7 @@ Limit = Annotated[int, Field(ge=1, description="rows at most")]
 
 @dataclass(frozen=True)
 class ToolAnswer:
-    """Result of a tool.
+    """Result of a tool for an AI assistant: a text, with data or a picture.
 
     Attributes
     ----------
@@ -88,18 +88,18 @@ class ToolAnswer:
 
 @dataclass(frozen=True)
 class KnownBindings:
-    """Bindings of a query in a frame from the sandbox, for a picture."""
+    """Bindings of a query in one frame, computed in the sandbox, for marking matches in a picture."""
 
     found: list[dict[str, int]]
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Return node ids by variable name, for each match."""
+        """Return the node ids by variable name, for each match in the frame."""
         del frame
         return self.found
 
 
 class StoreTools:
-    """Tools for one store.
+    """Tools of an AI assistant for one store.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class StoreTools:
         self._store.close()
 
     def tools(self) -> dict[str, Callable[..., ToolAnswer]]:
-        """Return the tools by name, in the recommended reading order."""
+        """Return the tool functions by name, in the order in which the assistant should read them."""
         reading = (
             *(self.list_traces, self.vocabulary, self.patterns_search, self.find, self.why_not),
             *(self.sql, self.check, self.timeline, self.show, self.picture, self.coverage_missing),
@@ -186,7 +186,7 @@ class StoreTools:
         return ToolAnswer(text, {"about": about, "text": text})
 
     def topic(self, about: Topic) -> str:
-        """Return the text on a topic of the vocabulary."""
+        """Return an explanation of a topic of the query language, such as relations or functions."""
         if about == "language":
             return self._language
         return topic_text(about, self._ask("views" if about == "views" else "vocabulary"))
@@ -357,7 +357,7 @@ class StoreTools:
         return ToolAnswer(f"{about['frame']}, {topic}: {size}", about, image, "image/jpeg")
 
     def _drawn(self, draw: Callable[[Path], None]) -> bytes:
-        """Return a picture that a function draws into a file."""
+        """Return the PNG picture that a function draws into a temporary file."""
         with self._turn, tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "drawn.png"
             draw(file)
@@ -456,7 +456,7 @@ def _encoded(image: Image, form: str) -> bytes:
 
 
 def _rows_text(reply: Mapping[str, Any]) -> str:
-    """Return rows as lines with ``|`` between the values, followed by notes.
+    """Return result rows as text for an assistant, with ``|`` between values, followed by notes.
 
     Parameters
     ----------
@@ -478,7 +478,7 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
 
 
 def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], int]:
-    """Return a header and the rows that fit, with their number."""
+    """Return result rows as text lines after a header, as far as they fit; and the number of these rows."""
     lines = [" | ".join(columns)]
     left = MOST_TEXT
     for number, row in enumerate(rows):
@@ -491,7 +491,7 @@ def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[
 
 
 def _remarks(reply: Mapping[str, Any]) -> list[str]:
-    """Return sentences about traces that cannot answer, and about likely mistakes."""
+    """Return sentences about traces that cannot answer a query, and about likely mistakes in it."""
     of: dict[str, list[str]] = {}
     for name, reason in reply.get("left_out", {}).items():
         of.setdefault(reason, []).append(name)

@@ -1,4 +1,4 @@
-"""Names for queries, as texts for a prompt."""
+"""Names for queries (kinds, relations, attributes, functions) as texts for the prompt of an assistant."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SIGNATURE: Final = re.compile(r"PREDICATE\s+(\w+\s*\([^)]*\))")
 
 
 def topic_text(about: Topic, known: Mapping[str, Any]) -> str:
-    """Return the text on a topic.
+    """Return an explanation of a topic of the query language for an assistant.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def _here(known: Mapping[str, Any]) -> str:
 
 
 def _ends(relations: Mapping[str, tuple[list[str], list[str]]]) -> list[str]:
-    """Return source and target kinds of relations; relations with equal kinds share a line."""
+    """Return text lines with the source and target kinds of relations, one line for equal kinds."""
     alike: dict[str, list[str]] = {}
     for name, (sources, targets) in relations.items():
         alike.setdefault(f"{', '.join(sources)} → {', '.join(targets)}", []).append(name)

@@ -1,4 +1,4 @@
-"""Queries of an assistant, run in the sandbox process.
+"""Queries of an AI assistant, run in the sandbox process.
 
 A query is ``{"ask": NAME, "with": {…}}``, where the name is a key of :data:`ANSWERS`. A reply with
 a list has ``columns`` and ``rows``, ``truncated`` if there are more rows, ``left_out`` with the
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def answer(store: Store, question: Mapping[str, Any], most: int) -> Reply:
-    """Return the reply to a query; see :data:`ANSWERS`."""
+    """Return the reply of the sandbox process to a query of an assistant."""
     about = dict(question["with"])
     about["limit"] = min(about.get("limit", most), most)
     return plain(ANSWERS[question["ask"]](store, **about))
@@ -38,14 +38,14 @@ def answer(store: Store, question: Mapping[str, Any], most: int) -> Reply:
 def _listed(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], limit: int, **about: Any
 ) -> Reply:
-    """Return the rows up to the limit, with a flag for more."""
+    """Return a reply with result rows up to a limit, and a flag that is true if there are more."""
     found = list(islice(rows, limit + 1))
     truncated = len(found) > limit
     return {"columns": columns, "rows": found[:limit], "truncated": truncated, **about}
 
 
 def _named(text: str, parameters: Mapping[str, Any], *, check: bool) -> tuple[str, dict[str, Any]]:
-    """Return a query or the text of a library name, and the values for its remaining parameters.
+    """Return the text of a query, or of a named library pattern, with the values of its parameters.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def _named(text: str, parameters: Mapping[str, Any], *, check: bool) -> tuple[st
 def _found(
     store: Store, text: str, parameters: Mapping[str, Any]
 ) -> tuple[Matches, dict[str, Any]]:
-    """Return the matches of a query, with reasons and notes."""
+    """Return the matches of a query, with the traces that cannot answer and notes on likely mistakes."""
     asked, values = _named(text, parameters, check=False)
     matches = store.find(asked, **values)
     return matches, {"left_out": matches.reasons, "notes": matches.notes}
@@ -254,7 +254,7 @@ def _views(store: Store, limit: int) -> Reply:
 
 
 def _vocabulary(store: Store, limit: int) -> Reply:
-    """Return the occurring kinds and relations with their counts."""
+    """Return the kinds and relations that occur in a store, with their counts."""
     del limit
     catalog = store.catalog()
     relations: Counter[str] = Counter()

@@ -1,4 +1,4 @@
-"""The application of all verbs, and one run of it: exit codes, errors and interruptions."""
+"""Start of the command line: registration of all verbs, exit codes, reports of errors and interruptions."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ for _group, _panel in (
 
 
 def _verb_in(arguments: Sequence[str]) -> Sequence[str]:
-    """Return the verb of a command line, after global options; at most one."""
+    """Return a list with the verb of a command line, without global options; an empty list without a verb."""
     return [one for one in arguments if one not in {"--quiet", "--verbose"}][:1]
 
 
@@ -119,14 +119,14 @@ def main() -> None:
 
 
 def _wants_json(arguments: list[str]) -> bool:
-    """True if the output, including errors, is for programs."""
+    """True if the options of a command line select JSON output. Errors are then JSON, too."""
     forms = {"--format=json", "--format=ndjson"}
     named = {value for name, value in pairwise(arguments) if name == "--format"}
     return "--json" in arguments or bool(forms & set(arguments)) or bool(named & {"json", "ndjson"})
 
 
 def run(arguments: list[str]) -> int:
-    """Run one command line.
+    """Run one command line of ``sgstore``, and return its exit code.
 
     Returns
     -------
@@ -163,7 +163,12 @@ def run(arguments: list[str]) -> int:
 
 
 def _ran(arguments: list[str]) -> int:
-    """Run one command line; return the exit code, also after a lost interruption."""
+    """Run one command line of ``sgstore``, and return its exit code.
+
+    A signal or deadline counts even if Python lost its exception.
+
+    An error is raised. A signal or deadline counts even if Python lost its exception.
+    """
     try:
         code = int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
         code = with_missing(code)
@@ -182,7 +187,7 @@ def _ran(arguments: list[str]) -> int:
 
 
 def _refused(error: SgstoreError, arguments: list[str]) -> int:
-    """Report an error; return the exit code."""
+    """Print an error of the library, as text or JSON, and return the exit code for it."""
     if _wants_json(arguments):
         write_error(error.as_dict())
     else:

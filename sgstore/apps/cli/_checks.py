@@ -1,4 +1,4 @@
-"""The verb check: verdicts of traces."""
+"""Command ``sgstore check``: evaluates CHECK statements, and prints a verdict for each trace."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _reported(
     require: bool,
     junit: Path | None,
 ) -> int:
-    """Print verdicts, or the explanation of the checks; return the exit code."""
+    """Print the verdicts of CHECK statements, or their explanation, and return the exit code."""
     from sgstore.temporal import columns_returned, verdict_columns, verdict_rows
 
     if explain:
@@ -144,7 +144,7 @@ _DOCUMENT: Final = (
 
 
 def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
-    """Return a verdict as a row for programs."""
+    """Return a verdict of a check as a row for JSON output, with its violations and entities."""
     spans = [_span(one, returned) for one in verdict.violations]
     witnesses = [
         {
@@ -160,7 +160,7 @@ def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
 
 
 def margin_document(verdict: Verdict) -> dict[str, Any] | None:
-    """Return the robustness of a verdict for programs, with None for infinite numbers."""
+    """Return the robustness margin of a verdict as a dictionary for JSON. Infinite numbers become ``None``."""
     found = verdict.robustness
     if found is None:
         return None

@@ -1,4 +1,4 @@
-"""The verbs of collections: collection commit, pack, unpack, verify, rebuild, gc."""
+"""Commands of ``sgstore collection`` (many stores): commit, pack, unpack, verify, rebuild, gc."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def pack(
 
 @collection.command()
 def commit(url: Place, *, out: PrintedRows) -> int:
-    """Make bundles of all that 'ingest URL … --shard' has landed, and a snapshot that has them."""
+    """Commit the traces of 'ingest URL … --shard' to a collection: new bundles, and a new snapshot."""
     from sgstore.collection import commit as commit_landed
 
     done = commit_landed(url_of(url) or url)
@@ -99,7 +99,7 @@ def unpack(
     url: Place,
     store: Annotated[Path, Argument(metavar="STORE", help="The store that is made.")],
 ) -> int:
-    """Put all traces of a collection into one new store."""
+    """Copy all traces of a collection into one new store."""
     from sgstore.collection import unpack as unpack_all
 
     names = unpack_all(url_of(url) or url, store)
@@ -109,7 +109,7 @@ def unpack(
 
 @collection.command()
 def verify(url: Place, *, out: PrintedRows) -> int:
-    """Verify that all bundles are as they were committed, and the catalogue true; list every fault."""
+    """Verify the bundles and the catalogue of a collection; list every fault."""
     from sgstore.collection import verify as verify_all
 
     found = verify_all(url_of(url) or url)
@@ -131,7 +131,7 @@ def rebuild(
     *,
     out: PrintedRows,
 ) -> int:
-    """Make the bundles of another version anew from their recordings, one after another."""
+    """Rebuild the bundles of other schema versions from their recordings, one after another."""
     from sgstore.collection import rebuild as make_anew
 
     with count_bar("rebuilding", "bundles") as on_bundle:
@@ -159,7 +159,7 @@ def gc(
     *,
     out: PrintedRows,
 ) -> int:
-    """Remove old snapshots, and files that no snapshot speaks of."""
+    """Remove old snapshots of a collection, and files that no snapshot uses."""
     from sgstore.collection import gc as collect
 
     seconds = seconds_of(older, "--older")

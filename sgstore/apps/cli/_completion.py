@@ -1,4 +1,4 @@
-"""Completion in a shell: patterns, traces, frames, formats, presets, abstractions.
+"""Shell completion of arguments: names of patterns, traces, frames, formats, presets and abstractions.
 
 Typer calls these functions when the user presses Tab after one of their arguments or options. They
 must be fast: names of the package need no database; only names of a store open it.
@@ -29,7 +29,10 @@ STORE_ENDINGS: Final = (".sgstore", ".duckdb", ".db")
 
 
 def stores(ctx: typer.Context, incomplete: str) -> Offers:
-    """Yield stores in the folder; with a default store, also the possible next arguments."""
+    """Yield completions of a store argument: the store files in the typed folder.
+
+    If the environment names a default store, completions of the next argument are added.
+    """
     folder, _, start = incomplete.rpartition("/")
     with suppress(OSError):
         for path in sorted(Path(folder or ("/" if incomplete[:1] == "/" else ".")).iterdir()):
@@ -47,7 +50,10 @@ def stores(ctx: typer.Context, incomplete: str) -> Offers:
 
 
 def patterns(ctx: typer.Context) -> Offers:
-    """Yield names of the library; predicates only for ``show``, because they cannot be run."""
+    """Yield completions of a pattern name of the library, with a short description.
+
+    Predicates are only for ``show``, because they cannot be run.
+    """
     from sgstore.lang.library import patterns as every
 
     for one in every().values():
@@ -56,13 +62,13 @@ def patterns(ctx: typer.Context) -> Offers:
 
 
 def traces(ctx: typer.Context) -> Offers:
-    """Yield the names of the traces of the store."""
+    """Yield completions of a trace name: all traces of the store on the command line."""
     for one in _traces(ctx):
         yield one.name, _about(one)
 
 
 def frames(ctx: typer.Context, incomplete: str) -> Offers:
-    """Yield completions of a frame name: the typed digits plus one more digit."""
+    """Yield completions of a frame name such as ``TRACE#12``: the typed digits and one more digit."""
     for one in _traces(ctx):
         head = next((h for h in (f"{one.name}#", f"{one.name}@") if incomplete.startswith(h)), "")
         digits = incomplete[len(head) :]
@@ -78,7 +84,7 @@ def frames(ctx: typer.Context, incomplete: str) -> Offers:
 
 
 def presets() -> Offers:
-    """Yield the names of presets."""
+    """Yield completions of a preset name (named settings of an ingest), with a summary."""
     from sgstore.model.config import PRESETS
 
     for name, one in PRESETS.items():
@@ -86,7 +92,7 @@ def presets() -> Offers:
 
 
 def formats() -> Offers:
-    """Yield the formats of exports."""
+    """Yield the names of the export formats as completions."""
     from sgstore.base import plugins
     from sgstore.exporters import EXPORTERS
 
@@ -95,7 +101,7 @@ def formats() -> Offers:
 
 
 def abstractions() -> Offers:
-    """Yield the abstractions of graphs."""
+    """Yield the names of the graph abstractions as completions."""
     from sgstore.base.plugins import ABSTRACTIONS
 
     for name in (*ABSTRACTIONS.own, *ABSTRACTIONS.others()):
@@ -103,7 +109,7 @@ def abstractions() -> Offers:
 
 
 def channels(ctx: typer.Context) -> Offers:
-    """Yield the channels of the recordings of the store."""
+    """Yield the recorded channels of a store (topics with sensor data) as completions."""
     sql = "SELECT DISTINCT channel, schema FROM payloads ORDER BY channel"
     with suppress(SgstoreError, OSError):
         file = _store(ctx)

@@ -1,4 +1,4 @@
-"""Verbs about coverage: content and gaps of a data set."""
+"""Commands of ``sgstore coverage``: kinds of scenes that a data set contains, and those that it lacks."""
 
 from __future__ import annotations
 
@@ -89,10 +89,10 @@ Within = Annotated[
 
 @dataclass(frozen=True)
 class FrameAskOptions(CollectionOptions, AskOptions):
-    """Options of a verb for classes of frames in stores or collections."""
+    """Command line options for frames selected from stores or collections."""
 
     def frames(self, *texts: str) -> Iterator[ChosenFrames]:
-        """Yield the selected frames of each text."""
+        """Yield the selected frames for each argument: a store, or a store with a query."""
         from sgstore.testsets.coverage import selection_of
 
         spill = self.spill()
@@ -104,14 +104,17 @@ class FrameAskOptions(CollectionOptions, AskOptions):
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """Options for the classes of frames."""
+    """Command line options that define the class of a frame: abstraction, window and incomplete windows."""
 
     abstraction: Abstraction = "RSV"
     window: Window = 1
     incomplete: Incomplete = "equal"
 
     def of(self, ask: FrameAskOptions, *texts: str, slots: Path | None = None) -> list[Classed]:
-        """Return the selected frames with their classes; report traces that cannot answer."""
+        """Return the selected frames of each argument, with the classes of their graphs.
+
+        Traces that cannot answer the query are reported.
+        """
         from sgstore.testsets.coverage import classed
 
         found: list[Classed] = []
@@ -128,7 +131,7 @@ class WindowOptions:
 
 @dataclass(frozen=True)
 class SceneOptions(WindowOptions):
-    """Options for the classes of frames, or for declared slots."""
+    """Command line options that define the classes of frames, by their graphs or by declared slots."""
 
     slots: Slots = None
 
@@ -166,7 +169,7 @@ def of_(
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """Measure how much of A is covered by B, by classes and by frames."""
+    """Measure how much of the frames of A is covered by B, by classes and by frames."""
     from sgstore.testsets.coverage import covered
 
     ask.report(covered(*scenes.of(ask, a, by, slots=scenes.slots)))
@@ -185,7 +188,7 @@ def novel_(
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """List the scenes of A that are not in B, the rarest first."""
+    """List the classes of scenes of A that do not occur in B, the rarest first."""
     from sgstore.testsets.coverage import novel, novel_clips, novel_frames
 
     listed = {"classes": novel, "frames": novel_frames, "clips": novel_clips}[listing]
@@ -194,7 +197,7 @@ def novel_(
 
 @coverage.command("venn")
 def venn_(a: A, b: B, *, scenes: SceneOptions, ask: FrameAskOptions) -> None:
-    """Count what A and B share, and what only one of them has."""
+    """Count the classes of scenes that occur in A and B, only in A, and only in B."""
     from sgstore.testsets.coverage import venn
 
     ask.report(venn(*scenes.of(ask, a, b, slots=scenes.slots)))
@@ -367,7 +370,7 @@ def windows_(
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """List the classes of windows: of a frame together with those recorded before it."""
+    """List the classes of windows; a window is a frame with the frames recorded before it."""
     from sgstore.testsets.coverage import classes
 
     (frames,) = WindowOptions(abstraction, window, incomplete).of(ask, a)
@@ -420,7 +423,7 @@ def failures_(
     windows: WindowOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """List failures of a system that are novel, and those that coverage would have predicted (S3C)."""
+    """List failures of a system in novel scenes, and failures that coverage would have predicted (S3C)."""
     from sgstore.testsets.coverage import S3C_THRESHOLD, failures, read_outcomes
 
     limits = S3C_THRESHOLD if threshold is None else _fraction(threshold)
@@ -454,7 +457,7 @@ def _slot_table(
 
 
 def _slot_picture(text: str, slots: Path, ask: FrameAskOptions, to: Path) -> None:
-    """Draw the pairs of slot values of a file, with gaps."""
+    """Draw a picture of the covered and missing pairs of slot values, for the slots declared in a file."""
     from sgstore.draw import draw_matrix
 
     (chosen,) = ask.frames(text)
@@ -467,7 +470,7 @@ def _slot_picture(text: str, slots: Path, ask: FrameAskOptions, to: Path) -> Non
 
 
 def _one_specification(slots: Path) -> Specification:
-    """Return the only specification in a file."""
+    """Return the coverage specification in a file, or raise an error for several."""
     from sgstore.testsets.coverage import Specification
 
     declared, *more = Specification.read(slots)

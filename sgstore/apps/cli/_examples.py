@@ -1,4 +1,4 @@
-"""Two examples for every verb, shown in its help, each with its purpose."""
+"""Examples of each command of ``sgstore`` for its help text: a command line with its purpose."""
 
 from __future__ import annotations
 
@@ -258,7 +258,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
 
 
 def examples_of(verb: str) -> str:
-    """Return the examples of a verb or group for its help; empty without examples.
+    """Return the examples of a command as text for its help; empty without examples.
 
     They have no frame and no line breaks, so that users can copy them.
     """

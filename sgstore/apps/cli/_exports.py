@@ -1,4 +1,4 @@
-"""Verbs that draw and write: show, export, shrink."""
+"""Commands that write pictures and clips: show, export, shrink."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ verbs = Verbs()
 
 @dataclass(frozen=True)
 class ClipOptions:
-    """Options for the content of clips."""
+    """Command line options for the content of exported clips."""
 
     before: Annotated[
         str, Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
@@ -101,7 +101,7 @@ class ClipOptions:
     ] = "pcd"
 
     def order(self, store: Store, clips: Sequence[Clip], **about: Any) -> Export:
-        """Return the export of these options."""
+        """Return an export of clips from a store, with the settings of the command line."""
         from sgstore.exporters import Export, parse_mounts
 
         return Export(
@@ -187,7 +187,7 @@ def export(
 
 
 def _write(written: Sequence[WrittenClip | WrittenFile], form: Format) -> None:
-    """Report losses, and print one row per written file."""
+    """Print one row for each written clip or file, and report lost messages."""
     _say_lost(written)
     rows = [one.as_row() for one in written]
     write_rows(tuple(rows[0]), [tuple(row.values()) for row in rows], form)
@@ -206,7 +206,7 @@ def _clips(
     parameters: Mapping[str, Any],
     margins: tuple[float, float],
 ) -> list[Clip]:
-    """Return clips around matches or given frames; or the unchanged cases of a lock."""
+    """Return the clips to export: around matches, around listed frames, or the unchanged cases of a lock."""
     frames, lock = named
     if lock is not None:
         from sgstore.model.world import Clip
@@ -246,7 +246,7 @@ def shrink(
     out: PrintedRows,
     bounds: QueryLimits,
 ) -> int:
-    """Cut traces, or a clip, to the fewest frames that still match, or violate a check.
+    """Cut each trace, or a clip, to the fewest frames that still match a query or violate a check.
 
     One row for each trace, and for each check. What is cut out is asked as if it were the
     whole recording.
@@ -288,7 +288,7 @@ def shrink(
 def _cut_out(
     store: Store, clips: list[Clip], text: str, to: Path
 ) -> dict[Clip, WrittenClip | WrittenFile]:
-    """Write clips from their recordings, and report losses."""
+    """Write clips from their recordings, report lost messages, and return the written files by clip."""
     from sgstore.exporters import Export, write_export
 
     with count_bar(to.name or "shrink", "clips") as progress:
@@ -300,7 +300,7 @@ def _cut_out(
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """Options for a picture."""
+    """Command line options for drawing a frame or an animation."""
 
     relations: Annotated[
         Literal["ego", "all", "none"], Option("--relations", help="Which edges are drawn.")
@@ -327,7 +327,7 @@ class DrawOptions:
     ] = 10.0
 
     def options(self, matches: Matches | None) -> dict[str, Any]:
-        """Return the parameters of the drawing functions, except those of animations."""
+        """Return the drawing options as keyword arguments, without those of animations."""
         options = asdict(self)
         del options["fps"]
         return {"matches": matches, **options}

@@ -18,7 +18,7 @@ _NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U001
 
 
 def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
-    """Write a test suite for each check, with a case for each trace.
+    """Write verdicts as a JUnit XML file: a test suite for each check, with a case for each trace.
 
     A violated check is a failure whose text names each violation. A trace that cannot answer, or a
     pending verdict, is skipped. A passed case contains the number of frames without an entity.
@@ -62,14 +62,14 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
 
 
 def _word(verdict: Verdict) -> str:
-    """Return the text of a verdict without a reason."""
+    """Return a verdict of a check as text for a report, without its reason."""
     return (
         "still due at the end of the recording" if verdict.verdict == "pending" else verdict.verdict
     )
 
 
 def _violations(verdict: Verdict) -> list[str]:
-    """Return a line for each violation: frames, times and values."""
+    """Return a text line for each violation of a check: its frames, times and values."""
     return [
         _plain(
             f"{one.trace}#{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
@@ -81,5 +81,5 @@ def _violations(verdict: Verdict) -> list[str]:
 
 
 def _plain(text: str) -> str:
-    """Replace characters that XML cannot hold by escapes."""
+    """Return a text in which escapes replace the characters that XML does not allow."""
     return _NO_XML.sub(lambda found: f"\\x{ord(found[0]):02x}", text)

@@ -1,4 +1,4 @@
-"""The verb monitor: checks and patterns over a recording as if it were live, or over a running simulator."""
+"""Command ``sgstore monitor``: evaluates checks and patterns frame by frame, on a recording or a simulator."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def monitor(
     statements: Statements,
     reading: ReadingOptions,
 ) -> int:
-    """Watch a recording as if it were live, or a running CARLA.
+    """Evaluate checks and patterns frame by frame, on a recording or a running CARLA.
 
     One line for each violation and each match, as soon as it is known; then the verdicts. The answers are
     those of check and find over a store. With --serve a page shows
@@ -109,7 +109,7 @@ def monitor(
 
 
 def _sensors(file: Path | None, *, shown: bool) -> list[Sensor]:
-    """Load the sensors listed in a file; ``shown``: a page displays their data."""
+    """Return the CARLA sensors listed in a file. An error means that no live page shows their data."""
     from sgstore.readers import load_sensors
 
     if file is not None and not shown:
@@ -125,7 +125,7 @@ def _watched_on_a_page(
     longest: float | None,
     port: int,
 ) -> tuple[Monitor, tuple[Verdict, ...]]:
-    """Run a monitor with its page; return it and the verdicts after both have ended."""
+    """Run a monitor and serve its live page until both have ended; return the monitor and the verdicts."""
     from sgstore.apps.explorer import LiveRun, serve_live
     from sgstore.temporal import paced
 
@@ -149,7 +149,7 @@ def _watched_on_a_page(
 
 
 def _called(asked: Mapping[str, list[str]]) -> list[str]:
-    """Return the names of the patterns in events, in query order."""
+    """Return the names of the patterns as they occur in monitor events, in the order of the queries."""
     from sgstore.lang.sql import each_match
     from sgstore.lang.syntax import parse
     from sgstore.lang.syntax.tree import MatchClause
@@ -211,5 +211,5 @@ def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
 
 
 def _line(text: str) -> None:
-    """Print a line without buffering."""
+    """Print a line to stdout at once, without buffering."""
     typer.echo(without_controls(text))

@@ -1,4 +1,4 @@
-"""The application, shared arguments of verbs, and groups of options."""
+"""Shared arguments and options of the commands, and their typer classes."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 class Verb(TyperCommand):
-    """Verb that rejects repeated options, unless they collect values."""
+    """Command of ``sgstore`` that rejects a repeated option, unless the option collects several values."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse a command line; return the remaining arguments."""
+        """Parse the arguments of a command, and return the unparsed ones."""
         if ctx.resilient_parsing:  # completion of an unfinished command line
             # the value of this option is being typed
             whole = args[:-1] if args and args[-1].startswith("-") else args
@@ -59,7 +59,7 @@ class Verb(TyperCommand):
         return rest
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write help, followed by examples."""
+        """Write the help of a command, followed by its examples."""
         super().format_help(ctx, formatter)
         _write_examples(ctx)
 
@@ -71,7 +71,7 @@ def _write_examples(ctx: Any) -> None:
 
 
 def _with_store(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
-    """Insert the store of ``SGSTORE_STORE`` into a command line without a store.
+    """Return the arguments of a command, with the store of ``SGSTORE_STORE`` if they have none.
 
     The first argument is a store if it looks like one, or if the number of arguments is complete.
     """
@@ -108,7 +108,7 @@ _LIMITED: Final = {"find": "the query", "sql": "the SQL"}
 
 
 def _advise(error: Any, verb: Verb) -> None:
-    """Add advice to a usage error, independent of the typer version."""
+    """Add a remedy to the message of a usage error: the right place of the store, or of a limit."""
     if getattr(error, "option_name", "") == "--limit" and verb.name in _LIMITED:
         error.possibilities = None
         error.message = f"{error.message}; write LIMIT 10 at the end of {_LIMITED[verb.name]}"
@@ -118,13 +118,13 @@ def _advise(error: Any, verb: Verb) -> None:
 
 
 def _places(verb: Verb) -> list[str]:
-    """Return the names of the arguments of a verb with a store as its first; else an empty list."""
+    """Return the argument names of a command whose first argument is a store; otherwise an empty list."""
     names = [one.name or "" for one in verb.params if one.param_type_name == "argument"]
     return names if names[:1] == ["store"] else []
 
 
 def _refuse_late_store(verb: Verb, ctx: Any) -> None:
-    """Reject swapped arguments: a store in the place of another argument."""
+    """Raise an error for a store file in the place of another argument, such as ``find QUERY STORE``."""
     values = [ctx.params[name] for name in _places(verb)]
     if not values or _is_database(values[0]):
         return
@@ -148,16 +148,16 @@ def _is_database(place: str | Path) -> bool:
 
 
 class Group(TyperGroup):
-    """Group of verbs, whose help ends in examples."""
+    """Group of commands (such as ``sgstore coverage``) with examples at the end of its help."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write help, followed by examples."""
+        """Write the help of a group of commands, followed by its examples."""
         super().format_help(ctx, formatter)
         _write_examples(ctx)
 
 
 def _says_one_thing(parameter: Any) -> bool:
-    """True if an option takes one value, so that a second value would replace it."""
+    """True if a command line option takes one value, which a repeated option would replace."""
     if parameter.param_type_name != "option" or parameter.multiple or parameter.count:
         return False
     return not parameter.is_flag or bool(parameter.secondary_opts)  # a repeated flag has no effect
@@ -173,7 +173,7 @@ class Verbs(typer.Typer):
         super().__init__(cls=Group, **options)
 
     def command(self, name: str | None = None, **options: Any) -> Callable[[Any], Any]:
-        """Return a decorator that registers a function as a verb; see :meth:`typer.Typer.command`."""
+        """Return a decorator that registers a function as a command; see :meth:`typer.Typer.command`."""
         register = super().command(name, cls=Verb, **options)
 
         def registered(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -188,7 +188,7 @@ _hints = cache(partial(get_type_hints, include_extras=True))
 
 
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Convert a function with dataclass parameters to one with their fields as parameters."""
+    """Return a function with plain parameters for typer: each dataclass parameter is replaced by its fields."""
     hints = _hints(function)
     bundles: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     parameters: list[inspect.Parameter] = []
@@ -278,7 +278,7 @@ QueryFile = Annotated[
 
 
 def pattern_option(about: str) -> Any:
-    """Return the option ``-p NAME`` for a pattern of the library."""
+    """Return the declaration of the option ``-p NAME``, which selects a pattern of the library."""
     names = ("--pattern", "-p")
     return Option(*names, metavar="NAME", help=about, autocompletion=completion.patterns)
 
@@ -338,7 +338,7 @@ Output = Annotated[
 
 @dataclass(frozen=True)
 class PrintedRows:
-    """Options for the format of rows, and the writer of rows."""
+    """Command line options for the format of result rows, with the methods that print the rows."""
 
     form: Annotated[
         Format, Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
@@ -350,17 +350,17 @@ class PrintedRows:
 
     @property
     def file(self) -> Path | None:
-        """Return the output file of the rows; ``None`` means stdout."""
+        """Return the output file for result rows; ``None`` means stdout."""
         return getattr(self, "output", None)
 
     @property
     def chosen(self) -> Format:
-        """Return the format that results from the options."""
+        """Return the output format that results from ``--format``, ``--json`` and the file name."""
         return form_of(self.form, self.file, as_json=self.as_json)
 
     @property
     def for_people(self) -> bool:
-        """True if the rows are a table."""
+        """True if result rows are printed as a text table for people, not in a machine format."""
         return self.chosen is Format.table
 
     def write(
@@ -370,7 +370,7 @@ class PrintedRows:
         types: Sequence[str] | None = None,
         totals: Mapping[str, str] | None = None,
     ) -> int:
-        """Write rows, and return their number; see :func:`sgstore.apps.cli._output.write_rows`.
+        """Print result rows in the chosen format, and return their number.
 
         A long table on a terminal ends with the number of rows, and sums of the columns in
         ``totals`` (column → unit).
@@ -393,7 +393,10 @@ class PrintedRows:
         return number
 
     def report(self, table: ReportTable, limit: int | None = 0) -> None:
-        """Write a table and its notes; ``limit`` 0 means all rows, ``None`` some rows on a terminal."""
+        """Print a table of results and its notes.
+
+        ``limit`` 0 means all rows; ``None`` means some rows on a terminal.
+        """
         if limit is None:
             limit = IN_TABLE if self.for_people and self.file is None else 0
         rows = table.rows[:limit] if limit else table.rows
@@ -405,20 +408,20 @@ class PrintedRows:
 
 
 def on_terminal(out: PrintedRows) -> bool:
-    """True if rows are shown on a terminal."""
+    """True if result rows go to a terminal, not to a file or a pipe."""
     return out.for_people and out.file is None and sys.stdout.isatty()
 
 
 @dataclass(frozen=True)
 class RowOptions(PrintedRows):
-    """Options for the format of rows and their file."""
+    """Command line options for the format of result rows and for their file."""
 
     output: Output = None
 
 
 @dataclass(frozen=True)
 class QueryLimits:
-    """Limits for the time and disk space of a query."""
+    """Command line options that limit the time and the temporary disk space of a query."""
 
     timeout: Annotated[
         str | None,
@@ -441,7 +444,7 @@ class QueryLimits:
     ] = None
 
     def spill(self) -> int:
-        """Set the time limit; return the disk limit.
+        """Start the time limit of the command, and return the limit for temporary disk space in bytes.
 
         Returns
         -------
@@ -454,7 +457,7 @@ class QueryLimits:
         return spill
 
     def opened(self, store: Path, tables: Mapping[str, Path] | None = None) -> Store:
-        """Open a store with these limits and user tables.
+        """Open a store for queries with the time and disk limits of the command line, and with user tables.
 
         Rows without a matching frame are reported.
         """
@@ -470,12 +473,12 @@ class QueryLimits:
 
 @dataclass(frozen=True)
 class AskOptions(QueryLimits, RowOptions):
-    """Options of a verb with queries: format of the rows, their file, and limits."""
+    """Command line options of a command with queries: format of the rows, their file, time and disk limits."""
 
 
 @dataclass(frozen=True)
 class Question:
-    """A query: a text, a file, or a pattern of the library; with parameter values."""
+    """Query on the command line: a text, a file or a pattern of the library, with values of its parameters."""
 
     query: QueryText = None
     file: QueryFile = None
@@ -485,17 +488,17 @@ class Question:
     parameters: Parameters = None
 
     def __bool__(self) -> bool:
-        """True if a query is given."""
+        """True if the command line contains a query."""
         return bool(self.query or self.file or self.name)
 
     def asked(self) -> tuple[str, Mapping[str, Any]]:
-        """Return the text of the query, and the values for its remaining parameters."""
+        """Return the text of the query on the command line, and the values of its parameters."""
         return asked_of(self.query, self.file, self.name, parameters_of(self.parameters))
 
 
 @dataclass(frozen=True)
 class Statements:
-    """Statements of the library and of the command line, combined with those of files."""
+    """Statements of a command: from files, from the library and from the command line."""
 
     names: PatternNames = None
     texts: Annotated[
@@ -511,7 +514,7 @@ class Statements:
     ] = False
 
     def asked(self, files: Sequence[Path] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
-        """Return texts of files, library and command line; and the values for their remaining parameters.
+        """Return the statements by source (file, library, command line), and the values of their parameters.
 
         Returns
         -------
@@ -540,7 +543,7 @@ class Statements:
 
 @dataclass(frozen=True)
 class GraphOptions:
-    """Options for the settings of the scene graphs."""
+    """Command line options that select the settings of the scene graphs: a file or a preset."""
 
     config: Annotated[
         Path | None, Option("--config", help="TOML file with settings of the scene graphs.")
@@ -556,7 +559,10 @@ class GraphOptions:
     ] = None
 
     def settings(self) -> Config | None:
-        """Return the settings of ``--config`` or ``--preset``, or ``None``."""
+        """Return the scene graph settings of ``--config`` or ``--preset``.
+
+        ``None`` means that neither is given.
+        """
         from sgstore.model.config import load
         from sgstore.model.config import preset as preset_named
 
@@ -569,7 +575,7 @@ class GraphOptions:
 
 @dataclass(frozen=True)
 class ReadingOptions(GraphOptions):
-    """Options for reading a recording: its road map, and the settings of the scene graphs."""
+    """Command line options for reading a recording: its road map, and the settings of the scene graphs."""
 
     road_map: Annotated[
         Path | None,
@@ -594,7 +600,7 @@ _ENDINGS: Final = {
 
 
 def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Format:
-    """Return the format by ``--format`` and ``--json``, or by the file name."""
+    """Return the output format that ``--format``, ``--json`` or the suffix of the output file selects."""
     if as_json and form not in {Format.table, Format.json}:
         raise typer.BadParameter(f"give one of --json and --format {form}")
     if as_json or form is not Format.table or output is None:
@@ -609,7 +615,7 @@ def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Forma
 
 
 def tables_of(given: list[str] | None) -> dict[str, Path]:
-    """Parse ``--with`` into files by table name: ``NAME=FILE``, or the name of the file."""
+    """Return files by table name from the option ``--with``: ``NAME=FILE``, or a file named like its table."""
     tables: dict[str, Path] = {}
     for text in given or []:
         name, equals, path = text.partition("=")
@@ -624,7 +630,7 @@ def tables_of(given: list[str] | None) -> dict[str, Path]:
 
 
 def query_of(text: str | None, file: Path | None) -> str:
-    """Return the query of an argument or of a file."""
+    """Return the text of a query, from an argument or from a file."""
     if (text is None) == (file is None):
         raise typer.BadParameter("give a query as an argument, or a file with -f FILE")
     return text if text is not None else text_of(file or Path("-"))
@@ -633,7 +639,7 @@ def query_of(text: str | None, file: Path | None) -> str:
 def asked_of(
     text: str | None, file: Path | None, name: str | None, values: Mapping[str, Any]
 ) -> tuple[str, Mapping[str, Any]]:
-    """Return a query (text, file, or library name), and the values for its remaining parameters."""
+    """Return the text of a query (argument, file or library name), and the values of its parameters."""
     if sum(source is not None for source in (text, file, name)) != 1:
         raise typer.BadParameter("give one of: a query as a text, a file with it, -p NAME")
     if name is None:
@@ -644,7 +650,7 @@ def asked_of(
 
 
 def text_of(file: Path) -> str:
-    """Return the text in a file; ``-`` is stdin."""
+    """Return the text of a file; the name ``-`` means stdin."""
     try:
         return sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -659,7 +665,7 @@ def lines_of(file: Path) -> list[str]:
 
 
 def parameters_of(pairs: list[str] | None) -> dict[str, Any]:
-    """Parse ``NAME=VALUE``: numbers, ``true`` and ``false``, JSON lists, else texts."""
+    """Return query parameters from texts ``NAME=VALUE``, as numbers, truth values, JSON lists or texts."""
     values: dict[str, Any] = {}
     for pair in pairs or []:
         name, equals, value = pair.partition("=")
@@ -697,12 +703,12 @@ _UNIT: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, None: 1.0}
 
 
 def jobs_of(number: int) -> int:
-    """Return the number of processes for ``--jobs``; 0 means one per core."""
+    """Return the number of worker processes for the option ``--jobs``; 0 means one per core."""
     return number or os.cpu_count() or 1
 
 
 def seconds_of(text: str, option: str) -> float:
-    """Parse a time such as ``2s`` to seconds."""
+    """Convert an option value such as ``2s`` to seconds."""
     match = _TIME.fullmatch(text.strip())
     if match is None:
         raise typer.BadParameter(f"{option} {text!r}: expected a time such as 2s, 500ms or 1min")
@@ -713,7 +719,7 @@ _SIZE: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([kMGT]?)B", re.IGNORECASE)
 
 
 def bytes_of(text: str, option: str) -> int:
-    """Parse a size such as ``20GB`` to bytes."""
+    """Convert an option value such as ``20GB`` to a number of bytes."""
     match = _SIZE.fullmatch(text.strip())
     size = round(float(match[1]) * 1000 ** "_kmgt".find(match[2].lower() or "_")) if match else 0
     if match is None or not 1000 <= size < 1 << 62:
@@ -724,7 +730,7 @@ def bytes_of(text: str, option: str) -> int:
 def say_left_out(
     matches: Matches | Answer | ChosenFrames | UserStatement | PartedMatches | PartedRows,
 ) -> None:
-    """Report the traces that cannot answer a query, with reasons, and likely mistakes in it."""
+    """Print the traces that cannot answer a query, with reasons, and likely mistakes in the query."""
     of: dict[str, list[str]] = {}
     for name, reason in matches.reasons.items():
         of.setdefault(reason, []).append(name)
@@ -734,7 +740,7 @@ def say_left_out(
 
 
 def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
-    """Report in one line what settings omitted; as JSON if the results are JSON."""
+    """Print one line about the data that settings excluded from the store; as JSON if the results are JSON."""
     if not found:
         return
     if chosen in {Format.json, Format.ndjson}:
@@ -744,7 +750,7 @@ def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
 
 
 def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
-    """Report unknown values by name, trace and reason; entries without a reason are skipped."""
+    """Print the parts of a query with unknown values, with trace and reason, if there is a reason."""
     from sgstore.temporal import unknown_notes
 
     for note in unknown_notes((f"{name} is unknown", trace, why) for name, trace, why in told):
@@ -752,13 +758,13 @@ def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
 
 
 def say_notes(notes: Iterable[str]) -> None:
-    """Report likely mistakes in a query."""
+    """Print notes about likely mistakes in a query."""
     for note in notes:
         say(f"note: {note}")
 
 
 def _scope_text(found: Mapping[str, Any]) -> str:
-    """Format the result of :func:`sgstore.model.scope.scope_of` as one line."""
+    """Return one line of text about the data that settings excluded from a store."""
     if not found:
         return ""
     scope, states = found.get("scope", ""), f"of {found['states']:,} states"

@@ -1,4 +1,4 @@
-"""Output of verbs: progress bars, tables, machine formats, and reports on recordings.
+"""Output of commands: progress bars, tables, machine formats, reports on recordings.
 
 Progress bars appear only on a terminal.
 """
@@ -68,7 +68,7 @@ def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
 
 @contextmanager
 def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | None]:
-    """Yield a function that shows a progress count; ``None`` if stderr is not a terminal."""
+    """Yield a function that shows a count on a progress bar; ``None`` if stderr is not a terminal."""
     if quiet() or not sys.stderr.isatty():
         yield None
         return
@@ -95,7 +95,7 @@ def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | 
 
 
 class Format(StrEnum):
-    """Format of rows."""
+    """Output format of result rows."""
 
     table = "table"
     json = "json"
@@ -129,7 +129,7 @@ def write_rows(
     output: Path | None = None,
     types: Sequence[str] | None = None,
 ) -> int:
-    """Print rows as they arrive, to stdout or a file; memory does not grow with their number.
+    """Write result rows to stdout or a file while they arrive, in constant memory.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def write_document(values: dict[str, Any], form: Format) -> None:
 
 @dataclass(slots=True)
 class _Manner:
-    """State of the options ``--quiet`` and ``--verbose``."""
+    """Current values of the options ``--quiet`` and ``--verbose``."""
 
     quiet: bool = False
     handler: Any = None
@@ -189,7 +189,9 @@ _manner = _Manner()
 
 
 def talk(*, quiet: bool, verbose: bool) -> None:
-    """Set quiet or verbose output; options before and after a verb are combined.
+    """Switch the messages on stderr off (``--quiet``) or to more detail (``--verbose``).
+
+    Options before and after a command are combined.
 
     Parameters
     ----------
@@ -210,7 +212,7 @@ def talk(*, quiet: bool, verbose: bool) -> None:
 
 
 def talk_as_usual() -> None:
-    """Reset the settings of :func:`talk`."""
+    """Reset the messages on stderr to normal: neither quiet nor verbose."""
     handler, _manner.handler, _manner.quiet = _manner.handler, None, False
     if handler is not None:
         import logging
@@ -220,29 +222,29 @@ def talk_as_usual() -> None:
 
 
 def number_of(number: int, what: str, more: str = "s") -> str:
-    """Return a count with its noun; ``more`` is the plural suffix."""
+    """Return a count with its noun, such as ``1 frame`` or ``2 frames``; ``more`` is the plural suffix."""
     return f"{number:,} {what}{'' if number == 1 else more}"
 
 
 def say(message: str) -> None:
-    """Print a remark, neither result nor error, on stderr."""
+    """Print a message on stderr that is neither a result nor an error."""
     if not _manner.quiet:
         complain(message)
 
 
 def say_json(found: Mapping[str, Any]) -> None:
-    """Print a remark as one line of JSON on stderr, for programs."""
+    """Print a message for programs on stderr, as one line of JSON."""
     if not _manner.quiet:
         sys.stderr.write(f"{json.dumps(found, ensure_ascii=False)}\n")
 
 
 def complain(message: str) -> None:
-    """Print an error on stderr."""
+    """Print an error message on stderr."""
     sys.stderr.write(f"sgstore: {without_controls(message)}\n")
 
 
 def quiet() -> bool:
-    """True if only results and errors are printed."""
+    """True if only results and errors are printed, because of ``--quiet``."""
     return _manner.quiet
 
 
@@ -252,7 +254,7 @@ def write_error(about: dict[str, Any]) -> None:
 
 
 def write_text(text: str, output: Path | None = None) -> None:
-    """Print a text literally, to stdout or a file.
+    """Write a text unchanged, to stdout or a file.
 
     Raises
     ------
@@ -305,7 +307,7 @@ _CONTROLS: Final = {code: f"\\u{code:04x}" for code in range(0x7F, 0xA0)}
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
-    """Return a value as JSON that is safe for a terminal."""
+    """Return a value as JSON text without characters that could control a terminal."""
     text = json.dumps(value, ensure_ascii=False, indent=indent)
     return text if text.isprintable() else text.translate(_CONTROLS)
 
@@ -344,7 +346,7 @@ def _json_value(value: Any, name: str = "") -> Any:
 
 
 def write_binary(write: Callable[[Path], int], form: Format, output: Path | None) -> int:
-    """Write Parquet, or Arrow from a temporary Parquet file, with bounded memory and common types.
+    """Write result rows as Parquet or Arrow, and return their number. The memory is bounded.
 
     Parameters
     ----------
@@ -375,7 +377,7 @@ def write_binary(write: Callable[[Path], int], form: Format, output: Path | None
 
 
 def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO) -> int:
-    """Write a table with widths from the first rows, so that output starts early."""
+    """Write rows as a text table, and return their number. Only the first rows set the column widths."""
     rows = iter(rows)
     first = [[_cell(value) for value in row] for row in islice(rows, ROWS_THAT_SET_WIDTHS)]
     if not first:
@@ -411,7 +413,7 @@ def _room(stream: TextIO) -> int | None:
 
 @dataclass(slots=True)
 class _TerminalColumn:
-    """Column of a table on a terminal: index, width, and shortening."""
+    """Column of a text table on a terminal: its index and width, and the way its texts are shortened."""
 
     place: int
     name: str
@@ -421,7 +423,7 @@ class _TerminalColumn:
     most: int = 0
 
     def text(self, cell: str) -> str:
-        """Return a cell as shown: paths keep both ends, other texts the beginning; numbers are never cut."""
+        """Return a table cell cut to the column width. Paths keep both ends, and numbers are never cut."""
         room = self.most or self.width
         if len(cell) > room and not (self.right or self.whole):
             end = (room - 1) * 2 // 3 if self.name in _PATHS else 0
@@ -436,7 +438,7 @@ def _terminal_line(cells: Sequence[str], layout: Sequence[_TerminalColumn]) -> s
 def _fitted(
     columns: Sequence[str], widths: Sequence[int], numeric: Sequence[bool], room: int
 ) -> tuple[list[int], list[int]]:
-    """Return the shown columns, and the widths of all.
+    """Return the columns of a text table that fit on the terminal, and the widths of all columns.
 
     First the widest texts are shortened, down to 8 letters; then the last columns are omitted; then
     the identifying columns are shortened. Numbers are never cut, because a cut number is a wrong
@@ -464,7 +466,7 @@ def _fitted(
 
 
 def _line(cells: Sequence[str], widths: Sequence[int], numeric: Sequence[bool]) -> str:
-    """Return a row as text with complete cells, for a file or a pipe."""
+    """Return a table row as one text line with complete cells, for a file or a pipe."""
     texts = (
         cell.rjust(width) if right else cell.ljust(width)
         for cell, width, right in zip(cells, widths, numeric, strict=True)
@@ -622,5 +624,5 @@ def _amount(size: int) -> str:
 
 
 def _shown(text: str) -> str:
-    """Replace unprintable characters, because texts from files could control the terminal."""
+    """Return a text with unprintable characters replaced, because they could control the terminal."""
     return "".join(c if c.isprintable() else "�" for c in text)

@@ -1,4 +1,4 @@
-"""Collections in place of a store, and their options for verbs."""
+"""Options of commands that accept a collection (many stores) instead of one store."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def url_of(store: Path) -> str | None:
-    """Return the place of a collection if the store argument names one, else ``None``."""
+    """Return the address of a collection if the store argument is one, else ``None``."""
     if (url := url_named(store)) is not None:
         return url
     with suppress(OSError, ValueError):  # unreadable paths are rejected later as a store
@@ -35,7 +35,7 @@ COLLECTIONS: Final = "Collections"
 
 @dataclass(frozen=True)
 class CollectionOptions:
-    """Options for a collection in place of a store."""
+    """Command line options for queries on a collection (many stores)."""
 
     engine: Annotated[
         str,
@@ -59,7 +59,7 @@ class CollectionOptions:
     def collection_at(
         self, url: str, bounds: QueryLimits, tables: list[str] | None = None, *, safe: bool = False
     ) -> Generator[Collection]:
-        """Open a collection with a time limit and user tables."""
+        """Open a collection (many stores) with the time limit and the user tables of the command."""
         from sgstore.collection import Collection
 
         if safe:
@@ -74,7 +74,7 @@ class CollectionOptions:
             yield whole
 
     def opened_at(self, place: Path, bounds: QueryLimits) -> Store | Collection:
-        """Open a store or a collection with limits."""
+        """Open a store or a collection with the limits of the command line."""
         if (url := url_of(place)) is None:
             return bounds.opened(place)
         with self.collection_at(url, bounds) as whole:
@@ -85,7 +85,7 @@ _asked: Final[list[Any]] = []  # Collection
 
 
 def note_asked(store: Store | Collection) -> None:
-    """Register the store of a verb: bundles of a collection may fail to answer."""
+    """Remember the collection of the current command, to report its missing bundles at the end."""
     if hasattr(store, "missing"):
         whole: Any = store
         _asked.append(whole)
@@ -97,7 +97,7 @@ def note_asked(store: Store | Collection) -> None:
 
 
 def with_missing(code: int) -> int:
-    """Report the bundles that did not answer; return the final exit code of a verb."""
+    """Report the bundles of a collection without a result, and return the final exit code."""
     missing = {name: why for whole in _asked for name, why in whole.missing.items()}
     for bundle, why in missing.items():
         say(f"bundle {bundle[:12]}… did not answer: {why}")
@@ -105,5 +105,5 @@ def with_missing(code: int) -> int:
 
 
 def forget_asked() -> None:
-    """Clear the registered stores after a verb."""
+    """Clear the list of collections that the last command used."""
     _asked.clear()

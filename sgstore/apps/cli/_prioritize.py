@@ -1,4 +1,4 @@
-"""The verbs criticality and prioritize: recorded measures, and orders of test cases."""
+"""Commands ``criticality`` (measures of encounters) and ``prioritize`` (order of test cases)."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def criticality(
     out: RowOptions,
     bounds: QueryLimits,
 ) -> None:
-    """List measures of recorded encounters: PET, TET, CPI, the closest encounter.
+    """List measures of recorded encounters of two entities: PET, TET, CPI, the closest encounter.
 
     A row is the ego of a trace and one of those that it could meet: the view
     encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.
@@ -72,7 +72,7 @@ def criticality(
 
 @dataclass(frozen=True)
 class OrderOptions:
-    """Options for an order of cases: the rule, and the unit of a case."""
+    """Command line options for the order of test cases: its rule, and the unit (frame, clip or trace)."""
 
     by: Annotated[
         Literal["risk", "diverse", "both", "learned"],
@@ -105,7 +105,7 @@ class OrderOptions:
     seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
 
     def spec(self) -> PrioritySpec:
-        """Return the specification of these options."""
+        """Return the specification of a test case order from the command line options."""
         from sgstore.testsets.selection import (
             MEASURES,
             Budget,
@@ -128,7 +128,7 @@ class OrderOptions:
 
 @dataclass(frozen=True)
 class OutcomeOptions:
-    """Options for known outcomes: for learning, and for rating an order."""
+    """Command line options for known test results, from which an order is learned or rated."""
 
     outcomes: Annotated[
         Path | None,
@@ -160,7 +160,7 @@ class OutcomeOptions:
     ] = None
 
     def check(self, by: str) -> None:
-        """Reject options without their required partner.
+        """Raise an error for an option that has no effect without another one.
 
         Raises
         ------
@@ -237,7 +237,7 @@ def prioritize(
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:
-    """Report, and draw, how soon the order finds failures."""
+    """Print how soon an order of test cases finds the known failures, and draw the curve."""
     from sgstore.testsets.selection import failed_in_order, failure_curve, fault_detection
 
     failed = failed_in_order(order, known)

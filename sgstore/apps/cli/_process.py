@@ -1,4 +1,4 @@
-"""Signals, deadlines and standard streams of the process.
+"""Signals, deadline and standard streams of the ``sgstore`` process.
 
 A run can end early by Ctrl-C, by a signal, or at its deadline, with the same treatment.
 
@@ -42,7 +42,7 @@ _ENDS: Final = tuple(
 
 @dataclass(slots=True)
 class _RunEnd:
-    """State of the process end: its cause, and the previous hook for lost errors."""
+    """Reason for the end of a command (signal or deadline), and the previous hook for unraisable errors."""
 
     signal: int = 0
     deadline_s: float = 0.0
@@ -54,7 +54,7 @@ _run = _RunEnd()
 
 
 def heed_signals() -> None:
-    """Handle signals like Ctrl-C, except those that the parent ignores (``nohup``)."""
+    """Make end signals (such as SIGTERM) act like Ctrl-C, except signals that the parent process ignores."""
     for number in _ENDS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
@@ -62,7 +62,7 @@ def heed_signals() -> None:
 
 
 def ignore_signals() -> None:
-    """Ignore further signals during the final steps of a run."""
+    """Ignore further signals during the last steps of a command."""
     for number in (signal.SIGINT, signal.SIGALRM, *_ENDS):
         signal.signal(number, signal.SIG_IGN)
     # An interruption inside code run from a text, as in libraries that generate classes, makes
@@ -83,7 +83,7 @@ def _hear_of_lost() -> None:
 
 
 def _lost(report: Any) -> None:
-    """Handle an error that Python could not raise; an interruption is raised again."""
+    """Handle an exception that Python could not raise; a keyboard interrupt is raised again later."""
     if not issubclass(report.exc_type, KeyboardInterrupt):
         _run.reported(report)
         return
@@ -97,7 +97,7 @@ def _again(_number: int, _frame: FrameType | None) -> None:
 
 
 def set_deadline(seconds: float) -> None:
-    """Set a deadline after which the run is interrupted; s."""
+    """Interrupt the current command after a number of seconds."""
     clear_deadline()
     _run.deadline_s = seconds
     _hear_of_lost()
@@ -106,7 +106,7 @@ def set_deadline(seconds: float) -> None:
 
 
 def clear_deadline() -> None:
-    """Remove the deadline and its state."""
+    """Remove the deadline of the current command."""
     if _run.deadline_s:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -121,12 +121,12 @@ def _too_late(_number: int, _frame: FrameType | None) -> None:
 
 
 def was_ended() -> bool:
-    """True if a signal or the deadline ended the run, even if its interruption was lost."""
+    """True if a signal or the deadline ended the command, even if Python lost the exception."""
     return bool(_run.signal) or _run.late
 
 
 def refuse_late() -> None:
-    """Raise an error if the deadline has passed.
+    """Raise an error if the deadline of the command has passed.
 
     Raises
     ------
@@ -140,12 +140,12 @@ def refuse_late() -> None:
 
 
 def exit_code() -> int:
-    """Return the exit code of an interrupted run."""
+    """Return the exit code of a command that a signal or its deadline ended."""
     return 128 + _run.signal if _run.signal else INTERRUPTED
 
 
 def word() -> str:
-    """Return a text for the cause of an interruption, such as ``ended by SIGTERM``."""
+    """Return the reason of an interruption as text, such as ``ended by SIGTERM``."""
     return f"ended by {signal.Signals(_run.signal).name}" if _run.signal else "interrupted"
 
 
@@ -154,7 +154,7 @@ def word() -> str:
 
 
 def take_streams() -> None:
-    """Replace Python's standard streams, open or closed, by our own.
+    """Replace the standard streams of Python by streams that report output errors as errors of the library.
 
     A full disk behind stdout raises :class:`~sgstore.errors.ExportError`, and a reader that has
     exited raises :class:`~sgstore.base.output_files.ReaderGoneError`. Failed writes to stderr are dropped,
@@ -172,7 +172,7 @@ def take_streams() -> None:
 
 
 def _occupy() -> None:
-    """Fill closed descriptors, so that a later file never becomes a standard stream."""
+    """Open the closed file descriptors 0 to 2, so that no later file gets the number of a standard stream."""
     descriptor = os.open(os.devnull, os.O_RDONLY)  # writes to it fail, as to a closed stream
     while descriptor < 3:
         descriptor = os.dup(descriptor)

@@ -1,4 +1,4 @@
-"""Verbs that find: find, why-not, like, translate, sql, patterns."""
+"""Commands with queries: find, why-not, like, translate, sql, patterns."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def find(
 
 
 def _returns_nothing(text: str) -> bool:
-    """True if a query has no ``RETURN``: one row per match and frame."""
+    """True if a query has no ``RETURN`` clause, so that each match gives one row per frame."""
     from sgstore.lang.sql import each_match
     from sgstore.lang.syntax import parse
     from sgstore.lang.syntax.tree import MatchClause
@@ -141,7 +141,7 @@ def _returns_nothing(text: str) -> bool:
 
 
 def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
-    """Print intervals, then their totals."""
+    """Print intervals of matching frames and their totals, and return their number."""
     traces: set[str] = set()
     frames, seconds = 0, 0.0
 
@@ -173,7 +173,7 @@ def _found_in(
     explain: bool,
     require: bool,
 ) -> int:
-    """Print the results of a collection for a query; return the exit code."""
+    """Print the results of a query on a collection, and return the exit code."""
     matches = whole.find(text, **values)
     if explain:
         typer.echo(matches.explain())
@@ -191,7 +191,7 @@ def _found_in(
 
 
 def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
-    """Report missing rows on a terminal; return the exit code."""
+    """Return the exit code for a number of result rows; on a terminal, report an empty result."""
     if not number and ask.for_people:
         say("nothing matches")
     return NO_MATCH if require and not number else 0
@@ -200,7 +200,10 @@ def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
 def _as_shown(
     answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return columns and rows for a format: readable names in tables; graphs for networkx in JSON."""
+    """Return the columns and rows of a query for an output format.
+
+    Tables get readable names of entities. JSON gets graphs in the node-link form of networkx.
+    """
     from sgstore.lang.sql import for_people
 
     if form is Format.table:
@@ -211,7 +214,7 @@ def _as_shown(
 def _node_link(
     answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return rows with graphs at the end, in JSON as for networkx."""
+    """Return the result rows; in JSON their graphs have the node-link form of networkx."""
     if form not in {Format.json, Format.ndjson}:
         return answer.columns, rows
     columns = ("directed", "multigraph", *answer.columns)
@@ -310,7 +313,7 @@ _FEATURES_SHOWN: Final = 3
 
 
 def _differing(features: dict[str, int]) -> str:
-    """Return the first features with counts as text, and the number of others."""
+    """Return the first differing features with their counts as text, and the number of the other features."""
     shown = [f"{n} x {text}" if n > 1 else text for text, n in features.items()]
     more = shown[_FEATURES_SHOWN:]
     return ", ".join([*shown[:_FEATURES_SHOWN], *([f"… {len(more)} more"] if more else [])])
@@ -324,7 +327,7 @@ def translate(
     ] = "sgl",
     output: Output = None,
 ) -> int:
-    """Translate properties of other tools into the query language; nothing of the file is run."""
+    """Translate properties of other tools into the query language, without running any code of the file."""
     from sgstore.lang.contrib.sgsm import translated
 
     write_text(translated(text_of(file)), output)
@@ -353,7 +356,7 @@ def sql(
     whole: CollectionOptions,
     ask: AskOptions,
 ) -> int:
-    """Ask a store in SQL, read only.
+    """Run a read-only SQL statement on a store.
 
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
     What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …').
@@ -425,7 +428,7 @@ LibraryName = Annotated[
 
 
 class Kind(StrEnum):
-    """Kinds of patterns."""
+    """Kind of a library pattern: predicate, concept, scenario or property."""
 
     predicate = "predicate"
     concept = "concept"
@@ -472,7 +475,7 @@ def search_patterns(
     *,
     out: RowOptions,
 ) -> int:
-    """Find patterns of the library by words, the best first."""
+    """Search the patterns of the library by words, with the best match first."""
     from sgstore.lang.library import search
 
     _write_patterns(search(" ".join(words), [*(kinds or ())]), out)
@@ -481,7 +484,7 @@ def search_patterns(
 
 @library.command("show")
 def show_pattern(name: LibraryName, as_json: AsJson = False, output: Output = None) -> int:
-    """Print a pattern: its text, its parameters, where it comes from, and a scene that it holds in.
+    """Print a pattern: its text, parameters, source, and a scene in which it is true.
 
     What is printed is a query, its remarks being comments: it can be changed and asked with find -f.
     """
@@ -556,7 +559,10 @@ def _check(store: Path, **options: Any) -> int:
 
 
 def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:
-    """Write intervals as rows; tables have names of the participants instead of node ids."""
+    """Print intervals of matching frames as rows, and return their number.
+
+    Tables contain the names of the entities instead of node ids.
+    """
     from sgstore.matches import intervals_for_people
 
     if ask.for_people:
@@ -573,7 +579,7 @@ def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:
 
 
 def _told(found: NamedPattern) -> dict[str, Any]:
-    """Return a pattern as data."""
+    """Return a library pattern as a dictionary for JSON output."""
     parameters = [
         {"name": p.name, "type": p.type, "default": p.default, "meaning": p.meaning}
         for p in found.parameters.values()
@@ -590,7 +596,7 @@ def _told(found: NamedPattern) -> dict[str, Any]:
 
 
 def _for_people(found: NamedPattern) -> str:
-    """Return a pattern as a query with default parameters and explanatory comments."""
+    """Return a library pattern as query text with default parameters and explanatory comments."""
     head = [f"{found.name}: {found.sentence}", f"source: {found.source}"]
     head += [f"param {p.name} = {p.default}: {p.meaning}" for p in found.parameters.values()]
     head += ["", *found.example.splitlines()] if found.example else []

@@ -1,4 +1,4 @@
-"""Verbs about recordings: ingest, info, doctor, record, import."""
+"""Commands for recordings: ingest, info, doctor, record, import."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def ingest(
     *,
     out: PrintedRows,
 ) -> int:
-    """Read recordings into a store; those that are in it already are skipped."""
+    """Read recordings into a store; recordings that it already contains are skipped."""
     from sgstore.apps.cli._output import ingest_bar
     from sgstore.ingest import ingest as ingest_traces
     from sgstore.ingest import recordings
@@ -120,7 +120,7 @@ def ingest(
 
 
 def _told(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
-    """Print the status of recordings; return the exit code."""
+    """Print the result of an ingest for each recording, and return the exit code."""
     from sgstore.model.scope import scope_of
 
     for outcome in outcomes:
@@ -142,7 +142,7 @@ def _with_scopes(
     reports: Iterable[Mapping[str, Any]],
     out: PrintedRows,
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Add a column with counts of omissions by settings, for machine formats."""
+    """Return result rows; machine formats get a column for the data that settings excluded."""
     if out.chosen not in {Format.json, Format.ndjson}:
         return columns, rows
     scopes = (one.get("scope") for one in reports)
@@ -152,7 +152,10 @@ def _with_scopes(
 def _landed(
     store: Path, paths: list[Path], shard: str | None, how: dict[str, Any], *, alone: bool
 ) -> list[TraceOutcome]:
-    """Land a share of recordings in a collection; ``alone``: an option for stores was given."""
+    """Ingest a share of recordings into the landing area of a collection, and return the results.
+
+    ``alone`` is true if an option for single stores was given, which is an error.
+    """
     if alone:
         raise typer.BadParameter("--force and --dry-run are for a store, not for a collection")
     from sgstore.collection import land
@@ -182,7 +185,7 @@ def _say_what_was_odd(outcome: TraceOutcome) -> None:
 
 
 def _no_kind(type_name: str) -> str:
-    """Return advice about a type name without a mapping."""
+    """Return advice about a type name of a recording that has no kind of entity."""
     name = json.dumps(type_name, ensure_ascii=False)
     return (
         "of which nothing says what kind it is; to say it, write into a file for --config:"
@@ -217,7 +220,7 @@ def info(
     *,
     out: PrintedRows,
 ) -> int:
-    """List the traces of a store, or describe one in full; of a collection, list them."""
+    """List the traces of a store or a collection, or describe a trace in full."""
     from sgstore.model.scope import scope_of
 
     if (url := url_of(store)) is not None:
@@ -251,7 +254,7 @@ def info(
 
 
 def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
-    """Print the catalogue entries of traces; without names, of all."""
+    """Print the catalogue entries of the named traces of a collection, or of all traces."""
     from sgstore.collection import Collection
 
     whole = Collection(url)
@@ -275,7 +278,7 @@ def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
 
 
 def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:
-    """Print all facts about traces: one as a document, several as rows."""
+    """Print all data about traces: a document for one trace, rows for several."""
     with file.snapshot():
         found = [file.trace(name) for name in names]
         channels = [[asdict(one) for one in file.channels(trace.trace_id)] for trace in found]
@@ -294,7 +297,7 @@ def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:
 
 @verbs.command(rich_help_panel=PANEL)
 def doctor(traces: Recordings, reading: ReadingOptions, out: PrintedRows) -> int:
-    """Check recordings: report what can be read, and any damage. Needs no store."""
+    """Check recordings: report readable content and damage. Needs no store."""
     from sgstore.ingest import recordings
     from sgstore.pipeline.doctor import Examination, examine
 
@@ -380,7 +383,7 @@ def record(
 
 @contextmanager
 def _counter() -> Generator[Callable[[int, float], None] | None]:
-    """Yield a function that counts frames on stderr; ``None`` without a terminal."""
+    """Yield a function that shows a frame count on stderr; ``None`` if stderr is not a terminal."""
     if quiet() or not sys.stderr.isatty():
         yield None
         return
@@ -394,7 +397,7 @@ def _counter() -> Generator[Callable[[int, float], None] | None]:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Options for the meaning of names in graphs."""
+    """Command line options that map labels of imported graphs to kinds and relations."""
 
     kind: Annotated[
         list[str] | None,
@@ -452,7 +455,7 @@ def import_(
     *,
     meaning: ImportOptions,
 ) -> int:
-    """Import graphs of other tools into a store: each becomes a frame."""
+    """Import graphs of other tools into a store: each graph becomes a frame."""
     from sgstore.model.vocabulary import relation_named
     from sgstore.pipeline.importing import Words, import_graphs
 

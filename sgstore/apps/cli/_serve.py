@@ -1,4 +1,4 @@
-"""Verbs that serve a store, to people and to assistants: serve, report, mcp."""
+"""Commands that serve or publish a store: serve (web page), report (HTML file), mcp (AI assistant)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def serve(
     port: Annotated[int, Option("--port", min=0, max=65535, help="0: any that is free.")] = 0,
     browse: Annotated[bool, Option("--open/--no-open", help="Open the page in a browser.")] = False,
 ) -> int:
-    """Explore a store in a browser: search, watch matches, see why a frame matches or not.
+    """Explore a store in a browser: search, view matches, and see why a frame matches or not.
 
     Prints an address with a token, for this machine alone. Needs the extra ui. Ends with Ctrl-C.
     """
@@ -88,7 +88,7 @@ def report(
     *,
     bounds: QueryLimits,
 ) -> int:
-    """Write the matches of a query as one page, to be watched without a server and without a network.
+    """Write the matches of a query as one HTML page that works without a server or network.
 
     Of checks it shows the violations.
     """
@@ -125,7 +125,7 @@ def mcp(
     max_rows: Annotated[int, Option("--max-rows", min=1, help="Rows of an answer at most.")] = 1000,
     tables: With = None,
 ) -> None:
-    """Serve a store to an assistant: a server of the Model Context Protocol on stdin and stdout.
+    """Serve a store to an AI assistant by the Model Context Protocol, on stdin and stdout.
 
     For the settings of an assistant: {"command": "sgstore", "args": ["mcp", "/path/to/drives.sgstore"]}.
     Queries run in a separate process that sees nothing but the store; files are written with --write-to only.

@@ -1,4 +1,4 @@
-"""Verbs about stores (verify, remove, rebuild, derive, payload), maps and settings, and the demo."""
+"""Commands for stores (verify, remove, rebuild, derive, payload), road maps, settings and the demo."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def verify(
     *,
     out: PrintedRows,
 ) -> int:
-    """Verify that a store is as it was published; list every fault."""
+    """Verify that a store has not changed since it was published; list every fault."""
     from sgstore.store import verify_file
 
     found = verify_file(store, recordings=payloads)
@@ -76,7 +76,7 @@ def remove(
     *,
     out: PrintedRows,
 ) -> int:
-    """Remove traces from a store, all or none; the recordings are not touched."""
+    """Remove traces from a store, all or none; the recordings stay."""
     from sgstore.store import StoreFile
 
     if not traces and not compact:
@@ -225,7 +225,7 @@ def map_(
 
 
 def _road_map(file: Path) -> RoadMap:
-    """Return the road map in a file or a recording."""
+    """Return the road map of a map file or a recording."""
     from sgstore.errors import MapError
     from sgstore.maps.map_files import read_map_file
     from sgstore.maps.opendrive import read_map
@@ -264,7 +264,7 @@ def payload(
     *,
     out: PrintedRows,
 ) -> int:
-    """Fetch the sensor data of a frame: a picture, a video up to it, or the message."""
+    """Fetch the sensor data of a frame: a picture, a video up to the frame, or the message."""
     from sgstore.store import StoreFile
 
     file = StoreFile(store)
@@ -322,7 +322,7 @@ def config(
     *,
     out: PrintedRows,
 ) -> None:
-    """Print all settings as commented TOML, to be changed and given to ingest."""
+    """Print all settings as commented TOML, as a template for ingest."""
     from sgstore.model.config import PRESETS, Config, as_markdown, as_toml, load
     from sgstore.model.config import preset as preset_named
 
@@ -348,7 +348,7 @@ def demo(
         Path | None, Option("--recording", help="The sample recording; by default the package's.")
     ] = None,
 ) -> int:
-    """Run the main job on the bundled recording: ingest, find, show, export."""
+    """Run the main commands on the bundled recording: ingest, find, show, export."""
     from sgstore.apps.demo import run_demo
 
     run_demo(folder, typer.echo, recording)

@@ -1,4 +1,4 @@
-"""Verbs about test sets: choice, locks, comparison of two stores."""
+"""Commands for test sets: select, lock, and diff (comparison of two stores)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ Objective = Literal["units", "frames", "seconds", "bytes"]
 
 @dataclass(frozen=True)
 class ChoiceOptions:
-    """Options for a selection: strategy, units, and limits."""
+    """Command line options for selecting test cases: strategy, units and limits."""
 
     minimal: Annotated[
         bool, Option("--minimal", help="The fewest that keep everything that occurs.")
@@ -116,7 +116,7 @@ class ChoiceOptions:
     seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
 
     def spec(self) -> SelectionSpec:
-        """Return the specification of these options."""
+        """Return the specification of a test case selection from the command line options."""
         from sgstore.testsets.selection import Budget, SelectionSpec, SelectionUnit
 
         return SelectionSpec(
@@ -180,7 +180,7 @@ def select(
     out: PrintedRows,
     bounds: QueryLimits,
 ) -> None:
-    """Choose frames, clips or traces for tests, rate the choice, and lock it.
+    """Select frames, clips or traces for tests, rate the selection, and write it as a lock.
 
     Without --minimal, --per-class, --rarest, --stratify or --weakest all are taken,
     or some at random within the --budget.
@@ -215,7 +215,7 @@ def select(
 def chosen_frames(
     opened: Store | Collection, name: str, query: str | None, parameters: list[str] | None
 ) -> ChosenFrames:
-    """Return the frames to select from."""
+    """Return the frames from which test cases are selected: the matches of a query, or all frames."""
     from sgstore.testsets.coverage import ChosenFrames, frames_of
 
     if query is None:
@@ -282,7 +282,7 @@ def verify_(
     whole: CollectionOptions,
     ask: AskOptions,
 ) -> int:
-    """Verify that a store holds the cases of a lock: recordings, settings, graphs, sensor messages.
+    """Verify that a store has the cases of a lock: recordings, settings, graphs, sensor messages.
 
     Exit code 1 if not. Other versions alone are told, and no difference
     without --strict.
@@ -304,7 +304,7 @@ def verify_(
 
 @lock.command("list")
 def list_(path: LockPath, out: RowOptions) -> None:
-    """List the cases of a lock."""
+    """List the test cases of a lock."""
     from sgstore.testsets.locks import read_lock
 
     columns = ("id", "trace", "first", "last", "frames", "split", "start_ns", "end_ns", "graph")
@@ -314,7 +314,7 @@ def list_(path: LockPath, out: RowOptions) -> None:
 
 @lock.command("union")
 def union_(a: LockA, b: LockB, output: LockOut) -> None:
-    """Write a lock of the cases that are in A or in B."""
+    """Write a lock of the test cases that are in A or in B."""
     from sgstore.testsets.locks import read_lock, union
 
     say_made(union(read_lock(a), read_lock(b)), output)
@@ -322,7 +322,7 @@ def union_(a: LockA, b: LockB, output: LockOut) -> None:
 
 @lock.command("intersect")
 def intersect_(a: LockA, b: LockB, output: LockOut) -> None:
-    """Write a lock of the cases that are in A and in B."""
+    """Write a lock of the test cases that are in A and in B."""
     from sgstore.testsets.locks import intersect, read_lock
 
     say_made(intersect(read_lock(a), read_lock(b)), output)
@@ -330,14 +330,14 @@ def intersect_(a: LockA, b: LockB, output: LockOut) -> None:
 
 @lock.command("minus")
 def minus_(a: LockA, b: LockB, output: LockOut) -> None:
-    """Write a lock of the cases of A that share no frame with B."""
+    """Write a lock of the test cases of A that share no frame with B."""
     from sgstore.testsets.locks import minus, read_lock
 
     say_made(minus(read_lock(a), read_lock(b)), output)
 
 
 def say_made(made: Lock, output: Path) -> None:
-    """Write a lock, and report its contents."""
+    """Write a lock (list of test cases with checksums) to a file, and print its content."""
     made.write(output)
     say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
 
@@ -364,7 +364,7 @@ def diff(
     *,
     ask: FrameAskOptions,
 ) -> int:
-    """Compare two stores or runs: which scenes, verdicts or matches appeared, vanished, changed."""
+    """Compare two stores or runs: scenes, verdicts and matches that appeared, vanished or changed."""
     from sgstore.testsets import diff as differences
     from sgstore.testsets.coverage import classed
 

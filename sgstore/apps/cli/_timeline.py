@@ -1,4 +1,4 @@
-"""The verb timeline: matches and violations over time, one lane per entity."""
+"""Command ``sgstore timeline``: plots matches and violations over time, with one lane per entity."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def timeline(
     *,
     bounds: QueryLimits,
 ) -> int:
-    """Plot matches and rule violations over time, one lane per entity, for each trace that has some.
+    """Plot matches and rule violations over time, one lane per entity, for each trace that has any.
 
     In the terminal, or with -o as a picture; all traces have one scale. With --parts FRAME one lane
     for each part of a pattern.
@@ -102,7 +102,7 @@ def timeline(
 def _asked(
     queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
 ) -> dict[str, tuple[str, Mapping[str, Any]]]:
-    """Return the texts to plot with their values, by lane name."""
+    """Return the queries to plot by lane name, each with the values of its parameters."""
     from sgstore.lang.library import pattern_named
 
     found: dict[str, tuple[str, Mapping[str, Any]]] = {}
@@ -120,7 +120,7 @@ def _asked(
 
 
 def _free(name: str, longer: str, taken: Mapping[str, object]) -> str:
-    """Return an unused name for a lane."""
+    """Return an unused name for a lane of a timeline."""
     if name not in taken:
         return name
     numbers = (f"{longer} ({number})" for number in count(2))

@@ -1,4 +1,4 @@
-"""Application: the endpoints of the page."""
+"""Web application of the explorer: all endpoints of its page."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ async def _lines(replies: Replies) -> AsyncGenerator[bytes]:
 
 
 async def _last(replies: Replies) -> AsyncGenerator[bytes]:
-    """Yield the last reply: the complete result of a query with one result."""
+    """Yield only the last reply of a query, as JSON: the complete result."""
     *_, last = [reply async for reply in replies]
     yield as_json(last)
 
 
 class _Answer(StreamingResponse):
-    """Streamed response; its end, for any reason, cancels the query.
+    """Streamed HTTP response with the results of a query. The end of the response cancels the query.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class _Answer(StreamingResponse):
             self.end()
 
     def ask(self) -> None:
-        """Run the query in its own thread; an error becomes a reply."""
+        """Run the query of the HTTP response in a thread. An error becomes a reply."""
         tell = partial(self._loop.call_soon_threadsafe, self._found.put_nowait)
         try:
             self._asked = self._pool()
@@ -130,14 +130,14 @@ class _Answer(StreamingResponse):
             yield reply
 
     def end(self) -> None:
-        """Cancel the query if it still runs."""
+        """Cancel the query of the HTTP response if it still runs."""
         self._gone.set()  # it may not have begun
         if self._asked is not None:
             self._asked.cancel(self._key)
 
 
 class Explorer:
-    """Shared state of the endpoints of one store.
+    """State that all endpoints of the web page share: stores, sandboxes, tags and running queries.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ class Explorer:
         self.busy = set[_Answer]()
 
     def warm(self) -> None:
-        """Read maps in a background thread before the first request."""
+        """Start reading the road maps of the stores in a thread, before the first request."""
         for reads in self.reads.values():
             self._threads.submit(reads.warm, self._ended)
 
@@ -205,7 +205,7 @@ class Explorer:
         )
 
     def _tables(self) -> dict[str, Path]:
-        """Return the tags as a table for queries."""
+        """Return the tags of users as a file for queries, by table name; empty without tags."""
         found = self.notes.read()
         if not found:
             return {}
@@ -214,7 +214,7 @@ class Explorer:
         return {"notes": table}
 
     def pool(self, side: str, text: str) -> SandboxPool:
-        """Return the sandboxes of a store; a query about tags gets sandboxes with the current tags."""
+        """Return the sandbox processes for a query on a store. A query about tags gets the current tags."""
         if side == "a" and "notes" in text.lower() and self._stamp != self.notes.stamp():
             self._stamp = self.notes.stamp()
             old, self._pools["a"] = self._pools["a"], self._pool("a")
@@ -225,7 +225,7 @@ class Explorer:
         return one_of(*self.stores)(fields.get("side"), "side")
 
     def _answer(self, pool: Callable[[], SandboxPool | Errand], *asked: Any) -> _Answer:
-        """Start a query in a thread and return its response.
+        """Start a query in a thread, and return the HTTP response that streams its results.
 
         Raises
         ------
@@ -241,7 +241,7 @@ class Explorer:
         return answer
 
     async def find(self, request: Request) -> Response:
-        """Stream matches of a pattern, or rows of SQL, as lines of JSON."""
+        """Endpoint that streams the matches of a pattern or the rows of an SQL statement, as JSON lines."""
         fields = await fields_of(request)
         question = taken(fields, "ask", "text", "parameters")
         if is_statement(question["text"]):
@@ -250,13 +250,13 @@ class Explorer:
         return self._answer(partial(self.pool, side, question["text"]), question, key)
 
     async def cancel(self, request: Request) -> Response:
-        """Stop a query."""
+        """Endpoint that stops a running query."""
         key = str(request.path_params["key"])
         done = any(pool.cancel(key) for pool in self._pools.values())
         return JSONResponse({"cancelled": done})
 
     async def one(self, request: Request, ask: str) -> Response:
-        """Return the complete result of a query (truth lanes, why not, verdicts) or its error."""
+        """Endpoint for a query with one complete result, such as the verdicts of checks."""
         fields = await fields_of(request)
         side = self._side(fields)
         question = {"ask": ask, **taken(fields, *_QUESTIONS[ask])}
@@ -267,24 +267,24 @@ class Explorer:
         return self._answer(pool, question, uuid.uuid4().hex, _last, "application/json")
 
     async def threaded(self, ask: Callable[..., T], *arguments: Any) -> T:
-        """Return the result of a slow function, run in a thread."""
+        """Run a slow function in a thread, and return its result."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, ask, *arguments)
 
     async def read(self, request: Request, name: str) -> Response:
-        """Read from a store: columns as bytes, a picture, or plain values."""
+        """Endpoint that reads data of a store: binary columns, a picture, or JSON values."""
         fields = await fields_of(request)
         reads = self.reads[self._side(fields)]
         ask = partial(getattr(reads, name), **taken(fields, *READS[name]))
         return answered(await self.threaded(ask))
 
     async def about(self, _: Request) -> Response:
-        """Return the stores with their traces, and the permissions of the page."""
+        """Endpoint with the traces of each store, and whether the page may write files."""
         sides = {side: await self.threaded(reads.about) for side, reads in self.reads.items()}
         writing = self.write_to is not None
         return JSONResponse({**sides["a"], "other": sides.get("b"), "writing": writing})
 
     async def tags(self, request: Request) -> Response:
-        """Return all tags; POST adds or removes a tag."""
+        """Endpoint with all tags of users; POST adds or removes a tag."""
         fields = await fields_of(request)
         if request.method == "POST":
             told = taken(fields, "trace", "seq", "tag", "note", "do")
@@ -296,7 +296,7 @@ class Explorer:
         return JSONResponse({"notes": notes, "file": self.notes.path.name})
 
     async def work(self, request: Request, name: str) -> Response:
-        """Run a longer task; stream its progress as lines of JSON, then its result or error."""
+        """Endpoint that runs a long task, such as an export, and streams its progress and result as JSON."""
         fields = await fields_of(request)
         question = {"ask": name, **taken(fields, *_WORK[name])}
         if "name" in question:
@@ -311,7 +311,7 @@ class Explorer:
         return self._answer(lambda: errand, question, "")
 
     def target(self, name: str) -> Path:
-        """Return a path in the writable folder.
+        """Return the path for a new file in the folder that the page may write to.
 
         Raises
         ------
@@ -327,7 +327,7 @@ class Explorer:
 
 
 async def page_of(request: Request, script: str = "main.js") -> Response:
-    """Return a page by its first script, with the nonce of the response's policy."""
+    """Return the HTML page with its first script, and with the nonce of the content security policy."""
     text = (PAGE / "index.html").read_text(encoding="utf-8").replace(_SCRIPT, f"js/{script}")
     nonce = request.scope["state"]["nonce"]
     return Response(text.replace(_NONCE, nonce), media_type="text/html")
@@ -350,7 +350,7 @@ _METHODS: Final = {name: "POST" if "frames" in told else "GET" for name, told in
 
 
 def answered(found: Any) -> Response:
-    """Return a response with columns as bytes, a picture with its type, or plain values."""
+    """Return an HTTP response for binary columns, for a picture with its media type, or for JSON values."""
     if isinstance(found, bytes):
         return Response(found, media_type="application/octet-stream")
     if isinstance(found, tuple):
@@ -360,7 +360,7 @@ def answered(found: Any) -> Response:
 
 
 def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
-    """Return the ASGI application of a store, behind a token.
+    """Return the ASGI application of the explorer. Its requests need a token.
 
     Parameters
     ----------
@@ -392,7 +392,7 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
 
 
 class _PageFiles(StaticFiles):
-    """Modules, styles and licences of the page; browsers must revalidate them."""
+    """Static files of the page. Browsers must ask for a newer version each time."""
 
     def file_response(self, *args: Any, **kwargs: Any) -> Response:
         response = super().file_response(*args, **kwargs)
@@ -403,7 +403,7 @@ class _PageFiles(StaticFiles):
 def application_of(
     table: Iterable[tuple[str, Endpoint]], lifespan: Callable[[Any], Any] | None = None
 ) -> Starlette:
-    """Return an application from endpoints (method and path) and the files of the page."""
+    """Return an ASGI application with the given endpoints and the static files of the page."""
     mimetypes.add_type("text/javascript", ".js")  # some systems map it to another type
     pairs = ((*where.split(), endpoint) for where, endpoint in table)
     routes = [Route(path, endpoint, methods=[method]) for method, path, endpoint in pairs]

@@ -1,4 +1,4 @@
-"""Guard of the server: requires the token, and rejects requests from other sites.
+"""Protection of the local web server: requires a token, and rejects requests from other sites.
 
 Pages of other sites can send requests to this machine: through a name for it (DNS rebinding), as a
 form, as a picture. Therefore the host, the origin and the browser's site header are checked first.
@@ -37,7 +37,7 @@ _ALWAYS: Final = {
 
 
 class Guard:
-    """Application behind a token; see the module.
+    """ASGI application that forwards a request only with a valid token, host and origin.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Guard:
         self._app, self._token, self._hosts, self._cookie = app, token, hosts, cookie
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Forward or reject a request."""
+        """Forward a request to the protected application, or reject it."""
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
@@ -72,7 +72,10 @@ class Guard:
         await (answer or self._app)(scope, receive, sent)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """Return a response that rejects or logs in a request; ``None`` if it may pass."""
+        """Return the response that rejects a request or sets the login cookie.
+
+        ``None`` means that the request may pass.
+        """
         asked = HTTPConnection(scope)
         headers = asked.headers
         host = headers.get("host", "")
@@ -102,7 +105,7 @@ class Guard:
 
 
 def host_of(name: str, port: int | None) -> str:
-    """Return a host name or address with a port, as browsers send it."""
+    """Return a host name or address with a port, in the form of the HTTP header ``Host``."""
     return f"[{name}]:{port}" if ":" in name else f"{name}:{port}"
 
 

@@ -1,4 +1,4 @@
-"""Live page of a monitor: frames on arrival, states of checks and patterns, and truth lanes of matches.
+"""Web page of a running monitor: current frames, states of checks and patterns, and truth lanes of matches.
 
 The monitor passes each frame to a :class:`LiveRun`. It keeps the last frames as sent messages, and
 the graphs of the last few seconds, so that the page can show the parts of a match around its time.
@@ -76,7 +76,7 @@ ASKED: Final = {
 
 
 class LiveRun:
-    """Messages for the page of a monitor.
+    """Messages of a running monitor for its web page, with the last frames and their graphs.
 
     Parameters
     ----------
@@ -103,11 +103,11 @@ class LiveRun:
         self._origin: tuple[float, float] | None = None
 
     def follow(self, monitor: Monitor) -> None:
-        """Set the monitor; call it before the first frame."""
+        """Set the monitor whose data the page shows; required before the first frame."""
         self._monitor = monitor
 
     def event(self, event: MonitorEvent) -> None:
-        """Add an event; it is sent with its frame."""
+        """Add an event of the monitor, which is sent to the page with the next frame."""
         told = {name: getattr(event, name) for name in _OF_EVENTS}
         told |= {"first": event.start.seq, "start": event.start.t}
         told |= {"last": event.end.seq, "end": event.end.t}
@@ -115,7 +115,7 @@ class LiveRun:
             self._events.append(finite(told))
 
     def step(self, here: FrameTime, graphs: Sequence[SceneGraph]) -> None:
-        """Add a frame with its graphs; of several egos the first one is shown."""
+        """Send a frame and its events to the page. With several egos, the page shows the first one."""
         graph, monitor = graphs[0], self._monitor
         with self._lock:
             if self._origin is None:
@@ -131,7 +131,7 @@ class LiveRun:
             self._recent.add(here, graph, self.name if monitor is None else monitor.trace)
 
     def end(self, verdicts: Sequence[Verdict]) -> None:
-        """Add the verdicts after the last frame."""
+        """Send the verdicts of all checks to the page, after the last frame."""
         with self._lock:
             listed = [[one.check, one.verdict, len(one.violations), one.reason] for one in verdicts]
             told = {"verdicts": listed, "events": self._events}
@@ -154,7 +154,7 @@ class LiveRun:
         return found
 
     def _new_still(self, things: Things) -> list[list[Any]]:
-        """Return new static entities: node, kind, x, y, heading, length, width."""
+        """Return static entities that the page does not know yet: node, kind, x, y, heading, length, width."""
         x, y = self._origin or (0.0, 0.0)
         new = [n for n, about in things.items() if about["is_static"] and n not in self._still]
         for node in new:
@@ -166,7 +166,7 @@ class LiveRun:
         return [self._still[node] for node in new]
 
     def about(self) -> dict[str, Any]:
-        """Return the description for the page, like a store with one trace."""
+        """Return the description of the live run for the page, in the form of a store with one trace."""
         key, cameras = "live" * self._has_map, [] if self._cameras is None else self._cameras.topics
         trace = {"name": self.name, "frames": 0, "seconds": 0.0, "period": 0.0, "map": ""}
         trace |= {"map_key": key, "origin": self._origin or (0.0, 0.0), "cameras": [*cameras]}
@@ -179,11 +179,11 @@ class LiveRun:
         return {**told, "writing": False, "checks": checks, "patterns": patterns}
 
     def map(self) -> bytes:
-        """Return the outlines of the road map; empty without a map."""
+        """Return the outlines of the road map as bytes; empty without a map."""
         return self._map
 
     def parts(self, text: str, binding: Mapping[str, int] | None) -> dict[str, Any]:
-        """Return the truth lanes of a match, over the frames with kept graphs; later frames continue them.
+        """Return, for each part of a pattern, the recent frames in which it is true for one match.
 
         Raises
         ------
@@ -197,7 +197,7 @@ class LiveRun:
             return {**match.lanes(self.name, self._gone).as_dict(), "known": known}
 
     def series(self, attribute: str, node: int, other: int | None = None) -> bytes:
-        """Return an attribute over the frames with kept graphs, as the explorer; later frames continue it.
+        """Return the values of an attribute in the recent frames, as binary columns.
 
         Raises
         ------
@@ -209,7 +209,7 @@ class LiveRun:
         return packed({"trace": self.name, "attribute": attribute}, columns)
 
     def picture(self, seq: int, channel: str) -> tuple[bytes, str]:
-        """Return the camera picture of a frame with its type; empty without a picture.
+        """Return the camera picture of a frame, with its media type; empty without a picture.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class LiveRun:
         return shown_picture(self._cameras.at(seq, channel), channel)
 
     def frame(self, seq: int) -> dict[str, Any]:
-        """Return the scene graph of a frame, in the form of the explorer.
+        """Return the scene graph of a recent frame as JSON values.
 
         Raises
         ------
@@ -233,7 +233,7 @@ class LiveRun:
         return told_graph(self._kept(seq).graph)
 
     def why(self, text: str, seq: int) -> dict[str, Any]:
-        """Return the first part of a pattern that fails in a frame, in the form of the explorer.
+        """Return the first part of a pattern that fails in a recent frame, as JSON values.
 
         Raises
         ------
@@ -255,19 +255,19 @@ class LiveRun:
             return self._recent.view(seq)
 
     def _hello(self) -> tuple[int, bytes]:
-        """Return the number of the first kept message, and the initial message for a page."""
+        """Return the number of the oldest stored message, and the first message for a newly opened page."""
         with self._lock:
             told = {"about": self.about(), "names": self._names, "still": [*self._still.values()]}
             return self._gone, b"event: hello\ndata: " + as_json(told) + b"\n\n"
 
     def _since(self, number: int) -> tuple[int, list[bytes]]:
-        """Return the kept messages from a number on, and the number of the next message."""
+        """Return the stored messages from a message number on, and the number of the next message."""
         with self._lock:
             found = list(islice(self._sent, max(number - self._gone, 0), None))
             return self._gone + len(self._sent), found
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield server-sent events: all kept messages, then each frame on arrival."""
+        """Yield server-sent events for the page: all stored messages, then each frame on arrival."""
         number, hello = self._hello()
         yield hello
         while True:
@@ -278,7 +278,7 @@ class LiveRun:
 
 
 def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
-    """Return the ASGI application of a monitor, behind a token; see ``application``."""
+    """Return the ASGI application with the page of a monitor. Its requests need a token."""
 
     async def ask(request: Request, name: str, fields: Sequence[str]) -> Response:
         told = taken(await fields_of(request), *fields)
@@ -296,7 +296,7 @@ def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: s
 
 
 def _columns(things: Things, ego: int | None, origin: tuple[float, float]) -> dict[str, Any]:
-    """Return the states of moving entities as columns for the page."""
+    """Return the states of the moving entities in a frame as columns for the page."""
     moving = {node: about for node, about in things.items() if not about["is_static"]}
     columns = {name: [a.get(name, math.nan) for a in moving.values()] for name in _STATES}
     for name, place in zip("xy", origin, strict=True):
@@ -311,7 +311,7 @@ def _columns(things: Things, ego: int | None, origin: tuple[float, float]) -> di
 
 
 def _origin_of(graph: SceneGraph) -> tuple[float, float]:
-    """Return an origin near the entities, so that coordinates fit into 32 bits."""
+    """Return a point near the entities as the origin, so that 32-bit coordinates are exact enough."""
     places = [a for n, a in graph.nodes.items() if n >= 0]
     first = graph.nodes[graph.ego] if graph.ego is not None else next(iter(places), {})
     return float(round(first.get("x", 0.0))), float(round(first.get("y", 0.0)))

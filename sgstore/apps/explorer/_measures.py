@@ -1,4 +1,4 @@
-"""Longer tasks of the page: coverage, marked clips as a test set, comparison of two stores.
+"""Long tasks of the explorer page: coverage, export or lock of selected clips, comparison of two stores.
 
 Each function implements the task of its name, with the fields as parameters.
 """
@@ -55,7 +55,7 @@ def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
 
 
 def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
-    """Return the size of clips, and the share of the store's classes that they keep.
+    """Return the length of the selected clips, and the share of the scene classes of the store in them.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
 
 
 def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
-    """Write a lock of clips."""
+    """Write the selected clips as a lock file (list of test cases with checksums)."""
     path = Path(to if to.endswith(".lock") else f"{to}.lock")
     with store.file.snapshot():
         found = _frames(store, clips)
@@ -87,7 +87,7 @@ def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
 
 
 def export(store: Store, clips: Clips, to: str, format: str) -> dict[str, Any]:
-    """Export clips in a format."""
+    """Export the selected clips into a folder, in a file format."""
     with store.file.snapshot():
         times = [(clip[0], store.file.log_times(*clip)) for clip in clips]
     cut = tuple(Clip(trace, int(log.min()), int(log.max())) for trace, log in times)
@@ -98,7 +98,7 @@ def export(store: Store, clips: Clips, to: str, format: str) -> dict[str, Any]:
 
 
 def diff(store: Store, other: str, abstraction: str) -> dict[str, Any]:
-    """Return the differing scenes and frames of two stores."""
+    """Return the scenes and frames in which two stores differ."""
     with Store(other) as second:
         a, b = (classed(ChosenFrames(s.file.path.name, s), abstraction) for s in (store, second))
         return {"result": {"scenes": _table(scenes(a, b)), "frames": _table(by_frame(a, b))}}
@@ -109,7 +109,7 @@ def _done(done: int, whole: int) -> None:
 
 
 def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], Any, float]]:
-    """Yield separate clips, each with the ids of its frames and its length in seconds."""
+    """Yield clips without overlaps, each with the ids of its frames and its length in seconds."""
     traces = {one.name: one for one in store.traces()}
     for trace, first, last in _apart(clips):
         of = traces.get(trace) or store.file.trace(
@@ -122,7 +122,7 @@ def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], 
 
 
 def _apart(clips: Clips) -> list[tuple[str, int, int]]:
-    """Sort clips by trace and time, and merge overlapping or adjacent ones."""
+    """Return clips sorted by trace and time, with overlapping or adjacent clips merged."""
     found: list[tuple[str, int, int]] = []
     for trace, first, last in sorted(clips):
         if found and found[-1][0] == trace and first <= found[-1][2] + 1:
@@ -133,6 +133,6 @@ def _apart(clips: Clips) -> list[tuple[str, int, int]]:
 
 
 def _table(of: ReportTable) -> dict[str, Any]:
-    """Return a table for the page, with the total number of rows."""
+    """Return a result table as JSON values for the page, with the total number of rows."""
     rows = finite(of.rows[:MOST_ROWS])
     return {"columns": of.columns, "rows": rows, "of": len(of.rows), "said": of.said}

@@ -1,4 +1,4 @@
-"""Validation of the page's requests, before a store is read."""
+"""Validation of the fields of a request from the web page, before a store is read."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LEAST_NODE: Final = -(1 << 31)
 
 
 class RequestError(SgstoreError):
-    """Invalid request.
+    """Error for an invalid request of the web page, with an HTTP status.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class RequestError(SgstoreError):
 
 
 async def fields_of(request: Request) -> dict[str, Any]:
-    """Return the fields of a JSON body; for GET those of the address.
+    """Return the fields of a request: of its JSON body, or for GET of its address.
 
     Raises
     ------
@@ -74,12 +74,12 @@ async def fields_of(request: Request) -> dict[str, Any]:
 
 
 def taken(fields: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """Return validated values by name (:data:`FIELDS`), with defaults from :data:`USUAL`."""
+    """Return the named fields of a request after validation (:data:`FIELDS`), with default values."""
     return {name: FIELDS[name](fields.get(name, USUAL.get(name)), name) for name in names}
 
 
 def one_of(*words: str) -> Callable[[object, str], str]:
-    """Return the validator of a field with fixed words; the first is the default."""
+    """Return a function that validates a request field with fixed words; the first word is the default."""
 
     def read(value: object, name: str) -> str:
         if value not in (None, *words):
@@ -100,7 +100,7 @@ def _text(value: object, name: str) -> str:
 
 
 def _parameters(value: Any, _: str) -> dict[str, Any]:
-    """Validate values of ``$name``: numbers, texts, truth values, lists of these."""
+    """Return the validated values of query parameters: numbers, texts, truth values, or lists of these."""
     found = value or {}
     if not isinstance(found, dict) or len(found) > 100:
         raise RequestError("parameters: expected an object")
@@ -112,7 +112,7 @@ def _parameters(value: Any, _: str) -> dict[str, Any]:
 
 
 def _binding(value: Any, _: str) -> dict[str, int] | None:
-    """Validate node ids by variable; ``None`` if the field is missing."""
+    """Return validated node ids by variable name. ``None`` means that the field is missing."""
     if value is None:
         return None
     if not isinstance(value, dict) or len(value) > 1000:
@@ -121,7 +121,7 @@ def _binding(value: Any, _: str) -> dict[str, int] | None:
 
 
 def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
-    """Validate lists of a trace and frame numbers."""
+    """Return validated rows of a request field: a trace name, followed by frame numbers."""
     if not isinstance(rows, list) or len(rows) > MOST_ITEMS:
         raise RequestError(f"{name}: expected a list of at most {MOST_ITEMS}")
     for row in rows:
@@ -131,7 +131,7 @@ def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
 
 
 def _clips(value: object, name: str) -> list[tuple[Any, ...]]:
-    """Validate clips: trace, first and last number."""
+    """Return validated clips: trace name, number of the first frame, number of the last frame."""
     found = _spans(value, name, 3)
     if any(first > last for _, first, last in found):
         raise RequestError("clips: one ends before it begins")

@@ -1,4 +1,4 @@
-"""Server program: an address with a token, ended by Ctrl-C."""
+"""Start of the local web server: it prints an address with a token, and Ctrl-C ends it."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def serve(
     browse: bool = False,
     on_start: Callable[[str], None] = print,
 ) -> None:
-    """Serve the explorer of a store until this process is interrupted.
+    """Serve the explorer page of a store until the user interrupts the process.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def serve(
 def serve_live(
     run: LiveRun, *, port: int = 0, browse: bool = False, on_start: Callable[[str], None] = print
 ) -> Generator[None]:
-    """Serve the page of a monitor on this machine until the end of the block.
+    """Serve the page of a monitor on this machine until the end of the ``with`` block.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def _begun(
     port: int,
     told: Iterable[Callable[[str], object]],
 ) -> Generator[tuple[uvicorn.Server, socket.socket]]:
-    """Yield a server of an application and its socket, and report its address."""
+    """Yield a web server with its socket, and report its address to the user."""
     with _listening(host, port) as listening:
         number = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)

@@ -1,4 +1,4 @@
-"""Reads of a store by trace and frame: columns of states, maps, pictures, graphs, words.
+"""Reader of a store for the web page: states, maps, pictures and graphs, by trace and frame.
 
 :data:`READS` has their fields.
 """
@@ -53,7 +53,7 @@ _PICTURES: Final = "jpeg", "png", "webp", "bmp"
 
 
 class Reads:
-    """Reader of one store for the page.
+    """Reader of one store for the web page.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Reads:
         self._reading, self._looking = threading.Lock(), threading.Lock()
 
     def _traces(self) -> tuple[dict[str, StoredTrace], dict[str, Any]]:
-        """Return traces by name, and the page's store description; cached while the file stays."""
+        """Return the traces of the store by name, and its description for the page. Both are cached."""
         with self._looking:  # after a change one thread reads, and the others wait
             catalog = self._store.catalog()
             if self._known is None or self._known[0] is not catalog:
@@ -87,11 +87,11 @@ class Reads:
         return {"store": file.path.name, "traces": listed, "codes": file.codes()}
 
     def about(self) -> dict[str, Any]:
-        """Return the traces of the store, and the names of codes in columns."""
+        """Return the traces of the store, and the kind and light names of the codes in binary columns."""
         return self._traces()[1]
 
     def frame_id(self, trace: str, seq: int) -> int:
-        """Return the id of a frame.
+        """Return the id of a frame, from its trace and its number.
 
         Raises
         ------
@@ -105,7 +105,7 @@ class Reads:
         return _among(self._traces()[0], name)
 
     def thumbs(self, frames: Sequence[tuple[str, int]]) -> bytes:
-        """Return states in some frames, for thumbnails."""
+        """Return the states of all entities in the given frames as bytes, to draw thumbnails."""
         if len(frames) > MOST_THUMBS:
             raise RequestError(f"frames: expected at most {MOST_THUMBS}")
         traces = self._traces()[0]  # read once, because the store may change
@@ -113,7 +113,7 @@ class Reads:
         return packed({}, self._store.file.states_at(of))
 
     def states(self, trace: str, first: int, last: int) -> bytes:
-        """Return states in a window of frames: ``frame.…`` columns per frame, the others per state."""
+        """Return the states of all entities in a range of frames, as binary columns."""
         frames, states = self._store.file.states(self._trace(trace).trace_id, first, last)
         # Start of the states of each frame, so that the page need not search.
         start = np.searchsorted(states.pop("seq"), [*frames["seq"].tolist(), 1 << 31])
@@ -122,7 +122,7 @@ class Reads:
         return packed({"trace": trace, "first": first, "last": last}, columns | states)
 
     def static(self, trace: str) -> bytes:
-        """Return static entities of a trace, and the names of all entities, as bytes."""
+        """Return the static entities of a trace, and the names of all entities, as bytes."""
         of = self._trace(trace).trace_id
         with self._store.file.snapshot():
             names = self._store.file.entity_names(of)
@@ -130,7 +130,7 @@ class Reads:
         return packed({"trace": trace, "names": names}, columns)
 
     def map(self, trace: str) -> bytes:
-        """Return the outlines of the road map of a trace; empty without a map."""
+        """Return the outlines of the road map of a trace as bytes; empty without a map."""
         key = _among(self._store.file.places(), trace)[2]
         with self._reading:  # one map at a time, so that it is not read twice
             if key not in self._maps:
@@ -139,7 +139,7 @@ class Reads:
             return self._maps[key]
 
     def warm(self, ended: threading.Event) -> None:
-        """Read the maps before the first request, until ``ended`` is set."""
+        """Read all road maps of the store before the first request. The event ``ended`` stops the reading."""
         with suppress(SgstoreError):
             for trace in self._traces()[0]:
                 if ended.is_set():
@@ -147,7 +147,7 @@ class Reads:
                 self.map(trace)
 
     def series(self, trace: str, attribute: str, node: int, other: int | None) -> bytes:
-        """Return an attribute over time."""
+        """Return the values of an attribute of one or two entities over time, as bytes."""
         columns = self._store.file.series(self._trace(trace).trace_id, attribute, node, other)
         return packed({"trace": trace, "attribute": attribute}, columns)
 
@@ -156,7 +156,7 @@ class Reads:
         return told_graph(self._store.file.graph(self.frame_id(trace, seq)))
 
     def picture(self, trace: str, seq: int, channel: str) -> tuple[bytes, str]:
-        """Return the recorded camera picture of a frame, and its type.
+        """Return the recorded camera picture of a frame, with its media type.
 
         Raises
         ------
@@ -166,11 +166,11 @@ class Reads:
         return shown_picture(self._store.file.carried(self.frame_id(trace, seq), channel), channel)
 
     def words(self) -> dict[str, Any]:
-        """Return the words of the language for completion."""
+        """Return the words of the query language that the editor completes."""
         return words(self._store.catalog())
 
     def library(self) -> list[dict[str, Any]]:
-        """Return the named patterns with their drawings."""
+        """Return the patterns of the library, each with a drawing."""
         names = ("name", "kind", "text", "sentence", "library")
         return [
             {name: getattr(one, name) for name in names} | {"drawing": one.example}
@@ -179,14 +179,14 @@ class Reads:
 
 
 def _among(traces: Mapping[str, T], name: str) -> T:
-    """Return the entry of a trace by its full name."""
+    """Return the entry of a mapping by trace name, or raise an error for an unknown trace."""
     if name not in traces:
         raise StoreError(f"no trace {name!r} in the store")
     return traces[name]
 
 
 def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
-    """Return a picture that browsers can show, with its type; empty without a picture."""
+    """Return a picture in a format of browsers, with its media type; empty without a picture."""
     if media is None:
         return b"", "application/octet-stream"
     if media.form not in _PICTURES:
@@ -195,7 +195,7 @@ def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
 
 
 def drawn_map(road_map: RoadMap | None) -> bytes:
-    """Return the outlines of a map; empty without a map."""
+    """Return the outlines of a road map as bytes; empty without a map."""
     if road_map is None:
         return packed({"origin": [0, 0], "words": []}, {})
     drawn = DrawnOutlines.of(road_map)

@@ -1,4 +1,4 @@
-"""Binary columns, which the page uses as typed arrays without copying; and JSON for browsers.
+"""Binary format of columns, which the page reads as typed arrays without copying; and JSON for browsers.
 
 ``u32 length of the header, u32 0``, the header as JSON padded to 8 bytes, then each column, little-endian,
 padded to 8 bytes. The header names the columns with their types and lengths under ``columns``.
@@ -25,7 +25,7 @@ PAGE: Final = Path(__file__).parent / "page"
 
 
 def packed(header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> bytes:
-    """Pack a header and columns into bytes.
+    """Return a header and binary columns packed into bytes, for the web page.
 
     Parameters
     ----------

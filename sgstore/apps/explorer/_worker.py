@@ -1,4 +1,4 @@
-"""Queries of the explorer's page, run in a sandbox process.
+"""Queries of the web page, run in a sandbox process.
 
 A query has ``ask``, a key of :data:`QUESTIONS`, and its parameters: ``text``, ``parameters``,
 ``frame``, …. Replies are sent when they are ready; a reply with ``more`` is followed by others.
@@ -28,7 +28,7 @@ BATCH_ROWS: Final = 500
 
 
 def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Yield the columns and the traces that cannot answer, then intervals with bindings in batches."""
+    """Yield the replies to a pattern query: columns and traces that cannot answer, then batches of matches."""
     with store.file.snapshot():
         matches = store.find(question["text"], **question["parameters"])
         names, found = tuple[str, ...](), list[list[Any]]()
@@ -67,7 +67,7 @@ def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Repl
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Yield the first part that fails in a frame, and changed numbers with which it would hold."""
+    """Yield the first part of a pattern that fails in a frame, and numbers with which it would not fail."""
     text, values, frame = question["text"], question["parameters"], question["frame"]
     answer = store.why_not(frame, text, **values)
     steps = answer.steps if isinstance(answer, WhyNotSteps) else (answer,)
@@ -87,7 +87,7 @@ def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]
 
 
 def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Yield verdicts of checks, with the violations of each trace."""
+    """Yield the verdicts of checks for each trace, with their violations."""
     run = store.check(question["text"], **question["parameters"])
     many, verdicts = 0, list[Reply]()
     for verdict in run:
@@ -105,7 +105,7 @@ def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[R
 
 
 def _measured(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Yield the result of coverage, a selection, or a clip task, after its progress."""
+    """Yield the progress of a long task (coverage, selection, export), then its result."""
     from sgstore.apps.explorer import _measures  # not needed by the others
 
     yield getattr(_measures, question.pop("ask"))(store, **question)
@@ -124,7 +124,7 @@ QUESTIONS: Final[Mapping[str, Asked]] = {
 
 
 def answer(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Yield replies to a query."""
+    """Yield the replies of the sandbox process to a query of the web page."""
     return QUESTIONS[question["ask"]](store, question, most)
 
 
