@@ -1,1 +1,1 @@
-"""Road maps: their formats, and look-ups of lanes and junctions."""
+"""Road maps: readers of map formats, and look-ups of lanes and junctions."""

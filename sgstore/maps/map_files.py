@@ -1,4 +1,4 @@
-"""Road maps of recordings: their own map, a file of the caller, or a file of a folder by name."""
+"""Choice of the road map for a recording: its own map, a given file, or a file of a folder by name."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ENCODING: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-
 
 
 def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
-    """Read a road map file; ``signs`` as in :func:`sgstore.maps.opendrive.read_map`.
+    """Read a road map file (OpenDRIVE, Lanelet2, SUMO network or lane text).
 
     Points of a Lanelet2 map use ``local_x`` and ``local_y``. Without them,
     ``map_projector_info.yaml`` in the same folder defines the projection, as in Autoware; the
@@ -73,7 +73,7 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _unpacked(path: Path) -> bytes:
-    """Return the bytes of a file, decompressed if it is gzip, as SUMO networks can be."""
+    """Return the bytes of a file, decompressed if it is gzip, like some SUMO networks."""
     content = path.read_bytes()
     if content[:2] != b"\x1f\x8b":
         return content
@@ -85,7 +85,7 @@ def _unpacked(path: Path) -> bytes:
 
 
 def _projection(path: Path) -> Projection | None:
-    """Read the projection file next to a map; ``None`` means no file."""
+    """Read the projection file next to a Lanelet2 map; ``None`` without such a file."""
     try:
         text = path.read_text(encoding="utf-8-sig")[:_LOOKED_AT]
     except FileNotFoundError:
@@ -108,7 +108,7 @@ def _decoded(content: bytes) -> str:
 
 
 class Maps:
-    """Road maps of the recordings of a run; each is read once.
+    """Road maps for the recordings of one ingest. Each map is read once.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ class Maps:
         self._given = read_map_file(given, signs) if given is not None and one_file else None
 
     def of(self, info: TraceInfo) -> tuple[RoadMap | None, list[str]]:
-        """Return the map of a recording, and warnings.
+        """Return the road map for a recording, and warnings about the choice.
 
         Its own OpenDRIVE has priority, then the map of the caller, then plain lanes of the
         recording.
@@ -167,7 +167,7 @@ class Maps:
         return self._read[text]
 
     def _named(self, name: str, warnings: list[str]) -> RoadMap | None:
-        """Find the map of this name in the folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
+        """Find the map file for a map name in a folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
         if self._folder is None:
             return None
         stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)
@@ -195,12 +195,12 @@ class Maps:
 
 
 def lost_lanes(info: TraceInfo, road_map: RoadMap | None) -> list[Loss]:
-    """Return losses for the unusable lanes of a recording, unless another map replaces them."""
+    """Return reports of the unusable lanes of a recording's map, unless another map replaces it."""
     if road_map is not None and road_map.text != info.map_text:
         return []
     return [Loss(reason, 0, 0) for reason in info.lost_lanes]
 
 
 def _is_opendrive(text: str) -> bool:
-    """True if a text is XML; plain lanes are another format."""
+    """Return True if a map text is XML, so OpenDRIVE; the lane text format is JSON."""
     return text[:100].lstrip("\ufeff \t\r\n").startswith("<")

@@ -1,4 +1,4 @@
-"""Reader of SUMO networks (``.net.xml``), which converts them to text of plain lanes.
+"""Reader of SUMO networks (``.net.xml``), which converts them to the lane text format of sgstore.
 
 A lane is a line with a width; lane 0 of an edge is its rightmost. Lanes inside a junction
 (``:J0_1_0``) are lanes of that junction. Crossings become crosswalks; walking areas are skipped.
@@ -70,7 +70,7 @@ class _SumoEdge:
 
 @dataclass(slots=True)
 class _SumoNet:
-    """Content of a network: edges, connections, positions of junctions, opposite lanes."""
+    """Contents of a SUMO network file: edges, connections, junction positions, traffic light phases."""
 
     edges: list[_SumoEdge] = field(default_factory=list[_SumoEdge])
     connections: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
@@ -84,7 +84,7 @@ class _SumoNet:
     logic: str = ""
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """Handle the start of an element."""
+        """Handle the start tag of an XML element."""
         self.depth += 1
         if self.depth == 1 and tag != "net":
             raise MapError(f"the root element is <{tag[:80]}>, expected <net>")
@@ -109,18 +109,18 @@ class _SumoNet:
             self.beside[self.edges[-1].lanes[-1].get("id", "")] = attributes.get("lane", "")
 
     def end(self, _tag: str) -> None:
-        """Handle the end of an element."""
+        """Handle the end tag of an XML element."""
         self.depth -= 1
 
 
 def is_sumo_net(text: str) -> bool:
-    """True if a text is a SUMO network, by its first elements."""
+    """Return True if a text is a SUMO network, by its first XML elements."""
     start = text[:_LOOKED_AT]
     return "<net " in start and ("<location " in start or "<edge " in start)
 
 
 def sumo_net_text(text: str) -> str:
-    """Convert a SUMO network to the text of plain lanes (:func:`sgstore.maps.roads.lane_text`).
+    """Convert a SUMO network to the lane text format of sgstore.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def sumo_net_text(text: str) -> str:
 
 
 def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[PlainCrosswalk]]:
-    """Return lanes by their ids, and crosswalks."""
+    """Return the lanes of a SUMO network by id, and its crosswalks."""
     lines: dict[str, LaneLine] = {}
     crosswalks: list[PlainCrosswalk] = []
     points = 0
@@ -190,7 +190,7 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
 
 
 def _around(net: _SumoNet) -> dict[tuple[str, str], str]:
-    """Map nodes and edges of roundabouts to a name: the id of the first node."""
+    """Return the name of the roundabout for each SUMO node and edge in a roundabout."""
     found: dict[tuple[str, str], str] = {}
     for one in net.roundabouts:
         nodes = one.get("nodes", "").split()
@@ -205,13 +205,13 @@ def _crosswalk(ident: str, sections: Sections) -> PlainCrosswalk:
 
 
 def _side(sections: Sections, *, left: bool) -> Border:
-    """Return a border that allows lane changes in both directions, as on SUMO edges."""
+    """Return a lane border that allows lane changes in both directions, as on SUMO edges."""
     line = sections.left if left else sections.right
     return Border(np.column_stack((line, sections.z)), to_left=True, to_right=True)
 
 
 def _set_beside(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> None:
-    """Register the lanes of an edge as neighbours; the next index is on the left."""
+    """Record the lanes of a SUMO edge as neighbours. The lane with the next index is on the left."""
     idents = [lane.get("id", "") for lane in edge.lanes]
     for right, left in pairwise(idents):
         if right in lines and left in lines:
@@ -223,7 +223,7 @@ def _set_beside(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> N
 
 
 def _with_opposites(net: _SumoNet, lines: dict[str, LaneLine]) -> dict[str, LaneLine]:
-    """Register the leftmost lanes of opposite edges as neighbours, if they touch."""
+    """Record the leftmost lanes of opposite SUMO edges as neighbours, if they touch."""
     back: dict[tuple[str, str], list[_SumoEdge]] = defaultdict(list)
     for edge in net.edges:
         if not edge.function and edge.lanes:
@@ -247,7 +247,7 @@ def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
 
 
 def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
-    """Add predecessors and successors to lanes, through the junction if it has lanes."""
+    """Return SUMO lanes with predecessors and successors, also through junctions with inner lanes."""
     after: dict[str, list[Joint]] = defaultdict(list)
     before: dict[str, list[Joint]] = defaultdict(list)
     for told in net.connections:
@@ -264,7 +264,7 @@ def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
 
 
 def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -> list[PlainSignal]:
-    """Return traffic lights, one for all lanes of a junction with the same link states."""
+    """Return the traffic lights of a SUMO network: one for all lanes of a junction with equal states."""
     links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
     for told in net.connections:
         name, number = told.get("tl", ""), told.get("linkIndex", "0")
@@ -285,7 +285,7 @@ def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -
 
 
 def _type(lane: dict[str, str]) -> str:
-    """Return the type of a lane by its permitted vehicle classes."""
+    """Return the lane type from the vehicle classes that a SUMO lane permits."""
     allowed = {*lane.get("allow", "").split()}
     if not allowed and _NONE in lane.get("disallow", "").split():
         return "none"
@@ -298,7 +298,7 @@ def _type(lane: dict[str, str]) -> str:
 
 
 def _shape(text: str) -> Floats:
-    """Parse the points (n, 3) of a line; empty for an invalid line."""
+    """Parse the points (n, 3) of a SUMO line; empty for an invalid line."""
     try:
         points = [[float(number) for number in point.split(",")] for point in text.split()]
         line = np.array([(*point, 0.0)[:3] for point in points], np.float64).reshape(-1, 3)

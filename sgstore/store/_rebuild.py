@@ -203,7 +203,7 @@ class _TableReader:
         self._tables = {one[2] for one in objects if one[:2] == ("table", self._schema)}
 
     def has(self, table: str) -> bool:
-        """True if the store has the table."""
+        """Return True if the store has the table."""
         return table in self._tables
 
     def rows(self, table: str, columns: str, *, needed: bool = False) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Conversion of OpenStreetMap XML to points in metres, ways and relations."""
+"""Parser of OpenStreetMap XML (Lanelet2 maps) into points in metres, ways and relations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NODE_TAGS: Final = ("ele", "local_x", "local_y")
 
 @dataclass(slots=True)
 class OsmElement:
-    """Node, way or relation; ``members`` has type, id and role of each member, or a way's nodes."""
+    """Element of an OpenStreetMap file: node, way or relation, with its tags and members."""
 
     kind: str
     ident: str
@@ -33,13 +33,13 @@ class OsmElement:
     place: tuple[str, str] = ("", "")
 
     def members_of(self, role: str, kind: str = "way") -> list[str]:
-        """Return the ids of the members with this role."""
+        """Return the ids of the members of a relation that have a role, such as ``left``."""
         return [ref for what, ref, own in self.members if own == role and what == kind]
 
 
 @dataclass(slots=True)
 class OsmDocument:
-    """Map as lines (n, 3) by way id, with their nodes and tags, and the relations."""
+    """Contents of an OpenStreetMap file: ways as lines (n, 3) of points in metres, and relations."""
 
     lines: dict[str, Floats]
     nodes: dict[str, list[str]]
@@ -49,7 +49,7 @@ class OsmDocument:
 
 
 def read_osm(text: str, projection: Projection) -> OsmDocument:
-    """Parse the points, ways and relations of a text.
+    """Parse an OpenStreetMap text into ways (lines of points in metres) and relations.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
 
 
 def _places(nodes: list[OsmElement], projection: Projection, warnings: list[str]) -> Floats:
-    """Return places (n, 3) of nodes: ``local_x`` and ``local_y`` if complete, else projected."""
+    """Return positions (n, 3) of OpenStreetMap nodes: ``local_x`` and ``local_y``, or projected degrees."""
     if not nodes:
         return np.zeros((0, 3))
     height, x, y = (
@@ -122,7 +122,7 @@ def _number(text: str) -> float:
 
 
 class _OsmBuilder:
-    """Handler of XML events; skips elements that an editor marks as deleted."""
+    """Handler of XML parser events that builds an OpenStreetMap document, without deleted elements."""
 
     def __init__(self) -> None:
         self.elements: list[OsmElement] = []
@@ -130,7 +130,7 @@ class _OsmBuilder:
         self._open: OsmElement | None = None
 
     def start(self, tag: str, attributes: dict[str, Any]) -> None:
-        """Handle the start of an element."""
+        """Handle the start tag of an XML element."""
         self._depth += 1
         if self._depth == 1 and tag != "osm":
             raise MapError(f"the root element is <{tag[:80]}>, expected <osm>")
@@ -152,5 +152,5 @@ class _OsmBuilder:
                 self._open.members.append((kind, ref, role))
 
     def end(self, _tag: str) -> None:
-        """Handle the end of an element."""
+        """Handle the end tag of an XML element."""
         self._depth -= 1

@@ -1,4 +1,4 @@
-"""Lanelets as plain lanes: centre lines, borders, joints and neighbours."""
+"""Conversion of Lanelet2 lanelets to lanes: centre lines, borders, successors and neighbours."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ SHORTEST: Final = 0.01
 
 
 class LaneletShape(NamedTuple):
-    """Lanelet between two lines, both in its own direction, with their first and last nodes."""
+    """Lanelet with its left and right border, both in driving direction."""
 
     element: OsmElement
     left: Floats
@@ -86,7 +86,7 @@ class LaneletShape(NamedTuple):
 
 
 def read_lanelets(document: OsmDocument) -> dict[str, LaneletShape]:
-    """Return lanelets by id; a lanelet without two borders is left out with a warning."""
+    """Return the lanelets of a map by id. A lanelet without two borders is skipped with a warning."""
     found: dict[str, LaneletShape] = {}
     broken: list[str] = []
     for ident, element in document.relations.items():
@@ -115,7 +115,7 @@ def read_lanelets(document: OsmDocument) -> dict[str, LaneletShape]:
 
 
 def roundabout_names(document: OsmDocument) -> dict[str, str]:
-    """Map each lanelet of a roundabout to Autoware's regulatory element."""
+    """Return the roundabout of each lanelet that is in a roundabout: lanelet id → roundabout id."""
     return {
         lanelet: ident[:MAX_NAME]
         for ident, element in document.relations.items()
@@ -126,7 +126,7 @@ def roundabout_names(document: OsmDocument) -> dict[str, str]:
 
 
 def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
-    """Return for each border True if it runs against the lanelet's direction."""
+    """Return, for the left and right border, True if its points run against the lanelet's direction."""
     along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
     across = np.hypot(*(left[[0, -1]] - right[[-1, 0]])[:, :2].T).sum()
     apart = bool(along > across)
@@ -137,7 +137,7 @@ def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
 
 
 def type_of(element: OsmElement) -> str:
-    """Return the type of a lane by its subtype, or by its declared participants."""
+    """Return the lane type of a lanelet, from its subtype, else from its permitted participants."""
     subtype = element.tags.get("subtype", "")
     told = {
         key.removeprefix("participant:").partition(":")[0]
@@ -190,7 +190,7 @@ def _border(document: OsmDocument, way: str, line: Floats, *, turned: bool) -> B
 
 
 def speed_of(text: str) -> float:
-    """Parse a speed to m/s (default unit km/h); NaN for an invalid speed."""
+    """Parse a speed text to m/s (default unit km/h); NaN for an invalid text."""
     found = _SPEED.fullmatch(text.strip())
     speed = float(found[1]) * _UNITS.get((found[2] or "").lower(), 1 / 3.6) if found else 0.0
     return speed if 0 < speed < 1000 else np.nan
@@ -199,7 +199,7 @@ def speed_of(text: str) -> float:
 def with_neighbours(
     document: OsmDocument, lines: Sequence[LaneLine], lanelets: dict[str, LaneletShape]
 ) -> list[LaneLine]:
-    """Add to each lane its neighbours with a common border."""
+    """Return lanes with their left and right neighbours: lanelets that share a border."""
     users: dict[str, list[tuple[str, bool]]] = defaultdict(list)  # lane, to the left of the way
     for line in lines:
         lanelet = lanelets[line.ident]
@@ -229,7 +229,7 @@ def with_neighbours(
 def with_joints(
     document: OsmDocument, lines: Sequence[LaneLine], lanelets: dict[str, LaneletShape]
 ) -> list[LaneLine]:
-    """Add to each lane its predecessors and successors: lanes with the same end points."""
+    """Return lanes with their predecessors and successors: lanelets with common end points."""
     at: dict[tuple[str, str], list[Joint]] = defaultdict(list)
     for line in lines:
         lanelet = lanelets[line.ident]

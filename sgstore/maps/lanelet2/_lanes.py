@@ -1,4 +1,4 @@
-"""Conversion of lanelets, regulatory elements, signs and stop lines to text of plain lanes."""
+"""Conversion of a Lanelet2 map (lanelets, rules, signs, stop lines) to the lane text format of sgstore."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def lanelet2_text(text: str, projection: Projection | None = None) -> str:
-    """Convert a Lanelet2 map to the text of plain lanes (:func:`sgstore.maps.roads.lane_text`).
+    """Convert the text of a Lanelet2 map to the lane text format of sgstore.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ _AREAS: Final = {"building": "building", "vegetation": "vegetation", "traffic_is
 
 
 def _areas(document: OsmDocument) -> list[PlainObject]:
-    """Return areas without traffic by their outer borders; other areas are counted in a warning."""
+    """Return the areas without traffic (such as buildings) of a Lanelet2 map, as outlines."""
     found: list[PlainObject] = []
     left: Counter[str] = Counter()
     broken: list[str] = []
@@ -115,7 +115,7 @@ def _areas(document: OsmDocument) -> list[PlainObject]:
 
 
 def _ring(document: OsmDocument, ways: Sequence[str]) -> Floats:
-    """Return the corners (n, 3) around an area from its consecutive ways; empty for an open area."""
+    """Join consecutive ways to the outline (n, 3) of an area; empty if the outline is open."""
     pieces = [way for way in ways if way in document.lines]
     if not pieces or len(pieces) < len(ways):
         return np.zeros((0, 3))

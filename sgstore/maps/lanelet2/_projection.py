@@ -58,7 +58,7 @@ _GRID: Final = re.compile(r"(\d{1,2})[C-HJ-NP-X]([A-HJ-NP-Z])([A-HJ-NP-V])")
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """Projection from latitude and longitude to metres.
+    """Projection of latitude and longitude to map coordinates in metres.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Projection:
             raise MapError(f"grid {self.grid!r} of MGRS; expected a zone and a square, as '54SUE'")
 
     def project(self, latitude: Floats, longitude: Floats, height: Floats) -> Floats:
-        """Return places (n, 3): x to the east, y to the north, z; m. The input is in degrees."""
+        """Convert degrees and heights to map positions (n, 3): x to the east, y to the north, z; m."""
         origin = self.origin
         if self.name == "LocalCartesian" and origin is not None:
             return _tangent_plane(latitude, longitude, height, origin)
@@ -114,7 +114,7 @@ class Projection:
         return np.column_stack((x - x0, y - y0, height))
 
     def _corner(self, x: Floats, y: Floats, zone: int) -> tuple[Floats, Floats]:
-        """Return the corner, in UTM, of the MGRS square of a map."""
+        """Return the UTM coordinates of the corner of the MGRS grid square of a map."""
         grid = _GRID.fullmatch(self.grid)
         if grid is None:
             return tuple(np.floor(np.mean(v, keepdims=True) / _SQUARE) * _SQUARE for v in (x, y))  # type: ignore[return-value]
@@ -128,7 +128,7 @@ class Projection:
 
 
 def read_projector_info(text: str) -> Projection:
-    """Read the projection from a ``map_projector_info.yaml`` of Autoware.
+    """Read the map projection from Autoware's file ``map_projector_info.yaml``.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def read_projector_info(text: str) -> Projection:
 
 
 def utm_zone(latitude: float, longitude: float) -> int:
-    """Return the UTM zone of a place, 1 to 60, with the exceptions of Norway and Svalbard."""
+    """Return the UTM zone of a position, 1 to 60, with the exceptions of Norway and Svalbard."""
     if 56 <= latitude < 64 and 3 <= longitude < 12:
         return 32
     if 72 <= latitude < 84 and 0 <= longitude < 42:
@@ -164,7 +164,7 @@ def utm_zone(latitude: float, longitude: float) -> int:
 
 
 def utm(latitude: Floats, longitude: Floats, zone: int, *, south: bool) -> tuple[Floats, Floats]:
-    """Return easting and northing (n,) in a zone of UTM; m."""
+    """Convert latitude and longitude to easting and northing (n,) in a UTM zone; m."""
     x, y = transverse_mercator(latitude, longitude, zone * 6.0 - 183.0, _UTM_SCALE)
     return x + 500_000.0, y + (10_000_000.0 if south else 0.0)
 
@@ -172,7 +172,7 @@ def utm(latitude: Floats, longitude: Floats, zone: int, *, south: bool) -> tuple
 def transverse_mercator(
     latitude: Floats, longitude: Floats, meridian: float, scale: float
 ) -> tuple[Floats, Floats]:
-    """Return x and y (n,) from the equator and a meridian; m."""
+    """Project latitude and longitude to x and y (n,), from the equator and a meridian; m."""
     sine = np.sin(np.radians(latitude))
     away = np.radians((longitude - meridian + 180) % 360 - 180)
     conformal = np.sinh(np.arctanh(sine) - _E * np.arctanh(_E * sine))
@@ -188,7 +188,7 @@ def transverse_mercator(
 def _tangent_plane(
     latitude: Floats, longitude: Floats, height: Floats, origin: tuple[float, float]
 ) -> Floats:
-    """Return places (n, 3) in the tangent plane at an origin: east, north, up; m."""
+    """Convert degrees and heights to positions (n, 3) around an origin: east, north, up; m."""
     phi, lam = np.radians(origin[0]), np.radians(origin[1])
     zero = _earth_centred(np.array([origin[0]]), np.array([origin[1]]), np.zeros(1))
     away = _earth_centred(latitude, longitude, height) - zero

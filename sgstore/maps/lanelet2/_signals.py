@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Rules:
-    """Regulatory elements with their references, and their lanelets by id."""
+    """Regulatory elements (traffic rules) of a Lanelet2 map, with the lanelets that they apply to."""
 
     elements: list[tuple[OsmElement, list[str]]] = field(
         default_factory=list[tuple[OsmElement, list[str]]]
@@ -34,7 +34,7 @@ class Rules:
 
     @classmethod
     def of(cls, document: OsmDocument, lanelets: dict[str, LaneletShape]) -> Rules:
-        """Collect the regulatory elements of a map."""
+        """Collect the regulatory elements (traffic rules) of a Lanelet2 map."""
         users: dict[str, list[str]] = defaultdict(list)
         for ident, lanelet in lanelets.items():
             for element in lanelet.element.members_of("regulatory_element", "relation"):
@@ -51,7 +51,7 @@ class Rules:
         return rules
 
     def take(self, document: OsmDocument, element: OsmElement, users: list[str]) -> None:
-        """Add an element that these lanelets reference."""
+        """Add a regulatory element (traffic rule), with the lanelets that refer to it."""
         self.elements.append((element, users))
         refers = [way for way in element.members_of("refers") if way in document.lines]
         self.stop_lines += [way for way in element.members_of("ref_line") if way in document.lines]
@@ -73,7 +73,7 @@ class Rules:
 
 
 def _sign(tags: dict[str, str], element: OsmElement | None = None) -> tuple[str, str]:
-    """Return the kind of a sign and its code, such as ``de274-60``."""
+    """Return the kind of a traffic sign and its code, such as ``de274-60``."""
     code = tags.get("subtype", "")
     if element is not None and not code:
         code = element.tags.get("sign_type", "")
@@ -87,7 +87,7 @@ def _sign(tags: dict[str, str], element: OsmElement | None = None) -> tuple[str,
 def plain_signals(
     document: OsmDocument, rules: Rules, lanes: Sequence[PlainLane], row_of: dict[str, int]
 ) -> list[PlainSignal]:
-    """Return lights by the ids of their elements, then signs and stop lines by their way ids."""
+    """Return the traffic lights, signs and stop lines of a Lanelet2 map, for the lane text format."""
 
     def rows(lanelets: Iterable[str]) -> tuple[int, ...]:
         return tuple(sorted({row_of[one] for one in lanelets if one in row_of}))
@@ -121,7 +121,7 @@ def plain_signals(
 
 
 def _standing(name: str, kind: str, line: Floats) -> PlainSignal:
-    """Return a signal with this line; a too short line is extended."""
+    """Return a traffic light, sign or stop line at the position of a line."""
     x, y, z = map(float, line.mean(axis=0))
     flat = line[:, :2]
     if run_of(line)[-1] < SHORTEST:

@@ -1,4 +1,4 @@
-"""Readers of road map texts: OpenDRIVE, and plain lanes of recordings without OpenDRIVE.
+"""Reader of road map texts: OpenDRIVE, and the lane text format of sgstore for other maps.
 
 ``document`` reads the text into tables. ``lanes`` evaluates reference lines and stacks lanes on
 them. ``network`` finds the traffic flow and makes nodes and relations; ``objects`` and ``signals``

@@ -1,4 +1,4 @@
-"""Conversion of OpenDRIVE text to tables of elements, with bounded time and memory.
+"""Parser of OpenDRIVE text into tables of XML elements, with bounded time and memory.
 
 The text is OpenDRIVE; the tables contain its elements.
 
@@ -83,7 +83,7 @@ Record = tuple[str, int, int]
 
 
 class Spoiled(Exception):  # noqa: N818 (control flow inside the package; a road is spoiled, not the map)
-    """Unusable roads (by row) and records, each with the reason."""
+    """Error: roads or records of an OpenDRIVE map are unusable, each with the reason."""
 
     def __init__(self, roads: dict[int, MapError], records: dict[Record, MapError]) -> None:
         self.roads = roads
@@ -93,7 +93,7 @@ class Spoiled(Exception):  # noqa: N818 (control flow inside the package; a road
 
 @dataclass(slots=True)
 class ElementTable:
-    """All elements of one kind, in the order of the text.
+    """All XML elements of one kind in an OpenDRIVE map, in the order of the text.
 
     Attributes
     ----------
@@ -116,11 +116,11 @@ class ElementTable:
 
     @property
     def of(self) -> Ints:
-        """Return the parents as an array (n,), int64."""
+        """Return the row of each element's parent element as an array (n,), int64."""
         return np.asarray(self.parent, np.int64)
 
     def texts(self, name: str, default: str = "") -> list[str]:
-        """Return a column of texts; ``default`` for a missing attribute."""
+        """Return an attribute of all elements as texts, with a default for missing values."""
         try:
             return [attributes[name] for attributes in self.attributes]
         except KeyError:
@@ -128,7 +128,7 @@ class ElementTable:
 
 
 class Document:
-    """An OpenDRIVE text as tables.
+    """OpenDRIVE map as tables: one table per kind of XML element.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ class Document:
         return self.tables[kind]
 
     def numbers(self, kind: str, name: str, default: float | None = None) -> Floats:
-        """Return a column of finite numbers.
+        """Return an attribute of all elements as finite numbers. An invalid number is a defect of its road.
 
         A missing number without default, or one that is not finite or too large, is a defect of its
         road, and the value is 0. Outside roads, the value is the default.
@@ -187,7 +187,7 @@ class Document:
         return values
 
     def integers(self, kind: str, name: str, default: int | None = None) -> Ints:
-        """Return a column of integers, under the same conditions as :meth:`numbers`."""
+        """Return an attribute of all elements as integers. An invalid number is a defect of its road."""
         values = self.numbers(kind, name, default)
         broken = (values != np.floor(values)) | (np.abs(values) > 1e9)
         self.accuse(kind, broken, f"attribute {name!r} is no whole number")
@@ -195,13 +195,13 @@ class Document:
         return values.astype(np.int64)
 
     def rough_numbers(self, kind: str, name: str, default: float = 0.0) -> Floats:
-        """Return a column of numbers: NaN for an invalid number, ``default`` for a missing one."""
+        """Return an attribute of all elements as numbers: NaN if invalid, a default value if missing."""
         values = _floats(self.tables[kind].texts(name, repr(default)))
         values[~(np.abs(values) <= MAX_MAGNITUDE)] = np.nan
         return values
 
     def accuse(self, kind: str, wrong: Bools, reason: str) -> None:
-        """Record a defect of the roads of the ``wrong`` rows; for :data:`RECORDS`, of the rows only."""
+        """Record a defect of the roads that have the given elements."""
         table = self.tables[kind]
         rows = np.flatnonzero(wrong)
         if kind in RECORDS and len(rows):
@@ -216,12 +216,12 @@ class Document:
                 self.blame[road] = MapError(reason, road=self.road_ids[road], element=table.element)
 
     def settle(self) -> None:
-        """Raise :class:`Spoiled` if a road or record has a defect so far."""
+        """Raise an error if a road or record of the map has a defect so far."""
         if self.blame or self.odd:
             raise Spoiled(self.blame, self.odd)
 
     def leave_out(self, records: Collection[Record]) -> None:
-        """Remove these records from the tables."""
+        """Remove defective records (such as signals) from the tables."""
         for kind in {kind for kind, _, _ in records}:
             table = self.tables[kind]
             every = self._records(kind, np.arange(len(table)))
@@ -231,7 +231,7 @@ class Document:
             table.road = table.road[kept]
 
     def _records(self, kind: str, rows: Ints) -> list[Record]:
-        """Convert rows of a kind to records. The rows of a road are contiguous."""
+        """Convert rows of a table to references (road, kind, number in the road)."""
         road = self.tables[kind].road
         within = rows - np.searchsorted(road, road[rows])
         numbers = [self.ordinals[row] for row in road[rows].tolist()]
@@ -239,7 +239,7 @@ class Document:
 
 
 def read_document(text: str, skip: frozenset[int] = frozenset()) -> Document:
-    """Parse an OpenDRIVE text into tables, without the roads numbered in ``skip``.
+    """Parse an OpenDRIVE text into tables of elements, without the given roads.
 
     Raises
     ------
@@ -256,7 +256,7 @@ _Node = tuple["ElementTable | None", dict[str, "_Node"]]
 
 
 def _grammar() -> tuple[dict[str, ElementTable], dict[str, _Node]]:
-    """Return empty tables, and the tree of tags that leads to them."""
+    """Return empty tables for all needed OpenDRIVE elements, and the tree of their XML tags."""
     tables: dict[str, ElementTable] = {}
 
     def branch(shape: Mapping[str, Any], kind: str, element: str) -> dict[str, _Node]:
@@ -276,7 +276,7 @@ def _grammar() -> tuple[dict[str, ElementTable], dict[str, _Node]]:
 
 
 class _Builder:
-    """Handler of expat's events: adds rows to tables as elements start."""
+    """Handler of XML parser events that adds OpenDRIVE elements to tables."""
 
     def __init__(self, skip: frozenset[int]) -> None:
         self.tables, root = _grammar()
@@ -287,7 +287,7 @@ class _Builder:
         self._roads = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """Handle the start of an element: add a row, enter a grouping element, or skip it."""
+        """Handle the start tag of an XML element: add a table row, enter the element, or skip it."""
         levels, rows = self._levels, self._rows
         node = levels[-1].get(tag)
         if node is None:
@@ -309,7 +309,7 @@ class _Builder:
         levels.append(below)
 
     def end(self, _tag: str) -> None:
-        """Handle the end of an element."""
+        """Handle the end tag of an XML element."""
         self._levels.pop()
         self._rows.pop()
 
@@ -332,7 +332,7 @@ def _parse(text: str, skip: frozenset[int]) -> tuple[dict[str, ElementTable], li
 
 
 def _floats(texts: list[str]) -> Floats:
-    """Convert texts to numbers; NaN for an invalid number."""
+    """Convert texts to numbers; NaN for an invalid text."""
     try:
         return np.fromiter(map(float, texts), np.float64, len(texts))
     except ValueError:
@@ -347,5 +347,5 @@ def _number(text: str) -> float:
 
 
 def coefficients_of(document: Document, kind: str) -> Floats:
-    """Return the coefficients a, b, c, d of all elements of a kind, (n, 4)."""
+    """Return the cubic coefficients a, b, c, d (n, 4) of all OpenDRIVE elements of a kind."""
     return np.stack([document.numbers(kind, letter, 0.0) for letter in "abcd"], axis=1)

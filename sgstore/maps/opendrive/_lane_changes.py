@@ -1,4 +1,4 @@
-"""Road marks, and the lane changes that they permit.
+"""Road marks of OpenDRIVE lanes, and the lane changes that these marks permit.
 
 The mark of a lane is on its outer border; the mark of the centre lane is on the line between left and right.
 The attribute ``laneChange`` decides. Without it the type of the mark decides: broken lines may be crossed, and
@@ -38,7 +38,7 @@ _CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
 
 
 def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
-    """Return the lane changes that a mark permits: towards higher and towards lower lane ids.
+    """Return two flags for a road mark: lane changes to higher lane ids, and to lower lane ids, are permitted.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ _Stretch = tuple[float, float, bool, bool]
 
 
 def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> LaneChanges:
-    """Return stretches for lane changes: neighbouring driving lanes with traffic in one direction."""
+    """Return the parts of neighbouring lanes where road marks permit a lane change."""
     left, right = wide_pairs(lanes, ribbons)
     driving = np.array([kind in DRIVING for kind in lanes.type], bool)
     one_way = lanes.forward[left] == lanes.forward[right]
@@ -83,7 +83,7 @@ def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) ->
 
 
 def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_Stretch]]:
-    """Return a function from two neighbouring lanes to the stretches of their common border."""
+    """Return a function: two neighbouring lanes → intervals of their common border with its road mark."""
     kind = "road/laneSection/lane/roadMark"
     table = document[kind]
     offsets = document.rough_numbers(kind, "sOffset").tolist()
@@ -118,7 +118,7 @@ def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_S
 
 
 def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:
-    """Return ``bold`` markings: at the outer border of one lane, at the inner border of the next."""
+    """Return the parts of lanes with a ``bold`` (broad) marking at their border."""
     kind = "road/laneSection/lane/roadMark"
     table, offsets = document[kind], document.rough_numbers(kind, "sOffset").tolist()
     columns = table.parent, offsets, table.texts("type", "none"), table.texts("weight")
@@ -155,7 +155,7 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
 
 
 def _along(ribbons: Ribbons, lane: Ints, to: Ints, ends: Floats) -> LaneChanges:
-    """Convert stretches from s to lengths of the centre line, and join consecutive ones."""
+    """Convert intervals from road positions s to lengths along lane centre lines, and join consecutive ones."""
     one, other = ribbons.along_at(lane, ends[:, 0]), ribbons.along_at(lane, ends[:, 1])
     start, end = np.minimum(one, other), np.maximum(one, other)
     order = np.lexsort((start, to, lane))

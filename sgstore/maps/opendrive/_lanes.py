@@ -1,4 +1,4 @@
-"""Reference lines of roads, their lanes, and the surface of lanes as cross sections.
+"""Lanes of OpenDRIVE roads, and their surfaces as cross sections.
 
 Along a lane section every lateral position (the centre lane's offset, the outer border of each
 lane) is a cubic of s between *cuts*: places where a record of any kind starts. Between cuts cubics
@@ -72,7 +72,7 @@ _SAMPLES: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class LaneSections:
-    """Lane sections, ordered by road and s; shape (n,).
+    """Lane sections (parts of a road with fixed lanes) of an OpenDRIVE map, by road and position s.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class LaneSections:
 
 @dataclass(frozen=True, slots=True)
 class LaneTable:
-    """All lanes except centre lanes, ordered by section and from left to right; shape (L,).
+    """All OpenDRIVE lanes except centre lanes, sorted by lane section and from left to right; shape (L,).
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class LaneTable:
 
 
 def read_lanes(document: Document) -> LaneTable:
-    """Read all lane sections and lanes; record defects of roads."""
+    """Read all lane sections and lanes of an OpenDRIVE map, and record defective roads."""
     sections, section_row = _read_sections(document)
     table = document["road/laneSection/lane"]
     ident = document.integers("road/laneSection/lane", "id")
@@ -159,7 +159,7 @@ def read_lanes(document: Document) -> LaneTable:
 
 
 def odd_sections(document: Document) -> list[str]:
-    """Return warnings about one-sided sections, which are read as two-sided."""
+    """Return warnings about lane sections for one side of a road, which are read as two-sided."""
     table = document["road/laneSection"]
     roads = {
         document.road_ids[road]
@@ -198,7 +198,7 @@ def _read_sections(document: Document) -> tuple[LaneSections, Ints]:
 
 
 def _stack(section: Ints, ident: Ints) -> tuple[Ints, Ints]:
-    """Return the next lane towards the centre, and the number of lanes between."""
+    """Return, for each lane, the next lane towards the road centre, and the number of lanes between."""
     n = len(ident)
     order = np.lexsort((np.abs(ident), ident > 0, section))
     same = (np.diff(section[order]) == 0) & (np.diff((ident > 0)[order].astype(np.int8)) == 0)
@@ -214,7 +214,7 @@ def _stack(section: Ints, ident: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _LaneIntervals:
-    """Intervals of lane sections between cuts, ordered by section and s; shape (n,)."""
+    """Intervals of OpenDRIVE lane sections. On an interval, each width or height is one cubic polynomial."""
 
     section: Ints
     start: Floats
@@ -256,7 +256,7 @@ def _intervals(document: Document, lanes: LaneTable, plan: PlanView) -> _LaneInt
 
 
 def _shifted(coefficients: Floats, by: Floats) -> Floats:
-    """Convert cubics over ``x`` to cubics over ``x - by``."""
+    """Convert cubic polynomials in ``x`` to cubic polynomials in ``x - by``."""
     return np.stack(
         (
             cubic(coefficients, by),
@@ -271,7 +271,7 @@ def _shifted(coefficients: Floats, by: Floats) -> Floats:
 def _along_road(
     document: Document, kind: str, lanes: LaneTable, intervals: _LaneIntervals
 ) -> Floats:
-    """Return cubics of a road record over the distance from each interval's start, (intervals, 4)."""
+    """Return the cubic of a road record (elevation, offset, …) on each interval of the road, (n, 4)."""
     middle = (intervals.start + intervals.end) / 2
     at = document.numbers(kind, "s")
     record = last_before(document[kind].road, at, lanes.sections.road[intervals.section], middle)
@@ -284,7 +284,7 @@ def _along_road(
 
 @dataclass(frozen=True, slots=True)
 class _LaneBorders:
-    """Outer and inner borders of lanes on intervals, as cubics over the distance from the interval's start."""
+    """Outer and inner borders of lanes, as cubic polynomials on intervals of the road."""
 
     first: Ints  # (L + 1,): start of the rows of each lane, one row per interval of its section
     interval: Ints
@@ -321,7 +321,7 @@ def _borders(
 def _of_lanes(
     document: Document, tag: str, lanes: LaneTable, at: tuple[Ints, Floats, Floats]
 ) -> tuple[Floats, Bools]:
-    """Return cubics of the lane records at places (lane, middle, start), and a mask of existing ones."""
+    """Return the cubics of lane records (width or border) at given positions, and a mask of existing ones."""
     kind = f"road/laneSection/lane/{tag}"
     lane, middle, start = at
     of = lanes.row[document[kind].of]
@@ -340,7 +340,7 @@ def _pieces(
     plan: PlanView,
     parts: tuple[_LaneIntervals, _LaneBorders, Floats],
 ) -> tuple[Ints, Ints]:
-    """Return the number of pieces of each interval, and its plan view record."""
+    """Return the number of straight pieces for each interval of a road, and its reference line record."""
     intervals, borders, heights = parts
     length = intervals.end - intervals.start
     road = lanes.sections.road[intervals.section]
@@ -373,7 +373,7 @@ def _pieces(
 
 
 def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, pieces: Floats) -> None:
-    """Reject roads, or the map, with intervals that need too many pieces."""
+    """Reject OpenDRIVE roads, or the whole map, that need too many surface pieces."""
     road = lanes.sections.road[intervals.section]
     lanes_here = np.bincount(lanes.section, minlength=len(lanes.sections.start)) + 1.0
     points = (pieces + 1) * lanes_here[intervals.section]
@@ -419,7 +419,7 @@ def _stations(
 def _lateral_jumps(
     intervals: _LaneIntervals, borders: _LaneBorders
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the greatest offset, jump and turn of the borders at the end of each interval."""
+    """Return the greatest offset, jump and turn of lane borders at the end of each road interval."""
     n = len(intervals.section)
     length = (intervals.end - intervals.start)[borders.interval]
     reach, step, corner = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -434,7 +434,7 @@ def _lateral_jumps(
 
 
 def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
-    """Compute the surface of all lanes.
+    """Compute the surfaces of all OpenDRIVE lanes, as cross sections along the lanes.
 
     Raises
     ------
@@ -467,7 +467,7 @@ def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
 def heights(
     document: Document, lanes: LaneTable, ribbons: Ribbons
 ) -> Callable[[Ints, Floats], Floats] | None:
-    """Return a function from lanes and places along them to heights (m), or ``None`` without heights.
+    """Return a function: (lane, position along it) → height; m. ``None`` if the map has no heights.
 
     Between cross sections a lane is straight. This is exact enough for heights, but not for slopes.
     ``ribbons`` can have more lanes, without a road.

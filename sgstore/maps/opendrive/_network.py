@@ -1,4 +1,4 @@
-"""Lanes, roads and junctions as nodes, with traffic flow and lane changes.
+"""Connections between OpenDRIVE lanes: successors, also through junctions.
 
 A lane ends at one end of its section, or at both if traffic runs both ways. The lanes after it come
 from links to the next section or road (also into a road, in its middle), or from the connecting
@@ -29,7 +29,7 @@ _OTHER: Final = {START: END, END: START}
 
 
 class Target(NamedTuple):
-    """Place where traffic enters a section: at its start, at its end, or within."""
+    """End point of an OpenDRIVE link: a lane section, and where traffic enters it (start, end or within)."""
 
     section: int
     contact: str
@@ -42,7 +42,7 @@ _Connection = tuple[Target, tuple[tuple[int, int], ...]]
 
 @dataclass(slots=True)
 class Network:
-    """Lanes of all roads, with look-ups by the ids of the map.
+    """Lanes of all OpenDRIVE roads, with look-ups by road, section and lane id.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Network:
 
     @classmethod
     def of(cls, document: Document, lanes: LaneTable) -> Network:
-        """Build the network of a document's lanes."""
+        """Build the look-ups of an OpenDRIVE map's lanes."""
         roads: dict[str, int] = {}
         warnings: list[str] = []
         for row, name in enumerate(document.road_ids):
@@ -78,13 +78,13 @@ class Network:
         return cls(lanes, roads, lane, first.tolist(), last.tolist(), warnings)
 
     def section_at(self, road: int, s: float) -> int:
-        """Return the section of a road at ``s``."""
+        """Return the lane section of a road at position ``s``."""
         starts = self.lanes.sections.start[self.first[road] : self.last[road] + 1]
         within = int(np.searchsorted(starts, s, side="right")) - 1
         return self.first[road] + max(within, 0)
 
     def target(self, attributes: dict[str, str]) -> Target | None:
-        """Return the section that a link between roads leads to, or ``None`` for an unknown road."""
+        """Return the lane section that a road link leads to, or ``None`` for an unknown road."""
         road = self.roads.get(attributes.get("elementId", ""))
         if road is None:
             return None
@@ -95,14 +95,14 @@ class Network:
         return Target(self.first[road] if contact == START else self.last[road], contact)
 
     def enters(self, lane: int, contact: str) -> bool:
-        """True if traffic at the end ``contact`` of a section may enter this lane."""
+        """Return True if traffic can enter a lane at the given end of its lane section."""
         if self.lanes.both[lane] or not contact:
             return True
         return bool(self.lanes.forward[lane]) == (contact in {START, "+"})
 
 
 def flows(document: Document, network: Network) -> tuple[Ints, Ints]:
-    """Return all pairs of lanes (from, to) with traffic flow, each once."""
+    """Return all pairs of connected OpenDRIVE lanes: traffic goes from the first to the second."""
     joints = _Joints(document, network)
     pairs = {
         (lane, beyond)
@@ -123,7 +123,7 @@ def _exits(lanes: LaneTable) -> Iterator[tuple[int, str]]:
 
 
 class _Joints:
-    """Look-up of the lanes after the ends of lanes."""
+    """Look-up of the lanes that continue an OpenDRIVE lane at its start or end."""
 
     def __init__(self, document: Document, network: Network) -> None:
         self._network = network
@@ -140,7 +140,7 @@ class _Joints:
         self._missed: set[str] = set()
 
     def beyond(self, lane: int, contact: str) -> list[int]:
-        """Return the lanes after one end of a lane that its traffic may enter."""
+        """Return the lanes that traffic may enter at one end of an OpenDRIVE lane."""
         network, lanes = self._network, self._network.lanes
         road, section, ident = (int(c[lane]) for c in (lanes.road, lanes.section, lanes.ident))
         linked = self._lane_links[contact].get(lane, [])
@@ -195,7 +195,7 @@ def _road_links(table: ElementTable) -> dict[int, dict[str, str]]:
 
 
 def _junctions(document: Document, network: Network) -> dict[tuple[str, str], list[_Connection]]:
-    """Map (junction, incoming road) to its connections; a direct junction connects both ways."""
+    """Return the connections of junctions: (junction, incoming road) → list of connections."""
     ways: dict[tuple[str, str], list[_Connection]] = defaultdict(list)
     junctions = document["junction"]
     links = _lane_pairs(document)
@@ -231,7 +231,7 @@ def _lane_pairs(document: Document) -> dict[int, tuple[tuple[int, int], ...]]:
 
 
 def _junction_ends(document: Document) -> dict[tuple[str, str], list[str]]:
-    """Map (junction, road) to the ends of the road at the junction."""
+    """Return the ends (start or end) of roads at junctions: (junction, road) → ends."""
     ends: dict[tuple[str, str], list[str]] = defaultdict(list)
     for kind, contact in (("road/predecessor", START), ("road/successor", END)):
         for row, attributes in _road_links(document[kind]).items():
@@ -242,7 +242,7 @@ def _junction_ends(document: Document) -> dict[tuple[str, str], list[str]]:
 
 
 def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]:
-    """Yield pairs of a main road's lane and a lane that branches off in a virtual junction."""
+    """Yield pairs of lanes in virtual junctions: lane of the main road, and lane that branches off."""
     links = _lane_pairs(document)
     table = document["junction/connection"]
     junctions = document["junction"].attributes
@@ -271,7 +271,7 @@ def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]
 
 
 def _whole(text: str) -> int:
-    """Parse a lane id; 0 (never a lane with traffic) for an invalid one."""
+    """Parse an OpenDRIVE lane id; 0 (the centre lane, without traffic) for an invalid one."""
     try:
         return int(text)
     except ValueError:

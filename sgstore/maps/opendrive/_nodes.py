@@ -1,4 +1,4 @@
-"""Lanes, roads and junctions as map nodes, and their relations."""
+"""Map nodes (lanes, roads, junctions) of an OpenDRIVE map, and the edges between them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FIRST_LANE: Final = 1
 
 
 def lane_nodes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapNodes:
-    """Return the nodes of the lanes, in their order."""
+    """Return one map node per OpenDRIVE lane, with type, length, speed limit and so on."""
     road_names = document.road_ids
     sections = lanes.sections
     number = sections.number[lanes.section]
@@ -60,13 +60,13 @@ def lane_nodes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapNod
 
 
 def junction_of(document: Document, road: int) -> str:
-    """Return the id of the junction of a road, or an empty text."""
+    """Return the id of the junction that a road is part of, or an empty text."""
     junction = document["road"].attributes[road].get("junction", "-1")
     return "" if junction == "-1" else junction
 
 
 def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str, ...]:
-    """Return turns of lanes in junctions; a road with several sections has one turn in total."""
+    """Return the turn direction of each lane in a junction. All sections of a road have one turn."""
     sign = np.where(lanes.forward, 1.0, -1.0)
     _, one = np.unique(lanes.section, return_index=True)
     of_road = np.zeros(len(document["road"]))
@@ -79,7 +79,7 @@ def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str,
 
 
 def _speed_limits(document: Document, lanes: LaneTable) -> Floats:
-    """Return speed limits at the middle of lanes: own record, else the road's; m/s."""
+    """Return the speed limit of each lane at its middle: its own record, else the road's; m/s."""
     sections = lanes.sections
     start, end = sections.start[lanes.section], sections.end[lanes.section]
     middle = (start + end) / 2
@@ -107,7 +107,7 @@ def _speeds(document: Document, kind: str) -> Floats:
 
 
 def speed(value: str, unit: str) -> float:
-    """Convert a speed to m/s; NaN for ``no limit``, ``undefined`` and invalid values."""
+    """Convert an OpenDRIVE speed to m/s; NaN for ``no limit``, ``undefined`` and invalid values."""
     try:
         metres = float(value) * SPEED_UNITS[unit.strip().lower()]
     except (ValueError, KeyError):
@@ -116,12 +116,12 @@ def speed(value: str, unit: str) -> float:
 
 
 def wide_pairs(lanes: LaneTable, ribbons: Ribbons) -> Ints:
-    """Return pairs of lanes that share a border, the left one first, (2, n)."""
+    """Return pairs of neighbouring lanes (2, n), the left one first, that share a border."""
     return _pairs(lanes, np.flatnonzero(ribbons.mean_widths() > NARROW))
 
 
 def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
-    """Return the edges ``toLeftOf``, ``toRightOf`` and ``opposes`` among lanes.
+    """Return the map edges ``toLeftOf``, ``toRightOf`` and ``opposes`` between lanes.
 
     Neighbours share a border. Lanes of traffic with only lanes without traffic between them (a
     median, a strip of grass) are also neighbours, because drivers look across it.
@@ -144,7 +144,7 @@ def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
 
 
 def _pairs(lanes: LaneTable, rows: Ints) -> Ints:
-    """Return pairs of consecutive lanes of a section among ``rows``, from left to right, (2, n)."""
+    """Return pairs of consecutive lanes (2, n) of a lane section, among the given lanes."""
     same: Bools = np.diff(lanes.section[rows]) == 0
     return np.stack((rows[:-1][same], rows[1:][same]))
 
@@ -152,7 +152,7 @@ def _pairs(lanes: LaneTable, rows: Ints) -> Ints:
 def flow_edges(
     lanes: LaneTable, nodes: MapNodes, ribbons: Ribbons, flow: tuple[Ints, Ints]
 ) -> list[Edge]:
-    """Return the edges ``travelsTo`` and ``conflictsWith`` among lanes; ``nodes`` are their nodes."""
+    """Return the map edges ``travelsTo`` (successor) and ``conflictsWith`` (crossing) between lanes."""
     crossing = [
         lane
         for lane, (kind, junction) in enumerate(zip(lanes.type, nodes.junction, strict=True))
@@ -167,7 +167,7 @@ def flow_edges(
 
 
 def road_nodes(document: Document) -> list[MapNodes]:
-    """Return the nodes of roads, junctions and roundabouts."""
+    """Return one map node per road, junction and roundabout of an OpenDRIVE map."""
     every = range(len(document["road"]))
     road = MapNodes.of(
         "road",
@@ -182,7 +182,7 @@ def road_nodes(document: Document) -> list[MapNodes]:
 
 
 def _roundabouts(document: Document) -> dict[str, set[str]]:
-    """Return roundabouts with their junctions: junction groups of that type (ASAM OpenDRIVE 1.8, 12.14)."""
+    """Return the roundabouts of an OpenDRIVE map with their junctions: id → junction ids."""
     groups, members = document["junctionGroup"], document["junctionGroup/junctionReference"]
     names, found = groups.texts("id"), dict[str, set[str]]()
     kinds = groups.texts("type")
@@ -193,7 +193,7 @@ def _roundabouts(document: Document) -> dict[str, set[str]]:
 
 
 def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
-    """Yield pairs of a road and its roundabout, as rows."""
+    """Yield pairs of row numbers: a road, and the roundabout that contains it."""
     ends: list[list[str]] = [[] for _ in range(len(document["road"]))]
     for kind in ("road/predecessor", "road/successor"):
         table = document[kind]
@@ -208,7 +208,7 @@ def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
 
 
 def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
-    """Map each road with a type to the start of each type along it."""
+    """Return the types (such as ``town``) of roads: road → (start position, type) in order."""
     table = document["road/type"]
     found: dict[str, list[tuple[float, str]]] = {}
     places = document.rough_numbers("road/type", "s").tolist()
@@ -218,14 +218,14 @@ def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
 
 
 def junction_types(document: Document) -> dict[str, str]:
-    """Map each junction to its type; by default ``default`` (ASAM OpenDRIVE 1.8, 12)."""
+    """Return the type of each OpenDRIVE junction: junction id → type; by default ``default``."""
     table = document["junction"]
     pairs = zip(table.texts("id"), table.texts("type", "default"), strict=True)
     return {name: kind.strip() or "default" for name, kind in pairs}
 
 
 def containment(document: Document, road: Ints) -> list[Edge]:
-    """Return the edges ``isIn``: lanes in roads, roads in junctions and roundabouts.
+    """Return the map edges ``isIn``: lanes in roads, roads in junctions and roundabouts.
 
     ``road``: rows of the roads of all lanes.
     """

@@ -1,4 +1,4 @@
-"""Objects at roads: crosswalks, parking spaces, and scenery with its outlines.
+"""Objects at OpenDRIVE roads: crosswalks, parking spaces, trees, buildings and so on.
 
 An object has outlines, in its own axes (``cornerLocal``) or along the road (``cornerRoad``); or a
 length and a width; or a radius; or it is a point. A ``repeat`` makes many objects of one: copies at
@@ -74,7 +74,7 @@ _CIRCLE: Final = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
 
 
 def kind_of_object(type_name: str, name: str) -> str:
-    """Return the kind of an object by its type, else by whole words of its type and name.
+    """Return the kind of an OpenDRIVE object, from its type, else from words in its name.
 
     :data:`PARKING` and :data:`PAINT` for objects that are not entities; ``prop`` for all others.
     """
@@ -96,18 +96,18 @@ def _singular(word: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """Objects of a map: nodes, and one geometry each."""
+    """Objects of an OpenDRIVE map, such as trees and buildings: a map node and a geometry each."""
 
     nodes: MapNodes
     shapes: list[Any]
 
     def take(self, rows: Ints) -> Objects:
-        """Return the objects of these rows, in this order."""
+        """Return the objects of the given rows, in this order."""
         return Objects(self.nodes.take(rows), [self.shapes[row] for row in rows.tolist()])
 
 
 class _Ring(NamedTuple):
-    """Corners (k, 2) of an area or line of an object."""
+    """Outline of a map object: corners (k, 2) of an area or line."""
 
     item: int
     corners: Floats
@@ -116,7 +116,7 @@ class _Ring(NamedTuple):
 
 @dataclass(slots=True)
 class _Items:
-    """Objects at the roads, one row per copy or strip, with their rings.
+    """Objects at the roads with their outlines, one row per copy of a repeated object.
 
     Corners in ``local`` are in the item's own axes; corners in ``along`` are s and t of its road.
     """
@@ -134,7 +134,7 @@ class _Items:
     def add(
         self, row: int, name: str, place: tuple[float, float, float], size: tuple[float, float]
     ) -> int:
-        """Add an item (object row, s, t and height, length and width); return its number."""
+        """Add one copy of an object at a road position, and return its row number."""
         self.row.append(row)
         self.name.append(name)
         self.place.append(place)
@@ -145,7 +145,7 @@ class _Items:
 def read_objects(
     document: Document, plan: PlanView, warnings: list[str]
 ) -> tuple[Objects, Objects, list[PlainLane], Ints]:
-    """Read the objects of a map; an object with an invalid place is left out with a warning.
+    """Read the objects of an OpenDRIVE map. Objects with an invalid position are skipped with a warning.
 
     Returns crosswalks, all other entities, parking spaces, and the rows of their roads.
     """
@@ -187,7 +187,7 @@ def read_objects(
 
 
 def _space(objects: Objects, row: int) -> PlainLane | None:
-    """Convert a parking space to a lane along its heading, or ``None`` without an area."""
+    """Convert a parking space to a lane along its heading, or ``None`` if it has no area."""
     nodes, shape = objects.nodes, objects.shapes[row]
     if shape.area <= 0:
         return None
@@ -212,7 +212,7 @@ def _space(objects: Objects, row: int) -> PlainLane | None:
 
 
 def _quadrangle(shape: Any) -> Floats:
-    """Return the four corners of a shape, or of its bounding rectangle, counter-clockwise, (4, 2)."""
+    """Return four corners (4, 2) of a shape or of its bounding rectangle, counter-clockwise."""
     if shape.geom_type != "Polygon" or len(shape.exterior.coords) != 5 or not shape.is_valid:
         shape = shapely.minimum_rotated_rectangle(shape)
     corners = np.asarray(shape.exterior.coords, np.float64)[:-1]
@@ -221,7 +221,7 @@ def _quadrangle(shape: Any) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class _Repeat:
-    """A ``repeat`` element: from ``s`` for ``length``, every ``distance``, with values at both ends."""
+    """OpenDRIVE element ``repeat``: copies of an object along the road, or one continuous strip."""
 
     s: float
     length: float
@@ -231,19 +231,19 @@ class _Repeat:
     width: tuple[float, float]
 
     def copies(self) -> int:
-        """Return the number of copies; for a strip, the number of steps along the road."""
+        """Return the number of copies of an object; for a strip, the number of steps along the road."""
         step = self.distance if self.distance > 0 else max(_STRIP_STEP, self.length / _MOST_STEPS)
         return int(min(np.floor(self.length / step + 1e-9), MOST_POINTS)) + 1
 
     def shares(self, n: int) -> Floats:
-        """Return the places of n copies along the repetition, 0 … 1, (n,)."""
+        """Return the relative positions 0 … 1 (n,) of n copies along a repetition."""
         if self.distance > 0 and self.length > 0:
             return np.arange(n, dtype=np.float64) * (self.distance / self.length)
         return np.linspace(0.0, 1.0, n)
 
 
 def _repeats(document: Document) -> dict[int, list[_Repeat]]:
-    """Map rows of objects to their repeats, without invalid ones."""
+    """Return the valid ``repeat`` elements (copies along the road) of each OpenDRIVE object: row → list."""
     kind = "road/object/repeat"
     names = ("s", "length", "distance", "tStart", "tEnd", "zOffsetStart", "zOffsetEnd")
     columns = [document.rough_numbers(kind, name) for name in names]
@@ -260,7 +260,7 @@ def _repeats(document: Document) -> dict[int, list[_Repeat]]:
 
 
 class _Outlines:
-    """Outlines of objects: rings of corners (k, 2), in their own axes and along their road."""
+    """Outlines of OpenDRIVE objects, as corners (k, 2), in object axes or road coordinates."""
 
     def __init__(self, document: Document) -> None:
         kind = "road/object"
@@ -271,14 +271,14 @@ class _Outlines:
         self.ids = document[kind].texts("id")
 
     def of(self, row: int) -> tuple[list[Floats], list[Floats]]:
-        """Return rings of an object in its own axes, and along its road relative to its place."""
+        """Return two lists of outlines of an object: in object axes, and in road coordinates."""
         place = np.array((self.own["s"][row], self.own["t"][row]))
         along = [ring - place for ring in self.along.get(row, [])]
         local = self.local.get(row, [])
         return (local if local or along else [self._plain(row)]), along
 
     def _plain(self, row: int) -> Floats:
-        """Return the outline of an object from its size, or a point."""
+        """Return an object's outline made from its length, width or radius, or a point."""
         length, width, radius = (self.own[name][row] for name in ("length", "width", "radius"))
         if length > 0 and width > 0:
             return np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (length / 2, width / 2)
@@ -288,7 +288,7 @@ class _Outlines:
 
 
 def _corners(document: Document, tag: str, names: tuple[str, str]) -> dict[int, list[Floats]]:
-    """Map rows of objects to outlines with corners of this kind, without invalid ones."""
+    """Return the valid outlines of OpenDRIVE objects with one kind of corners: object row → outlines."""
     kind = f"road/object/outline/{tag}"
     points = np.column_stack([document.rough_numbers(kind, name) for name in names])
     outline = document[kind].of
@@ -304,7 +304,7 @@ def _corners(document: Document, tag: str, names: tuple[str, str]) -> dict[int, 
 def _items(
     outlines: _Outlines, repeats: dict[int, list[_Repeat]], rows: list[int], warnings: list[str]
 ) -> _Items:
-    """Return the objects of ``rows`` with all their repeats."""
+    """Return all copies of the given OpenDRIVE objects, as rows with outlines."""
     items = _Items()
     own = outlines.own
     for row in rows:
@@ -337,7 +337,7 @@ _Rings = tuple[list["Floats"], list["Floats"]]
 
 
 def _stand(items: _Items, item: int, rings: _Rings) -> None:
-    """Add rings to an item at its place."""
+    """Add outlines to one copy of an object, moved to its position."""
     s, t, _ = items.place[item]
     items.local.extend(_Ring(item, ring) for ring in rings[0])
     items.along.extend(_Ring(item, ring + np.array((s, t))) for ring in rings[1])
@@ -350,7 +350,7 @@ def _copy(
     repeat: _Repeat,
     one: tuple[_Rings, tuple[float, float]],
 ) -> int:
-    """Add the copies that a ``repeat`` makes of an object; return the next copy number."""
+    """Add the copies of an object that a ``repeat`` element describes. Return the next copy number."""
     shares = repeat.shares(repeat.copies()).tolist()
     for number, share in enumerate(shares, name[1]):
         place = (
@@ -363,7 +363,7 @@ def _copy(
 
 
 def _stretch(items: _Items, row: int, name: str, repeat: _Repeat) -> None:
-    """Add the strip along the road that a ``repeat`` without distance makes."""
+    """Add the continuous strip along the road that a ``repeat`` element without distance describes."""
     n = repeat.copies() + 1
     share = repeat.shares(n)
     s, t = repeat.s + share * repeat.length, np.interp(share, (0, 1), repeat.t)
@@ -380,7 +380,7 @@ def _stretch(items: _Items, row: int, name: str, repeat: _Repeat) -> None:
 def _placed(
     document: Document, plan: PlanView, items: _Items, columns: dict[str, Any]
 ) -> list[_Ring]:
-    """Return all rings in map axes."""
+    """Return all object outlines in map coordinates."""
     local, item = _laid_out(items.local)
     cos, sin = np.cos(columns["heading"][item]), np.sin(columns["heading"][item])
     x = columns["x"][item] + cos * local[:, 0] - sin * local[:, 1]
@@ -395,14 +395,14 @@ def _placed(
 
 
 def _laid_out(rings: list[_Ring]) -> tuple[Floats, Ints]:
-    """Concatenate the corners of rings, with the item of each corner."""
+    """Concatenate the corners of outlines. Return the corners, and the object row of each corner."""
     points = np.concatenate([np.zeros((0, 2)), *(ring.corners for ring in rings)])
     items = np.array([ring.item for ring in rings], np.int64)
     return points, np.repeat(items, np.array([len(ring.corners) for ring in rings], np.int64))
 
 
 def _moved(rings: list[_Ring], points: Floats) -> Iterator[_Ring]:
-    """Yield the rings with new corners, taken from ``points`` in order."""
+    """Yield outlines with their corners replaced by new points, in order."""
     end = 0
     for ring in rings:
         begin, end = end, end + len(ring.corners)
@@ -410,7 +410,7 @@ def _moved(rings: list[_Ring], points: Floats) -> Iterator[_Ring]:
 
 
 def _shapes(items: _Items, rings: list[_Ring]) -> list[Any]:
-    """Return the geometry of each item: an area, a line, or a point."""
+    """Return the shapely geometry of each object: an area, a line, or a point."""
     parts: list[list[Any]] = [[] for _ in items.row]
     for item, corners, is_area in rings:
         if len(corners) == 1:

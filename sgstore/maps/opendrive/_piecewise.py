@@ -1,4 +1,4 @@
-"""Arrays in groups, and piecewise cubic polynomials along roads."""
+"""Arrays divided into groups, and piecewise cubic polynomials along roads."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
 
 
 def starts_of(counts: Ints) -> Ints:
-    """Return the starts of consecutive groups of these sizes, and the end, (n + 1,)."""
+    """Return the start indices of consecutive groups of the given sizes, and the end, (n + 1,)."""
     return np.concatenate((np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)))
 
 
 def ragged(counts: Ints) -> tuple[Ints, Ints]:
-    """Expand groups of these sizes: the group of each row, and the row's number in its group.
+    """Return, for each row of consecutive groups, the group index and the row's index in the group.
 
     >>> ragged(np.array([2, 0, 3]))
     (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))
@@ -26,7 +26,7 @@ def ragged(counts: Ints) -> tuple[Ints, Ints]:
 
 
 def last_before(group: Ints, at: Floats, asked_group: Ints, asked_at: Floats) -> Ints:
-    """Find the record for each place: the last one of its group that starts at or before it.
+    """Find, for each position on a road, the last record of this road that starts at or before it.
 
     Parameters
     ----------
@@ -63,18 +63,18 @@ def last_before(group: Ints, at: Floats, asked_group: Ints, asked_at: Floats) ->
 
 
 def cubic(coefficients: Floats, at: Floats) -> Floats:
-    """Evaluate cubics ``(..., 4)``, constant first, at ``at``."""
+    """Evaluate cubic polynomials with coefficients ``(..., 4)``, constant first."""
     c = coefficients
     return c[..., 0] + at * (c[..., 1] + at * (c[..., 2] + at * c[..., 3]))
 
 
 def cubic_slope(coefficients: Floats, at: Floats) -> Floats:
-    """Return first derivatives of cubics ``(..., 4)`` at ``at``."""
+    """Return the first derivatives of cubic polynomials ``(..., 4)`` at given positions."""
     c = coefficients
     return c[..., 1] + at * (2 * c[..., 2] + at * 3 * c[..., 3])
 
 
 def cubic_bend(coefficients: Floats, at: Floats) -> Floats:
-    """Return second derivatives of cubics ``(..., 4)`` at ``at``."""
+    """Return the second derivatives of cubic polynomials ``(..., 4)`` at given positions."""
     c = coefficients
     return 2 * c[..., 2] + at * 6 * c[..., 3]

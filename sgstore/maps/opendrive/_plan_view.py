@@ -1,4 +1,4 @@
-"""Reference lines: the plan view of roads, evaluated at many places at once."""
+"""Reference lines of OpenDRIVE roads (line, arc, spiral, polynomial), evaluated at many positions at once."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _BELOW_ONE: Final = 1 - 1e-12
 
 @dataclass(frozen=True, slots=True)
 class _Measure:
-    """Arc length of cubics: end parameter, length, and shares of the length at 65 equal steps."""
+    """Arc lengths of cubic curves, with the share of the length at 65 equal parameter steps."""
 
     span: Floats
     length: Floats
@@ -41,7 +41,7 @@ class _Measure:
 
 @dataclass(frozen=True, slots=True)
 class PlanView:
-    """Records of all plan views, ordered by road and s.
+    """Geometry records (line, arc, spiral, …) of the reference lines of all roads, by road and s.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class PlanView:
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Places on reference lines; shape (N,): position, heading and curvature."""
+    """Positions on reference lines of roads: coordinates, heading and curvature; shape (N,)."""
 
     x: Floats
     y: Floats
@@ -84,7 +84,7 @@ class Poses:
 
 
 def read_plan_view(document: Document) -> PlanView:
-    """Read the plan views of all roads; record defects of roads."""
+    """Read the reference lines of all OpenDRIVE roads, and record defective roads."""
     table = document["road/geometry"]
     n = len(table)
     s, x, y, heading, length = (
@@ -151,7 +151,7 @@ def _read_cubics(document: Document, kind: Codes, length: Floats) -> tuple[Float
 
 
 def _measured(u: Floats, v: Floats, span: Floats, length: Floats) -> _Measure:
-    """Compute spans (where NaN), arc lengths, and shares of them at equal parameter steps."""
+    """Compute arc lengths of cubic curves, and shares of the length at equal parameter steps."""
     unknown = np.isnan(span)
     reach = np.where(unknown, length, span)  # the arc length is never shorter than u
     arc = _arc_table(u, v, reach)
@@ -173,7 +173,7 @@ def _arc_table(u: Floats, v: Floats, span: Floats) -> Floats:
 
 
 def _parameter(u: Floats, v: Floats, measure: _Measure, rows: Ints, share: Floats) -> Floats:
-    """Return the parameters at which these cubics reach a share of their arc length.
+    """Return the curve parameter at which a cubic curve reaches a share of its arc length.
 
     Cubic Hermite interpolation in the cell of the table.
     """
@@ -199,7 +199,7 @@ def _parameter(u: Floats, v: Floats, measure: _Measure, rows: Ints, share: Float
 
 
 def poses(plan: PlanView, record: Ints, s: Floats) -> Poses:
-    """Return places on reference lines.
+    """Return position, heading and curvature of points on road reference lines.
 
     Parameters
     ----------
@@ -235,7 +235,7 @@ def poses(plan: PlanView, record: Ints, s: Floats) -> Poses:
 
 
 def _spiral(ds: Floats, curvature: Floats, rate: Floats) -> tuple[Floats, Floats]:
-    """Return the displacement along and across after ``ds`` on clothoids."""
+    """Return the displacement along and across after a length ``ds`` on a clothoid (road spiral)."""
     at = ds[:, None] * ((_NODES + 1) / 2)
     angle = at * (curvature[:, None] + rate[:, None] * at / 2)
     half = ds / 2
@@ -243,7 +243,7 @@ def _spiral(ds: Floats, curvature: Floats, rate: Floats) -> tuple[Floats, Floats
 
 
 def _cubic(plan: PlanView, record: Ints, ds: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return displacement along and across, turn, and curvature after ``ds`` on parametric cubics."""
+    """Return displacement, turn and curvature after a length ``ds`` on parametric cubic curves."""
     number = np.cumsum(plan.kind == CUBIC) - 1
     length = plan.length[record]
     share = np.where(length > 0, ds / np.maximum(length, _TINY), 0.0)

@@ -1,4 +1,4 @@
-"""Positions of signals and objects: road, s and t → x, y and z."""
+"""Positions of signals and objects: from road coordinates s and t to map coordinates x, y and z."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def places(
     document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return map positions and headings of places ``s`` and ``t`` on roads, clamped to their ends.
+    """Convert road coordinates ``s`` and ``t`` to map positions and headings, clamped to the road ends.
 
     Returns x, y and z in map axes, and the heading of the road there.
     """
@@ -40,7 +40,7 @@ def places(
 
 
 def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> Ints:
-    """Return the rows with a valid place; add a warning for each other row."""
+    """Return the rows of signals or objects with a valid position. Other rows cause warnings."""
     table = document[kind]
     placed = np.ones(len(table), bool)
     for name in ("s", "t", "zOffset", "hdg", "hOffset"):
@@ -60,7 +60,7 @@ def node_columns(
     rows: Ints,
     at: tuple[Floats, Floats, Floats] | None = None,
 ) -> dict[str, Any]:
-    """Return columns of :class:`~sgstore.maps.roads.MapNodes` for places of signals or objects.
+    """Return the map node columns (position, heading, size) for signals or objects.
 
     ``at`` is s, t and the height above the road, else the element's own. The heading is the sum of
     the road's and the element's heading.

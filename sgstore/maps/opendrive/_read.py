@@ -1,4 +1,4 @@
-"""Reader of road map texts: OpenDRIVE, and plain lanes of recordings without OpenDRIVE.
+"""Reader of road map texts: OpenDRIVE, or the lane text format of sgstore.
 
 See :mod:`sgstore.maps.opendrive` for the steps and the treatment of defects.
 """
@@ -58,7 +58,7 @@ _KEPT: Final = 4
 
 @lru_cache(maxsize=_KEPT)
 def read_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
-    """Return the road map that a text describes; recent maps are cached.
+    """Return the road map of an OpenDRIVE or lane text. Recent maps are cached.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def read_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
 
 
 def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
-    """Read a map text without the cache; see :func:`read_map`."""
+    """Parse an OpenDRIVE or lane text into a road map, without the cache."""
     if is_lane_text(text):
         return read_lane_text(text, name or _short_digest(text))
     skip: dict[int, MapError] = {}
@@ -112,7 +112,7 @@ def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _without(odd: Mapping[Record, MapError], skip: Container[int]) -> list[str]:
-    """Return warnings about omitted records of kept roads: one line per road and kind."""
+    """Return warnings about skipped records (such as signals) of roads: one line per road and kind."""
     groups: dict[tuple[str, int], list[MapError]] = {}
     for (kind, road, _), error in odd.items():
         if road not in skip:

@@ -1,4 +1,4 @@
-"""Signals: type, place and controlled lanes, with warnings about contradictions.
+"""OpenDRIVE signals (traffic lights, signs): type, position and controlled lanes.
 
 This module finds signals whose place contradicts the lanes of their orientation.
 
@@ -43,7 +43,7 @@ _READERS: Final = {"asam": "as ASAM OpenDRIVE reads it", "carla": "as CARLA read
 
 @dataclass(slots=True)
 class Doubts:
-    """Collector of contradictory orientations of the signals of a map.
+    """Collector of OpenDRIVE signals whose orientation contradicts their lanes.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ class Doubts:
         there: frozenset[int],
         readings: tuple[frozenset[int], frozenset[int]],
     ) -> None:
-        """Check an element of a signal at a place (road, s).
+        """Check the orientation of a signal at a road position against the lanes there.
 
         ``there``: the driving lanes at this place; ``readings``: the lanes of its orientation in
         the chosen and in the other interpretation.
@@ -118,7 +118,7 @@ class Doubts:
         return bool(lanes.both[lane] or lanes.forward[lane] == (end == END))
 
     def _before(self, road: int, s: float) -> str:
-        """Return the end of the road with a junction near this place, or an empty text."""
+        """Return the end of the road with a junction near a position, or an empty text."""
         if not self._junctions:
             self._lengths = self.document.rough_numbers("road", "length").tolist()
             self._junctions = {
@@ -173,7 +173,7 @@ Stops = frozenset[tuple[int, float]]
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Signals and the lanes that they apply to.
+    """Traffic lights and signs of an OpenDRIVE map, with the lanes that they apply to.
 
     Attributes
     ----------
@@ -193,25 +193,25 @@ class Signals:
     told: str = ""
 
     def edges(self, first: int) -> Edge:
-        """Return the edges ``controlsTrafficOf``; ``first`` is the row of the first signal among the nodes."""
+        """Return the map edges ``controlsTrafficOf`` from signals to lanes."""
         found = {(first + row, lane) for row, lanes in enumerate(self.lanes) for lane, _ in lanes}
         pairs = sorted(found)
         signal, lane = np.array(pairs, np.int64).reshape(-1, 2).T
         return ("controlsTrafficOf", signal, FIRST_LANE + lane)
 
     def places(self, first: int) -> tuple[Ints, Ints, Floats]:
-        """Return rows of signals among the nodes, their lanes, and the places ``s`` on the roads."""
+        """Return signals, their lanes, and the road positions ``s`` where they apply, as columns."""
         rows = [(row, *one) for row, lanes in enumerate(self.lanes) for one in sorted(lanes)]
         row, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
         return first + row, lane, np.array([s for *_, s in rows], np.float64)
 
     def stop_lines(self, first: int) -> Ints:
-        """Return rows of the painted stop lines among the nodes."""
+        """Return the node rows of the signals that are painted stop lines."""
         return first + np.array([r for r, c in enumerate(self.codes) if c == _STOP_LINE], np.int64)
 
 
 def read_signals(document: Document, plan: PlanView, network: Network, signs: Signs) -> Signals:
-    """Read the signals of a map; a signal with an invalid place is left out with a warning."""
+    """Read the signals of an OpenDRIVE map. Signals with an invalid position are skipped with a warning."""
     reach = _Reach(document, network, signs.orientation)
     kinds = dict(signs.kinds)
     parts = (_elements(document, plan, reach, kinds), _signal_objects(document, plan, reach))
@@ -226,7 +226,7 @@ def read_signals(document: Document, plan: PlanView, network: Network, signs: Si
 
 
 def read_controllers(document: Document) -> dict[str, tuple[str, ...]]:
-    """Map each controller to the ids of the signals that switch together."""
+    """Return the signals that switch together: controller id → signal ids."""
     table = document["controller/control"]
     names = document["controller"].texts("id")
     members: dict[str, list[str]] = {}
@@ -236,12 +236,12 @@ def read_controllers(document: Document) -> dict[str, tuple[str, ...]]:
 
 
 def is_signal_object(name: str) -> bool:
-    """True if an object with this name is a signal."""
+    """Return True if the name of a map object shows that it is a traffic signal."""
     return bool(_SPEED_OBJECT.match(name)) or _STOP_STENCIL in name.lower()
 
 
 def kind_of_signal(code: str, *, dynamic: bool, name: str = "") -> str:
-    """Return the kind of a signal with this type code; by default ``sign``."""
+    """Return the kind of an OpenDRIVE signal from its type code; by default ``sign``."""
     if _LIGHT.match(code) and code not in _NOT_LIGHTS:
         return "traffic_light"
     if code in KIND_OF_TYPE:
@@ -252,7 +252,7 @@ def kind_of_signal(code: str, *, dynamic: bool, name: str = "") -> str:
 
 
 class _Reach:
-    """Look-up of the driving lanes at a place of a road, by their ids or their direction."""
+    """Look-up of the driving lanes at a road position, for the signals that apply there."""
 
     def __init__(self, document: Document, network: Network, orientation: str) -> None:
         self.warnings = network.warnings
@@ -274,7 +274,7 @@ class _Reach:
         self._known: dict[tuple[int, object], frozenset[int]] = {}
 
     def valid(self, element: tuple[str, int, str], place: tuple[int, float]) -> frozenset[int]:
-        """Return the driving lanes at a place (road, s) to which an element's validity applies."""
+        """Return the driving lanes at a road position to which the signal's validity element applies."""
         kind, row, signal = element
         ranges = self._ranges[kind].get(row)
         orientation = self._tables[kind].attributes[row].get("orientation", "")
@@ -299,14 +299,14 @@ class _Reach:
         return self._known[key]
 
     def on_side(self, place: tuple[int, float], *, left: bool) -> frozenset[int]:
-        """Return the driving lanes at a place (road, s) to the left or right of the centre lane."""
+        """Return the driving lanes at a road position, to the left or right of the centre lane."""
         lanes = self._driving.get(self._network.section_at(*place), [])
         return frozenset(lane for lane, ident in lanes if (ident > 0) == left)
 
     def _oriented(
         self, lanes: list[tuple[int, int]], orientation: str, reading: str
     ) -> frozenset[int]:
-        """Return the lanes that an orientation selects: by direction, or by side."""
+        """Return the lanes that the orientation of a signal selects: by direction, or by road side."""
         if orientation not in {"+", "-"}:
             return frozenset(lane for lane, _ in lanes)
         plus, about = orientation == "+", self._network.lanes
@@ -362,7 +362,7 @@ def _stops(lanes: frozenset[int], place: tuple[int, float]) -> Stops:
 
 
 def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
-    """Map each signal to the lanes and places of all references to it."""
+    """Return, for each signal, the lanes and positions of all references to it."""
     kind = "road/signalReference"
     table = document[kind]
     s = document.rough_numbers(kind, "s")
@@ -377,7 +377,7 @@ def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
 
 
 def _limit(attributes: dict[str, str]) -> float:
-    """Return the speed limit of a sign; the default unit is km/h, or mph for codes of the United States."""
+    """Return the speed limit of a sign. The default unit is km/h, or mph for codes of the United States."""
     american = attributes.get("type", "").startswith("R") or attributes.get("country") == "US"
     unit = attributes.get("unit") or ("mph" if american else "km/h")
     return speed(attributes.get("value", ""), unit)

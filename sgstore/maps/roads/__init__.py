@@ -1,4 +1,4 @@
-"""The road map: lanes, roads, junctions, crosswalks and signals as arrays, with bulk look-ups.
+"""Road maps as arrays (lanes, roads, junctions, crosswalks, signals), with fast look-ups for many positions.
 
 A map is read once (:mod:`sgstore.maps.opendrive`) and never changes. Queries are bulk queries: the lanes
 under a thousand footprints, or the parts of the map around sixty egos. Every answer is a set,

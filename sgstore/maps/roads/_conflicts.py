@@ -1,4 +1,4 @@
-"""Lanes through junctions that cross or merge."""
+"""Conflicts between lanes: lanes in junctions that cross or merge."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_PAIRS: Final = 2_000_000
 def conflicts(
     ribbons: Ribbons, lanes: Ints, junction: Sequence[str], flow: tuple[Ints, Ints]
 ) -> tuple[Ints, Ints]:
-    """Return pairs of lanes of a junction that cross or merge, each once, the lower lane first.
+    """Return pairs of lanes in a junction that cross or merge.
 
     Lanes cross if the interiors of their centre lines meet. They merge if both flow into one lane
     or end in one place. Lanes that start in one place do not conflict, however long they overlap.
@@ -60,7 +60,7 @@ def conflicts(
 
 
 def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
-    """Return all pairs of lanes of one junction, the lower lane first."""
+    """Return all pairs of lanes in the same junction, each pair once."""
     names: dict[str, int] = {}
     for name in junction:
         names.setdefault(name, len(names))
@@ -77,7 +77,7 @@ def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
 
 
 def _share(src: Ints, dst: Ints, one: Ints, other: Ints) -> Bools:
-    """Return a mask of the pairs of lanes with a common successor in ``src → dst``."""
+    """Return a mask of the pairs of lanes that have a common successor lane."""
     after: dict[int, set[int]] = {}
     for lane, onward in zip(src.tolist(), dst.tolist(), strict=True):
         after.setdefault(lane, set()).add(onward)
@@ -101,7 +101,7 @@ def _together(ribbons: Ribbons, one: Ints, other: Ints, *, at_end: bool) -> Bool
 
 
 def _heights(ribbons: Ribbons, lines: Any, one: Ints, other: Ints) -> Floats:
-    """Return the height of the first lane of a pair above the second, where they are closest."""
+    """Return the height difference of each pair of lanes where they are closest; m."""
     shortest: Any = shapely.shortest_line(lines[one], lines[other])
     heights: list[Floats] = []
     for lanes, end in ((one, 0), (other, -1)):

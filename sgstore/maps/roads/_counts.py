@@ -1,4 +1,4 @@
-"""Counts of the parts of a road map."""
+"""Summary of a road map: numbers of lanes, roads, junctions and so on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class MapCount:
-    """Number of parts of a map, of one kind.
+    """Number and total length of the parts of a road map of one kind, such as driving lanes.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class MapCount:
 
 
 def summary(road_map: RoadMap) -> list[MapCount]:
-    """Summarise a road map: lanes by type, most frequent first, other parts, and warnings last.
+    """Summarise a road map: numbers of lanes by type, of roads, junctions and so on, and warnings.
 
     A road with several types counts under each type, with its length of that type.
     """
@@ -69,7 +69,7 @@ def _of(kinds: list[str], kind: str) -> list[int]:
 
 
 def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]:
-    """Count the parts and add up their lengths per kind, longest kind first."""
+    """Count map parts (such as lanes) by kind, and add up their lengths, longest kind first."""
     count: Counter[str] = Counter()
     total: defaultdict[str, float] = defaultdict(float)
     for kind, length in lengths:
@@ -80,7 +80,7 @@ def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]
 
 
 def _stretches(road_map: RoadMap, kinds: list[str]) -> Iterable[tuple[str, float]]:
-    """Yield types of roads and their lengths, each type once per road; empty for an unknown type."""
+    """Yield type and length of each part of a road with one road type; empty for an unknown type."""
     nodes = road_map.nodes
     for row in _of(kinds, "road"):
         length = float(nodes.length[row])

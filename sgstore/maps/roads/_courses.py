@@ -1,4 +1,4 @@
-"""Curvature and slope of lanes, metre by metre.
+"""Curvature and slope along lanes, in steps of one metre.
 
 A lane is cut into 1 to 10,000 equal stretches of about :data:`STRETCH`. The curvature of a stretch
 is the turn of its centre line from end to end, divided by the length. The slope is the rise divided
@@ -35,7 +35,7 @@ _DIGITS: Final = 7
 
 @dataclass(frozen=True, slots=True)
 class LaneCourses:
-    """Stretches of lanes with curvature and slope, ordered by lane and start; shape (n,).
+    """Table of lane intervals with constant curvature and slope, by lane and start; shape (n,).
 
     A place before the start of its lane is on the first stretch, a place after the end on the last.
 
@@ -62,18 +62,18 @@ class LaneCourses:
 
     @classmethod
     def none(cls) -> LaneCourses:
-        """Return an empty table: no lane has a known course."""
+        """Return an empty table of lane curvature and slope."""
         nowhere = np.zeros(0)
         return cls(np.zeros(0, np.int64), nowhere, nowhere, nowhere, nowhere)
 
     def rows(self) -> Iterator[tuple[int, float, float, float]]:
-        """Yield node id of the lane, start, curvature and slope of each stretch."""
+        """Yield node id of the lane, start, curvature and slope of each lane interval."""
         columns = (self.start, self.curvature, self.slope)
         return zip((-2 - self.lane).tolist(), *(one.tolist() for one in columns), strict=True)
 
     @staticmethod
     def of(ribbons: Ribbons, heights: Heights | None) -> LaneCourses:
-        """Compute curvature and slope along lanes.
+        """Compute curvature and slope along all lanes from their surfaces.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class LaneCourses:
 
 
 def _joined(every: LaneCourses) -> LaneCourses:
-    """Join neighbouring stretches that have the same curvature and slope."""
+    """Join consecutive lane intervals that have the same curvature and slope."""
     if not len(every):
         return every
     slope = np.nan_to_num(every.slope)

@@ -1,4 +1,4 @@
-"""Cross sections of lanes: a centre line and its borders."""
+"""Cross sections of lanes (left point, centre, right point), computed from lines."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ last share."""
 
 @dataclass(frozen=True, slots=True)
 class Sections:
-    """Cross sections along a line, in the line's direction; shape (n, 2) and (n,)."""
+    """Cross sections of a lane along its centre line: centre, left and right points; n rows."""
 
     left: Floats
     right: Floats
@@ -54,18 +54,18 @@ class Sections:
         object.__setattr__(self, "middle", (self.left + self.right) / 2)
 
     def turned_round(self) -> Sections:
-        """Return the sections against the line's direction."""
+        """Return the cross sections of the lane in the opposite direction."""
         return Sections(self.right[::-1], self.left[::-1], self.z[::-1])
 
     def up_to(self, left: Floats, right: Floats, z: float) -> Sections:
-        """Append a cross section at the end of the line."""
+        """Return the cross sections of the lane with one more section at the end."""
         return Sections(
             np.vstack((self.left, left)), np.vstack((self.right, right)), np.append(self.z, z)
         )
 
     @staticmethod
     def between(left: Floats, right: Floats) -> Sections:
-        """Compute cross sections of a lane from its two borders, at every point of both.
+        """Compute the cross sections of a lane from its left and right border.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class Sections:
     def across(
         centre: Floats, lefts: Sequence[Floats], rights: Sequence[Floats], half: float
     ) -> tuple[Sections, bool]:
-        """Compute cross sections of a lane; the flag is True if its borders define the width.
+        """Compute the cross sections of a lane from its centre line and pieces of its borders.
 
         Parameters
         ----------
@@ -137,7 +137,7 @@ class Sections:
 
 
 def thinned(line: Floats) -> Floats:
-    """Remove points of a line (n, 3) that are closer than :data:`APART` to the previous one; keep the end."""
+    """Remove points of a line (n, 3) that are too close to the previous point."""
     if len(line) < 2:
         return line
     step = np.hypot(*np.diff(line[:, :2], axis=0).T)
@@ -155,13 +155,13 @@ def thinned(line: Floats) -> Floats:
 
 
 def run_of(line: Floats) -> Floats:
-    """Return the length (n,) of a line up to each of its points, seen from above; m."""
+    """Return the length of a line from its start to each of its points (n,), seen from above; m."""
     return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))))
 
 
 @dataclass(frozen=True, slots=True)
 class Feet:
-    """Nearest points on lines to some places; shape (n,) and (n, 2).
+    """Nearest points on lines for some positions, with their distances along the lines.
 
     ``along``: length of the line up to the point, with all lines laid end to end. ``is_end``: True
     at the end of a line.
@@ -173,7 +173,7 @@ class Feet:
 
 
 def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
-    """Return the nearest points on lines to places (n, 2); each line has at least two different points."""
+    """Find the nearest point on lines for each of some positions (n, 2)."""
     start = np.concatenate([line[:-1, :2] for line in lines])
     way = np.concatenate([line[1:, :2] for line in lines]) - start
     x, y = places.T
@@ -201,12 +201,12 @@ def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
 
 
 def along_line(line: Floats, places: Floats) -> Floats:
-    """Return the lengths (n,) of a line up to its points nearest to places (n, 2); m."""
+    """Return, for positions (n, 2), the length along a line to the nearest point of the line; m."""
     return feet(places, [line]).along
 
 
 def _cuts(run: Floats, more: Sequence[Floats]) -> Floats:
-    """Return the places of cross sections along a line: its own points, and other distinct ones."""
+    """Return the lengths along a line where cross sections are placed."""
     inner = np.concatenate([run[1:-1], *more])
     own = np.arange(len(inner)) < len(run) - 2
     inside = (inner > APART) & (inner < run[-1] - APART)
@@ -229,7 +229,7 @@ class _Side:
 
 
 def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats]) -> _Side | None:
-    """Return the ends of the cross sections on one side, or ``None`` without a border on this side."""
+    """Return the left or right ends of a lane's cross sections; ``None`` without a border on this side."""
     if not borders:
         return None
     found = feet(places, borders)
@@ -249,7 +249,7 @@ def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats
 
 
 def half_width(centre: Floats, others: Sequence[Floats]) -> float:
-    """Return half the width of a lane without borders, from the centre lines of its neighbours; m."""
+    """Return half the width of a lane without borders, from the distance to its neighbours; m."""
     run = run_of(centre)
     places = np.linspace(0.0, run[-1], _LOOKS)
     middle = np.column_stack([np.interp(places, run, column) for column in centre[:, :2].T])
@@ -267,7 +267,7 @@ def half_width(centre: Floats, others: Sequence[Floats]) -> float:
 def way_between(
     start: tuple[Floats, float, float, float], end: tuple[Floats, float, float, float]
 ) -> Sections:
-    """Return a lane between two places: position (2,), heading, width and height of both ends.
+    """Return the cross sections of a smooth lane between two lane ends (position, heading, width, height).
 
     Its centre line is a cubic; the lengths of its tangents are those of an arc with the same turn.
     """

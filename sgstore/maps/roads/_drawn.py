@@ -21,7 +21,7 @@ TOLERANCE: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class DrawnOutlines:
-    """Rings and lines of a map, in painting order.
+    """Simplified outlines of a road map (polygons and lines) as plain columns, in painting order.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class DrawnOutlines:
 
     @staticmethod
     def of(road_map: RoadMap, tolerance: float = TOLERANCE) -> DrawnOutlines:
-        """Return the outlines of lanes, crosswalks and objects of a map.
+        """Return the simplified outlines of lanes, crosswalks and objects of a road map.
 
         Parameters
         ----------

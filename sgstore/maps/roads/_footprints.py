@@ -1,4 +1,4 @@
-"""Look-up of the lanes that footprints touch, with overlap and offset.
+"""Look-up of the lanes below footprints (ground rectangles) of objects, with overlap and lateral offset.
 
 Every frame needs this look-up, so it must be fast. A lane is a chain of quadrangles
 (:class:`~sgstore.maps.roads._ribbons.Ribbons`), short where it bends. A grid brings footprints and
@@ -46,7 +46,7 @@ _MOST_STEPS: Final = 256
 
 @dataclass(frozen=True, slots=True)
 class Touches:
-    """Pairs of a footprint and a lane that touch, ordered by footprint and lane; shape (H,).
+    """Pairs of an object footprint (ground rectangle) and a lane that it touches; shape (H,).
 
     ``row``, ``lane`` (from 0), ``overlap``, ``offset``, ``heading_error`` as in
     :class:`~sgstore.maps.roads.LaneHits`; ``inside``: True if the footprint's centre is in the lane.
@@ -62,7 +62,7 @@ class Touches:
 
 @dataclass(frozen=True, slots=True)
 class _Quads:
-    """Quadrangles of lanes, ordered by lane and along it; shape (Q,), corners (4, Q).
+    """Pieces of lane surfaces as quadrangles, sorted by lane and along the lane; Q pieces.
 
     The corners are right start, right end, left end, left start: counter-clockwise, ``turn`` +1,
     unless the lane has a negative width there. The whole quadrangle is within ``radius`` of its
@@ -118,7 +118,7 @@ def _quads(ribbons: Ribbons) -> _Quads:
 
 
 def _unfold(x: Floats, y: Floats) -> None:
-    """Shorten crossing end cross sections of quadrangles to their crossing point, in place.
+    """Correct twisted pieces of lane surfaces in place: crossing ends are cut at the crossing point.
 
     In a bend that is tighter than the lane is wide, the inner border runs backwards, beyond the
     centre of the bend. This part adds no area to the lane.
@@ -140,7 +140,7 @@ def _unfold(x: Floats, y: Floats) -> None:
 
 
 class _Grid:
-    """Square grid of cells with the quadrangles in each cell; without empty cells."""
+    """Square grid over the map, with the pieces of lane surfaces in each cell."""
 
     def __init__(self, quads: _Quads) -> None:
         low = np.stack((quads.x.min(axis=0), quads.y.min(axis=0)))
@@ -166,11 +166,11 @@ class _Grid:
         self.keys, self.begin = key[begin], np.append(begin, len(key))
 
     def cells(self, places: Floats) -> Ints:
-        """Return the cells (2, N), int64, of the places (2, N)."""
+        """Return the grid cells (2, N) of positions (2, N), int64."""
         return np.floor((places - self.origin) / self.cell).astype(np.int64)
 
     def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
-        """Return the quadrangles in rectangles of grid cells, as pairs of rectangle and quadrangle.
+        """Return the lane pieces in rectangles of grid cells, as pairs (rectangle, lane piece).
 
         Each pair occurs once: a pair that shares several cells counts in the first of them.
         """
@@ -193,7 +193,7 @@ class _Grid:
 
 
 def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
-    """List the cells of grid rectangles, as pairs of rectangle and cell."""
+    """List the cells in rectangles of a grid, as pairs (rectangle, cell)."""
     spans = np.maximum(last - first + 1, 0)
     sizes = spans[0] * spans[1]
     row = np.repeat(np.arange(len(sizes)), sizes)
@@ -204,7 +204,7 @@ def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _Shapes:
-    """Footprints; shape (N,). ``a`` and ``b`` are half of length and width, ``z`` is the height."""
+    """Footprints (ground rectangles) of N objects: position, heading, half size and height."""
 
     x: Floats
     y: Floats
@@ -217,7 +217,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, boxes: Floats, z: Floats) -> _Shapes:
-        """Make footprints from boxes (N, 5); a missing or zero side gets the length :data:`TOUCH`."""
+        """Make footprints from boxes (N, 5). A missing or zero side becomes very short."""
         half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5].T)) / 2, TOUCH / 2)
         heading = np.nan_to_num(boxes[:, 2])
         x, y = np.ascontiguousarray(boxes[:, :2].T)
@@ -225,7 +225,7 @@ class _Shapes:
 
 
 class LaneIndex:
-    """Index of all lanes of a map, for look-ups by footprint.
+    """Spatial index of all lanes of a map, to find the lanes below object footprints.
 
     Parameters
     ----------
@@ -240,13 +240,13 @@ class LaneIndex:
         self._storey = storey
 
     def touches(self, boxes: Floats, z: Floats) -> Touches:
-        """Return the lanes that footprints touch; see :meth:`sgstore.maps.roads.RoadMap.lanes_of`."""
+        """Return the lanes that footprints (ground rectangles of objects) touch."""
         shapes = _Shapes.of(boxes, z)
         found = [self._touching(shapes)] if worth() else self._touching_in_chunks(shapes)
         return chained([_no_touches(), *(self._gathered(shapes, *touching) for touching in found)])
 
     def _touching(self, shapes: _Shapes) -> tuple[Ints, Ints, Bools, Floats]:
-        """Return touching pairs of footprint and quadrangle, a mask of inner centres, and measures."""
+        """Return touching pairs of a footprint and a lane piece, with overlap area and centre mask."""
         from sgstore.maps.roads import _loops
 
         grid, quads = self._grid, self._quads
@@ -276,7 +276,7 @@ class LaneIndex:
             )
 
     def _cells(self, shapes: _Shapes) -> tuple[Ints, Ints, Ints]:
-        """Return footprints with a finite position, and the first and last cell of each, (2, R)."""
+        """Return the footprints with a finite position, and the first and last grid cell of each."""
         grid = self._grid
         cos, sin = np.abs(shapes.cos), np.abs(shapes.sin)
         reach = np.stack((cos * shapes.a + sin * shapes.b, sin * shapes.a + cos * shapes.b)) + TOUCH
@@ -291,7 +291,7 @@ class LaneIndex:
         return rows, first, last
 
     def _candidates(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints]]:
-        """Yield pairs of a footprint and a close quadrangle, each pair once, in chunks of footprints."""
+        """Yield pairs of a footprint and a close lane piece, each pair once, in chunks of footprints."""
         grid, quads = self._grid, self._quads
         rows, first, last = self._cells(shapes)
         if not len(rows):
@@ -334,7 +334,7 @@ class LaneIndex:
         return Touches(row, lane[best], overlap, offset, error, within)
 
     def _aside(self, shapes: _Shapes, row: Ints, quad: Ints) -> tuple[Floats, Floats]:
-        """Return lateral offset and heading error of footprints on the lanes of these quadrangles.
+        """Return lateral offset (m) and heading error (rad) of footprints relative to their lanes.
 
         The offset refers to the place of the lane whose cross section runs through the footprint's
         centre. This place may be in a quadrangle that the footprint does not touch. Between two
@@ -367,7 +367,7 @@ class LaneIndex:
 
 
 def _first_least(values: Floats, starts: Ints) -> Ints:
-    """Return the row of the first minimum of each group; groups begin at ``starts``."""
+    """Return the index of the first minimum in each group of consecutive values."""
     least = np.minimum.reduceat(values, starts)
     group = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(values)))
     rows = np.flatnonzero(values == least[group])[::-1]
@@ -383,7 +383,7 @@ def _no_touches() -> Touches:
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Pairs of footprint and quadrangle; shape (n,)."""
+    """Pairs of an object footprint and a piece of a lane surface (quadrangle); n pairs."""
 
     row: Ints
     quad: Ints
@@ -405,7 +405,7 @@ class _Pairs:
         return cls(row, quad, shapes.a[row], shapes.b[row], quads.turn[quad], along, across)
 
     def take(self, rows: Ints) -> _Pairs:
-        """Return the pairs of these rows."""
+        """Return the pairs with the given indices."""
         return _Pairs(
             self.row[rows],
             self.quad[rows],
@@ -417,7 +417,7 @@ class _Pairs:
         )
 
     def touching(self) -> tuple[Bools, Bools]:
-        """Return masks of the pairs that touch, and of the pairs with the centre in the quadrangle."""
+        """Return two masks: footprint and lane piece touch; the footprint's centre is in the piece."""
         a, b = self.a + TOUCH, self.b + TOUCH
         x, y = self.x, self.y
         apart = (x.min(axis=0) > a) | (x.max(axis=0) < -a)
@@ -432,19 +432,19 @@ class _Pairs:
         return ~apart, inside
 
     def middle_line(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the start of each quadrangle's centre line, and the vector to its end."""
+        """Return the start of the centre line of each lane piece, and the vector to its end."""
         x, y = (self.x[0] + self.x[3]) / 2, (self.y[0] + self.y[3]) / 2
         return x, y, (self.x[1] + self.x[2]) / 2 - x, (self.y[1] + self.y[2]) / 2 - y
 
     def beside(self) -> tuple[Floats, Floats]:
-        """Return the footprint centre's share along the centre line (0 … 1), and its squared distance."""
+        """Return the relative position 0 … 1 of the footprint along the lane piece, and squared distance."""
         x, y, along_x, along_y = self.middle_line()
         share = -(x * along_x + y * along_y) / np.maximum(along_x**2 + along_y**2, 1e-18)
         at = np.clip(share, 0.0, 1.0)
         return share, (x + at * along_x) ** 2 + (y + at * along_y) ** 2
 
     def between(self) -> Floats:
-        """Return the place of the footprint's centre between both cross sections, 0 … 1.
+        """Return the relative position 0 … 1 of a footprint's centre between both ends of a lane piece.
 
         Unlike the projection, this share continues from quadrangle to quadrangle without a gap or
         overlap.
@@ -456,14 +456,14 @@ class _Pairs:
         return np.where(usable, ahead / np.where(usable, both, 1.0), self.beside()[0])
 
     def _ahead(self, right: int, left: int) -> tuple[Floats, Floats]:
-        """Return the distance of the footprint's centre ahead of a cross section, and the lane width there."""
+        """Return the distance of a footprint's centre from an end of the lane piece, and the width there."""
         across_x, across_y = self.x[left] - self.x[right], self.y[left] - self.y[right]
         width = np.hypot(across_x, across_y)
         ahead = self.y[right] * across_x - self.x[right] * across_y
         return ahead / np.maximum(width, _POINT), width
 
     def common_areas(self) -> Floats:
-        """Return the common area of footprint and quadrangle; negative for clockwise quadrangles.
+        """Return the overlap area of footprint and lane piece; m². Clockwise pieces give negative areas.
 
         The area of a polygon P in the box [-a, a] × [-b, b] is ∮ x̂ dy along P's edges where |y| ≤ b, with
         x̂ = x held within ±a: Green's theorem for the field (x̂, 0). Along an edge the integral of x̂ is a

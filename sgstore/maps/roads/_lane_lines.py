@@ -1,4 +1,4 @@
-"""Conversion of lane lines, links and borders to plain lanes.
+"""Conversion of lane lines with links and borders (OSI, CommonRoad, Lanelet2, SUMO) to lanes of a road map.
 
 The input is lane lines and links, the output is plain lanes.
 
@@ -59,7 +59,7 @@ _ABOUT: Final = 1.0
 
 
 class Joint(NamedTuple):
-    """Another lane that touches an end of a lane, and the end of it: ``start``, ``end`` or empty (unknown)."""
+    """Link from a lane end to another lane, with the other lane's end: ``start``, ``end`` or unknown."""
 
     lane: str
     contact: str = ""
@@ -70,7 +70,7 @@ class Joint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Border:
-    """Line at the side of a lane.
+    """Line at the left or right side of a lane, with the permission to cross it.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Border:
 
 @dataclass(frozen=True, slots=True)
 class LaneLine:
-    """Lane as a line; left, right, start and end refer to the line, not to the traffic.
+    """Lane as a centre line with borders and links. Left and right refer to the line, not to the traffic.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class LaneLine:
 
     @staticmethod
     def with_junctions(lines: Sequence[LaneLine]) -> list[LaneLine]:
-        """Assign a junction to lanes for motor traffic whose centre lines run through one another.
+        """Group crossing lanes into junctions, and return the lanes with their junction names.
 
         This applies to lanes that cross, diverge and merge, but not to lanes on different storeys.
         Lanes without sections stay unchanged.
@@ -186,7 +186,7 @@ class LaneLine:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Junction as an area, with pairs of lanes (from, to) that are connected through it."""
+    """Junction as an area: pairs of lanes (from, to) that are connected through it."""
 
     ident: str
     ways: tuple[tuple[str, str], ...]
@@ -194,7 +194,7 @@ class Area:
 
 @dataclass(slots=True)
 class _Network:
-    """Lanes of a map by index, with look-ups of their ends."""
+    """Lanes of a map with surfaces, and look-ups of their ends and directions."""
 
     lines: list[LaneLine]
     sections: list[Sections]
@@ -206,28 +206,28 @@ class _Network:
         return 1 if self.lines[lane].forward else -1
 
     def end_of(self, lane: int, contact: str) -> Floats:
-        """Return the start or end point of a lane's line."""
+        """Return the start or end point of a lane's centre line."""
         middle = self.sections[lane].middle
         return middle[0 if contact == Joint.START else -1]
 
     def gap(self, lane: int, end: str, other: int, contact: str) -> float:
-        """Return the distance between an end of a lane and an end of another lane; m."""
+        """Return the distance between an end of one lane and an end of another lane; m."""
         return float(np.hypot(*(self.end_of(lane, end) - self.end_of(other, contact))))
 
     def runs_against(self, lane: int, other: int) -> bool:
-        """True if the lines of two neighbouring lanes run in opposite directions."""
+        """Return True if the lines of two neighbouring lanes run in opposite directions."""
         key = (lane, other) if lane < other else (other, lane)
         if key not in self._turned:
             self._turned[key] = _turned_round(*(self.sections[row].middle for row in key))
         return self._turned[key]
 
     def exits(self, lane: int, contact: str) -> bool:
-        """True if traffic leaves a lane at this end of its line."""
+        """Return True if traffic leaves a lane at the given end of its line."""
         line = self.lines[lane]
         return line.both or line.forward == (contact == Joint.END)
 
     def enters(self, lane: int, contact: str) -> bool:
-        """True if traffic enters a lane at this end of its line."""
+        """Return True if traffic enters a lane at the given end of its line."""
         line = self.lines[lane]
         return line.both or line.forward == (contact == Joint.START)
 
@@ -235,7 +235,7 @@ class _Network:
 def plain_lanes(
     lines: Sequence[LaneLine], areas: Sequence[Area] = ()
 ) -> tuple[list[PlainLane], list[str]]:
-    """Return plain lanes, and warnings about skipped or guessed parts.
+    """Convert lane lines to lanes of a road map. Return the lanes, and warnings about guesses.
 
     Raises
     ------
@@ -307,7 +307,7 @@ def _check_numbers(lines: Sequence[LaneLine], areas: Sequence[Area]) -> None:
 
 
 def _shaped(lines: Sequence[LaneLine]) -> _Network:
-    """Compute the lane surfaces and return the network of lanes with a surface."""
+    """Compute the surfaces of lanes from lines. Lanes without a surface are dropped."""
     network = _Network([], [], {})
     usable: list[LaneLine] = []
     short: list[str] = []
@@ -348,7 +348,7 @@ def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[
 
 
 def about_lanes(lanes: Sequence[str], what: str) -> str:
-    """Return a warning that names the first few of these lanes."""
+    """Return a warning text that names the first few of several lanes."""
     more = f" and {len(lanes) - LISTED} more" if len(lanes) > LISTED else ""
     return f"{'lanes' if len(lanes) > 1 else 'lane'} {', '.join(lanes[:LISTED])}{more}: {what}"
 
@@ -359,7 +359,7 @@ def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
 
 
 def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
-    """Add connecting lanes through junction areas."""
+    """Add lanes through junction areas: each connects the end of one lane with the start of another."""
     missing: list[str] = []
     astray: list[str] = []
     for area in areas:
@@ -381,7 +381,7 @@ def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
 
 
 def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
-    """True if the traffic of a lane enters or leaves an area, or if the lane has no joints."""
+    """Return True if traffic of a lane enters or leaves a junction area, or the lane has no links."""
     joints = line.after if line.forward == at_exit else line.before
     joints = (*line.before, *line.after) if line.both else joints
     untold = not line.before and not line.after
@@ -414,7 +414,7 @@ def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) 
 
 
 def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, float, float]:
-    """Return an end of a lane: place, heading of its traffic, width and height."""
+    """Return position, traffic heading, width and height at one end of a lane."""
     sections = network.sections[lane]
     at, other = (0, 1) if contact == Joint.START else (-1, -2)
     middle = sections.middle
@@ -447,7 +447,7 @@ def _joints(network: _Network) -> set[_Joined]:
 
 
 def _contact(network: _Network, lane: int, end: str, other: int) -> str:
-    """Return the end of another lane that touches an end of a lane."""
+    """Return which end (start or end) of another lane touches an end of a lane."""
     line, ident = network.lines[other], network.lines[lane].ident
     says = {
         contact
@@ -468,7 +468,7 @@ def _onto(network: _Network, joints: Iterable[_Joined]) -> list[set[int]]:
 
 
 def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
-    """Extend lanes to the next one across small gaps, as between points half a metre apart."""
+    """Extend lanes to the next lane across small gaps."""
     nearest: dict[int, tuple[float, str, int, str]] = {}
     for row, end, other, contact in sorted(joints):
         gap = network.gap(row, end, other, contact)
@@ -488,7 +488,7 @@ _Sides = tuple[set[int], set[int]]
 
 
 def _beside(network: _Network) -> list[_Sides]:
-    """Return the neighbours on both sides of each line; a link in one direction is enough."""
+    """Return the left and right neighbours of each lane. A link from one of two neighbours is enough."""
     beside: list[_Sides] = [(set(), set()) for _ in network.lines]
     for row, line in enumerate(network.lines):
         for side, idents in enumerate((line.left_beside, line.right_beside)):
@@ -510,7 +510,7 @@ def _beside(network: _Network) -> list[_Sides]:
 
 
 def _turned_round(one: Floats, other: Floats) -> bool:
-    """True if two neighbouring lines run in opposite directions."""
+    """Return True if two neighbouring lines run in opposite directions."""
     way, back = one[-1] - one[0], other[-1] - other[0]
     same = float(way @ back)
     if abs(same) < 0.5 * float(np.hypot(*way) * np.hypot(*back)):
@@ -521,7 +521,7 @@ def _turned_round(one: Floats, other: Floats) -> bool:
 
 
 def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set[int]:
-    """Return lanes of traffic that are separated from a lane only by lanes without traffic."""
+    """Return driving lanes that only lanes without traffic separate from a given lane."""
     if network.lines[row].type not in TRAFFIC:
         return set()
     found: set[int] = set()
@@ -541,7 +541,7 @@ def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set
 
 
 def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int]:
-    """Yield the neighbouring lanes of traffic with oncoming traffic."""
+    """Yield the neighbouring lanes with oncoming traffic."""
     if network.lines[row].type not in TRAFFIC:
         return
     for other in others:
@@ -555,7 +555,7 @@ def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int
 def _changes(
     network: _Network, row: int, beside: _Sides, against: set[int]
 ) -> Iterator[tuple[int, float, float]]:
-    """Yield stretches where traffic may change to a neighbouring lane, in the direction of travel."""
+    """Yield the parts of a lane where vehicles may change to a neighbouring lane."""
     line, middle = network.lines[row], network.sections[row].middle
     if line.type not in DRIVING:
         return
@@ -579,7 +579,7 @@ def _changes(
 
 
 def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float, float]]:
-    """Return the stretches of a lane's line whose nearest border on one side may be crossed."""
+    """Return the parts of a lane where its border on one side may be crossed."""
     line, middle = network.lines[row], network.sections[row].middle
     borders = [b for b in (line.lefts, line.rights)[side] if len(b.line) > 1]
     spans: list[tuple[float, float, float, bool]] = []
@@ -602,7 +602,7 @@ def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float,
 
 
 def _names(network: _Network) -> list[str]:
-    """Return unique names of lanes; an ambiguous name gets the lane's id as a suffix."""
+    """Return a unique name for each lane. An ambiguous name gets the lane's id as a suffix."""
     wanted = [line.name or line.ident for line in network.lines]
     count: dict[str, int] = defaultdict(int)
     for name in wanted:
@@ -614,7 +614,7 @@ def _names(network: _Network) -> list[str]:
 
 
 def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
-    """Return the road of each lane; a lane without a road belongs to the road of its neighbours."""
+    """Return the road of each lane. A lane without a road gets the road of its neighbours."""
     road = [line.road for line in network.lines]
     for row, line in enumerate(network.lines):
         if road[row]:
@@ -630,7 +630,7 @@ def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
 
 
 def _junctions(network: _Network) -> list[str]:
-    """Return the junction of each lane; an unnamed junction is a group of lanes that cross or touch."""
+    """Return the junction of each lane. Lanes that cross or touch form an unnamed junction."""
     junction = [line.junction or "" for line in network.lines]
     rows = [row for row, line in enumerate(network.lines) if line.junction is None]
     if not rows:

@@ -1,4 +1,4 @@
-"""Text format of plain lanes: stores keep maps without OpenDRIVE in it.
+"""Lane text format of sgstore (JSON), in which stores keep road maps that are not OpenDRIVE.
 
 The text is JSON with one lane per line, so that people can read it and tools can compare it::
 
@@ -62,7 +62,7 @@ _RELATED: Final = ("onto", "left_beside", "right_beside", "against")
 
 
 def is_lane_text(text: str) -> bool:
-    """True if a text may be a map of plain lanes: it begins like a JSON object."""
+    """Return True if a map text is probably in the lane text format: it begins like a JSON object."""
     return text[:100].lstrip("\ufeff \t\r\n").startswith("{")
 
 
@@ -73,7 +73,7 @@ def lane_text(
     crosswalks: Sequence[PlainCrosswalk] = (),
     objects: Sequence[PlainObject] = (),
 ) -> str:
-    """Return the text of plain lanes, signals, crosswalks, objects and warnings."""
+    """Write lanes, signals, crosswalks and objects as JSON text (lane text format of sgstore)."""
     head = {"format": FORMAT, "version": VERSION, "warnings": list(warnings)}
     rows = ",\n".join(_dumps(_fields(lane)) for lane in lanes)
     more = ",\n".join(_dumps(_signal_fields(signal)) for signal in signals)
@@ -86,7 +86,7 @@ def lane_text(
 
 
 def read_lane_text(text: str, name: str) -> RoadMap:
-    """Parse a text of plain lanes into a road map.
+    """Parse the lane text format of sgstore (JSON) into a road map.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def _fields(lane: PlainLane) -> dict[str, Any]:
 
 
 def _signal_fields(signal: PlainSignal) -> dict[str, Any]:
-    """Convert a signal to JSON fields, without missing values."""
+    """Convert a traffic light or sign to JSON fields, without missing values."""
     places = {key: round(getattr(signal, key), DIGITS) for key in _POSE}
     told: dict[str, Any] = {key: place for key, place in places.items() if math.isfinite(place)}
     told |= {"name": signal.name, "kind": signal.kind, "lanes": list(signal.lanes)}
@@ -186,7 +186,7 @@ def _lane(row: Any, number: int, lanes: int) -> PlainLane:
 
 
 class _TextRow:
-    """Lane or signal of a text; raises :class:`MapError` for an invalid field."""
+    """JSON object of a lane or signal, with checked access to its fields."""
 
     def __init__(self, fields: dict[str, Any], number: int, lanes: int, what: str = "lane") -> None:
         self._fields = fields
@@ -302,7 +302,7 @@ class _TextRow:
         return tuple(values)
 
     def _stretches(self, key: str, numbers: int) -> tuple[tuple[int, float, float], ...]:
-        """Read lists of lane, start and end along it; start only, if ``numbers`` is 2."""
+        """Read a JSON list of intervals: lane, start, and optionally end along the lane."""
         values = self._fields.get(key, [])
         shape = "[lane, start, end]" if numbers == 3 else "[lane, along]"
         expected = f"at most {MAX_RELATED} stretches {shape}"

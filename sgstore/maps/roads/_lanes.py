@@ -1,4 +1,4 @@
-"""Conversion of plain lanes to a ``RoadMap``, and cross sections from lines.
+"""Conversion of lanes with cross sections, signals and objects to a road map.
 
 A plain lane has its cross sections in the direction of travel and its related lanes. All other
 parts of a :class:`~sgstore.maps.roads.RoadMap` follow from them: roads, junctions, turns, conflicts,
@@ -36,7 +36,7 @@ _FIRST_LANE: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class PlainLane:
-    """Lane with cross sections; other lanes are referred to by their index in the list of lanes.
+    """Lane with cross sections, neighbours and successors, independent of a map format.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class PlainLane:
     def painted_across(
         lanes: Sequence[PlainLane], lines: Sequence[Floats]
     ) -> list[dict[int, float]]:
-        """For each painted line (n, 2 or 3), find the lanes for motor traffic and the place along each; m.
+        """Find the driving lanes below painted lines (such as stop lines), and the position along each lane.
 
         A line between two consecutive lanes belongs to the first.
         """
@@ -113,7 +113,7 @@ class PlainLane:
 
 @dataclass(frozen=True, slots=True)
 class PlainSignal:
-    """A traffic light or sign.
+    """Traffic light or sign with its position and lanes, independent of a map format.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ class PlainSignal:
 
 @dataclass(frozen=True, slots=True)
 class PlainCrosswalk:
-    """Pedestrian crossing.
+    """Pedestrian crossing with its outline, independent of a map format.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ class PlainCrosswalk:
 
 @dataclass(frozen=True, slots=True)
 class PlainObject(PlainCrosswalk):
-    """Object at the side of lanes, as an outline on the ground.
+    """Object next to the lanes (such as a building) with its outline on the ground.
 
     Attributes
     ----------
@@ -192,7 +192,7 @@ def road_map_of(
     text: str,
     warnings: Iterable[str] = (),
 ) -> RoadMap:
-    """Build the road map of plain lanes, signals, crosswalks and objects from ``text``.
+    """Build a road map from lanes, signals, crosswalks and objects.
 
     Raises
     ------
@@ -236,14 +236,14 @@ def road_map_of(
 
 
 def _stops(signals: Sequence[PlainSignal], first: int) -> tuple[Ints, Ints, Floats]:
-    """Return the stopping places of signals as columns: signal, lane, and place along it."""
+    """Return the stop positions of traffic lights and signs: signal, lane, and position along the lane."""
     rows = [(first + row, *stop) for row, signal in enumerate(signals) for stop in signal.stops]
     column, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
     return column, lane, np.array([along for *_, along in rows], np.float64)
 
 
 def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
-    """Return the surface of plain lanes."""
+    """Return the surfaces of lanes as one table of cross sections."""
     counts = np.array([len(lane.z) for lane in lanes], np.int64)
     offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     left = np.concatenate([np.zeros((0, 2)), *(lane.left for lane in lanes)])
@@ -275,7 +275,7 @@ def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
 
 
 def headings(x: Floats, y: Floats, first: Bools, alone: Floats | None = None) -> Floats:
-    """Return headings of polylines at their points, (N,), not wrapped; ``first`` marks line starts.
+    """Return the heading of polylines at each of their points (N,); rad, not wrapped.
 
     A line of one point has the heading ``alone``. An inner point has the mean of the directions of
     both pieces, weighted by their lengths; the cubic through points and headings then stays close
@@ -305,7 +305,7 @@ def headings(x: Floats, y: Floats, first: Bools, alone: Floats | None = None) ->
 
 
 def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
-    """Return the nodes of plain lanes with these surfaces."""
+    """Return one map node per lane, with type, length, speed limit and so on."""
     every, length = np.arange(len(ribbons)), ribbons.lengths
     middle = ribbons.at(every, length / 2)
     turns = turn_words(ribbons.turned())
@@ -329,7 +329,7 @@ def plain_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
 
 
 def _road_nodes(lanes: Sequence[PlainLane], ribbons: Ribbons) -> MapNodes:
-    """Return roads ordered by first lane; the length is the sum of the longest lanes per section."""
+    """Return one map node per road, with its length, sorted by the first lane of the road."""
     junction: dict[str, str] = {}
     longest: dict[str, dict[int, float]] = {}
     for lane, length in zip(lanes, ribbons.lengths.tolist(), strict=True):
@@ -365,7 +365,7 @@ def _crosswalk_nodes(crosswalks: Sequence[PlainCrosswalk]) -> MapNodes:
 
 
 def _object_nodes(objects: Sequence[PlainObject]) -> MapNodes:
-    """Return objects as their smallest bounding boxes; the heading is along the longer side."""
+    """Return one map node per object, with the object's smallest bounding box."""
     boxes = [shapely.Polygon(one.outline).minimum_rotated_rectangle for one in objects]
     sides = np.array([np.diff(shapely.get_coordinates(box)[:3], axis=0) for box in boxes])
     sides = sides.reshape(-1, 2, 2)
@@ -448,7 +448,7 @@ Edge = tuple[str, "Ints", "Ints"]
 
 
 def edges_of(parts: Sequence[Edge]) -> MapEdges:
-    """Convert edges between rows of nodes to unique, ordered edges between node ids."""
+    """Convert edges between node rows to unique, sorted map edges between node ids."""
     code = np.concatenate([np.full(len(src), RELATION_CODE[name]) for name, src, _ in parts])
     src = np.concatenate([s for _, s, _ in parts])
     dst = np.concatenate([d for _, _, d in parts])
@@ -457,7 +457,7 @@ def edges_of(parts: Sequence[Edge]) -> MapEdges:
 
 
 def _spread(groups: Sequence[tuple[int, ...]]) -> Ints:
-    """Return pairs of a group's index and each of its members, (n, 2)."""
+    """Return pairs (group index, member) for all members of groups, (n, 2)."""
     row = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     return np.column_stack((row, np.array([*chain(*groups)], np.int64)))
 

@@ -1,4 +1,4 @@
-"""Loop over footprints and quadrangles of lanes, for numba; ``_footprints`` has the same in numpy."""
+"""Compiled loops (numba) for footprints on lane surfaces. ``_footprints`` has the same in numpy."""
 
 # ruff: noqa: PLR0913, PLR0917
 
@@ -27,7 +27,7 @@ def touching(
     turn: Floats,
     touch: float,
 ) -> tuple[Ints, Ints, Bools, Floats]:
-    """Return touching pairs of footprint and quadrangle, a mask of inner centres, and measures.
+    """Return touching pairs of an object footprint and a lane piece, with overlap area and centre mask.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def touching(
 
 @compiled
 def _counts(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
-    """True if a quadrangle counts in a cell: in the first cell always, in others only if it begins there."""
+    """Return True if a lane piece counts in a grid cell, so that each lane piece is found only once."""
     if cell_x > first[0] and quad_first[0] != cell_x:
         return False
     return cell_y == first[1] or quad_first[1] == cell_y
@@ -97,7 +97,7 @@ def _counts(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
 
 @compiled
 def _doubled(found: Ints, inside: Bools, numbers: Floats) -> tuple[Ints, Bools, Floats]:
-    """Copy the arrays into arrays of twice the size."""
+    """Copy result arrays into arrays of twice the size."""
     return (
         np.concatenate((found, np.empty_like(found))),
         np.concatenate((inside, np.empty_like(inside))),
@@ -107,7 +107,7 @@ def _doubled(found: Ints, inside: Bools, numbers: Floats) -> tuple[Ints, Bools, 
 
 @compiled
 def _place(corners: Floats, shapes: Shapes, row: int, at_x: Floats, at_y: Floats) -> None:
-    """Write the corners of a quadrangle in the axes of a footprint."""
+    """Convert the corners of a lane piece into the axes of an object footprint."""
     x, y, cos, sin, _, _ = shapes
     for corner in range(4):
         dx, dy = corners[corner] - x[row], corners[4 + corner] - y[row]
@@ -119,7 +119,7 @@ def _place(corners: Floats, shapes: Shapes, row: int, at_x: Floats, at_y: Floats
 def _meets(
     x: Floats, y: Floats, size: tuple[float, float], turn: float, touch: float
 ) -> tuple[bool, bool]:
-    """Return two flags: footprint and quadrangle touch; the footprint's centre is inside."""
+    """Return two flags: footprint and lane piece touch; the footprint's centre is in the piece."""
     a, b = size[0] + touch, size[1] + touch
     if x.min() > a or x.max() < -a or y.min() > b or y.max() < -b:
         return False, False
@@ -136,7 +136,7 @@ def _meets(
 
 @compiled
 def _beside(x: Floats, y: Floats) -> tuple[float, float]:
-    """Return the place of the footprint's centre along the centre line, and its squared distance."""
+    """Return the relative position of a footprint along the lane piece, and the squared distance."""
     from_x, from_y = (x[0] + x[3]) / 2, (y[0] + y[3]) / 2
     along_x, along_y = (x[1] + x[2]) / 2 - from_x, (y[1] + y[2]) / 2 - from_y
     share = -(from_x * along_x + from_y * along_y) / max(along_x**2 + along_y**2, 1e-18)
@@ -146,7 +146,7 @@ def _beside(x: Floats, y: Floats) -> tuple[float, float]:
 
 @compiled
 def _common_area(corner_x: Floats, corner_y: Floats, size: tuple[float, float]) -> float:
-    """Return the common area of footprint and quadrangle."""
+    """Return the overlap area of an object footprint and a lane piece; m²."""
     a, b = size
     area = 0.0
     for i in range(4):

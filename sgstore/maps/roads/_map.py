@@ -1,4 +1,4 @@
-"""``RoadMap``: lanes, roads, junctions, crosswalks and signals as arrays, and distances along its lanes."""
+"""Road map as arrays (lanes, roads, junctions, crosswalks, signals), with distances along lanes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _MOST_AT_ONCE: Final = 1 << 22
 def _downstream(
     lengths: Floats, src: Ints, dst: Ints, limit: float
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
-    """Yield, in chunks, a lane, a lane that starts within ``limit`` after its end, and the distance.
+    """Yield pairs of lanes and their distance, if the second lane starts within ``limit`` after the first.
 
     Traffic flows from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
     """
@@ -108,7 +108,7 @@ _MERGED: Final = " without sections"
 
 @dataclass(frozen=True, slots=True)
 class MapNodes:
-    """All nodes of a map, ordered by descending node id: row i has node id -1 - i.
+    """All parts of a road map (lanes, roads, signals, …) as columns. Row i has node id -1 - i.
 
     Attributes
     ----------
@@ -154,7 +154,7 @@ class MapNodes:
 
     @classmethod
     def of(cls, kind: str | Sequence[str], name: Sequence[str], **columns: Any) -> MapNodes:
-        """Make nodes from the available columns; missing columns are empty, 0 or NaN.
+        """Make a table of map parts from given columns. Missing columns are empty, 0 or NaN.
 
         ``kind``: one, or one per node.
         """
@@ -172,11 +172,11 @@ class MapNodes:
         return cls(**(values | columns))
 
     def take(self, rows: Ints) -> MapNodes:
-        """Return these rows, in this order."""
+        """Return the map parts of the given rows, in this order."""
         return taken(self, rows)
 
     def first_sections(self) -> Ints:
-        """Map each lane to the first lane with its road and number, other nodes to themselves; (K,)."""
+        """Return, for each lane, the row of the first lane section with the same road and lane number."""
         same = np.arange(len(self))
         first: dict[tuple[str, int], int] = {}
         for column in np.flatnonzero(self.kind == KIND_CODE["lane"]).tolist():
@@ -188,7 +188,7 @@ class MapNodes:
 
 @dataclass(frozen=True, slots=True)
 class MapEdges:
-    """Edges among the nodes of a map; shape (E,).
+    """Edges between the parts of a road map (such as successor or neighbour); shape (E,).
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ class MapEdges:
 
 @dataclass(frozen=True, slots=True)
 class LaneHits:
-    """Pairs of a footprint and a lane that touch, ordered by footprint; shape (H,).
+    """Pairs of an object footprint and a lane that it touches, sorted by footprint; shape (H,).
 
     Attributes
     ----------
@@ -238,7 +238,7 @@ class LaneHits:
 
 @dataclass(frozen=True, slots=True)
 class LaneChanges:
-    """Stretches where traffic may change to a neighbouring lane; shape (n,).
+    """Parts of lanes where vehicles may change to a neighbouring lane; shape (n,).
 
     Attributes
     ----------
@@ -258,13 +258,13 @@ class LaneChanges:
 
     @classmethod
     def none(cls) -> LaneChanges:
-        """Return an empty table: no permitted lane changes."""
+        """Return an empty table of permitted lane changes."""
         no_lanes, nowhere = np.zeros(0, np.int64), np.zeros(0)
         return cls(no_lanes, no_lanes, nowhere, nowhere)
 
 
 class RoadMap:
-    """A road map: nodes, edges and lane surfaces, with geometric look-ups.
+    """Road map: lanes, roads, junctions and signals with edges and lane surfaces, and geometric look-ups.
 
     Parameters
     ----------
@@ -363,14 +363,14 @@ class RoadMap:
         self._lanes = len(ribbons.offsets) - 1
 
     def outlines(self) -> Geometries:
-        """Return shapely polygons, lines or points of the nodes, (K,); ``None`` for nodes without a shape.
+        """Return shapely polygons, lines or points of all map parts (K,); ``None`` for parts without a shape.
 
         Roads, junctions and ``off_road`` have no shape: a road consists of its lanes.
         """
         return self._outlines.copy()
 
     def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
-        """Return the lanes, of any type, that footprints touch on their storey.
+        """Return the lanes that footprints (ground rectangles of objects) touch at their height.
 
         Parameters
         ----------
@@ -402,7 +402,7 @@ class RoadMap:
         )
 
     def crosswalks_of(self, boxes: Floats, z: Floats) -> tuple[Ints, Ints]:
-        """Find the crosswalks under footprints; return pairs of footprint row and node id.
+        """Find the crosswalks below object footprints. Return pairs of footprint index and node id.
 
         Boxes and heights as in :meth:`lanes_of`.
         """
@@ -422,7 +422,7 @@ class RoadMap:
         return row[order], -1 - column[order]
 
     def near(self, x: Floats, y: Floats, radius: float) -> tuple[Ints, Ints]:
-        """Find the map parts within ``radius`` of points; return pairs of point row and node id.
+        """Find the map parts within ``radius`` of points. Return pairs of point index and node id.
 
         A road or junction is near if one of its lanes is near. Ordered by row and by descending
         node id.
@@ -438,7 +438,7 @@ class RoadMap:
         return np.concatenate(rows), -1 - np.concatenate(columns)
 
     def _present(self, places: Floats, radius: float) -> Bools:
-        """Return a mask (N, K) of the nodes within ``radius`` of the places (N, 2)."""
+        """Return a mask (N, K) of the K map parts within ``radius`` of N positions."""
         columns, tree = self._extents
         finite = np.flatnonzero(np.isfinite(places).all(axis=1))
         low, high = places[finite] - radius, places[finite] + radius
@@ -464,7 +464,7 @@ class RoadMap:
         return present
 
     def near_shapes(self, corners: Floats, distance: float) -> tuple[Ints, Ints]:
-        """Find the map parts within ``distance`` of shapes; return pairs of shape row and node id.
+        """Find the map parts within ``distance`` of shapes. Return pairs of shape index and node id.
 
         Parameters
         ----------
@@ -485,7 +485,7 @@ class RoadMap:
         return row[order], -1 - columns[place][order]
 
     def lanes_of_signal(self, signal: str) -> Ints:
-        """Return node ids of the driving lanes that a signal applies to; empty for an unknown id.
+        """Return node ids of the driving lanes that a traffic signal applies to; empty for an unknown id.
 
         For a signal that is missing in the map, :meth:`lanes_ref` can replace its id.
         """
@@ -501,7 +501,7 @@ class RoadMap:
         return self._controlled.get(signal, np.zeros(0, np.int64))
 
     def waypoints(self, spacing: float) -> LanePoints:
-        """Return points along the centre lines of all lanes, every ``spacing`` metres from each lane's start.
+        """Return points along the centre lines of all lanes, every ``spacing`` metres.
 
         Raises
         ------
@@ -512,7 +512,7 @@ class RoadMap:
 
     @cached_property
     def without_sections(self) -> RoadMap:
-        """Return the map with one node for all sections of a lane.
+        """Return the map with one node per lane, in which all sections of the lane are merged.
 
         The node is the one of the first section, with the name ``road_number``. The other nodes
         stay, without edges; node ids keep their meaning. Surface queries still distinguish
@@ -568,7 +568,7 @@ class RoadMap:
 
     @cached_property
     def reach(self) -> tuple[Ints, Ints, Floats]:
-        """Return pairs of connected lanes, with the start of the second measured along the first.
+        """Return pairs of lanes connected along the driving direction, with the distance of their starts.
 
         Returns
         -------
@@ -596,7 +596,7 @@ class RoadMap:
 
     @cached_property
     def places(self) -> MapPlaces:
-        """Return places of junctions, roundabouts, zones, broad lines, crosswalks and signals along the lanes.
+        """Parts of lanes covered by junctions, crosswalks, signals, zones and so on.
 
         Empty for a map without sections, as :attr:`reach`.
         """
@@ -625,7 +625,7 @@ class RoadMap:
         )
 
     def _on_roundabouts(self) -> MapPlaces:
-        """Return the lanes of each roundabout as stretches along these lanes."""
+        """Return the lanes of each roundabout as intervals along these lanes."""
         (lane, road), (part, whole) = self._containment
         around = np.flatnonzero(self.nodes.kind[whole] == KIND_CODE["roundabout"])
         of_road: dict[int, list[int]] = {}
@@ -642,7 +642,7 @@ class RoadMap:
         )
 
     def _on_zones(self) -> MapPlaces:
-        """Return merge and departure zones along their lanes."""
+        """Return merge and departure zones (areas near on-ramps and off-ramps) as intervals of lanes."""
         lanes = slice(1, 1 + self._lanes)
         pairs = {
             name: (-2 - self.edges.src[on], -2 - self.edges.dst[on])
@@ -676,7 +676,7 @@ class RoadMap:
 
     @cached_property
     def _crosswalks(self) -> tuple[Ints, shapely.STRtree, Ints | None]:
-        """Return the crosswalks: columns, a spatial index, and the grid cells near them.
+        """Crosswalks of the map: rows, a spatial index, and the grid cells near them.
 
         The cells are ``None`` if there are too many.
         """
@@ -694,7 +694,7 @@ class RoadMap:
 
     @cached_property
     def _corners(self) -> tuple[Floats, Floats]:
-        """Return boxes (M, 4) around the shapes of :attr:`_extents`, and some corners (M, C, 2) of each; m."""
+        """Bounding boxes (M, 4) of map parts, and some corners (M, C, 2) of their shapes; m."""
         _, tree = self._extents
         every, shape = shapely.get_coordinates(tree.geometries, return_index=True)
         count = np.bincount(shape, minlength=len(tree.geometries))
@@ -713,7 +713,7 @@ class RoadMap:
 
     @cached_property
     def _containment(self) -> tuple[tuple[Ints, Ints], ...]:
-        """Return pairs of child and parent nodes: lanes in roads, then roads in junctions or roundabouts."""
+        """Pairs of a map part and the part that contains it: lane in road, road in junction."""
         inside = self.edges.relation == RELATION_CODE["isIn"]
         child, parent = -1 - self.edges.src[inside], -1 - self.edges.dst[inside]
         lane = self.nodes.kind[child] == KIND_CODE["lane"]
@@ -727,12 +727,12 @@ class RoadMap:
 
     @staticmethod
     def lanes_ref(names: Iterable[str]) -> str:
-        """Return a substitute id, made of lane names, for a signal that the map lacks."""
+        """Return a substitute id, made of lane names, for a traffic signal that the map lacks."""
         return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
 
     @staticmethod
     def within(outline: Any, places: Floats) -> NDArray[np.bool_]:
-        """Return a mask (N,) of the places (N, 2) inside a shapely polygon."""
+        """Return a mask (N,) of the positions (N, 2) inside a shapely polygon."""
         return np.asarray(shapely.contains_xy(outline, *places.T), np.bool_)
 
     @staticmethod
@@ -754,7 +754,7 @@ def _names_in(ref: str) -> set[str]:
 
 
 def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
-    """Return unique edges between the representative nodes of :meth:`MapNodes.first_sections`."""
+    """Return unique map edges between lanes, after the sections of each lane are merged."""
     src, dst = -1 - same[-1 - edges.src], -1 - same[-1 - edges.dst]
     table = np.column_stack([edges.relation.astype(np.int64), src, dst])[src != dst]
     relation, src, dst = np.unique(table, axis=0).reshape(-1, 3).T
@@ -770,12 +770,12 @@ def _floor(places: Floats) -> Ints:
 
 
 def _numbered(cells: Ints) -> Ints:
-    """Return a number for each square (N, 2); a few squares may share a number."""
+    """Return a number for each grid square (N, 2). A few squares may share a number."""
     return cells[:, 0] << 32 ^ cells[:, 1]
 
 
 def _rectangles(boxes: Floats) -> Geometries:
-    """Return footprints as polygons; a missing or zero side becomes 0.1 mm long."""
+    """Convert object footprints to shapely polygons. A missing or zero side becomes 0.1 mm long."""
     half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5])) / 2, 5e-5)
     heading = np.nan_to_num(boxes[:, 2])
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]

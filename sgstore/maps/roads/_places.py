@@ -1,4 +1,4 @@
-"""Places of junctions, crosswalks, signals and stop lines along the lanes of a map.
+"""Positions of junctions, crosswalks, signals and stop lines along the lanes of a map.
 
 A road or junction covers its lanes completely; a lane covers itself. A crosswalk covers the part of
 a lane of its storey where it crosses the centre line. A signal has one place on each of its lanes.
@@ -34,7 +34,7 @@ BROAD_LINES: Final = ("broad_line_left", "broad_line_right")
 
 @dataclass(frozen=True, slots=True)
 class MapPlaces:
-    """Stretches of lanes that parts of a map cover, ordered by part, lane and start; shape (n,).
+    """Intervals of lanes covered by map parts (junctions, crosswalks, signals, …); shape (n,).
 
     Attributes
     ----------
@@ -58,13 +58,13 @@ class MapPlaces:
         return len(self.part)
 
     def rows(self) -> Iterator[tuple[int, str, int, float, float]]:
-        """Yield node id, kind, node id of the lane, start and end of each stretch."""
+        """Yield map part (node id, kind), lane node id, start and end of each lane interval."""
         ids = ((-1 - self.part).tolist(), self.what, (-2 - self.lane).tolist())
         return zip(*ids, self.start.tolist(), self.end.tolist(), strict=True)
 
     @classmethod
     def none(cls) -> MapPlaces:
-        """Return an empty table."""
+        """Return an empty table of lane intervals."""
         no_parts, nowhere = np.zeros(0, np.int64), np.zeros(0)
         return cls(no_parts, (), no_parts, nowhere, nowhere)
 
@@ -72,14 +72,14 @@ class MapPlaces:
     def of(
         cls, part: Ints, what: Sequence[str], lane: Ints, start: Floats, end: Floats
     ) -> MapPlaces:
-        """Make stretches from columns in any order."""
+        """Make a sorted table of lane intervals from columns in any order."""
         order = np.lexsort((end, start, lane, part))
         told = tuple(what[int(row)] for row in order)
         return cls(part[order], told, lane[order], start[order], end[order])
 
     @staticmethod
     def of_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
-        """Make stretches with broad markings from rows of lane, side, start and end; m."""
+        """Make a table of lane intervals with broad markings, from rows of lane, side, start and end; m."""
         lane = np.array([row[0] for row in rows], np.int64)
         start, end = (np.array([row[i] for row in rows], np.float64) for i in (2, 3))
         return MapPlaces.of(lane + 1, [BROAD_LINES[not row[1]] for row in rows], lane, start, end)
@@ -88,7 +88,7 @@ class MapPlaces:
 def made_of_lanes(
     ribbons: Ribbons, what: str, names: Sequence[str], column: dict[str, int]
 ) -> MapPlaces:
-    """Return the complete lanes of roads or junctions as stretches.
+    """Return whole lanes as lane intervals of their road or junction.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def made_of_lanes(
 def on_crosswalks(
     ribbons: Ribbons, columns: Ints, shapes: Any, z: Floats, storey: float
 ) -> MapPlaces:
-    """Return crosswalks on the lanes that they cross, from the first common place to the last.
+    """Return, for each crosswalk, the intervals of the lanes that it crosses.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def on_crosswalks(
 
 
 def _by_length(ribbons: Ribbons, lane: Ints, at: Floats) -> Floats:
-    """Convert lengths along polylines to lengths along centre lines; m."""
+    """Convert lengths along straight pieces of a line to lengths along curved centre lines; m."""
     x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
     found = np.empty(len(lane))
     for one in np.unique(lane).tolist():
@@ -159,7 +159,7 @@ def of_signals(
     applies: tuple[Ints, Ints],
     stops: tuple[Ints, Ints, Floats],
 ) -> MapPlaces:
-    """Return the places of signals on the lanes that they apply to.
+    """Return the positions of traffic signals along the lanes that they apply to.
 
     Parameters
     ----------
@@ -186,6 +186,6 @@ def of_signals(
 
 
 def together(parts: Sequence[MapPlaces]) -> MapPlaces:
-    """Join several tables of stretches."""
+    """Concatenate several tables of lane intervals."""
     one = chained(parts)
     return MapPlaces.of(one.part, one.what, one.lane, one.start, one.end)

@@ -1,4 +1,4 @@
-"""Lane surfaces, and lanes that cross or merge in junctions.
+"""Lane surfaces as tables of cross sections, with look-ups of points along lanes.
 
 Ribbons describe lane surfaces independent of the source format.
 """
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Ribbons:
-    """Cross sections of lanes in the direction of travel; lane i has rows ``offsets[i]:offsets[i + 1]``.
+    """Surfaces of all lanes as cross sections. Lane i has the rows ``offsets[i]:offsets[i + 1]``.
 
     Between two cross sections a lane is the quadrangle of their four ends. A lane has at least two
     cross sections; they may be in one place. Where a lane jumps, its cross sections jump too.
@@ -55,23 +55,23 @@ class Ribbons:
         return len(self.offsets) - 1
 
     def followed_by(self, more: Ribbons) -> Ribbons:
-        """Append the ribbons of more lanes."""
+        """Return the lane surfaces with those of more lanes appended."""
         offsets = np.concatenate((self.offsets, self.offsets[-1] + more.offsets[1:]))
         return replace(chained([self, more]), offsets=offsets)
 
     @property
     def lengths(self) -> Floats:
-        """Return the lengths of the centre lines, (L,); m."""
+        """Lengths of the centre lines of all lanes, (L,); m."""
         return self.along[self.offsets[1:] - 1]
 
     @property
     def lane(self) -> Ints:
-        """Return the lane of each cross section, (S,)."""
+        """Lane index of each cross section, (S,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
     @property
     def bends(self) -> Floats:
-        """Return the turn of the centre line up to the next cross section, (S,); rad.
+        """Angle between each cross section and the next along the centre line, (S,); rad.
 
         0 where the lane jumps, and at its end.
         """
@@ -83,7 +83,7 @@ class Ribbons:
         return bend
 
     def between(self, lane: Ints, along: Floats, column: Floats) -> Floats:
-        """Interpolate values of cross sections at places on lanes.
+        """Interpolate a column of cross sections at given positions along lanes.
 
         ``lane`` and ``along`` as in :meth:`at`.
         """
@@ -91,11 +91,11 @@ class Ribbons:
         return column[before] + share * (column[before + 1] - column[before])
 
     def height(self, lane: Ints, along: Floats) -> Floats:
-        """Return heights at places on lanes; m."""
+        """Return heights at given positions along lanes; m."""
         return self.between(lane, along, self.z)
 
     def at(self, lane: Ints, along: Floats) -> LanePoints:
-        """Return points of centre lines.
+        """Return points on centre lines (position, heading) at given positions along lanes.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class Ribbons:
         )
 
     def _turns(self, before: Ints) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-        """Return the headings at both ends of pieces relative to their chord, and the chord vectors."""
+        """Return the headings at both ends of centre line pieces relative to their chord, and the chords."""
         after = before + 1
         x, y = (self.left_x + self.right_x) / 2, (self.left_y + self.right_y) / 2
         way = x[after] - x[before], y[after] - y[before]
@@ -141,7 +141,7 @@ class Ribbons:
         return first, last, way
 
     def along_at(self, lane: Ints, s: Floats) -> Floats:
-        """Return lengths of the centre lines up to places ``s`` of their roads, (N,); m."""
+        """Convert road positions ``s`` to lengths along lane centre lines, (N,); m."""
         sign = np.where(self.s[self.offsets[1:] - 1] < self.s[self.offsets[:-1]], -1.0, 1.0)
         before, share = self._place(self.s, sign, lane, s)
         return self.along[before] + share * (self.along[before + 1] - self.along[before])
@@ -149,7 +149,7 @@ class Ribbons:
     def _place(
         self, column: Floats, sign: Floats, lane: Ints, value: Floats
     ) -> tuple[Ints, Floats]:
-        """Find the cross sections before places, and the share of the way to the next.
+        """Find the cross section before each position on a lane, and the relative position to the next.
 
         ``column`` rises along lanes where ``sign`` is 1 and falls where it is -1. All lanes are
         searched at once, laid end to end with gaps of 1 m.
@@ -165,7 +165,7 @@ class Ribbons:
         return before, np.clip((into - run[before]) / np.where(gap > 0, gap, 1.0), 0.0, 1.0)
 
     def mean_widths(self) -> Floats:
-        """Return mean widths along the road, (L,); m."""
+        """Return the mean width of each lane, (L,); m."""
         width = np.hypot(self.left_x - self.right_x, self.left_y - self.right_y)
         starts = self.offsets[:-1]
         step = np.abs(np.diff(self.s, append=0.0))
@@ -176,7 +176,7 @@ class Ribbons:
         return np.where(total > 0, weighted / np.where(total > 0, total, 1.0), plain)
 
     def turned(self) -> Floats:
-        """Return the turn of lanes from start to end, positive to the left, (L,); rad, not wrapped."""
+        """Return the heading change of each lane from start to end, positive to the left, (L,); rad."""
         bend = wrapped(np.diff(self.heading, append=0.0))
         bend[self.offsets[1:] - 1] = 0.0
         return np.add.reduceat(bend, self.offsets[:-1])
@@ -184,7 +184,7 @@ class Ribbons:
 
 @dataclass(frozen=True, slots=True)
 class LanePoints:
-    """Points of the centre lines of lanes; shape (N,).
+    """Points on the centre lines of lanes: position, heading, height; shape (N,).
 
     Attributes
     ----------
@@ -217,7 +217,7 @@ class LanePoints:
 
 
 def _is_smooth(first: Floats, last: Floats) -> Bools:
-    """True for pieces without a jump: both headings are within 1 rad of the chord."""
+    """Return True for pieces of a line without a jump: both end headings are within 1 rad of the chord."""
     return (np.abs(first) < 1) & (np.abs(last) < 1)
 
 
@@ -227,7 +227,7 @@ def wrapped(angle: Floats) -> Floats:
 
 
 def waypoints(ribbons: Ribbons, spacing: float) -> LanePoints:
-    """Return points along all centre lines, every ``spacing`` metres from the start of each lane.
+    """Return points along the centre lines of all lanes, every ``spacing`` metres.
 
     Raises
     ------
@@ -243,14 +243,14 @@ def waypoints(ribbons: Ribbons, spacing: float) -> LanePoints:
 
 
 def centre_lines(ribbons: Ribbons) -> NDArray[Any]:
-    """Return shapely lines along the centres of lanes, (L,)."""
+    """Return the centre lines of all lanes as shapely lines, (L,)."""
     x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
     lines: Any = shapely.linestrings(np.column_stack((x, y)), indices=ribbons.lane)
     return lines
 
 
 def lane_polygons(ribbons: Ribbons) -> NDArray[Any]:
-    """Return shapely polygons of lanes, (L,): along the right border and back along the left."""
+    """Return the surfaces of all lanes as shapely polygons, (L,)."""
     counts = np.diff(ribbons.offsets)
     lane = ribbons.lane
     number = np.arange(len(lane)) - ribbons.offsets[lane]

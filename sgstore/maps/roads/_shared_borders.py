@@ -1,4 +1,4 @@
-"""Borders that neighbouring lanes share, and the line midway between two borders.
+"""Neighbouring lanes that share a border, and the centre line between two borders.
 
 Lanes described by their borders only: the middle line, and lanes that share a border. The pieces of a border
 have any order and direction; two of them can be next to each other, as double lines are. The direction of a
@@ -38,7 +38,7 @@ _SHARED: Final = 0.1
 
 
 def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
-    """Return the line in the middle of two borders, by shares of their lengths.
+    """Return the centre line between the left and right borders of a lane.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
 
 
 def _chained(pieces: Sequence[Floats], side: str) -> Floats:
-    """Join the pieces of a border, beginning with the longest and continuing with the nearest end."""
+    """Join the pieces of a lane border, from the longest piece on, each time with the nearest end."""
     left = [thin for piece in pieces if len(thin := thinned(piece)) > 1 and run_of(thin)[-1] > 0]
     if not left:
         raise ValueError(f"neither a centre line nor a boundary to its {side}")
@@ -104,7 +104,7 @@ def _chained(pieces: Sequence[Floats], side: str) -> Floats:
 
 
 def _cut_back(line: Floats, other: Floats, end: int) -> Floats:
-    """Cut the part of a border that extends beyond the end of the other border."""
+    """Cut the part of a lane border that extends beyond the end of the other border."""
     run = run_of(line)
     found = feet(other[[end], :2], [line])
     along, apart = float(found.along[0]), float(np.hypot(*(found.at[0] - other[end, :2])))
@@ -120,7 +120,7 @@ def _cut_back(line: Floats, other: Floats, end: int) -> Floats:
 
 
 def with_shared_borders(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Add neighbours that share a border, on sides without known neighbours.
+    """Return lanes with more neighbours: lanes that share a border are neighbours.
 
     Two lanes share a border if they are on its two sides, along the same part of it.
     """
@@ -160,7 +160,7 @@ def _told(lines: Sequence[LaneLine], key: tuple[int, int]) -> bool:
 
 
 def _place(centre: Floats, border: Floats) -> tuple[float, float, bool]:
-    """Return start and end of a lane along a border, and True if it is on the border's left."""
+    """Return start and end of a lane along a border, and True if the lane is on the left of the border."""
     centre, border = thinned(centre)[:, :2], border[:, :2]
     own, at = _looks(centre), run_of(border)[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
     onto, back = feet(own, [border]), feet(_looks(border), [centre])
@@ -176,7 +176,7 @@ def _place(centre: Floats, border: Floats) -> tuple[float, float, bool]:
 
 
 def _looks(line: Floats) -> Floats:
-    """Return places (n, 2) along a line, at equal distances."""
+    """Return positions (n, 2) at equal distances along a line."""
     run = run_of(line)
     at = run[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
     return np.column_stack([np.interp(at, run, column) for column in line[:, :2].T])

@@ -1,4 +1,4 @@
-"""Merge and departure zones along the lanes of a map.
+"""Merge and departure zones of a map: lanes near on-ramps, off-ramps and lane ends.
 
 ISO 34502 has three kinds of road geometry: the road, the merge zone and the departure zone. It does
 not define their lengths. Here a merge zone is
@@ -49,7 +49,7 @@ def zones(
     flow: tuple[Ints, Ints],
     beside: tuple[Ints, Ints],
 ) -> MapPlaces:
-    """Return the zones on the lanes of a map.
+    """Return the merge and departure zones (near on-ramps and off-ramps) as intervals of lanes.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def zones(
 
 @dataclass(frozen=True, slots=True)
 class _Lanes:
-    """Lanes for motor traffic with lengths, successors, predecessors and groups of neighbours."""
+    """Driving lanes with lengths, successors, predecessors and groups of neighbours."""
 
     types: Sequence[str]
     inside: Sequence[bool]
@@ -93,11 +93,11 @@ class _Lanes:
     group: Sequence[int]
 
     def turned(self) -> _Lanes:
-        """Return the lanes against the direction of travel."""
+        """Return the lanes with the driving direction reversed: successors become predecessors."""
         return replace(self, after=self.before, before=self.after)
 
     def reaches(self, leading: frozenset[str]) -> dict[int, float]:
-        """Return lanes in a zone, and the length of the zone before the lane's end; m."""
+        """Return the lanes in a merge zone: lane → length of the zone at the lane's end; m."""
         groups: dict[int, list[int]] = {}
         for lane, of in enumerate(self.group):
             if self.types[lane] in DRIVING:
@@ -117,7 +117,7 @@ class _Lanes:
         return found
 
     def _joining(self) -> Iterable[int]:
-        """Yield the lanes directly before the place where several roads become one."""
+        """Yield the lanes directly before the position where several roads become one road."""
         reached: dict[int, set[int]] = {}
         coming: dict[int, set[int]] = {}
         last: dict[int, set[int]] = {}
@@ -133,7 +133,7 @@ class _Lanes:
                 yield from last[target]
 
     def _onto(self, lane: int) -> Iterable[tuple[int, int]]:
-        """Yield the lane groups after a junction that a lane leads to, with the last lane before each."""
+        """Yield the lane groups behind the next junction of a lane, with the last lane before each group."""
         queue, seen = [lane], {lane}
         while queue and len(seen) < _MOST:
             at = queue.pop()
@@ -147,7 +147,7 @@ class _Lanes:
     def _walk_back(
         self, lane: int, groups: Mapping[int, Sequence[int]], found: dict[int, float]
     ) -> None:
-        """Add a lane and its neighbours to a zone, back to :data:`LONG` before its end or to a junction."""
+        """Add a lane, its neighbours and predecessors to a merge zone, within the zone's greatest length."""
         queue = [(lane, LONG)]
         while queue:
             at, left = queue.pop()
@@ -162,7 +162,7 @@ class _Lanes:
 
 
 def _related(count: int, pairs: tuple[Ints, Ints], traffic: Sequence[bool]) -> list[list[int]]:
-    """Return the lanes related to each lane, for motor traffic only."""
+    """Return the related lanes (such as successors) of each lane, for driving lanes only."""
     found: list[list[int]] = [[] for _ in range(count)]
     for one, other in zip(*(column.tolist() for column in pairs), strict=True):
         if traffic[one] and traffic[other]:
@@ -171,7 +171,7 @@ def _related(count: int, pairs: tuple[Ints, Ints], traffic: Sequence[bool]) -> l
 
 
 def _groups(beside: Sequence[Sequence[int]]) -> list[int]:
-    """Return for each lane the number of the first lane in its group of neighbours."""
+    """Return, for each lane, the index of the first lane in its group of neighbours."""
     group = [-1] * len(beside)
     for first in range(len(beside)):
         queue = [first] if group[first] < 0 else []

@@ -228,7 +228,7 @@ def _only(rows: Rows) -> Bools:
 
 
 def _assigned(near: _Near) -> dict[int, int]:
-    """Assign as many traffic lights as possible to map signals, with minimal sum of squared distances."""
+    """Assign the maximum number of traffic lights to map signals, with minimal sum of squared distances."""
     cost = near.ahead**2 + near.left**2 + (_OF_HEIGHT * near.up) ** 2
     found: dict[int, int] = {}
     for rows in _heaps(near):
