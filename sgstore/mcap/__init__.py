@@ -1,4 +1,4 @@
-"""Guarded reader of MCAP files and rosbag2 bags."""
+"""Reader of MCAP files (logs of messages) and rosbag2 folders, robust against damaged files."""
 
 from sgstore.mcap._chunks import (
     HEAD,

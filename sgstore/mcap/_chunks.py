@@ -1,4 +1,4 @@
-"""Decompression of MCAP chunks, with limits against damaged files."""
+"""Chunks (compressed blocks of messages) of MCAP files: reading and decompression, with limits."""
 
 from __future__ import annotations
 
@@ -36,36 +36,36 @@ if TYPE_CHECKING:
 
 
 class Recording(Protocol):
-    """Protocol of an open file of messages: an MCAP file or another container."""
+    """Interface of an open log of messages: an MCAP file, or a file of another format."""
 
     @property
     def path(self) -> Path:
-        """Path of the file."""
+        """Path of the recording."""
         ...
 
     @property
     def size(self) -> int:
-        """Size of the file; bytes."""
+        """Size of the recording; bytes."""
         ...
 
     @property
     def mtime_ns(self) -> int:
-        """Modification time of the file; ns."""
+        """Modification time of the recording; ns."""
         ...
 
     @property
     def schemas(self) -> Mapping[int, Schema]:
-        """Schemas by id."""
+        """Message schemas of the recording, by schema id."""
         ...
 
     @property
     def channels(self) -> Mapping[int, Channel]:
-        """Channels by id."""
+        """Channels of the recording, by channel id."""
         ...
 
     @property
     def counts(self) -> Mapping[int, int] | None:
-        """Number of messages by channel id, as declared in the file."""
+        """Number of messages by channel id, as declared in the recording."""
         ...
 
     @property
@@ -85,7 +85,7 @@ class Recording(Protocol):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """Yield all messages, in runs. Unreadable parts are added to ``report``.
+        """Yield all messages of the recording, in groups of consecutive messages.
 
         ``wanted``: true for the offset of a chunk to read. ``keep``: true for a channel whose messages a later
         walk needs again. ``rank``: order number of a channel. With it, messages come in order of time; messages
@@ -100,11 +100,11 @@ class Recording(Protocol):
         ...
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Check once whether messages are in order of time. Later walks do not raise :class:`OutOfOrder`."""
+        """Check the time order of all messages once. If it is wrong, later calls of ``walk`` sort them."""
         ...
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file of the recording."""
         ...
 
 
@@ -114,14 +114,14 @@ LAST_NS: Final = (1 << 63) - 1
 
 @dataclass(frozen=True, slots=True)
 class RecordPlace:
-    """Place of a record in the file: its offset, and its length with its head; bytes."""
+    """Position of a record in an MCAP file: byte offset and length."""
 
     offset: int
     length: int
 
 
 def loss_of_chunk(reason: str, place: RecordPlace, head: ChunkHead | None) -> Loss:
-    """Return the loss for an unusable chunk, with the time span of its head if valid."""
+    """Return a report entry for an unreadable chunk of an MCAP file, with its time span if known."""
     known = head is not None and head.start_ns <= head.end_ns <= LAST_NS
     return Loss(
         reason,
@@ -133,7 +133,7 @@ def loss_of_chunk(reason: str, place: RecordPlace, head: ChunkHead | None) -> Lo
 
 
 def name_of(opcode: int) -> str:
-    """Return the name of a record type, in words."""
+    """Return the readable name of an MCAP record type."""
     try:
         return Opcode(opcode).name.lower().replace("_", " ")
     except ValueError:
@@ -210,13 +210,13 @@ _DEFINITIONS: Final = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
 
 
 class StrictStream(ReadDataStream):
-    """Parser stream that raises an error for a truncated text or number."""
+    """Stream for the MCAP parser that raises an error for a truncated text or number."""
 
     def __init__(self, record: bytes | memoryview) -> None:
         super().__init__(BytesIO(record))
 
     def read(self, length: int) -> bytes:
-        """Return exactly ``length`` bytes."""
+        """Return exactly ``length`` bytes. Fewer available bytes are an error."""
         data = super().read(length)
         if len(data) != length:
             raise EndOfFile
@@ -225,7 +225,7 @@ class StrictStream(ReadDataStream):
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """Columns of consecutive messages in a file: those of one chunk, or a run outside chunks; shape (n,).
+    """Group of consecutive messages of an MCAP file, as columns: those of one chunk, or outside chunks.
 
     Attributes
     ----------
@@ -266,7 +266,7 @@ class Messages:
 
     @property
     def chunks(self) -> Ints:
-        """Return the byte offset of the chunk of each message; -1 outside chunks."""
+        """Byte offset of the chunk of each message; -1 outside chunks."""
         return np.full(len(self), self.chunk_offset)
 
     def chunk_of(self, row: int) -> int:
@@ -275,7 +275,7 @@ class Messages:
         return self.chunk_offset
 
     def data(self, row: int) -> memoryview:
-        """Return the data of one message."""
+        """Return the bytes of one message."""
         return self.read(int(self.offset[row]) + MESSAGE_HEAD.itemsize, int(self.length[row]))
 
     def span(self, start: int, stop: int) -> Self:
@@ -283,13 +283,13 @@ class Messages:
         return self.take(slice(start, stop))
 
     def take(self, rows: NDArray[np.bool_] | slice) -> Self:
-        """Return the messages of the given rows."""
+        """Return the messages with the given row numbers."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self.COLUMNS})
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """Header fields of a chunk record.
+    """Header fields of a chunk (compressed block of messages) in an MCAP file.
 
     Attributes
     ----------
@@ -316,7 +316,7 @@ class ChunkHead:
 
 
 def read_chunk_head(file: BufferedReader, offset: int) -> ChunkHead:
-    """Return the head of the chunk record at an offset.
+    """Read the header of the chunk at a byte offset of an MCAP file.
 
     Raises
     ------
@@ -343,7 +343,7 @@ def read_chunk_head(file: BufferedReader, offset: int) -> ChunkHead:
 
 
 def head_of_cut_chunk(rest: bytes, offset: int) -> tuple[ChunkHead, bytes] | None:
-    """Return the head of a truncated chunk record, and the available part of its data.
+    """Return the header of a truncated chunk, and the available part of its compressed data.
 
     ``rest``: the bytes from the offset on. ``None`` means that the head itself is truncated.
     """
@@ -361,7 +361,7 @@ def head_of_cut_chunk(rest: bytes, offset: int) -> tuple[ChunkHead, bytes] | Non
 def read_records(
     file: BufferedReader, head: ChunkHead, *, verify: bool = True, memory: Memory | None = None
 ) -> Records:
-    """Return the records of a chunk, decompressed, and verified if the chunk has a checksum.
+    """Read and decompress a chunk of an MCAP file, and verify its checksum.
 
     Parameters
     ----------
@@ -383,7 +383,7 @@ def read_records(
 
 
 def read_stored(file: BufferedReader, head: ChunkHead, memory: Memory | None = None) -> Records:
-    """Return the records of a chunk as stored in the file.
+    """Read the compressed bytes of a chunk from an MCAP file.
 
     Raises
     ------
@@ -408,7 +408,7 @@ def read_stored(file: BufferedReader, head: ChunkHead, memory: Memory | None = N
 def records_of(
     stored: Records, head: ChunkHead, *, verify: bool = True, into: memoryview | None = None
 ) -> Records:
-    """Return the decompressed records for the result of :func:`read_stored`.
+    """Decompress the bytes of a chunk, and verify the checksum.
 
     ``into``: optional memory of the chunk's size for the result.
 
@@ -453,7 +453,7 @@ def decompress(
 
 
 def decompress_head(stored: bytes, compression: str, size: int) -> bytes:
-    """Return the first bytes of a truncated chunk, at most ``size``; empty if it is undecodable."""
+    """Decompress the beginning of a truncated chunk, at most ``size`` bytes; empty if impossible."""
     pieces: list[bytes] = []
     left = size
     with suppress(*READ_ERRORS):  # The error at the missing end; the earlier bytes are valid.
@@ -524,7 +524,7 @@ _DECOMPRESS: Final[dict[str, Callable[[Records, int, memoryview | None], Records
 def parse_records(
     records: Records, chunk_offset: int, *, whole: bool = True
 ) -> tuple[Messages, list[tuple[int, memoryview]]]:
-    """Return the messages of a chunk as columns, and its definitions.
+    """Parse a decompressed chunk. Return its messages as columns, and its schemas and channels.
 
     Parameters
     ----------
@@ -566,7 +566,7 @@ def message_columns(
     chunk_offset: int,
     read: Callable[[int, int], memoryview],
 ) -> Messages:
-    """Return message records as columns.
+    """Return message records of an MCAP file as columns: channel, log time, position and so on.
 
     Parameters
     ----------
@@ -597,7 +597,7 @@ def message_columns(
 
 
 def _frame_records(records: Records) -> tuple[Ints, list[tuple[int, int, int]], int]:
-    """Return the offsets of messages, the spans of definitions, and the end of the last complete record."""
+    """Return the offsets of messages in a chunk, the spans of definitions, and the last complete end."""
     offsets = array("q")
     definitions: list[tuple[int, int, int]] = []
     position, total, head_at = 0, len(records), HEAD.unpack_from

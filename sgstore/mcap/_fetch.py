@@ -1,4 +1,4 @@
-"""Access to single messages, and to bags (folders of split recordings).
+"""Access to single messages of recordings, and to bags (folders with the files of one recording).
 
 A rosbag2 bag is a folder. Its ``metadata.yaml`` lists the MCAP files of one recording. A position in a bag
 counts from the start of its first file, as if the files were one. Only the list of files is read from
@@ -56,7 +56,7 @@ _KEY: Final = re.compile(r"(relative_file_paths|storage_identifier|compression_m
 
 @dataclass(frozen=True, slots=True)
 class BagPart:
-    """File of a bag.
+    """File of a bag (folder with the files of one recording), with its position in the bag.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class BagPart:
 
 
 def bag_folder(path: Path) -> Path | None:
-    """Return the folder of the bag at a path (folder or ``metadata.yaml``), or ``None`` without a bag.
+    """Return the folder of a bag from its path or its ``metadata.yaml``, or ``None`` if it is not a bag.
 
     A folder is a bag if its ``metadata.yaml`` begins like those of rosbag2, because other tools write such
     files, too.
@@ -93,7 +93,7 @@ def bag_folder(path: Path) -> Path | None:
 
 @lru_cache(maxsize=1024)
 def _is_remote_bag(url: str) -> bool:
-    """True if a URL is a bag folder in an object store. A URL with a file suffix is not a bag."""
+    """Return True if a URL is a bag folder in an object store. A URL with a file suffix is not a bag."""
     if url.lower().endswith(_FILES):
         return False
     from sgstore.mcap._remote import open_url
@@ -106,7 +106,7 @@ def _is_remote_bag(url: str) -> bool:
 
 
 def parts_of(folder: Path) -> tuple[BagPart, ...]:
-    """Return the files of a bag, in the order of its metadata.
+    """Return the files of a bag, in the order of its metadata file.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def parts_of(folder: Path) -> tuple[BagPart, ...]:
 
 
 def part_at(parts: tuple[BagPart, ...], place: int) -> BagPart | None:
-    """Return the file of the bag that contains a position, or ``None``."""
+    """Return the file of a bag that contains a byte position of the bag, or ``None``."""
     there = (part for part in parts if part.base <= place < part.base + part.size)
     return next(there, None)
 
@@ -156,7 +156,7 @@ def _listed(path: Path) -> list[str]:
 
 
 def read_metadata(text: str) -> dict[str, list[str]]:
-    """Return the files of a bag and its storage format from its metadata. An absent key has no values.
+    """Parse the YAML metadata of a bag: key → file names or storage format.
 
     Other keys and their nested values are skipped.
     """
@@ -186,7 +186,7 @@ def read_metadata(text: str) -> dict[str, list[str]]:
 
 
 def _values(text: str) -> list[str]:
-    """Return the texts of a list ``[a, b]``, or the single text."""
+    """Return the texts of a YAML list ``[a, b]``, or the single text."""
     if text.startswith("[") and text.endswith("]"):
         return [part.strip() for part in text[1:-1].split(",") if part.strip()]
     return [text]
@@ -203,7 +203,7 @@ def _plain(text: str) -> str:
 
 
 def _inside(folder: Path, name: str) -> Path:
-    """Return the path of a listed file. Early versions prefix the name of the folder."""
+    """Return the path of a file listed in a bag's metadata. Early versions prefix the folder name."""
     parts = PurePosixPath(name).parts
     if not parts or PurePosixPath(name).is_absolute() or ".." in parts or "\0" in name:
         raise TraceError(f"it lists {name!r}, which is not in its folder", path=folder / METADATA)
@@ -226,13 +226,13 @@ def _size(path: Path) -> int:
 
 
 def message_at(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
-    """Return the data of one message by its position; see :func:`messages_at`."""
+    """Return the bytes of one message of a recording, from its position."""
     (data,) = messages_at(path, [(chunk_offset, offset, length)])
     return bytes(data)
 
 
 def messages_at(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[memoryview]:
-    """Yield the data of messages, in the order of ``places``.
+    """Yield the bytes of several messages of a recording, in the order of the given positions.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ def messages_at(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[
 
 
 def _bytes_at(path: Path, offset: int, length: int) -> memoryview:
-    """Return a message record outside chunks; empty if the offset is outside the file."""
+    """Return the bytes of a message outside chunks; empty if the offset is outside the file."""
     with open_regular(path) as file:
         try:
             file.seek(offset)
@@ -279,7 +279,7 @@ def _bytes_at(path: Path, offset: int, length: int) -> memoryview:
 
 
 def _records_at(path: Path, chunk_offset: int) -> memoryview:
-    """Return the records of a chunk; empty if the offset is outside the file."""
+    """Return the decompressed records of a chunk; empty if the offset is outside the file."""
     with open_regular(path) as file:
         try:
             return memoryview(read_records(file, read_chunk_head(file, chunk_offset)))
@@ -295,7 +295,7 @@ def _is_message(record: memoryview, length: int) -> bool:
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file, or of all files of a bag in order, as hexadecimal digits.
+    """Return the SHA-256 of a recording (a file, or all files of a bag) as hexadecimal digits.
 
     Raises
     ------
@@ -342,7 +342,7 @@ def read_and_digest(path: Path, digest: str, read: Callable[[], _Found]) -> tupl
 
 
 def check_name(path: Path) -> None:
-    """Raise if the path of a recording is not valid UTF-8, which a store needs.
+    """Raise an error if the path of a recording is not valid UTF-8, which a store needs.
 
     Raises
     ------
@@ -359,7 +359,7 @@ def check_name(path: Path) -> None:
 
 
 def mark_of(path: Path) -> tuple[int, int]:
-    """Return the size (bytes) and modification time (ns) of a recording, to detect a replaced file.
+    """Return the size (bytes) and modification time (ns) of a recording, to detect a changed file.
 
     For a bag: the total size of its files, and their latest modification time.
 
@@ -397,7 +397,7 @@ def mark_of_open(file: BufferedReader) -> tuple[int, int]:
 
 @contextmanager
 def near(path: Path, folder: Path) -> Generator[None]:
-    """Context manager that reads a remote recording from a local copy.
+    """Context manager in which a remote recording is read from a local copy.
 
     Other code still uses the URL of the recording.
 
@@ -446,7 +446,7 @@ def remote_names(url: str) -> list[str]:
 
 
 def _part_of(path: Path, parts: tuple[BagPart, ...], place: int) -> tuple[Path, int]:
-    """Return the file of the bag that contains a position, and the position of its first byte."""
+    """Return the file of a bag that contains a byte position, and the file's first position."""
     part = part_at(parts, place)
     if part is None:
         raise TraceError("no file of the bag is there: it was replaced", path=path, offset=place)

@@ -1,4 +1,4 @@
-"""Findings of the reading of a file: losses and warnings. This module does not need the MCAP parser."""
+"""Losses and warnings from reading a file. This module does not need the MCAP parser."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MAX_LOSSES: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """Unusable part of a recording, for the report.
+    """Unreadable part of a recording: reason, number of messages, bytes and time span.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Loss:
 
 @dataclass(slots=True)
 class Findings:
-    """Findings of a walk over a file, filled during the reading of its messages.
+    """Losses and warnings from reading a recording, filled while the messages are read.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Findings:
     losses: list[Loss] = field(default_factory=list[Loss])
 
     def lose(self, loss: Loss) -> None:
-        """Add a loss. If the list is full, the last entry sums up all further losses."""
+        """Add an unreadable part to the report. If the list is full, the last entry sums up all others."""
         losses = self.losses
         if len(losses) < MAX_LOSSES:
             losses.append(loss)

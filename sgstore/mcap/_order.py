@@ -1,4 +1,4 @@
-"""Reading of messages in order of time, for any order in the file.
+"""Reading of messages sorted by log time, whatever their order in the file.
 
 Messages are ordered by log time. Within a channel, messages of equal log time keep their order. Between
 channels, equal log times are ordered by publish time, then by the rank of the channel, then by its topic. The
@@ -66,12 +66,12 @@ _SIZES: Final = np.floor(2 ** (np.arange(256) / 8)).astype(np.int64)
 
 
 class OutOfOrder(Exception):  # noqa: N818  (a signal, not an error)
-    """Signal that messages are not in order of time. The next walk sorts them."""
+    """Signal: the messages are not in order of time, so the next reading must sort them."""
 
 
 @dataclass(frozen=True, slots=True)
 class SortedMessages(Messages):
-    """Messages of several chunks, in order of time.
+    """Group of messages sorted by time, which can come from several chunks of a file.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class SortedMessages(Messages):
 
     @property
     def chunks(self) -> Ints:
-        """Return the byte offset of the chunk of each message; -1 outside chunks."""
+        """Byte offset of the chunk of each message; -1 outside chunks."""
         return self.places
 
     def chunk_of(self, row: int) -> int:
@@ -99,7 +99,7 @@ class SortedMessages(Messages):
         return int(self.places[row])
 
     def data(self, row: int) -> memoryview:
-        """Return the data of one message."""
+        """Return the bytes of one message."""
         held: bytes | None = self.held[row]
         if held is not None:
             return memoryview(held)
@@ -108,7 +108,7 @@ class SortedMessages(Messages):
 
 @dataclass(slots=True)
 class ChannelRanks:
-    """Order of the channels for messages of equal time.
+    """Reading order of channels for messages with equal times.
 
     Attributes
     ----------
@@ -127,12 +127,12 @@ class ChannelRanks:
     _loose: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(IDS, np.bool_))
 
     def of(self, channel: NDArray[Any]) -> Ints:
-        """Return the order number of each channel."""
+        """Return the position of each channel in the reading order for equal times."""
         self._learn()
         return self._numbers[channel]
 
     def is_loose(self, channel: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return a mask of the channels whose order does not matter for messages of equal time."""
+        """Return a mask of the channels whose order does not matter for messages with equal times."""
         self._learn()
         return self._loose[channel]
 
@@ -152,7 +152,7 @@ class ChannelRanks:
 
 
 def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Times:
-    """Return the publish times, raised where necessary to ascend within each channel and log time."""
+    """Return publish times, increased where a message was published before its predecessor on the channel."""
     order = np.lexsort((channel, log_time))  # stable: equal messages keep their place
     log, number, times = log_time[order], channel[order], publish_time[order]
     same = (log[1:] == log[:-1]) & (number[1:] == number[:-1])
@@ -170,7 +170,7 @@ def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Tim
 
 
 class OrderCheck:
-    """Check of the time order of messages, run by run.
+    """Check that the messages of a file are sorted by time, group by group.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class OrderCheck:
         self._channel = np.zeros(0, np.int64)
 
     def follows(self, run: Messages) -> bool:
-        """True if the messages of a run are in order and after all earlier ones."""
+        """Return True if a group of messages is sorted by time and follows all earlier groups."""
         log = np.concatenate([self._log, run.log_time_ns])
         steps = np.diff(log)
         if (steps < 0).any():
@@ -203,7 +203,7 @@ class OrderCheck:
         return True
 
     def _is_in_order(self, log: Ints, publish: Times, channel: Ints) -> bool:
-        """True if consecutive messages of equal log time are in order."""
+        """Return True if consecutive messages with equal log time are in the right order."""
         bound = ~self._ranks.is_loose(channel)
         log, publish, number = log[bound], publish[bound], self._ranks.of(channel[bound])
         before = publish[1:] < publish[:-1]
@@ -216,19 +216,17 @@ class OrderCheck:
 
 @dataclass(slots=True)
 class _IndexBlock:
-    """Index entries of consecutive messages of a file. ``first`` is the number of the first message."""
+    """Part of the sort index of a file: one entry per message, for consecutive messages."""
 
     first: int
     entries: NDArray[np.void]
 
     def sort(self, key: str) -> None:
-        """Sort the entries by a key, with a stable sort."""
+        """Sort the index entries by a key, in stable order."""
         self.entries = self.entries[np.argsort(self.entries[key], kind="stable")]
 
     def split(self, key: str, edge: Edge) -> _IndexBlock:
-        """Remove and return the entries before a key value.
-
-        ``None`` means all. The entries must be sorted by the key.
+        """Remove the index entries before a key value, and return them.
 
         ``None`` means all. The entries must be sorted by the key.
         """
@@ -240,12 +238,12 @@ class _IndexBlock:
         return part
 
     def numbers(self) -> Numbers:
-        """Return the number of each message in the file."""
+        """Return the number of each message, counted from the start of the file."""
         return (self.first + self.entries["row"].astype(np.int64)).astype(np.uint32)
 
 
 class TimeOrder:
-    """Sorted index of the messages of a file.
+    """Sort index of a file, to read its messages in order of time.
 
     Parameters
     ----------
@@ -293,7 +291,7 @@ class TimeOrder:
     def _blocks(
         self, runs: Iterable[Messages], keeps: Callable[[int], bool], codes: bytearray
     ) -> Iterator[_IndexBlock]:
-        """Yield the blocks of the index, sorted by log time. Message size codes are added to ``codes``."""
+        """Yield the parts of the sort index, each sorted by log time."""
         waiting, first = bytearray(), 0
         for run in runs:
             self._note(run, keeps)
@@ -308,7 +306,7 @@ class TimeOrder:
             yield _block_of(waiting, first)
 
     def _note(self, run: Messages, keeps: Callable[[int], bool]) -> None:
-        """Record the position and channels of a run, and how far its log times run backwards."""
+        """Record position and channels of a group of messages, and how far its log times run backwards."""
         for number in np.unique(run.channel).tolist():
             self._kept[number] = keeps(number)
             times = run.log_time_ns[run.channel == number]
@@ -324,7 +322,7 @@ class TimeOrder:
     def walk(
         self, report: Findings, wanted: Callable[[int], bool] | None = None
     ) -> Iterator[Messages]:
-        """Yield the messages in order of time. Losses and warnings are added to ``report``.
+        """Yield the messages of a file in order of time, in groups.
 
         ``wanted``: true for the offset of a chunk to read; other chunks are skipped.
         """
@@ -362,7 +360,7 @@ class TimeOrder:
         self._cache.clear()
 
     def _batch(self, rows: Ints, of: Ints, reads: Numbers) -> SortedMessages:
-        """Read messages as one batch, given by run number (``of``) and row."""
+        """Read some messages of several chunks as one group, in order of time."""
         columns = np.zeros((7, len(rows)), np.int64)
         held = np.full(len(rows), None, np.object_)
         for run in np.unique(of).tolist():
@@ -395,7 +393,7 @@ class TimeOrder:
         )
 
     def _read(self, number: int, reads: Numbers | None = None) -> Messages:
-        """Return the messages of a run."""
+        """Read a group of consecutive messages again from the file."""
         messages = self._cache.get(number)
         if messages is not None:
             self._cache.move_to_end(number)
@@ -417,25 +415,25 @@ class TimeOrder:
         return self._starts[number + 1] - self._starts[number]
 
     def _memory(self, number: int) -> int:
-        """Return the memory of the messages of a run; bytes."""
+        """Return the memory needed for the messages of a group; bytes."""
         return self._bytes[number] + COLUMN_BYTES * self._count(number)
 
     def _cached(self) -> int:
         return sum(map(self._memory, self._cache))
 
     def _fetch(self, place: int, offset: int, length: int) -> memoryview:
-        """Return the data of a message without a copy."""
+        """Return the bytes of a message without a copy."""
         number = bisect_right(self._places, offset if place < 0 else place) - 1
         return self._read(number).read(offset + MESSAGE_HEAD.itemsize, length)
 
 
 def _no_place(_position: int, _length: int) -> memoryview:
-    """Raise, because messages of several chunks have no common positions."""
+    """Raise an error, because messages of several chunks have no common byte positions."""
     raise NotImplementedError
 
 
 def _entries_of(run: Messages) -> bytes:
-    """Return the index entries of a run of messages."""
+    """Return the sort index entries of a group of messages."""
     entries = np.zeros(len(run), _ENTRY)
     entries["log"], entries["publish"] = run.log_time_ns, run.publish_time_ns
     entries["channel"] = run.channel
@@ -450,7 +448,7 @@ def _block_of(entries: bytearray, first: int) -> _IndexBlock:
 
 
 def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> Iterator[Numbers]:
-    """Yield the numbers of messages in order of time, part by part. The blocks become empty.
+    """Yield message numbers of a file in order of time, part by part. The given index becomes empty.
 
     Parameters
     ----------
@@ -481,7 +479,7 @@ def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> 
 
 
 def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
-    """Return key values that divide the messages into parts small enough to sort.
+    """Return key values that divide the messages of an index into parts small enough to sort.
 
     A value with many messages becomes a separate part. The last part begins at the greatest value.
     """
@@ -499,7 +497,7 @@ def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
 
 
 def _raise_publish_times(blocks: Sequence[_IndexBlock]) -> None:
-    """Apply :func:`published` to messages of one log time, block by block."""
+    """Increase publish times in an index that are before those of the previous message of the channel."""
     latest = np.zeros(IDS, np.uint64)
     for block in blocks:
         channel = block.entries["channel"]

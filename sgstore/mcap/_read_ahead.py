@@ -56,13 +56,13 @@ MOST_BUFFERS: Final = 128
 
 
 class Buffers:
-    """Reusable memory for the records of chunks. One thread owns it; other threads may fill it."""
+    """Memory buffers for decompressed chunks, used again for later chunks."""
 
     def __init__(self) -> None:
         self._kept: list[bytearray] = []
 
     def take(self, size: int) -> memoryview:
-        """Return memory of ``size`` bytes with undefined contents, reserved until its last view is gone."""
+        """Return memory of ``size`` bytes with undefined contents. It is reserved while a view of it exists."""
         if not size:
             return memoryview(bytearray())
         for buffer in self._kept:
@@ -78,16 +78,16 @@ class Buffers:
 
     @property
     def kept(self) -> int:
-        """Total size of all buffers; bytes."""
+        """Total size of all memory buffers; bytes."""
         return sum(map(len, self._kept))
 
     def clear(self) -> None:
-        """Forget all buffers. Memory with existing views stays valid."""
+        """Drop all memory buffers. Memory with existing views stays valid."""
         self._kept.clear()
 
 
 def _is_free(buffer: bytearray) -> bool:
-    """True if a buffer has no view. Only then can its size change."""
+    """Return True if a memory buffer has no view. Only then can its size change."""
     try:
         buffer.append(buffer.pop())
     except BufferError:
@@ -107,7 +107,7 @@ MAX_SUMMARY: Final = 64 << 20
 
 @dataclass(slots=True)
 class Summary:
-    """Contents of the summary of a file; empty without a summary.
+    """Summary section of an MCAP file: schemas, channels, and a list of chunks; empty if absent.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class Summary:
 
 
 def read_summary(file: BinaryIO, size: int) -> Summary:
-    """Return the summary of a file of ``size`` bytes. An invalid summary has a ``fault``."""
+    """Read the summary section of an MCAP file. An invalid summary has the attribute ``fault``."""
     try:
         return _parsed(_content(file, size))
     except READ_ERRORS as error:
@@ -202,7 +202,7 @@ _COLUMNS: Final = 7
 
 
 class Spool:
-    """Cache of the messages of chunks, by file and chunk offset."""
+    """Cache on disk for the messages of MCAP chunks, by file and chunk offset."""
 
     def __init__(self) -> None:
         self._file: SpooledTemporaryFile[bytes] | None = None
@@ -211,7 +211,7 @@ class Spool:
         self._most = MOST_SPOOLED
 
     def put(self, path: Path, messages: Messages, kept: NDArray[np.bool_]) -> None:
-        """Cache the positions of all messages of a chunk, and the data of some.
+        """Add a chunk to the cache: the positions of all messages, and the bytes of some.
 
         A chunk that is already cached is skipped, as is any chunk when the cache is full.
         """
@@ -245,11 +245,11 @@ class Spool:
         self._size += total
 
     def has(self, path: Path, chunk_offset: int) -> bool:
-        """True if the messages of a chunk are cached."""
+        """Return True if the messages of a chunk are in the cache."""
         return (path, chunk_offset) in self._places
 
     def get(self, path: Path, chunk_offset: int, anew: Callable[[], Read]) -> Messages | None:
-        """Return the cached messages of a chunk. ``None`` means not cached, or no longer readable.
+        """Return the messages of a chunk from the cache. ``None`` means not cached, or no longer readable.
 
         Parameters
         ----------
@@ -295,7 +295,7 @@ class Spool:
 
 
 def _reader(starts: dict[int, int], data: memoryview, anew: Callable[[], Read]) -> Read:
-    """Return a function that reads message data by position. ``starts``: record offset → offset in ``data``."""
+    """Return a function that reads the bytes of a cached message by position."""
     whole: list[Read] = []
 
     def read(position: int, length: int) -> memoryview:
@@ -354,7 +354,7 @@ def chunks_in(file: BufferedReader) -> Iterator[int]:
 
 
 class ReadAhead:
-    """Reader of chunk records that decompresses some chunks in advance.
+    """Reader of MCAP chunks that decompresses the next chunks in other threads.
 
     Parameters
     ----------
@@ -379,7 +379,7 @@ class ReadAhead:
         self._found: Found = {}
 
     def records(self, head: ChunkHead) -> Records:
-        """Return the records of a chunk, possibly decompressed in advance.
+        """Return the decompressed records of a chunk.
 
         Raises
         ------
@@ -402,7 +402,7 @@ class ReadAhead:
         return found
 
     def close(self) -> None:
-        """Stop the threads and free the buffers."""
+        """Stop the threads, and free the memory buffers."""
         self._offsets = iter(())
         self._begun.clear()
         self._found = {}
@@ -412,7 +412,7 @@ class ReadAhead:
         self._buffers.clear()
 
     def _begin(self) -> None:
-        """Start the decompression of the next chunks, up to the limit."""
+        """Start the decompression of the next chunks in other threads, up to a limit."""
         while self._size + BATCH <= AHEAD and (chunks := self._batch()):
             if self._threads is None:
                 self._threads = ThreadPoolExecutor(THREADS, "sgstore-chunks")
@@ -427,7 +427,7 @@ class ReadAhead:
             self._size += size
 
     def _batch(self) -> list[_Chunk]:
-        """Return the next chunks, still compressed."""
+        """Return the next chunks of the file, still compressed."""
         chunks: list[_Chunk] = []
         size = 0
         try:
@@ -453,7 +453,7 @@ class ReadAhead:
 
 
 class _Chunk(NamedTuple):
-    """Compressed chunk, with memory for the result and a flag for the checksum test."""
+    """Compressed chunk of a file, with memory for the decompressed bytes."""
 
     head: ChunkHead
     stored: Records
@@ -476,7 +476,7 @@ def _cost(head: ChunkHead) -> int:
 
 
 def _is_apt(head: ChunkHead) -> bool:
-    """True if decompression of a chunk in advance is worthwhile."""
+    """Return True if decompression of a chunk in another thread saves time."""
     compressed = bool(head.compression) and head.data_length < WORTH * head.size
     return compressed and _cost(head) <= LARGEST
 

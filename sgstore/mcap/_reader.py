@@ -1,4 +1,4 @@
-"""Guarded reader of MCAP files, which reads every usable part and reports the rest.
+"""Reader of MCAP files that reads every usable message and reports damaged parts.
 
 A file is read record by record in file order, with one chunk in memory at a time. If messages are requested in
 order of time, but are not in this order, an index is sorted (:mod:`sgstore.mcap._order`). The summary at the
@@ -101,7 +101,7 @@ _HOLDS_CONTENT: Final = frozenset(
 
 @dataclass(slots=True)
 class _FileWalk:
-    """Position of a walk through a file, and its findings.
+    """State of one reading of an MCAP file: position, and losses so far.
 
     ``pending`` is a lost chunk. The message indexes after it contain its number of messages.
     """
@@ -120,7 +120,7 @@ class _FileWalk:
 
 
 class McapFile:
-    """MCAP file for one or more readings from the start.
+    """Reader of an MCAP file, also of a damaged one. The file can be read several times.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class McapFile:
     has_log_times = True
 
     def __new__(cls, path: Path, spool: Spool | None = None) -> Self:
-        """Create a reader of a file, or of all files of a bag."""
+        """Create a reader of an MCAP file, or of all files of a bag."""
         del spool
         if cls is McapFile and bag_folder(path) is not None:
             return object.__new__(cast("type[Self]", McapBag))
@@ -202,7 +202,7 @@ class McapFile:
         self.close()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the MCAP file."""
         for ahead in self._aheads:
             ahead.close()
         self._file.close()
@@ -210,7 +210,7 @@ class McapFile:
             self._spool.close()
 
     def reopen(self) -> None:
-        """Open the file again after it was closed.
+        """Open the MCAP file again after it was closed.
 
         Raises
         ------
@@ -241,7 +241,7 @@ class McapFile:
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """Yield all messages, chunk by chunk. Unreadable parts are added to ``report``.
+        """Yield all messages of the file, in groups, one chunk at a time.
 
         Parameters
         ----------
@@ -280,14 +280,14 @@ class McapFile:
         yield from self._order.walk(report, wanted)
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Check once whether messages are in order of time. Later walks do not raise :class:`OutOfOrder`."""
+        """Check the time order of all messages once. If it is wrong, later calls of ``walk`` sort them."""
         if not self._in_order and not self._unordered:
             with suppress(OutOfOrder):
                 for _ in self.walk(Findings(), rank=rank):
                     pass
 
     def _time_order(self, ranks: ChannelRanks, keep: Callable[[int], bool] | None) -> TimeOrder:
-        """Return a sorted index of all messages. Repeat if a channel definition came after its messages."""
+        """Return a sort index of all messages of the file."""
         while True:
             findings, known = Findings(), len(self.channels)
             runs = self._in_file_order(findings, None, keep)
@@ -296,7 +296,7 @@ class McapFile:
                 return found
 
     def _again(self, place: int, count: int) -> Messages:
-        """Read a run of messages again, from the chunk or record at ``place``."""
+        """Read a group of consecutive messages again, from a byte position."""
         runs = self._in_file_order(Findings(), _all, None, place)
         for run in runs:
             runs.close()
@@ -310,7 +310,7 @@ class McapFile:
         keep: Callable[[int], bool] | None,
         start: int = len(MAGIC),
     ) -> Generator[Messages]:
-        """Yield all messages in file order, from the record at ``start``."""
+        """Yield all messages in file order, from a byte position on."""
         walk = _FileWalk(report, self._read_ahead(wanted), wanted, keep, start)
         self._aheads.append(walk.ahead)
         try:
@@ -331,7 +331,7 @@ class McapFile:
         self._closing_words(walk)
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """Yield the bytes of a record, with its head, in pieces.
+        """Yield the bytes of a record of the MCAP file in pieces.
 
         Raises
         ------
@@ -359,7 +359,7 @@ class McapFile:
         return header.profile, header.library
 
     def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
-        """Start the read-ahead for a walk over all chunks of a large file."""
+        """Start decompression in other threads for a reading of all chunks of a large file."""
         if wanted is not None or self.size <= SMALL:
             return ReadAhead(self._file, verified=self._verified)
         offsets = self._chunk_starts or chunks_in(self._file)
@@ -367,13 +367,13 @@ class McapFile:
         return ReadAhead(self._file, offsets, self._verified)
 
     def _head(self, position: int) -> tuple[int, int] | None:
-        """Return the opcode and length of the record at a position. ``None`` means an incomplete head."""
+        """Return type and length of the record at a byte position. ``None`` means truncated."""
         self._file.seek(position)
         head = self._file.read(HEAD.size)
         return HEAD.unpack(head) if len(head) == HEAD.size else None
 
     def _passes(self, walk: _FileWalk, length: int) -> bool:
-        """Skip a record without useful content, the most frequent type. Return True if it is valid."""
+        """Skip a record without useful content. Return True if its length is valid."""
         stop = walk.position + HEAD.size + length
         sound = walk.pending is None and stop <= self.size
         sound = sound and self._chunk_behind(walk.position, stop) is None
@@ -382,7 +382,7 @@ class McapFile:
         return sound
 
     def _step(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
-        """Yield the messages of one record, and move the walk behind the record."""
+        """Yield the messages of one record, and move to the next record."""
         start = walk.position
         stop = start + HEAD.size + length
         if opcode != Opcode.MESSAGE_INDEX:
@@ -416,7 +416,7 @@ class McapFile:
             yield from self._flush(walk)
 
     def _flush(self, walk: _FileWalk) -> Iterator[Messages]:
-        """Yield the collected messages outside chunks."""
+        """Yield the messages collected outside chunks."""
         if not walk.run:
             return
         offsets = np.frombuffer(walk.run, np.int64)
@@ -431,12 +431,12 @@ class McapFile:
         yield from self._known(walk, messages)
 
     def _outside(self, offsets: Ints) -> Messages:
-        """Return the messages outside chunks at the given offsets."""
+        """Return the messages outside chunks at the given byte offsets."""
         heads = b"".join(self._at(int(at), MESSAGE_HEAD.itemsize) for at in offsets)
         return message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
 
     def _end(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
-        """Handle the end of the data. If the summary lists chunks behind it, continue there."""
+        """Handle the end of the data. If the file's summary lists later chunks, continue there."""
         yield from self._flush(walk)
         resume = self._chunk_behind(start, self.size)
         walk.closed = resume is None
@@ -446,7 +446,7 @@ class McapFile:
             walk.position = resume
 
     def _chunk(self, walk: _FileWalk, place: RecordPlace, astray: int | None) -> Iterator[Messages]:
-        """Yield the messages of a chunk. ``astray``: offset of another listed chunk that starts inside it."""
+        """Yield the messages of a chunk."""
         if walk.wanted is not None and not walk.wanted(place.offset):
             return
         walk.chunks += 1
@@ -476,7 +476,7 @@ class McapFile:
     def _records(
         self, walk: _FileWalk, head: ChunkHead
     ) -> tuple[Messages, list[tuple[int, memoryview]]]:
-        """Return the messages and definitions of a chunk, from the cache or the file."""
+        """Return the messages of a chunk and its schemas and channels, from the cache or the file."""
 
         def read() -> tuple[Messages, list[tuple[int, memoryview]]]:
             return parse_records(walk.ahead.records(head), head.offset)
@@ -489,7 +489,7 @@ class McapFile:
         return found
 
     def _known(self, walk: _FileWalk, messages: Messages) -> Iterator[Messages]:
-        """Yield the messages without those of undefined channels."""
+        """Yield messages without those of undefined channels, which are reported as lost."""
         lost = ~self._known_channels[messages.channel]
         if lost.any():
             unknown: list[int] = np.unique(messages.channel[lost]).tolist()
@@ -508,7 +508,7 @@ class McapFile:
             yield messages
 
     def _chunk_behind(self, start: int, stop: int) -> int | None:
-        """Return the offset of the first chunk in the summary between ``start`` and ``stop``, or ``None``.
+        """Return the offset of the first chunk between two offsets, from the file's summary, or ``None``.
 
         An offset of the summary counts only if a valid chunk head is at this place.
         """
@@ -521,7 +521,7 @@ class McapFile:
         return None
 
     def _broken(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
-        """Handle a record with an impossible length. Continue at the next chunk in the summary, or end."""
+        """Handle a record with an impossible length: continue at the next chunk of the summary, or end."""
         resume = self._chunk_behind(walk.position, self.size)
         start = walk.position
         stop = self.size if resume is None else resume
@@ -557,7 +557,7 @@ class McapFile:
     def _of_cut(
         self, start: int
     ) -> tuple[ChunkHead | None, Messages | None, list[tuple[int, memoryview]]]:
-        """Return the head, complete messages and definitions of a truncated chunk."""
+        """Return header, complete messages and definitions of a truncated chunk."""
         found = head_of_cut_chunk(bytes(self._at(start, min(self.size - start, MAX_CHUNK))), start)
         if found is None:
             return None, None, []
@@ -569,20 +569,20 @@ class McapFile:
             return head, None, []
 
     def _count(self, walk: _FileWalk, length: int) -> None:
-        """Add the entries of a message index to the loss of its chunk."""
+        """Add the message counts of an index record to the report of its lost chunk."""
         if walk.pending is None:
             return
         entries = max(length - 6, 0) // 16
         walk.pending = replace(walk.pending, messages=max(walk.pending.messages, 0) + entries)
 
     def _settle(self, walk: _FileWalk) -> None:
-        """Report a lost chunk after its message indexes are read."""
+        """Report a lost chunk, after the records with its message counts are read."""
         if walk.pending is not None:
             walk.report.lose(walk.pending)
             walk.pending = None
 
     def _closing_words(self, walk: _FileWalk) -> None:
-        """Add warnings about the whole file, for oddities without loss of data."""
+        """Add warnings about oddities of the whole file that lose no data."""
         warn = walk.report.warnings.append
         left = self.size - walk.position
         if not walk.closed:
@@ -619,7 +619,7 @@ class McapFile:
         offset: int,
         place: RecordPlace | None = None,
     ) -> None:
-        """Add a schema, channel or metadata record, and report a malformed one."""
+        """Add a schema, channel or metadata record of the file. A malformed record is reported."""
         try:
             odd = self._take_up(opcode, content, place)
         except READ_ERRORS as error:
@@ -630,7 +630,7 @@ class McapFile:
             walk.report.warnings.append(odd)
 
     def _take_up(self, opcode: int, content: memoryview, place: RecordPlace | None = None) -> str:
-        """Add a definition; the first one of an id counts. Return a warning or an empty text."""
+        """Add a schema or channel to the file object. Return a warning; empty if the record is valid."""
         stream = StrictStream(content)
         if opcode == Opcode.METADATA and place is not None:
             if place not in self.metadata:
@@ -657,7 +657,7 @@ class McapFile:
             raise TraceError(reason, path=self.path)
 
     def _at(self, position: int, length: int) -> memoryview:
-        """Return bytes of the file.
+        """Return bytes of the file at a position.
 
         Raises
         ------
@@ -675,7 +675,7 @@ class McapFile:
 
 
 class McapBag(McapFile):
-    """MCAP files of a bag, read one after another. Positions count from the start of the first file.
+    """Reader of a bag (folder of MCAP files) as one recording. Positions count from the first file.
 
     Parameters
     ----------
@@ -725,7 +725,7 @@ class McapBag(McapFile):
         self.profile, self.library = first.profile, first.library
 
     def _open(self, part: BagPart) -> None:
-        """Read the definitions and summary of a file. The file is open only during the reading."""
+        """Read the schemas, channels and summary of one file of the bag."""
         name = part.path.name
         if part.size < 0:
             self._faults.append(Loss(f"{name}: {METADATA} lists it, but there is no such file"))
@@ -746,7 +746,7 @@ class McapBag(McapFile):
             self.counts[own] = self.counts.get(own, 0) + file.counts[number]
 
     def close(self) -> None:
-        """Close all files."""
+        """Close all files of the bag."""
         for file in self._files.values():
             file.close()
         if self._own_spool:
@@ -754,7 +754,7 @@ class McapBag(McapFile):
 
     @property
     def compression(self) -> str:
-        """Compression of the first chunk; ``zstd`` before the first chunk."""
+        """Name of the compression of the first chunk; ``zstd`` before the first chunk."""
         return next(iter(self._files.values())).compression
 
     def _in_file_order(
@@ -764,7 +764,7 @@ class McapBag(McapFile):
         keep: Callable[[int], bool] | None,
         start: int = 0,
     ) -> Generator[Messages]:
-        """Yield all messages, file by file."""
+        """Yield all messages of the bag, file by file."""
         del start  # A bag is always read from the start.
         report.losses += self._faults
         for base, file in self._files.items():
@@ -782,7 +782,7 @@ class McapBag(McapFile):
                 _take_up(found, report, file.path.name, base)
 
     def _again(self, place: int, count: int) -> Messages:
-        """Read a run of messages of one file again."""
+        """Read a group of messages of one file of the bag again."""
         part = part_at(self._parts, place)
         if part is None or part.base not in self._files:
             raise TraceError("no file of the bag is there", path=self.path, offset=place)
@@ -797,7 +797,7 @@ class McapBag(McapFile):
         return replace(messages, read=read)
 
     def _use(self, file: McapFile) -> None:
-        """Open a file, and close the files that were not used recently."""
+        """Open a file of the bag, and close files that were not used recently."""
         if file in self._open_files:
             self._open_files.remove(file)
         self._open_files.append(file)
@@ -807,7 +807,7 @@ class McapBag(McapFile):
         del self._open_files[:-MOST_OPEN]
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """Yield the bytes of a record, with its head, in pieces."""
+        """Yield the bytes of a record of the bag in pieces."""
         part = part_at(self._parts, place.offset)
         if part is None or part.base not in self._files:
             raise TraceError("no file of the bag is there", path=self.path, offset=place.offset)
@@ -819,7 +819,7 @@ class McapBag(McapFile):
             file.close()
 
     def _learn(self, file: McapFile) -> None:
-        """Add the new channels and other new records of a file."""
+        """Add the new channels, schemas and other records of a file to the bag."""
         told = len(file.channels), len(file.metadata), len(file.attachments)
         if self._told.get(file.path) == told:
             return
@@ -839,7 +839,7 @@ class McapBag(McapFile):
         self.attachments += [place for place in moved if place not in known]
 
     def _take(self, number: int, file: McapFile, key: tuple[Any, ...], alike: list[int]) -> int:
-        """Return the id in the bag for a channel of a file.
+        """Return the channel id in the bag for a channel of one file.
 
         ``alike``: the file's channels with this key.
         """
@@ -862,18 +862,18 @@ class McapBag(McapFile):
         return number
 
     def _free(self, number: int, taken: dict[int, Any]) -> int:
-        """Return the given id if it is free, else the next free one."""
+        """Return the given channel id if it is unused in the bag, else the next unused id."""
         free = number if number not in taken else max(taken) + 1
         if free >= IDS:  # The limit applies to all files together.
             raise TraceError(f"more than {IDS} channels or schemas", path=self.path)
         return free
 
     def _meant(self, keep: Callable[[int], bool], file: McapFile) -> Callable[[int], bool]:
-        """Convert the filter ``keep`` from channel ids of the bag to channel ids of one file."""
+        """Convert a filter by channel ids of the bag to a filter by channel ids of one file."""
         return lambda number: keep(self._own[file.path, number])
 
     def _placed(self, file: McapFile, run: Messages, base: int) -> Messages:
-        """Return the messages of a file with the channel ids and positions of the bag."""
+        """Return the messages of a file with channel ids and positions of the whole bag."""
         ids, index = np.unique(run.channel, return_inverse=True)
         own = np.array([self._own[file.path, number] for number in ids.tolist()], np.int64)
         if run.chunk_offset >= 0:
@@ -890,7 +890,7 @@ def _all(_channel: int) -> bool:
 
 
 def _key_of(channel: Channel, file: McapFile) -> tuple[Any, ...]:
-    """Return the key of a channel. Channels of two files with equal keys become one channel of the bag."""
+    """Return a key for a channel: channels of two files with equal keys are one channel of the bag."""
     schema = file.schemas.get(channel.schema_id)
     definition = (schema.name, schema.encoding, schema.data) if schema else ()
     return channel.topic, channel.message_encoding, *definition
@@ -901,7 +901,7 @@ def _moved(wanted: Callable[[int], bool], base: int) -> Callable[[int], bool]:
 
 
 def _take_up(found: Findings, report: Findings, name: str, base: int) -> None:
-    """Add the findings of one file to the report of the bag."""
+    """Add the losses and warnings of one file to the report of the bag."""
     report.warnings += [f"{name}: {warning}" for warning in found.warnings]
     for loss in found.losses[: max(MAX_LOSSES - len(report.losses), 1)]:
         place = loss.offset + base if loss.offset >= 0 else -1

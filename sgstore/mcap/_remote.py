@@ -41,7 +41,7 @@ _copies: Final[dict[str, Path]] = {}
 
 @cache
 def object_stores() -> Any:
-    """Import obstore and return it.
+    """Import the package obstore, and return it.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def object_store_at(url: str) -> Any:
 
 
 def _options(url: str) -> dict[str, Any]:
-    """Return the settings of the client. A private S3 server (AWS_ENDPOINT_URL) may use plain HTTP."""
+    """Return client settings for an object store. A private S3 server may use plain HTTP."""
     retry = {
         "max_retries": TRIES,
         "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=5)},
@@ -87,7 +87,7 @@ def reason_of_object_store(error: BaseException) -> tuple[str, bool]:
 
 
 def fetch_object(store: Any, name: str, file: IO[bytes]) -> None:
-    """Write an object into an open file, and try again after an early end.
+    """Download an object into an open file, and try again after an early end.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def _opened(root: str, endpoint: str) -> Any:
 
 
 def _at(url: str) -> tuple[Any, str]:
-    """Return the object store of a URL, and the name of the object in it."""
+    """Return the object store for a URL, and the name of the object in it."""
     scheme, _, rest = url.partition("://")
     host, _, name = rest.partition("/")
     root = f"{scheme}://{host}"
@@ -145,7 +145,7 @@ def _told(url: str) -> Generator[None]:
 
 
 def _mark(about: Any) -> tuple[int, int]:
-    """Return the size and modification time of an object; bytes, ns.
+    """Return size (bytes) and modification time (ns) of an object in an object store.
 
     Object stores report whole seconds. The digits below one second are a hash of the object's tag, so that they
     differ between two versions within a second.
@@ -156,7 +156,7 @@ def _mark(about: Any) -> tuple[int, int]:
 
 
 def mark_of_url(url: str) -> tuple[int, int]:
-    """Return the size and modification time of an object; bytes, ns.
+    """Return size (bytes) and modification time (ns) of the object at a URL.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def mark_of_url(url: str) -> tuple[int, int]:
 
 
 def names_below(url: str) -> Iterator[str]:
-    """Yield the URLs of all objects below a URL, in any order.
+    """Yield the URLs of all objects below a URL of an object store, in any order.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def names_below(url: str) -> Iterator[str]:
 
 
 def open_url(url: str) -> io.BufferedReader:
-    """Open an object, or its local copy, for reading.
+    """Open the object at a URL, or its local copy, for reading.
 
     Raises
     ------
@@ -206,11 +206,11 @@ def open_url(url: str) -> io.BufferedReader:
 
 
 class NoRangesError(TraceError):
-    """A server does not support byte ranges."""
+    """Error: a server does not support byte ranges."""
 
 
 class RemoteFile(io.RawIOBase):
-    """File object for a remote object, which reads only the needed byte ranges.
+    """File object for a remote recording, which downloads only the needed byte ranges.
 
     Attributes
     ----------
@@ -230,19 +230,19 @@ class RemoteFile(io.RawIOBase):
         self.mark = _mark(about)
 
     def readable(self) -> bool:
-        """Return True."""
+        """Return True: the file is readable."""
         return True
 
     def seekable(self) -> bool:
-        """Return True."""
+        """Return True: the read position can be changed."""
         return True
 
     def tell(self) -> int:
-        """Return the position."""
+        """Return the read position in the file; bytes."""
         return self._position
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Change the position."""
+        """Change the read position in the file, and return it."""
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self.mark[0]}[whence]
         if base + offset < 0:
             raise OSError(EINVAL, "negative position")
@@ -261,13 +261,13 @@ class RemoteFile(io.RawIOBase):
         return len(data)
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the remote file."""
         if self._whole is not None:
             self._whole.close()
         super().close()
 
     def piece(self, start: int, stop: int) -> memoryview:
-        """Return a byte range. Without range support on the server, the whole object is fetched once.
+        """Return a byte range of the remote file. Without server support, the whole file is downloaded.
 
         Raises
         ------
@@ -302,7 +302,7 @@ class RemoteFile(io.RawIOBase):
         return whole(self.name, stop - start, ask)
 
     def _fetched(self) -> IO[bytes]:
-        """Fetch the whole object into an unnamed temporary file."""
+        """Download the whole remote file into a temporary file without a name."""
         file = TemporaryFile()  # noqa: SIM115  closed in close()
         with _told(self.name):
             fetch_object(self._store, self._key, file)
@@ -310,7 +310,7 @@ class RemoteFile(io.RawIOBase):
 
 
 def whole(url: str, size: int, ask: Callable[[], memoryview]) -> memoryview:
-    """Repeat a request, a few times, until all bytes arrive.
+    """Repeat a download request a few times, until all bytes arrive.
 
     Raises
     ------
@@ -340,7 +340,7 @@ def whole(url: str, size: int, ask: Callable[[], memoryview]) -> memoryview:
 
 @contextmanager
 def copied(urls: list[str], folder: Path) -> Generator[None]:
-    """Context manager that reads remote objects from local copies in a folder.
+    """Context manager in which remote files are read from local copies in a folder.
 
     Raises
     ------
