@@ -1,1 +1,1 @@
-"""Sets of tests: coverage, selection, locks, and the difference between stores."""
+"""Test sets: coverage of scene classes, selection of test cases, locks, comparison of two stores."""

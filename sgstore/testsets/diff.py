@@ -31,7 +31,7 @@ _CHECK: Final = re.compile(r"(?:^|[;\n])\s*CHECK\b", re.IGNORECASE)
 
 
 def scenes(a: Classed, b: Classed) -> ReportTable:
-    """Return classes of scenes that are in one selection only, or with different shares of frames.
+    """Return a table of scene classes that only one selection has, or whose shares of frames differ.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def scenes(a: Classed, b: Classed) -> ReportTable:
 
 
 def by_frame(a: Classed, b: Classed) -> ReportTable:
-    """Compare traces of the same name frame by frame, by the classes of scenes.
+    """Return a table that counts the frames with equal and with different scene classes, by trace name.
 
     Returns
     -------
@@ -121,14 +121,14 @@ def _tally(rows: list[tuple[Any, ...]], what: str) -> list[str]:
 
 
 def has_checks(text: str) -> bool:
-    """True if a text contains checks, not a query."""
+    """True if a query text contains ``CHECK`` statements."""
     return _CHECK.search(text) is not None
 
 
 def verdicts(
     a: Store | Collection, b: Store | Collection, text: str, values: Mapping[str, Any]
 ) -> ReportTable:
-    """Compare verdicts of checks on the traces of two stores or collections, matched by trace name.
+    """Return a table of the check verdicts that differ between two stores, by trace name.
 
     Returns
     -------
@@ -172,7 +172,7 @@ def _spans(verdict: Verdict | None) -> Any:
 def matches(
     a: Store | Collection, b: Store | Collection, query: str, values: Mapping[str, Any]
 ) -> ReportTable:
-    """Compare frames that a query finds in the traces of two stores or collections, by trace name.
+    """Return a table of the differing matches of a query in two stores, by trace name.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Frames to be covered: those of a store, or the matches of a query."""
+"""Frames whose coverage is measured: all frames of a store, or the matches of a query."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ChosenFrames:
-    """Frames of a store, or of a collection.
+    """Selected frames of a store or a collection (many stores).
 
     Attributes
     ----------
@@ -50,11 +50,11 @@ class ChosenFrames:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Return the traces that cannot answer the query."""
+        """Return the names of the traces that cannot answer the query."""
         return tuple(self.reasons)
 
     def scope(self, *, world: bool) -> dict[str, Any]:
-        """Return the omissions by settings, as :func:`sgstore.model.scope.scope_of`."""
+        """Return the data that settings excluded from the store of the frames, as JSON values."""
         chosen = None
         if self.frame_id is not None:
             chosen = set(np.unique(trace_of(self.frame_id)).tolist())
@@ -65,7 +65,7 @@ class ChosenFrames:
 
     @property
     def one_store(self) -> Store:
-        """Return the store of the frames.
+        """Return the store of the frames, or raise an error if the frames are of a collection.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class ChosenFrames:
         raise one_store_needed(self.store.place.url)
 
     def joined(self, tables: Mapping[str, Path]) -> ChosenFrames:
-        """Return the same frames with user tables for patterns; see :class:`sgstore.query.Store`."""
+        """Return the same frames of a store that has additional user tables for queries."""
         if not tables:
             return self
         if isinstance(self.store, Store):
@@ -86,22 +86,22 @@ class ChosenFrames:
 
     @property
     def abstracted(self) -> Abstracted | CollectionFrames:
-        """Return the interface of its store for abstractions."""
+        """Return the object that computes classes and features of the frames in an abstraction."""
         return self.store.file.abstracted
 
     @property
     def place(self) -> str:
-        """Return the path or URL of its store."""
+        """Return the path of the store, or the URL of the collection, that contains the frames."""
         if isinstance(self.store, Store):
             return str(self.store.file.path.resolve())
         return self.store.place.url
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Keep a store open for several queries; a collection never changes."""
+        """Return a context manager in which several queries see the same state of the store."""
         return self.store.file.snapshot()
 
     def rows_of(self, frame_id: Ints) -> Ints:
-        """Return the rows of the chosen frames among frames with ascending ids."""
+        """Return the indices of the selected frames in an ascending array of frame ids."""
         if self.frame_id is None:
             return np.arange(len(frame_id))
         at = np.searchsorted(frame_id, self.frame_id)
@@ -113,7 +113,7 @@ class ChosenFrames:
 def selection_of(
     text: str, *, max_spill: int = 0, engine: str = "local", partial: bool = False
 ) -> ChosenFrames:
-    """Parse a selection: a store, frames of it by a query, or frames of a lock.
+    """Return the frames that a text selects: of a store, of a store with a query, or of a lock file.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def selection_of(
 
 
 def _place_and_query(text: str) -> tuple[str, str]:
-    """Split a text into the place of a store or collection, and the query after it."""
+    """Split the text ``STORE:QUERY`` into the place of a store or collection, and the query."""
     if url_named(text) is not None:
         colon = _BEFORE_QUERY.search(text)
         return (text, "") if colon is None else (text[: colon.start()], text[colon.end() :])
@@ -182,7 +182,7 @@ _BEFORE_QUERY: Final = re.compile(r":(?![/\d])")
 def _opened(
     place: str, *, max_spill: int = 0, engine: str = "local", partial: bool = False
 ) -> Store | Collection:
-    """Open a store or a collection; options as in :func:`selection_of`."""
+    """Open a store or a collection (many stores) for queries."""
     if not _is_collection(place):
         return Store(place, max_spill=max_spill)
     from sgstore.collection import Collection
@@ -191,7 +191,7 @@ def _opened(
 
 
 def frames_of(store: Store | Collection, query: str, /, **parameters: object) -> Ints:
-    """Return the ids of the frames that match a query, ascending; ``**parameters`` are its ``$name`` values."""
+    """Return the ids of the frames that match a query, ascending."""
     if block_of(query) is not None:  # read as columns
         found = store.find(f"{query} RETURN FRAMES", **parameters).numpy()["frame_id"]
         return np.unique(found.astype(np.int64))
@@ -200,26 +200,26 @@ def frames_of(store: Store | Collection, query: str, /, **parameters: object) ->
 
 
 def traces_of(store: Store | Collection) -> Sequence[StoredTrace | TraceFacts]:
-    """Return the traces of a store or collection, by name."""
+    """Return the traces of a store or collection, sorted by name."""
     return store.info() if isinstance(store, Store) else store.catalog.traces
 
 
 def recordings_of(store: Store | Collection) -> dict[int, str]:
-    """Return the digest of the recording of each trace, by trace id."""
+    """Return the digest of the recording file of each trace, by trace id."""
     if isinstance(store, Store):
         return {one.trace_id: one.digest for one in store.info()}
     return {one["trace_id"]: one["digest"] for one in store.traces()}
 
 
 def periods_of(store: Store | Collection, frame_id: Ints) -> Floats:
-    """Return the median period of the trace of each frame, (N,); ns."""
+    """Return the frame period in ns for each frame, (N,): the median of its trace."""
     periods = {one.trace_id: one.period_ns for one in traces_of(store)}
     traces, number = np.unique(trace_of(frame_id), return_inverse=True)
     return np.array([periods.get(one, 0) for one in traces.tolist()], np.float64)[number]
 
 
 def run_begins(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Bools:
-    """Return a mask (N,) of frames that begin a run: the first of a trace, or after a gap."""
+    """Return a mask (N,) of frames that start a run: the first frame of a trace, or after a time gap."""
     step = np.diff(time_ns, prepend=time_ns[:1])
     periods, place = np.unique(periods_of(store, frame_id), return_inverse=True)
     longest = np.array([longest_step_ns(int(period)) for period in periods.tolist()])
@@ -227,7 +227,7 @@ def run_begins(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Bool
 
 
 def names_of(store: Store | Collection, frame_id: Sequence[int] | Ints) -> list[str]:
-    """Return the names of frames in the usual notation, ``TRACE#SEQ``."""
+    """Return the names of frames in the form ``TRACE#SEQ``."""
     traces = {trace.trace_id: trace.name for trace in traces_of(store)}
     ids = np.asarray(frame_id, np.int64)
     return [

@@ -1,4 +1,4 @@
-"""Frames of one or several selections, with their classes as numbers.
+"""Selected frames with the classes of their scene graphs, as class numbers.
 
 A class is that of a frame's graph in an abstraction, or that of a window of the last t frames.
 """
@@ -42,7 +42,7 @@ CountedUnit = Literal["frame", "run", "trace"]
 
 @dataclass(frozen=True)
 class Classed:
-    """Frames with their classes.
+    """Selected frames with the class of each frame's scene graph, or of a window of frames.
 
     Attributes
     ----------
@@ -62,25 +62,25 @@ class Classed:
 
     @property
     def known(self) -> Bools:
-        """Return a mask (N,) of frames with a known class."""
+        """Return a mask (N,) of frames whose class is known."""
         return self.code != UNKNOWN
 
     @property
     def unknown(self) -> int:
-        """Return the number of frames with an unknown class."""
+        """Return the number of frames whose class is unknown."""
         return int((self.code == UNKNOWN).sum())
 
     def sizes(self, unit: CountedUnit = "frame") -> Ints:
-        """Return the number of units of each class, (len(names),)."""
+        """Return the number of frames (or of runs or traces) with each class, (len(names),)."""
         code = self.code[self._units(unit)]
         return np.bincount(code, minlength=len(self.names)).astype(np.int64)
 
     def samples(self, unit: CountedUnit) -> int:
-        """Return the number of traces if traces are counted, else 0: each unit is its own sample."""
+        """Return the number of traces if a class is counted once per trace, otherwise 0."""
         return len(np.unique(trace_of(self.frame_id))) if unit == "trace" else 0
 
     def _units(self, unit: CountedUnit) -> Ints:
-        """Return the rows that represent the counted units."""
+        """Return the indices of the counted frames: all frames, or one per run or trace for each class."""
         rows = np.flatnonzero(self.known)
         if unit == "frame" or not len(rows):
             return rows
@@ -90,24 +90,24 @@ class Classed:
         return rows[self.run_begins()[rows]]
 
     def run_begins(self) -> Bools:
-        """Return a mask (N,) of frames that begin a run of one class."""
+        """Return a mask (N,) of frames that start a run of consecutive frames with the same class."""
         found = begins(self.frame_id)
         found[1:] |= self.code[1:] != self.code[:-1]
         return found
 
     def present(self) -> Ints:
-        """Return the codes of the occurring classes, ascending."""
+        """Return the numbers of the classes that occur in the frames, ascending."""
         return np.flatnonzero(self.sizes())
 
     def first(self) -> Ints:
-        """Return the id of the first frame of each class, or -1, (len(names),)."""
+        """Return the id of the first frame with each class, (len(names),); -1 for a class without frames."""
         found = np.full(len(self.names), -1)
         rows = np.flatnonzero(self.known)[::-1]
         found[self.code[rows]] = self.frame_id[rows]
         return found
 
     def in_order(self) -> Ints:
-        """Return the rows in ingest order of traces, frame after frame, (N,)."""
+        """Return the indices of the frames in the order of ingest of their traces, (N,)."""
         rank = {trace.trace_id: i for i, trace in enumerate(traces_of(self.chosen.store))}
         traces, number = np.unique(trace_of(self.frame_id), return_inverse=True)
         ranks = np.array([rank.get(trace, len(rank)) for trace in traces.tolist()], np.int64)
@@ -121,7 +121,7 @@ def classed(
     missing: Missing = "equal",
     slots: Specification | None = None,
 ) -> Classed:
-    """Return the frames of a selection with their classes.
+    """Return selected frames with the classes of their scene graphs in an abstraction.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def classed(
 
 
 def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
-    """Return each frame with the class of its window."""
+    """Return frames with the classes of windows (each frame with the frames before it)."""
     frame_id, code = whole.frame_id, whole.code
     ids, time_ns = whole.chosen.abstracted.times()
     time_ns = time_ns[np.searchsorted(ids, frame_id)]
@@ -193,7 +193,7 @@ def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
 
 
 def _numbered(parts: Sequence[Ints]) -> tuple[Ints, Ints]:
-    """Number tuples so that equal tuples have equal numbers; return also one row per number."""
+    """Return one number per tuple of values, equal for equal tuples; and one index per distinct number."""
     key = parts[0]
     for part in parts[1:]:
         key = np.unique(key * (int(part.max(initial=0)) + 1) + part, return_inverse=True)[1]
@@ -202,13 +202,13 @@ def _numbered(parts: Sequence[Ints]) -> tuple[Ints, Ints]:
 
 
 def _window_name(classes: Sequence[str]) -> str:
-    """Return a hash of a window's classes, 32 hexadecimal digits, the same in every store."""
+    """Return a name for the class of a window: a hash of the classes of its frames, equal in every store."""
     text = "\n".join(classes).encode()
     return blake2b(text, digest_size=16, person=b"sgstore window").hexdigest()
 
 
 def shared(*of: Classed) -> tuple[tuple[str, ...], list[Classed]]:
-    """Renumber several selections with common class numbers."""
+    """Return several selections of frames with the same class numbers for equal classes."""
     if all(one.names == of[0].names for one in of):  # parts of one store
         return of[0].names, list(of)
     number: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""Comparison of selections: common, new and missing classes, estimates of unseen classes, and failures.
+"""Comparison of selected frames by class: common, new and missing classes, and estimates of unseen classes.
 
 The estimates of unseen classes use the frequencies of the seen classes.
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Estimate of the number of unseen classes.
+    """Statistical estimate of the number of scene classes that the data set has not shown yet.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Estimate:
 
 
 def estimate(sizes: Ints, samples: int = 0) -> Estimate:
-    """Estimate the number of unseen classes.
+    """Estimate the number of unseen scene classes from the frequencies of the seen classes.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def estimate(sizes: Ints, samples: int = 0) -> Estimate:
 
 
 def _interval(seen: int, unseen: float, variance: float) -> tuple[float, float]:
-    """Return the 95 % interval of the number of classes, log-normal above the seen number."""
+    """Return the 95 % confidence interval of the total number of classes (log-normal distribution)."""
     if unseen <= 0:
         return float(seen), float(seen)
     width = math.exp(1.96 * math.sqrt(math.log(1 + variance / unseen**2)))
@@ -103,7 +103,7 @@ def _interval(seen: int, unseen: float, variance: float) -> tuple[float, float]:
 def expected_classes(
     sizes: Ints, drawn: Ints, units: int = 0, weight: Ints | None = None
 ) -> Floats:
-    """Return the mean number of classes in a random subset: exact rarefaction.
+    """Return the expected number of classes in a random subset of the frames (rarefaction).
 
     A class in m of N units is missed by a subset of n in C(N - m, n) of C(N, n) cases
     (hypergeometric).
@@ -141,7 +141,7 @@ POINTS = 40
 
 
 def classes(a: Classed, unit: CountedUnit = "frame") -> ReportTable:
-    """Return the classes of a selection, the most frequent first.
+    """Return a table of the scene classes in a selection of frames, the most frequent first.
 
     Returns
     -------
@@ -190,7 +190,7 @@ def _said(a: Classed, unit: CountedUnit) -> list[str]:
 
 
 def unseen(found: Estimate, unit: CountedUnit) -> str:
-    """Return the estimate of unseen classes as a sentence."""
+    """Return an estimate of the number of unseen classes as a sentence."""
     return (
         f"unseen: {found.unseen_mass:.2%} of further {unit}s would be of a new class (Good-Turing);"
         f" at least {found.chao1:.0f} classes in all (Chao1, 95 %: {found.low:.0f} to {found.high:.0f}),"
@@ -199,7 +199,7 @@ def unseen(found: Estimate, unit: CountedUnit) -> str:
 
 
 def covered(of: Classed, by: Classed) -> ReportTable:
-    """Return the share of the classes of one selection that occur in another, by class and by frame.
+    """Return a table with the share of the classes of one selection that occur in another selection.
 
     Returns
     -------
@@ -220,13 +220,16 @@ def covered(of: Classed, by: Classed) -> ReportTable:
 
 
 def is_novel(a: Classed, than: Classed) -> Bools:
-    """Return a mask (N,) of frames with a class that another selection lacks; common numbering required."""
+    """Return a mask (N,) of frames whose class does not occur in another selection of frames.
+
+    Both selections must have the same class numbers.
+    """
     there = np.append(than.sizes() > 0, True)  # the last entry is for unknown classes
     return ~there[a.code]
 
 
 def novel(a: Classed, than: Classed) -> ReportTable:
-    """Return the classes of one selection that another lacks, the rarest first.
+    """Return a table of the classes that occur in one selection but not in another, the rarest first.
 
     Returns
     -------
@@ -250,7 +253,7 @@ def novel(a: Classed, than: Classed) -> ReportTable:
 
 
 def novel_frames(a: Classed, than: Classed) -> ReportTable:
-    """Return the frames with novel classes, rarest classes first.
+    """Return a table of the frames with classes that another selection lacks, the rarest class first.
 
     Returns
     -------
@@ -269,7 +272,7 @@ def novel_frames(a: Classed, than: Classed) -> ReportTable:
 
 
 def novel_clips(a: Classed, than: Classed) -> ReportTable:
-    """Return runs of consecutive frames with novel classes, the longest first.
+    """Return a table of clips with classes that another selection lacks, the longest clip first.
 
     Returns
     -------
@@ -296,7 +299,7 @@ def novel_clips(a: Classed, than: Classed) -> ReportTable:
 
 
 def venn(a: Classed, b: Classed) -> ReportTable:
-    """Return the sizes of intersection, differences and union of two selections.
+    """Return a table with the number of classes in both of two selections, in one only, and in total.
 
     Returns
     -------
@@ -320,7 +323,7 @@ def venn(a: Classed, b: Classed) -> ReportTable:
 
 
 def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> ReportTable:
-    """Return the number of classes in the first n units, in ingest order of traces.
+    """Return a table with the number of distinct classes in the first n frames (or runs or traces).
 
     Returns
     -------
@@ -346,7 +349,9 @@ def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> Rep
 
 
 def curve(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Ints]:
-    """Return the sizes of the classes, and the number of classes after each unit.
+    """Return the number of frames of each class, and the number of distinct classes after each frame.
+
+    Runs or traces can be counted instead of frames.
 
     A trace is a unit that adds all its classes at once.
     """
@@ -365,7 +370,7 @@ def curve(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Ints]:
 
 
 def rank_sizes(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Floats]:
-    """Return the sizes of the classes, largest first, and their cumulative shares of all units."""
+    """Return the number of frames of each class, largest first, and the cumulative shares of all frames."""
     sizes = np.sort(a.sizes(unit))[::-1]
     sizes = sizes[sizes > 0]
     return sizes, np.cumsum(sizes) / max(int(sizes.sum()), 1)

@@ -1,4 +1,4 @@
-"""Differences between two selections of frames: features, and a decision tree."""
+"""Features that distinguish the scenes of two selections of frames, one by one and as a decision tree."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ def tree(
     weight: Floats,
     depth: int = DEPTH,
 ) -> list[tuple[tuple[str, ...], float, float]]:
-    """Build a decision tree by Gini's impurity (Breiman et al., "Classification and regression trees", 1984).
+    """Return the leaves of a decision tree that separates two groups of scenes by their features.
+
+    The split criterion is Gini's impurity (Breiman et al., "Classification and regression trees",
+    1984).
 
     Parameters
     ----------
@@ -74,7 +77,7 @@ def tree(
 
 
 def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tuple[int, int] | None:
-    """Return the best question: a feature, and the threshold of its number of occurrences."""
+    """Return the best split of a decision tree: a feature, and the threshold of its count."""
     good = np.where(ours, weight, 0.0)
     total, positive = float(weight.sum()), float(good.sum())
     if min(positive, total - positive) < 1e-9:
@@ -111,7 +114,7 @@ def explain(
     by_frame: bool = False,
     depth: int = DEPTH,
 ) -> tuple[ReportTable, ReportTable]:
-    """Explain the differences of ``b`` from ``a``; classes count once, or by their frames.
+    """Return tables of the features, and of a decision tree, that distinguish two selections of frames.
 
     Parameters
     ----------
@@ -177,7 +180,7 @@ def explain(
 
 
 def _without(a: Classed, b: Classed) -> tuple[Classed, int]:
-    """Return ``a`` without the frames of ``b``, and the number of removed frames."""
+    """Return a selection of frames without the frames of another one, and the number of removed frames."""
     if a.chosen.place != b.chosen.place:
         return a, 0
     rows = np.flatnonzero(~np.isin(a.frame_id, b.frame_id))

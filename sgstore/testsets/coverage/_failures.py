@@ -1,4 +1,4 @@
-"""Failures of a system under test by the classes of its inputs."""
+"""Failures of a tested system, compared with the scene classes of its training and test inputs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ID: Final = re.compile(r"[0-9]{1,19}")
 
 
 def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[str, bool]:
-    """Read the outcomes of a system's inputs from a CSV file.
+    """Return test outcomes from a CSV file: True for a failure, by the name of the input.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[st
 def told_outcomes(
     outcomes: Mapping[str, bool], chosen: ChosenFrames, frame_id: Ints
 ) -> tuple[Bools, Bools]:
-    """Return masks (N,) of failed frames, and of frames with a known outcome."""
+    """Return two masks (N,) of frames: those with a failure, and those with a known test outcome."""
     failed, known = (np.zeros(len(frame_id), np.bool_) for _ in range(2))
     place = {int(frame): row for row, frame in enumerate(frame_id.tolist())}
     ids = chosen.abstracted.times()[0]
@@ -127,7 +127,7 @@ def _failed(where: str, columns: list[str], told: list[str], threshold: float) -
 def failures(
     train: Classed, test: Classed, outcomes: Mapping[str, bool]
 ) -> tuple[ReportTable, ReportTable]:
-    """Compare the failures of test inputs with the classes of training inputs.
+    """Return tables of test failures: their shares, and the failures in scene classes not in training.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Features of frames in an abstraction, such as (car, near, ego), and combinations of k features.
+"""Features of scene graphs, such as (car, near, ego), and combinations of k features in frames.
 
 Equal classes have equal features; therefore one frame per class is read.
 """
@@ -46,7 +46,7 @@ _ROWS: Final = 8_192
 
 @dataclass(frozen=True)
 class ClassFeatures:
-    """Features of classes, with counts.
+    """Number of times that each feature occurs in each scene class.
 
     Attributes
     ----------
@@ -67,12 +67,12 @@ class ClassFeatures:
 
     @property
     def there(self) -> Bools:
-        """Return a mask (C, F) of the features of each class."""
+        """Return a mask (C, F): True if a scene class has a feature."""
         return self.counts > 0
 
 
 def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeatures:
-    """Return the features of the classes of a selection.
+    """Return the features of the scene classes that occur in selected frames.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeat
 
 
 def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedinteger[Any]]:
-    """Allocate an array for features of classes.
+    """Return an array of zeros for the feature counts of classes, or raise an error if it is too large.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedint
 
 
 def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int = 0) -> Floats:
-    """Return total weights (K, F) of the classes with each feature more than ``more_than`` times."""
+    """Return the total weight (K, F) of the classes that have a feature more than ``more_than`` times."""
     total = np.zeros((len(weights), counts.shape[1]))
     # Integers below 2²⁴ are exact in 32 bits.
     small = np.abs(weights).sum() < 1 << 24 and (weights == np.round(weights)).all()
@@ -140,7 +140,7 @@ def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int =
 
 @dataclass(frozen=True)
 class Combinations:
-    """Occurring combinations of k features.
+    """Combinations of k features that occur together in frames, with their numbers of frames.
 
     Attributes
     ----------
@@ -158,13 +158,13 @@ class Combinations:
     frames: Ints
 
     def texts(self, rows: Sequence[int] | Ints) -> list[str]:
-        """Return combinations as readable texts."""
+        """Return some combinations of features as readable texts."""
         names = [" ".join(name) for name in self.features.names]
         return [" & ".join(names[i] for i in one) for one in self.members[rows].tolist()]
 
     @staticmethod
     def of(found: ClassFeatures, k: int) -> Combinations:
-        """Return all combinations of k features, with the number of frames of each.
+        """Return all combinations of k features that occur in frames, with the number of frames of each.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class Combinations:
 
 
 def _counted(found: ClassFeatures, members: Ints) -> Iterator[int]:
-    """Yield the number of frames of each combination; eight classes per byte."""
+    """Yield the number of frames that have each combination of features."""
     packed = np.packbits(found.there, axis=0).T.copy()
     for row in members.tolist():
         both = np.bitwise_and.reduce(packed[row], axis=0)
@@ -199,7 +199,7 @@ def _counted(found: ClassFeatures, members: Ints) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Combos:
-    """Combinations that a selection has, and those that it lacks.
+    """Combinations of features that occur in a selection of frames, and those that are missing.
 
     Attributes
     ----------
@@ -222,7 +222,7 @@ class Combos:
 
     @property
     def missing(self) -> ReportTable:
-        """Return the missing combinations.
+        """Return a table of the missing combinations of features.
 
         The columns are ``combination``, ``frames_in_reference`` (or ``None``), ``query``.
         """
@@ -233,7 +233,7 @@ class Combos:
         return ReportTable(("combination", "frames_in_reference", "query"), list(rows))
 
     def covered(self) -> ReportTable:
-        """Return the occurring combinations, most frequent first: ``combination``, ``frames``."""
+        """Return a table of the occurring combinations of features, the most frequent first."""
         found = self.found
         rows = np.flatnonzero(found.frames)
         rows = rows[np.argsort(-found.frames[rows], kind="stable")]
@@ -241,7 +241,7 @@ class Combos:
         return ReportTable(("combination", "frames"), list(listed))
 
     def matrix(self) -> tuple[list[str], Ints, Bools]:
-        """Return pairs of features: names, frames with both (F, F), and a mask of wanted pairs (F, F)."""
+        """Return the names of the features, the number of frames of each pair, and a mask of required pairs."""
         own = self.found.features
         frames = _together(own)
         wanted = np.ones(frames.shape, np.bool_)
@@ -258,7 +258,7 @@ def combos(
     *,
     of_ego: bool = False,
 ) -> Combos:
-    """Count the combinations of k features in a selection, and list the missing ones.
+    """Count the combinations of k features in selected frames, and list the missing combinations.
 
     Parameters
     ----------
@@ -306,7 +306,7 @@ def combos(
 
 
 def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
-    """Map class features to another list of features."""
+    """Return feature counts of classes with the columns of another list of features."""
     place = {name: i for i, name in enumerate(names)}
     counts = zeros((len(own.codes), len(names)), own.counts.dtype)
     for column, name in enumerate(own.names):
@@ -316,7 +316,7 @@ def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
 
 
 def _together(found: ClassFeatures) -> Ints:
-    """Return the number of frames with both features of each pair, (F, F)."""
+    """Return the number of frames that have both features of a pair, for all pairs, (F, F)."""
     total = np.zeros((len(found.names), len(found.names)))
     kind = np.float32 if found.frames.sum() < 1 << 24 else np.float64  # exact for integers
     for first in range(0, len(found.codes), _ROWS):

@@ -1,4 +1,4 @@
-"""Selections of frames, missing values as queries, and result tables.
+"""Queries for missing features and slot values, and result tables.
 
 Missing features and slot values are returned as queries that users can run.
 """
@@ -28,7 +28,7 @@ _PARTS: Final = {
 
 
 def query_of_features(features: Sequence[tuple[str, ...]]) -> str | None:
-    """Return a query for frames with all of these features; ``None`` if a feature has no pattern.
+    """Return a query for frames that have all given features; ``None`` if a feature has no pattern.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def query_of_features(features: Sequence[tuple[str, ...]]) -> str | None:
 
 
 def is_of_ego(feature: Sequence[str]) -> bool:
-    """True for a feature of the ego, or of a lane by its role relative to the ego."""
+    """True if a feature contains the ego, or a lane named relative to the ego."""
     return any(label in _EGOS or _ROLE.fullmatch(label) for label in feature[::2])
 
 
@@ -56,7 +56,7 @@ def _pattern(feature: Sequence[str]) -> str | None:
 
 
 def _node(label: str) -> str | None:
-    """Return the pattern of a node with a label of an abstraction."""
+    """Return the query pattern of a node for a node label of an abstraction; ``None`` without a pattern."""
     if label in _EGOS:
         return "(:Ego)"
     if label in _PARTS:
@@ -77,7 +77,7 @@ _TEXT: Final = re.compile(r"'(?:[^'\\]|\\.|'')*'")
 
 
 def block_of(pattern: str) -> str | None:
-    """Convert ``MATCH … WHERE …`` to the content of ``EXISTS {…}``; ``None`` for other clauses."""
+    """Return the text inside ``EXISTS {…}`` for a query ``MATCH … WHERE …``; ``None`` for other clauses."""
     found = _PATTERN.fullmatch(pattern)
     if found is None or _BEYOND.search(_TEXT.sub("''", found["body"])):
         return None
@@ -85,7 +85,7 @@ def block_of(pattern: str) -> str | None:
 
 
 def query_of_blocks(there: Sequence[str], absent: Sequence[str]) -> str:
-    """Return a query for frames with some blocks and without others."""
+    """Return a query for frames that match some patterns and do not match others."""
     parts = [f"EXISTS {{{block}}}" for block in there]
     parts += [f"NOT EXISTS {{{block}}}" for block in absent]
     where = f" WHERE {' AND '.join(parts)}" if parts else ""
@@ -99,7 +99,7 @@ Row = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Table with column names.
+    """Table of results: column names, rows and notes.
 
     Attributes
     ----------
@@ -114,18 +114,18 @@ class ReportTable:
     said: list[str] = field(default_factory=list[str])
 
     def without(self, *names: str) -> ReportTable:
-        """Return the table without some columns."""
+        """Return the table without the named columns."""
         kept = [place for place, name in enumerate(self.columns) if name not in names]
         rows = [tuple(row[place] for place in kept) for row in self.rows]
         return ReportTable(tuple(self.columns[place] for place in kept), rows, self.said)
 
     def column(self, name: str) -> list[Any]:
-        """Return the values of a column."""
+        """Return the values of a column of the table."""
         place = self.columns.index(name)
         return [row[place] for row in self.rows]
 
     def dicts(self) -> list[dict[str, Any]]:
-        """Return the rows as dicts from column to value."""
+        """Return the rows of the table as dictionaries by column name."""
         return [dict(zip(self.columns, row, strict=True)) for row in self.rows]
 
 
@@ -134,12 +134,12 @@ SHARES = ("measure", "part", "of", "share", "denominator")
 
 
 def share(measure: str, part: float, of: float, denominator: str) -> Row:
-    """Return a row of a table of shares; the share is ``None`` for an empty denominator."""
+    """Return a table row with a share: its name, both numbers, and their quotient or ``None`` for x / 0."""
     return measure, part, of, part / of if of else None, denominator
 
 
 def of_unknown(unknown: int, text: str) -> list[str]:
-    """Return the note about frames without a class, or an empty list."""
+    """Return a list with a note about the frames without a known class; empty without such frames."""
     if not unknown:
         return []
     return [

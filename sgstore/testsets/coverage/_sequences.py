@@ -1,4 +1,4 @@
-"""Sequences of manoeuvres: their events, and the sequences of k manoeuvres in a data set.
+"""Manoeuvres in recordings, and coverage of the sequences of k manoeuvres.
 
 A *manoeuvre* is a named pattern. An *event* is a match of it at its moment: where it is complete,
 or, for a pattern of one frame, where it begins to hold. Its name contains the pattern and the kinds
@@ -39,7 +39,7 @@ WITHIN_S: Final = 10.0
 
 
 def manoeuvres_named(names: Sequence[str] = ()) -> dict[str, str]:
-    """Return patterns by name: ``NAME`` of the library, or ``NAME=QUERY``; default: all its manoeuvres.
+    """Return queries of manoeuvres by name, from texts ``NAME`` (library) or ``NAME=QUERY``.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def manoeuvres_named(names: Sequence[str] = ()) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class ManoeuvreEvents:
-    """Manoeuvre events in some frames, ordered by trace and time.
+    """Starts of manoeuvres in selected frames, ordered by trace and time.
 
     Attributes
     ----------
@@ -93,21 +93,21 @@ class ManoeuvreEvents:
     said: list[str]
 
     def over(self, names: tuple[str, ...]) -> ManoeuvreEvents:
-        """Return the events with codes for a superset of names."""
+        """Return the same manoeuvre events, numbered by a longer list of names."""
         place = {name: i for i, name in enumerate(names)}
         moved = np.array([place[name] for name in self.names] or [0], np.int64)
         return replace(self, names=names, code=moved[self.code])
 
     @cached_property
     def traces(self) -> list[tuple[int, slice]]:
-        """Return the traces, and the slice of events of each."""
+        """Return the trace ids, each with the slice of its manoeuvre events."""
         traces, first = np.unique(trace_of(self.frame_id), return_index=True)
         ends = np.append(first[1:], len(self.code))
         return list(zip(traces.tolist(), map(slice, first.tolist(), ends.tolist()), strict=True))
 
 
 def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> ManoeuvreEvents:
-    """Find the manoeuvre events in some frames.
+    """Return the starts of manoeuvres in selected frames, found by queries.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> Manoeuvre
 
 
 def _ascending(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Ints:
-    """Return the times of frames, shifted by a day after each backward jump of the trace's clock."""
+    """Return frame times that never decrease: each backward jump of the clock adds a day."""
     found = store.file.rows(
         "SELECT frame_id FROM (SELECT frame_id,"
         " time_ns < lag(time_ns) OVER (PARTITION BY trace_id ORDER BY frame_id) AS back FROM frames)"
@@ -152,13 +152,13 @@ def _ascending(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Ints
 
 
 def _steps(text: str) -> int:
-    """Return the number of steps of a query; for a union, of its last part."""
+    """Return the number of sequence steps of a query (of its last part for a union)."""
     found = [one for one in parse(text) if isinstance(one, MatchClause)]
     return len(found[-1].sequence.steps) if found else 1
 
 
 class _Cast:
-    """Names and kinds of the participants in matches of a store."""
+    """Names and kinds of the entities in the matches of a store."""
 
     def __init__(self, store: Store | Collection) -> None:
         self._ids = {trace.name: trace.trace_id for trace in traces_of(store)}
@@ -170,7 +170,7 @@ class _Cast:
         self._kinds |= dict.fromkeys(rows, "ego")
 
     def happening(self, name: str, interval: Interval, *, stepped: bool) -> tuple[int, int, str]:
-        """Return frame, time and name with participants of an event."""
+        """Return a manoeuvre event: frame, time, and name with its entities, such as ``stops(car)``."""
         trace = self._ids[interval.trace]
         nodes = [node for node in interval.values.values() if isinstance(node, int)]
         kinds = [self._kinds[trace, node] for node in nodes if (trace, node) in self._kinds]
@@ -183,7 +183,7 @@ class _Cast:
 
 
 def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> dict[int, int]:
-    """Return the sequences of k events in one recording, each with its first starting event.
+    """Return the sequences of k manoeuvres in one recording, each with the index of its first event.
 
     Parameters
     ----------
@@ -225,7 +225,10 @@ def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) 
 
 
 def _following(code: Ints, time_ns: Ints, names: int) -> list[Ints]:
-    """Return for each name the first event strictly after each event; the number of events if none."""
+    """Return, for each manoeuvre name, the index of its next event after each event.
+
+    The index is the number of events if there is no later one.
+    """
     found: list[Ints] = []
     for name in range(names):
         places = np.flatnonzero(code == name)
@@ -236,7 +239,7 @@ def _following(code: Ints, time_ns: Ints, names: int) -> list[Ints]:
 
 @dataclass(frozen=True)
 class SequenceCoverage:
-    """Sequences of manoeuvres that a selection has, and those that it lacks.
+    """Tables of the sequences of manoeuvres that occur in selected frames, and of the missing sequences.
 
     Attributes
     ----------
@@ -260,7 +263,7 @@ def sequences(
     manoeuvres: Mapping[str, str] | None = None,
     within_s: float = WITHIN_S,
 ) -> SequenceCoverage:
-    """Count the sequences of k manoeuvres in a selection, and list the missing ones.
+    """Count the sequences of k manoeuvres in selected frames, and list the missing sequences.
 
     Parameters
     ----------
@@ -312,7 +315,7 @@ def sequences(
 
 
 def check_sequences(names: int, k: int) -> None:
-    """Reject too many sequences.
+    """Raise an error if there are too many possible sequences of k manoeuvres.
 
     Raises
     ------
@@ -326,7 +329,7 @@ def check_sequences(names: int, k: int) -> None:
 
 
 def _in_traces(of: ManoeuvreEvents, k: int, within_ns: int) -> dict[int, tuple[int, int]]:
-    """Map sequences to their number of traces, and the first frame of the first occurrence."""
+    """Return, for each sequence of manoeuvres, its number of traces and the frame of its first occurrence."""
     found: dict[int, tuple[int, int]] = {}
     for _, rows in of.traces:
         here = sequences_in(of.code[rows], of.time_ns[rows], len(of.names), k, within_ns)
@@ -338,7 +341,7 @@ def _in_traces(of: ManoeuvreEvents, k: int, within_ns: int) -> dict[int, tuple[i
 
 
 def _text(number: int, names: Sequence[str], k: int) -> str:
-    """Return a sequence as readable text: ``stops(car) then starts(car)``."""
+    """Return a sequence of manoeuvres as text, such as ``stops(car) then starts(car)``."""
     found: list[str] = []
     for _ in range(k):
         number, place = divmod(number, len(names))

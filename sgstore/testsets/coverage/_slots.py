@@ -1,4 +1,4 @@
-"""Coverage over declared slots: scene parameters with values defined by patterns, and their combinations.
+"""Coverage of declared slots: parameters of a scene, whose values are defined by patterns.
 
 Slots are declared in a TOML file::
 
@@ -59,7 +59,7 @@ _RETURN: Final = re.compile(r"\bRETURN\b", re.IGNORECASE)
 
 
 def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple[Any, ...], int]]:
-    """Return the columns of a query, and the number of frames of each combination of values.
+    """Return the columns of a query, and the number of frames of each combination of returned values.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
 
 
 def _with_frames(query: str) -> str:
-    """Return a query extended by the frame of each match among its returned values."""
+    """Return a query that also returns the frame of each match."""
     found = [one for one in each_match(parse(query)) if isinstance(one, syntax.MatchClause)]
     for part in reversed(found):  # insertions move the later text
         returns = part.returns
@@ -107,7 +107,7 @@ def _with_frames(query: str) -> str:
 def specification(
     chosen: ChosenFrames, query: str, declared: int = 0, reference: str | ChosenFrames = ""
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Return the occurring and the missing cells of a specification.
+    """Return tables of the occurring and the missing combinations of values that a query returns.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ _MAX_VALUES: Final = 1_000
 
 @dataclass(frozen=True)
 class Slot:
-    """Parameter of a scene.
+    """Slot: a parameter of a scene, with a pattern for each of its values.
 
     Attributes
     ----------
@@ -186,18 +186,18 @@ class Slot:
 
     @property
     def domain(self) -> tuple[str, ...]:
-        """Return all its values, ``none`` first."""
+        """Return the names of all values of the slot, ``none`` first."""
         return (NONE, *self.values)
 
     def block(self, value: str) -> tuple[list[str], list[str]]:
-        """Return the required and the excluded patterns of a value."""
+        """Return the patterns that a frame must match, and must not match, to have a value of the slot."""
         blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
         return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
 
 
 @dataclass(frozen=True)
 class Specification:
-    """Slots, with the frames and combinations that count.
+    """Declared slots (parameters of a scene), with the frames and value combinations that count.
 
     Attributes
     ----------
@@ -220,7 +220,7 @@ class Specification:
     def matrix(
         self, chosen: ChosenFrames
     ) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
-        """Return pairs of slot values: their common frames, and the wanted pairs.
+        """Return all pairs of slot values, the number of frames of each pair, and a mask of required pairs.
 
         Returns
         -------
@@ -261,7 +261,7 @@ class Specification:
 
     @staticmethod
     def read(path: str | Path) -> list[Specification]:
-        """Read the specifications in a file.
+        """Return the slot specifications of a TOML file.
 
         Parameters
         ----------
@@ -324,7 +324,7 @@ def _specification(path: Path, given: Any, name: str) -> Specification:
 
 
 def _tables(path: Path, given: Mapping[str, Any]) -> dict[str, Path]:
-    """Return the files of tables, relative to the folder of the slot file."""
+    """Return the user table files named in a slot file, relative to the folder of that file."""
     tables = given.get("tables", {})
     if not isinstance(tables, dict) or not all(isinstance(one, str) for one in tables.values()):
         raise ConfigError(
@@ -356,7 +356,7 @@ def _slot(path: Path, given: Any) -> Slot:
 
 
 class _Held:
-    """Cache of the frames of a selection in which patterns hold."""
+    """Cache of the selected frames that match each pattern."""
 
     def __init__(self, chosen: ChosenFrames, tables: Mapping[str, Path]) -> None:
         self._chosen = chosen = chosen.joined(tables)
@@ -365,7 +365,7 @@ class _Held:
         self._known: dict[str, Bools] = {}
 
     def of(self, pattern: str) -> Bools:
-        """Return a mask (F,) of the frames that match a pattern; an empty pattern matches all."""
+        """Return a mask (F,) of the selected frames that match a pattern. An empty pattern matches all."""
         if pattern not in self._known:
             there = np.ones(len(self._ids), np.bool_)
             if pattern:
@@ -374,7 +374,7 @@ class _Held:
         return self._known[pattern]
 
     def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
-        """Map each slot value to the counted frames that have it."""
+        """Return the frames that have each slot value, as bit masks by slot and value."""
         counts = self.of(specification.where)
         held: dict[tuple[str, str], Bits] = {}
         for slot in specification.slots:
@@ -387,7 +387,7 @@ class _Held:
         return held
 
     def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
-        """Return the frames that count, names of their slot values, and an index into the names."""
+        """Return the frames that count, the distinct combinations of slot values, and their index per frame."""
         rows = np.flatnonzero(self.of(specification.where))
         names, code = [""], np.zeros(len(rows), np.int64)
         for slot in specification.slots:
@@ -410,7 +410,7 @@ class _Held:
 
 
 def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints, list[str], Ints]:
-    """Return the class of each frame by the values of declared slots.
+    """Return frames with classes that are defined by the values of declared slots.
 
     Returns
     -------
@@ -433,7 +433,7 @@ def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints,
 def _combined(
     specification: Specification, k: int, held: _Held
 ) -> Iterator[tuple[tuple[Slot, ...], tuple[str, ...], int]]:
-    """Yield all possible combinations of values of k slots, with the number of frames of each.
+    """Yield each possible combination of values of k slots, with its number of frames.
 
     Raises
     ------
@@ -464,7 +464,7 @@ def _combined(
 def slot_coverage(
     chosen: ChosenFrames, specifications: Sequence[Specification], k: int = 0
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Return the occurring and the missing combinations of slot values.
+    """Return tables of the occurring and the missing combinations of slot values.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Locks: test sets as text with digests of the content of every case.
+"""Lock: text file with the cases of a test set and the digests of their content.
 
 ``_text`` reads and writes the text. ``_cases`` makes cases of a store or collection, and finds them
 again. ``_sets`` has union, intersection and difference. ``_verify`` finds changes.

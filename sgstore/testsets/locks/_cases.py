@@ -1,4 +1,4 @@
-"""Cases of a store or collection with content digests, and look-up of a lock's cases."""
+"""Creation of locks (lists of test cases with content digests) from a store or collection."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CasePart = tuple["Ints", "Ints", str]
 
 
 def locked(trace: StoredTrace, mark: Mark) -> LockedTrace:
-    """Return a trace in the form for a lock."""
+    """Return a trace of a store as an entry of a lock, with its digests."""
     source = trace.name, trace.digest, trace.ego, trace.flavour
     part = trace.frames, trace.since, trace.until
     return LockedTrace(*source, *part, mark.config, mark.map, trace.version)
@@ -51,7 +51,7 @@ def lock_of(
     payloads: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
-    """Return the lock of some parts of a store or collection; each bundle makes its own part.
+    """Return a lock of some clips of a store or collection, with the digests of their content.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def _lock_of_bundles(
 def lock_in(
     store: Store, parts: Sequence[tuple[list[int], list[int], str]], *, payloads: bool
 ) -> str:
-    """Return the text of the lock of some parts of a bundle."""
+    """Return the text of a lock of some clips in one bundle of a collection."""
     own = [(np.array(ids, np.int64), np.array(times, np.int64), of) for ids, times, of in parts]
     return lock_of(store, own, {}, payloads=payloads).text()
 
@@ -145,7 +145,7 @@ def _case(part: CasePart, trace: str, graph: str, payload: Payload | None) -> Lo
 
 
 def payload_digests(store: Store, groups: Sequence[Ints]) -> Iterator[Payload]:
-    """Yield digests of the messages of groups of frames, by channel, in recording order.
+    """Yield the digests of the sensor messages in groups of frames, by channel.
 
     The digest of a channel covers its messages in the order of their log times, each once,
     independent of other messages between them.
@@ -171,7 +171,7 @@ def payload_digests(store: Store, groups: Sequence[Ints]) -> Iterator[Payload]:
 
 
 def recording_of(store: Store, trace_id: int) -> Path:
-    """Return the path of a trace's recording, verified as the ingested file.
+    """Return the path of the recording of a trace, or raise an error if the file has changed.
 
     Raises
     ------
@@ -189,7 +189,7 @@ def recording_of(store: Store, trace_id: int) -> Path:
 
 
 def _digests(store: Store, path: Path, groups: Sequence[Ints]) -> Iterator[Payload]:
-    """Yield the digests for groups of frames of one recording."""
+    """Yield the digests of the sensor messages in groups of frames of one recording."""
     found = MessagePlaces.of(store.file, np.unique(np.concatenate(groups)))
     places = list(
         zip(found.chunk_offset.tolist(), found.offset.tolist(), found.length.tolist(), strict=True)

@@ -1,4 +1,4 @@
-"""Cases of a lock in a store: their frames and their clips."""
+"""Search for the test cases of a lock in a store: their frames and clips."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int, str]]:
-    """Return the clips of a lock in a store.
+    """Return the clips of a lock in a store: trace name, first and last log time in ns, and id.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
 
 
 def _same(trace: LockedTrace, store: Store) -> StoredTrace:
-    """Return the store's trace that corresponds to a lock's trace, with the same settings."""
+    """Return the trace of a store with the same recording and settings as a trace of a lock."""
     trace_id = Identity.id_of(trace.recording, trace.ego)
     found = next((one for one in store.info() if one.trace_id == trace_id), None)
     if found is None:
@@ -80,7 +80,7 @@ def _not_there(trace: LockedTrace, place: str | Path) -> StoreError:
 
 
 def rows_of(case: LockedCase, trace_id: int, frame_id: Ints) -> slice:
-    """Return the slice of a case's frames among a store's frames with ascending ids."""
+    """Return the slice of a test case's frames in an ascending array of frame ids."""
     first, last = frame_ids(trace_id, np.array([case.first, case.last]))
     return slice(
         int(np.searchsorted(frame_id, first)), int(np.searchsorted(frame_id, last, side="right"))
@@ -88,7 +88,7 @@ def rows_of(case: LockedCase, trace_id: int, frame_id: Ints) -> slice:
 
 
 def frames_of_lock(lock: Lock, store: Store | Collection) -> Ints:
-    """Return the ids of the frames of a lock's cases in a store or collection, ascending.
+    """Return the ids of all frames in the test cases of a lock, ascending.
 
     Raises
     ------
@@ -111,14 +111,14 @@ def frames_of_lock(lock: Lock, store: Store | Collection) -> Ints:
 
 
 def frames_in(store: Store, lock: str) -> list[int]:
-    """Return the ids of the frames of a lock's cases in a bundle, ascending."""
+    """Return the ids of the frames of a lock's test cases in one bundle of a collection, ascending."""
     return frames_of_lock(lock_from(lock), store).tolist()
 
 
 def by_bundle(
     lock: Lock, whole: Collection, *, by_name: bool = False
 ) -> tuple[dict[str, Lock], list[LockedTrace]]:
-    """Split a lock by bundle; return also the traces without a bundle."""
+    """Return the parts of a lock by bundle of a collection, and the traces that no bundle contains."""
     names = {row["name"]: row["bundle"] for row in whole.traces()} if by_name else {}
     home: dict[str, str] = {}
     for one in lock.traces:
@@ -136,7 +136,7 @@ def by_bundle(
 
 
 def store_beside(path: str | Path, lock: Lock) -> Path:
-    """Find the only store in the lock's folder, or the working folder, with all its traces.
+    """Return the only store near a lock file (its folder, the working folder) with all traces of the lock.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Set operations on locks; equal cases have the same frames of the same trace."""
+"""Union, intersection and difference of locks. Equal test cases have the same frames of the same trace."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Source = tuple[str, str]
 
 
 def union(a: Lock, b: Lock) -> Lock:
-    """Return the cases of both locks; ``a`` has priority for equal cases.
+    """Return a lock with the test cases of both locks. Of equal cases, the one of ``a`` is kept.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def union(a: Lock, b: Lock) -> Lock:
 
 
 def intersect(a: Lock, b: Lock) -> Lock:
-    """Return the cases of ``a`` that are also in ``b``.
+    """Return a lock with the test cases of lock ``a`` that are also in lock ``b``.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def intersect(a: Lock, b: Lock) -> Lock:
 
 
 def minus(a: Lock, b: Lock) -> Lock:
-    """Return the cases of ``a`` that share no frame with a case of ``b``.
+    """Return a lock with the test cases of lock ``a`` that share no frame with a case of lock ``b``.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def minus(a: Lock, b: Lock) -> Lock:
 
 
 def meets(a: Lock, b: Lock) -> Callable[[LockedCase], bool]:
-    """Return a function that is True for a case of ``a`` with a common frame in ``b``."""
+    """Return a function that is True for a test case of lock ``a`` with a frame that lock ``b`` also has."""
     sources = _sources(a)
     firsts: dict[Source, list[int]] = {}
     ends: dict[Source, list[int]] = {}
@@ -87,7 +87,7 @@ def _placed(lock: Lock) -> dict[tuple[Source, int, int], LockedCase]:
 
 
 def _check(a: Lock, b: Lock) -> None:
-    """Reject locks that disagree about a trace or a case."""
+    """Raise an error if two locks contradict each other about a trace or a test case."""
     theirs = {(trace.recording, trace.ego): trace for trace in b.traces}
     for trace in a.traces:
         other = theirs.get((trace.recording, trace.ego))
@@ -107,7 +107,7 @@ def _check(a: Lock, b: Lock) -> None:
 
 
 def _made(how: str, a: Lock, b: Lock, ours: list[LockedCase], theirs: list[LockedCase]) -> Lock:
-    """Build a lock from cases of both; a trace of ``b`` gets its name in ``a``, or a free name."""
+    """Return a new lock with test cases of two locks. Traces of the second lock can get another name."""
     traces = {(trace.recording, trace.ego): trace for trace in a.traces}
     taken = {trace.name for trace in a.traces}
     names: dict[str, str] = {}

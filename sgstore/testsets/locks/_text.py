@@ -1,4 +1,6 @@
-"""Text format of locks: JSON, one trace or case per line, equal bytes for equal content.
+"""Text format of locks (lists of test cases): JSON with one entry per line. Equal content gives equal bytes.
+
+JSON with one trace or case per line. Equal content gives equal bytes.
 
 The text has no path and no time of day. Therefore it is the same on every machine for the same
 selection of the same recordings, and two locks can be compared line by line.
@@ -33,7 +35,7 @@ ENDING: Final = ".lock"
 
 @dataclass(frozen=True, slots=True)
 class LockedTrace:
-    """Trace of the cases of a lock.
+    """Entry of a lock for a trace: name, recording, settings and digests.
 
     Attributes
     ----------
@@ -66,7 +68,7 @@ class LockedTrace:
 
 @dataclass(frozen=True, slots=True)
 class LockedCase:
-    """Test case: consecutive frames of a trace.
+    """Entry of a lock for a test case: consecutive frames of a trace, with digests.
 
     Attributes
     ----------
@@ -103,7 +105,7 @@ class LockedCase:
 
 @dataclass(frozen=True)
 class Lock:
-    """Test set.
+    """Lock: the test cases of a test set, with the digests of their content.
 
     Attributes
     ----------
@@ -123,7 +125,7 @@ class Lock:
     cases: tuple[LockedCase, ...] = field(default=())
 
     def text(self) -> str:
-        """Return the content of the lock's file."""
+        """Return the text of the lock file."""
         head = {KEY: FORMAT, "made_with": dict(self.made_with), "selection": dict(self.selection)}
         whole = json.dumps(head, ensure_ascii=False, indent=2, sort_keys=True)[:-2]
         for name, rows in (("traces", self.traces), ("cases", self.cases)):
@@ -133,7 +135,7 @@ class Lock:
 
     @property
     def ordered(self) -> tuple[LockedCase, ...]:
-        """Return the cases in the recorded order, if there is one; others follow by trace and frame."""
+        """Return the test cases in their recorded order; cases without an order follow by trace and frame."""
         order = self.selection.get("order")
         names = [str(name) for name in order] if isinstance(order, list) else []
         places = {name: place for place, name in enumerate(names)}
@@ -157,7 +159,7 @@ class Lock:
         write_bytes(path, data)
 
     def trace(self, name: str) -> LockedTrace:
-        """Return a trace by its name."""
+        """Return the lock's entry for a trace name."""
         return next(one for one in self.traces if one.name == name)
 
 
@@ -185,7 +187,7 @@ def read_lock(path: str | Path) -> Lock:
 
 
 def lock_from(text: str) -> Lock:
-    """Parse a lock from the text of :meth:`Lock.text`."""
+    """Return the lock that a text describes."""
     return _lock(json.loads(text))
 
 
@@ -250,5 +252,5 @@ def _row(kind: type[_Row], values: Any, where: str) -> _Row:
 
 
 def made_with() -> dict[str, Any]:
-    """Return the versions of sgstore and of the schema."""
+    """Return the versions of sgstore and of its database schema, by name."""
     return {"sgstore": version("sgstore"), "schema": SCHEMA_VERSION}

@@ -1,4 +1,4 @@
-"""Comparison of a lock with a store or collection, case by case."""
+"""Comparison of a lock (list of test cases) with a store or collection, case by case."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _COMPARED = ("recording", "ego", "since", "until", "frames", "config", "map", "f
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Difference between a lock and a store.
+    """Difference between a test case of a lock and the content of a store.
 
     Attributes
     ----------
@@ -45,12 +45,12 @@ class Difference:
 
     @property
     def matters(self) -> bool:
-        """True if the test set differs; a version difference is not enough."""
+        """True if the content of a test case differs, not only the version of the software."""
         return self.what != "version"
 
 
 def verify(lock: Lock, store: Store | Collection, *, payloads: bool = True) -> Iterator[Difference]:
-    """Compare a lock with a store or collection.
+    """Yield the differences between the test cases of a lock and a store or collection.
 
     A trace is found by its recording and its ego, else by its name. Therefore a changed recording
     that was ingested again is compared, and the affected cases are named.
@@ -87,7 +87,7 @@ def _missing(trace: LockedTrace) -> Difference:
 
 
 def _of_bundles(lock: Lock, whole: Collection, *, payloads: bool) -> Iterator[Difference]:
-    """Yield the differences in each bundle for its traces, in the order of the lock."""
+    """Yield the differences between a lock and the bundles of a collection, in the order of the lock."""
     own, lacking = by_bundle(lock, whole, by_name=True)
     asked = {bundle: {"lock": part.text(), "payloads": payloads} for bundle, part in own.items()}
     found = {one.name: [_missing(one)] for one in lacking}
@@ -98,7 +98,7 @@ def _of_bundles(lock: Lock, whole: Collection, *, payloads: bool) -> Iterator[Di
 
 
 def differences_in(store: Store, lock: str, *, payloads: bool) -> dict[str, list[Any]]:
-    """Compare a part of a lock with a bundle; return differences by trace."""
+    """Return the differences between part of a lock and one bundle of a collection, by trace."""
     whole = lock_from(lock)
     found: dict[str, list[Any]] = {}
     for trace in whole.traces:
@@ -111,7 +111,7 @@ def differences_in(store: Store, lock: str, *, payloads: bool) -> dict[str, list
 def verify_case(
     lock: Lock, case: LockedCase, store: Store, *, graphs: bool = True, payloads: bool = True
 ) -> Iterator[Difference]:
-    """Compare one case of a lock with a store, as :func:`verify`.
+    """Yield the differences between one test case of a lock and a store.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ def _cases(
 
 
 def _frames(cases: Sequence[LockedCase], store: Store, trace: StoredTrace) -> tuple[Ints, Ints]:
-    """Return ids (ascending) and log times of the frames from the first to the last case."""
+    """Return the ids and log times of a trace's frames from the first to the last test case."""
     numbers = [min((c.first for c in cases), default=0), max((c.last for c in cases), default=0)]
     first, last = frame_ids(trace.trace_id, np.array(numbers)).tolist()
     found = store.file.arrays(

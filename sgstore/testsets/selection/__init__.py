@@ -1,4 +1,4 @@
-"""Selection of frames, clips or traces of a store, with measures of its quality.
+"""Selection of test cases (frames, clips or traces of a store), with measures of its quality.
 
 ``_units`` defines units and their elements. ``_choose`` has the strategies, splits and locks.
 ``_cover`` and ``_sets`` find small sets of units that hold all elements, and lower bounds. Curves

@@ -25,7 +25,7 @@ _DRAWS: Final = 2_000
 
 @dataclass(frozen=True)
 class FaultDetection:
-    """Measured speed at which an order finds the failures.
+    """Measures of how soon an order of test cases finds the failures (APFD).
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class FaultDetection:
 
     @property
     def said(self) -> str:
-        """Return all values in a sentence."""
+        """Return all values of the failure measures in a sentence."""
         found = ", ".join(f"{self.found[s]:.0%} in the first {s:.0%}" for s in SHARES)
         return (
             f"APFD {self.apfd:.3f} ({self.low:.3f} to {self.high:.3f}; chance is 0.5): of {self.failures:,}"
@@ -56,7 +56,7 @@ class FaultDetection:
 
 
 def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
-    """Measure how soon an order finds the failures.
+    """Return measures of how soon an order of test cases finds the failures.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
 
 
 def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, float, float]]:
-    """Return the failures in the first cases of an order.
+    """Return points of a curve: the number of failures in the first n test cases of an order.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Lower bounds of set covers, and covers by HiGHS, an integer programme solver (extra [solver])."""
+"""Lower bounds for the cost of set covers, and cheaper covers by the integer solver HiGHS (optional)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _MEMBERSHIPS: Final = 200_000_000
 
 
 def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
-    """Return a lower bound, and a cover that is not more expensive than the given one.
+    """Return a lower bound for the cost of a set cover, an equal or cheaper cover, and element prices.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
 
 
 def _suggested(family: SetFamily, left: Floats) -> Ints:
-    """Return a cover from the sets with the least cost above the prices of their elements."""
+    """Return a set cover made of the sets with the lowest cost in relation to their element prices."""
     order = np.lexsort((family.rank, left / np.maximum(np.diff(family.starts), 1)))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
@@ -119,12 +119,12 @@ _LOOK_S: Final = 0.1
 
 
 def has_solver() -> bool:
-    """True if HiGHS is installed."""
+    """True if the integer solver HiGHS is installed."""
     return find_spec("highspy") is not None
 
 
 def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, int]:
-    """Return the improved or given cover, a lower bound, and the used solver nodes.
+    """Return a set cover improved by the integer solver, a lower bound for the cost, and the solver steps.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, i
 
 
 def _silent() -> Any:
-    """Return a silent solver: since version 1.15 a new solver prints its name to stdout."""
+    """Return an integer solver that prints nothing, also not its name."""
     import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
 
     class Silent(highspy.Highs):
@@ -180,7 +180,7 @@ def _silent() -> Any:
 
 
 def _run(solver: Any) -> None:
-    """Solve in a thread, so that an exception from a signal handler stops it."""
+    """Run an integer solver in a thread, so that a signal handler can stop it by an exception."""
     # All solvers of a process share one lock; an interrupted solver holds it until it stops.
     _wait(solver)
     solver.HandleUserInterrupt = True
@@ -194,13 +194,13 @@ def _run(solver: Any) -> None:
 
 
 def _wait(solver: Any) -> None:
-    """Wait for the end of a solver. A signal handler can raise meanwhile."""
+    """Wait for the end of an integer solver. A signal handler can raise an exception meanwhile."""
     while not solver.wait(_LOOK_S)[0]:
         pass
 
 
 def _programme(family: SetFamily) -> Any:
-    """Return the integer programme of a cover: a binary variable per set, a row per element."""
+    """Return a set cover as an integer programme: one 0/1 variable per set, one constraint per element."""
     import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
 
     sets, elements = len(family), len(family.need)

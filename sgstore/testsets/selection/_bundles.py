@@ -1,4 +1,4 @@
-"""Units of a collection: each bundle reports only those that a minimal selection can need.
+"""Selection from a collection: each bundle reports only frames or clips that a minimal selection can need.
 
 Of units with the same classes the cheapest is enough. Therefore a bundle reports one unit for each
 set of classes, with its frames, and its numbers of units and frames. The selection and its bounds
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class UnitsWished:
-    """Parameters of units, as plain values of :class:`sgstore.testsets.selection.SelectionSpec`."""
+    """Definition of selection units (frames, clips or traces), as plain values for another process."""
 
     unit: str
     clip_s: float
@@ -47,7 +47,7 @@ class UnitsWished:
 def cheapest_units(
     chosen: ChosenFrames, whole: Collection, wish: UnitsWished
 ) -> tuple[Units, Holdings]:
-    """Return the cheapest unit of each set of classes in each bundle, with their elements.
+    """Return the cheapest clip (or frame or trace) for each set of scene classes in each bundle.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def cheapest_units(
 
 
 def cheapest_in(store: Store, frames: list[int] | None, wish: dict[str, Any]) -> dict[str, Any]:
-    """Return the cheapest unit of each set of classes in a bundle, as plain values."""
+    """Return the cheapest clip (or frame or trace) for each set of scene classes in one bundle."""
     how = UnitsWished(**wish)
     chosen = ChosenFrames("", store, None if frames is None else np.array(frames, np.int64))
     units = units_of(chosen, SelectionUnit(how.unit), how.clip_s, how.stride_s)
@@ -115,7 +115,7 @@ def cheapest_in(store: Store, frames: list[int] | None, wish: dict[str, Any]) ->
 
 
 def _classed(chosen: ChosenFrames, abstraction: str) -> Classed:
-    """Return the frames with their classes; missing classes are computed but not stored."""
+    """Return frames with their scene classes. Missing classes are computed, but not stored."""
     with working_folder("classes") as folder:
         part = PartFile.of_coded(chosen.one_store.file, abstraction, folder / "classes.parquet")
         of = PartFile.merged_classes([part])

@@ -1,4 +1,4 @@
-"""Selection strategies, budgets, splits such as train and test, and locks of a selection.
+"""Strategies that select test cases within a budget; splits such as train and test; locks of a selection.
 
 A budget is spent unit by unit; shared frames are paid once.
 """
@@ -54,7 +54,7 @@ ROUNDING = 1 + 1e-12
 
 @dataclass
 class BudgetTracker:
-    """Remainder of a selection budget, and the frames already paid.
+    """Rest of a selection budget (time, bytes or frames), and the frames that are already paid.
 
     Attributes
     ----------
@@ -77,14 +77,14 @@ class BudgetTracker:
 
     @classmethod
     def of(cls, units: Units, measure: Measure, most: float = np.inf) -> BudgetTracker:
-        """Make a tracker of an unspent budget."""
+        """Return a tracker whose budget is not used yet."""
         shared = units.overlap and measure != "units"
         weights = units.weights(measure) if shared else None
         nothing = np.zeros(len(units.frame_id), np.bool_)
         return cls(units, units.costs(measure), weights, nothing, 0.0, most * ROUNDING)
 
     def prices(self, some: Ints) -> Floats:
-        """Return the present price of units; 0 if all their frames are bought."""
+        """Return the price of selection units: the cost of their frames that are not paid yet."""
         if self.weights is None:
             return self.cost[some]
         begin, end = self.units.begin[some].tolist(), self.units.end[some].tolist()
@@ -92,13 +92,16 @@ class BudgetTracker:
         return np.array([self.weights[own][~self.bought[own]].sum() for own in rows])
 
     def buy(self, one: int, price: float) -> None:
-        """Add a unit to the selection and pay its price."""
+        """Add a frame, clip or trace to the selection, and subtract its price from the budget."""
         self.bought[self.units.begin[one] : self.units.end[one]] = True
         self.spent += price
         self.left -= price
 
     def fitting(self, order: Ints, most: float = np.inf) -> Ints:
-        """Select units in order, up to a limit; skip units that do not fit or add no frames."""
+        """Return the selection units that fit into the budget, in the given order, and pay them.
+
+        Units without new frames are skipped.
+        """
         found: list[int] = []
         end = max(self.left - most * ROUNDING, 0.0)
         cost = self.cost[order]
@@ -121,7 +124,7 @@ class BudgetTracker:
 
 
 class Strategy(StrEnum):
-    """Strategy of a selection."""
+    """Strategy by which test cases are selected."""
 
     every = "every"
     minimal = "minimal"
@@ -133,7 +136,7 @@ class Strategy(StrEnum):
 
 @dataclass(frozen=True)
 class SelectionSpec:
-    """Specification of a selection.
+    """Specification of a test case selection: strategy, units, budget and limits.
 
     Attributes
     ----------
@@ -187,7 +190,7 @@ class SelectionSpec:
     within_s: float = WITHIN_S
 
     def __post_init__(self) -> None:
-        """Reject inconsistent values.
+        """Raise an error for settings that contradict each other.
 
         Raises
         ------
@@ -219,7 +222,7 @@ class SelectionSpec:
 
     @property
     def one_of_alike(self) -> bool:
-        """True if one unit, the cheapest, is enough of units with the same classes."""
+        """True if only the cheapest of several clips with the same scene classes needs to be considered."""
         shared = self.unit is SelectionUnit.clip and (self.stride_s or math.inf) < self.clip_s
         least = self.strategy is Strategy.minimal or (
             self.strategy is Strategy.per_class and self.each == 1
@@ -228,12 +231,12 @@ class SelectionSpec:
 
     @property
     def wished(self) -> UnitsWished:
-        """Return the parameters of units for a bundle."""
+        """Return the definition of the selection units (frames, clips or traces) for the bundle processes."""
         least = self.abstraction, self.objective, self.seed
         return UnitsWished(self.unit.value, self.clip_s, self.stride_s, *least)
 
     def as_dict(self, query: str) -> dict[str, Any]:
-        """Return all values as plain values for a lock."""
+        """Return the specification as a dictionary of plain values, which a lock stores."""
         cover = self.strategy in {Strategy.minimal, Strategy.per_class, Strategy.rarest}
         told = {
             "sequences": self.sequences,
@@ -260,7 +263,7 @@ class SelectionSpec:
 
 @dataclass(frozen=True)
 class Selection:
-    """Selected units.
+    """Selected test cases (frames, clips or traces), with their cost and quality.
 
     Attributes
     ----------
@@ -292,7 +295,7 @@ class Selection:
 
 
 def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
-    """Select units of some frames.
+    """Select test cases from some frames by a strategy.
 
     Raises
     ------
@@ -342,14 +345,14 @@ def _selected(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def holdings_of(spec: SelectionSpec, units: Units) -> Holdings:
-    """Return the elements of units: classes, combinations of features, or sequences of manoeuvres."""
+    """Return the scene classes, feature combinations or manoeuvre sequences in each frame, clip or trace."""
     if spec.sequences:
         return sequence_holdings(units, spec.sequences, spec.manoeuvres, spec.within_s)
     return holdings(units, spec.abstraction, spec.combos, of_ego=spec.of_ego)
 
 
 def _every(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    """Select all units, or random units until the budget is used up."""
+    """Select all frames, clips or traces, or random ones until the budget is used up."""
     picked = np.arange(len(units))
     if spec.budget is not None:
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
@@ -424,7 +427,7 @@ def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any
 
 
 def _met(held: Holdings, units: Units, picked: Ints) -> int:
-    """Return the number of elements that some units hold."""
+    """Return the number of scene classes (or combinations) that the selected clips contain."""
     taken = np.zeros(len(units), np.bool_)
     taken[picked] = True
     return int(held.weight[np.unique(held.pairs[1][taken[held.pairs[0]]])].sum())
@@ -439,7 +442,7 @@ def _above(cost: float, bound: float) -> str:
 
 
 def _rarest(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
-    """Cover the rarest class first, each time with the unit that adds most other uncovered classes."""
+    """Select clips for the rarest scene class first, preferring clips with many other missing classes."""
     measure = spec.budget.measure if spec.budget else spec.objective
     tracker = BudgetTracker.of(units, measure, spec.budget.most if spec.budget else np.inf)
     family = held.family(units, tracker.cost, 1, rank)
@@ -498,7 +501,7 @@ def _stratified(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 def _allotted(
     order: Ints, stratum: Ints, tracker: BudgetTracker, shares: Floats, rank: Ints
 ) -> Ints:
-    """Select units of each stratum up to its share, then random units for the rest of the budget."""
+    """Select clips of each stratum up to its share of the budget, then random clips for the rest."""
     within_share: list[Ints] = []
     used = np.zeros(len(shares))
     for number, share in enumerate(shares.tolist()):
@@ -516,7 +519,7 @@ def _allotted(
 
 
 def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    """Select units in the order of their least value, unknown ones last, within the budget."""
+    """Select clips in ascending order of their lowest value, within the budget. Unknown values are last."""
     value = least_of_check(units, spec.by) if is_check(spec.by) else least_values(units, spec.by)
     order = np.lexsort((rank, np.where(np.isnan(value), np.inf, value)))
     if spec.budget is not None:
@@ -536,7 +539,7 @@ def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
-    """Return the stratum of each unit (the most frequent value of its frames), and all values."""
+    """Return the stratum of each clip (the most frequent value of its frames), and all values."""
     from sgstore.exporters import Labels
 
     asked = np.flatnonzero(units.asked)
@@ -558,7 +561,7 @@ def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
 
 
 def _value(value: Any) -> str:
-    """Return the stratum name of a value."""
+    """Return the name of a stratum (group of clips with equal values) from its value."""
     if value is None:
         return "unknown"
     if isinstance(value, bool):
@@ -567,7 +570,7 @@ def _value(value: Any) -> str:
 
 
 def listed(selection: Selection) -> ReportTable:
-    """Return a table of the selected units, in the order of selection.
+    """Return a table of the selected test cases, in the order of selection.
 
     Returns
     -------
@@ -594,7 +597,7 @@ def listed(selection: Selection) -> ReportTable:
 
 
 def names_of_units(units: Units, picked: Ints) -> list[str]:
-    """Return the names of units as in locks: ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` for a single frame."""
+    """Return the names of test cases: ``TRACE#FIRST-LAST``, or ``TRACE#SEQ`` for a single frame."""
     first, last = units.first[picked], units.last[picked]
     names = names_of(units.chosen.store, first)
     for place in np.flatnonzero(first != last).tolist():
@@ -607,7 +610,7 @@ def names_of_units(units: Units, picked: Ints) -> list[str]:
 
 
 def parse_split(text: str) -> dict[str, float]:
-    """Parse ``train=0.8,test=0.2`` into shares by name.
+    """Return shares by split name from a text such as ``train=0.8,test=0.2``.
 
     Raises
     ------
@@ -634,7 +637,9 @@ def parse_split(text: str) -> dict[str, float]:
 
 
 def split(selection: Selection, shares: dict[str, float]) -> dict[int, str]:
-    """Return the split of each selected unit; all units of one recording have the same split.
+    """Return the split (such as train or test) of each selected test case.
+
+    All test cases of a recording have the same split.
 
     Recordings with most selected frames come first; each goes to the split that lacks most.
 
@@ -667,7 +672,7 @@ def _drawn(digest: str, seed: int) -> bytes:
 def split_table(
     selection: Selection, parts: dict[int, str], shares: dict[str, float]
 ) -> ReportTable:
-    """Return a table of the splits: their content, and the share of it that other splits also have.
+    """Return a table of the splits (such as train and test): their content, and their common scene classes.
 
     Returns
     -------
@@ -720,7 +725,7 @@ def locked_selection(
     payloads: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
-    """Return the lock of a selection.
+    """Return a lock (test cases with content digests) of the selected test cases.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Set cover: reduction, greedy choice, bounds, and overlapping units.
+"""Cheap set covers: selected clips that together contain all scene classes, with proven lower bounds.
 
 Reduction removes clear decisions: required sets, and redundant elements and sets. It also splits
 the problem into independent parts.
@@ -48,7 +48,7 @@ _TABLE: Final = 1 << 26
 
 
 def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
-    """Return the required sets, and the remaining parts with their set indices."""
+    """Return the sets that every cover needs, and the remaining independent subproblems."""
     need, alive = family.need.copy(), np.ones(len(family), np.bool_)
     forced = np.zeros(len(family), np.bool_)
     wanted = need > 0
@@ -70,14 +70,14 @@ def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
 
 
 def cheapest_alike(family: SetFamily) -> Bools:
-    """Return a mask (S,) of the cheapest set among equal ones; enough if each element is needed once."""
+    """Return a mask (S,) of the cheapest set among sets with equal elements."""
     alive = np.ones(len(family), np.bool_)
     _drop_same_sets(family, alive, np.ones(len(family.need), np.bool_))
     return alive & (np.diff(family.starts) > 0)
 
 
 def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
-    """Take all sets of elements that have no more sets than needed."""
+    """Select all sets that contain an element with no more sets than it needs."""
     while True:
         rows = alive[family.set_of]
         often = np.bincount(family.members[rows], minlength=len(need))
@@ -92,7 +92,7 @@ def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
 
 
 def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Bools) -> None:
-    """Keep one of the elements with equal sets: the one with the greatest need."""
+    """Keep one of several elements that are in the same sets: the one that needs most sets."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.members[rows], family.set_of[rows], len(need), len(family))
     elements = np.flatnonzero(wanted)
@@ -101,7 +101,7 @@ def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Boo
 
 
 def _drop_same_sets(family: SetFamily, alive: Bools, wanted: Bools) -> None:
-    """Keep the cheapest of the sets with equal elements."""
+    """Keep the cheapest of several sets with equal elements."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.set_of[rows], family.members[rows], len(family), len(wanted))
     sets = np.flatnonzero(alive)
@@ -110,7 +110,7 @@ def _drop_same_sets(family: SetFamily, alive: Bools, wanted: Bools) -> None:
 
 
 def _keys(of: Ints, what: Ints, size: int, things: int) -> tuple[Ints, Ints]:
-    """Return a hash of 106 bits for each set, as two numbers: equal for equal sets."""
+    """Return a 106-bit hash of the members of each set, as two numbers. Equal sets have equal hashes."""
     words = np.random.Generator(np.random.PCG64(20_24)).integers(1 << 31, size=(2, 2, things))
     found: list[Ints] = []
     for low, high in words:
@@ -130,7 +130,7 @@ def _repeated(*keys: Ints) -> Bools:
 def _drop_larger_elements(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools, most: int
 ) -> int:
-    """Drop elements whose sets include all sets of another element; return the number of steps."""
+    """Remove elements that are covered whenever another element is covered; return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -144,7 +144,7 @@ def _drop_larger_elements(
 
 
 def _drop_smaller_sets(family: SetFamily, alive: Bools, wanted: Bools, most: int) -> int:
-    """Drop sets that a set of equal or lower cost contains; return the number of steps."""
+    """Remove sets that are part of another set of equal or lower cost; return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -165,7 +165,7 @@ def _contained(
     superfluous: Callable[[Ints, Ints], Ints],
     most: int,
 ) -> tuple[Bools, int]:
-    """Find redundant items: those contained in others, or containing others.
+    """Return a mask of redundant sets or elements, found by inclusion tests, and the number of steps.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def _contained(
 def _compared(
     one: Ints, other: Ints, sizes: tuple[int, int], done: Bools, batch: int
 ) -> tuple[Ints, tuple[Ints, Ints]]:
-    """Return some pending items, the smallest first, each with possible containing items.
+    """Return the next sets for an inclusion test, the smallest first, with sets that could contain them.
 
     A containing item has all components of the item, also its first, which is the rarest.
     """
@@ -232,7 +232,7 @@ def _compared(
 def _holding(
     key: Ints, sizes: tuple[int, int], pairs: tuple[Ints, Ints], most: int
 ) -> tuple[Ints, Ints, int]:
-    """Return the pairs whose second item has all components of the first, and the number of steps.
+    """Return the pairs of sets in which the second set contains the first, and the number of steps.
 
     All pairs share the first component. Pairs that are undecided within the limit are excluded.
     """
@@ -263,7 +263,7 @@ def _holding(
 def _parts(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools
 ) -> list[tuple[SetFamily, Ints]]:
-    """Return the remaining sets as independent families, ordered by first set."""
+    """Return the remaining sets split into independent subproblems without common elements."""
     rows = alive[family.set_of] & wanted[family.members]
     sets, members = family.set_of[rows], family.members[rows]
     group = _joined(sets, members, len(family), len(need))[sets]
@@ -285,7 +285,7 @@ def _parts(
 
 
 def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
-    """Return the smallest set index in each set's connected component, (many,)."""
+    """Return the connected component of each set, as the lowest index of its sets, (many,)."""
     first = np.arange(many)
     while True:
         # Propagate the least set number through elements and sets.
@@ -310,7 +310,7 @@ def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
 
 @dataclass(frozen=True)
 class Cover:
-    """Cover: chosen sets, with cost and lower bound.
+    """Set cover: indices of the selected sets, their cost, and a lower bound for the cost of any cover.
 
     Attributes
     ----------
@@ -331,12 +331,12 @@ class Cover:
 
     @property
     def exact(self) -> bool:
-        """True if the cover is proven to be the cheapest."""
+        """True if no cheaper set cover exists."""
         return self.cost <= self.bound + ROUNDING * max(self.cost, 1)
 
 
 def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
-    """Return a cheap cover that meets all needs, with a lower bound for its cost.
+    """Return a cheap set cover, with a lower bound for the cost of any cover.
 
     Parameters
     ----------
@@ -364,7 +364,7 @@ def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Sets chosen within a budget, with the needs that they meet.
+    """Sets selected within a budget, with the amount of elements that they cover.
 
     Attributes
     ----------
@@ -384,7 +384,7 @@ class Fitted:
 
 
 def within(family: SetFamily, budget: float) -> Fitted:
-    """Choose sets within a budget that meet most needs: greedy, or the best single set.
+    """Return sets within a budget that cover many elements: a greedy choice, or the best single set.
 
     The bound is that of submodular functions: for any current choice, the optimum meets at most its
     needs plus the largest gains of single sets that fit the budget together, the last one in part.
@@ -420,7 +420,7 @@ def _at_most(family: SetFamily, chosen: Ints, budget: float) -> float:
 
 @dataclass(frozen=True)
 class UnitPieces:
-    """Selection units as ranges of pieces, which overlapping units share.
+    """Clips as ranges of pieces: overlapping clips share pieces, and a shared piece costs once.
 
     Attributes
     ----------
@@ -435,17 +435,17 @@ class UnitPieces:
     cost: Floats
 
     def left(self, one: int, taken: Bools) -> float:
-        """Return the cost of those pieces of a unit that are not yet taken."""
+        """Return the cost of the pieces of a clip that are not selected yet."""
         own = slice(int(self.begin[one]), int(self.end[one]))
         return float(self.cost[own][~taken[own]].sum())
 
     def beside(self, one: int) -> range:
-        """Return the units that share a piece with a unit, including itself."""
+        """Return the range of clips that overlap with a clip, including this clip."""
         low = int(np.searchsorted(self.end, self.begin[one], side="right"))
         return range(low, int(np.searchsorted(self.begin, self.end[one])))
 
     def together(self, picked: Ints) -> float:
-        """Return the total cost of units."""
+        """Return the total cost of some clips; shared frames cost once."""
         taken = np.zeros(len(self.cost), np.bool_)
         for one in picked.tolist():
             taken[self.begin[one] : self.end[one]] = True
@@ -453,7 +453,7 @@ class UnitPieces:
 
 
 def pieces(units: Units, measure: Measure) -> tuple[Units, UnitPieces]:
-    """Return the pieces of units, and the units as ranges of pieces."""
+    """Return clips cut into pieces at each start and end of a clip, and each clip as a range of pieces."""
     cuts = np.unique(np.concatenate([units.begin, units.end]))
     parts = replace(units, begin=cuts[:-1], end=cuts[1:])
     cost = parts.summed(units.weights(measure), measure)
@@ -462,7 +462,7 @@ def pieces(units: Units, measure: Measure) -> tuple[Units, UnitPieces]:
 
 
 def cheapest(units: Units, held: Holdings, measure: Measure, rank: Ints) -> Cover:
-    """Return units that hold all elements at a low total cost: the greedy choice, or the fewest units.
+    """Return clips (or frames or traces) that contain all scene classes at a low total cost.
 
     The bound comes from single pieces.
     """
@@ -478,7 +478,7 @@ def cheapest(units: Units, held: Holdings, measure: Measure, rank: Ints) -> Cove
 
 
 def affordable(units: Units, held: Holdings, measure: Measure, rank: Ints, budget: float) -> Fitted:
-    """Return units within a budget that hold most elements: greedy, or the best single unit.
+    """Return clips (or frames or traces) within a budget that contain many scene classes.
 
     The bound comes from single pieces.
     """
@@ -492,11 +492,11 @@ def affordable(units: Units, held: Holdings, measure: Measure, rank: Ints, budge
 
 
 def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> Ints:
-    """Choose units one after another by gain per additional cost."""
+    """Select clips one after another, each time the one with the most new elements per additional cost."""
     taken = np.zeros(len(spans.cost), np.bool_)
 
     def cheapened(one: int) -> Iterator[tuple[int, float]]:
-        """Yield the new prices of units that share pieces with a taken unit."""
+        """Yield the clips that overlap with a selected clip, with their lower prices."""
         taken[spans.begin[one] : spans.end[one]] = True
         for other in spans.beside(one):
             yield other, max(spans.left(other, taken), 1e-9)
@@ -505,7 +505,7 @@ def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> I
 
 
 def _thinned(family: SetFamily, spans: UnitPieces, chosen: Ints) -> Ints:
-    """Remove redundant units, those with the greatest savings first."""
+    """Return selected clips without redundant ones. Clips that save most are removed first."""
     times = np.zeros(len(spans.cost) + 1, np.int64)
     np.add.at(times, spans.begin[chosen], 1)
     np.add.at(times, spans.end[chosen], -1)

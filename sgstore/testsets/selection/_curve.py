@@ -1,4 +1,4 @@
-"""Elements kept after each unit of a selection, and after units in random order."""
+"""Curve of a selection: number of scene classes in the first n test cases, and in n random ones."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _WORK: Final = 30_000_000
 
 @dataclass(frozen=True)
 class Curve:
-    """Curve of a selection: elements that its first n units keep.
+    """Points of a curve: the number of scene classes (or combinations) in the first n test cases.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Curve:
 
 
 def curve(selection: Selection, points: int = POINTS) -> Curve:
-    """Return the curve of a selection by classes or combinations.
+    """Return the number of scene classes in the first n selected test cases, and in n random ones.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
 
 
 def _of_all_units(selection: Selection) -> Selection:
-    """Return the same selection among all units, including those that bundles left out."""
+    """Return the same selection with all units, also those that the bundles of a collection left out."""
     spec, some = selection.spec, selection.units
     units = units_of(some.chosen, spec.unit, spec.clip_s, spec.stride_s)
     picked = np.searchsorted(units.first, some.first[selection.picked])
@@ -119,7 +119,7 @@ def _points(most: int, points: int) -> Ints:
 
 
 def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[Floats, float]:
-    """Return the number of random units that hold a number of elements, for several random orders.
+    """Return the number of random test cases that contain a number of classes, for several random orders.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Failure probabilities of cases, learned from the outcomes of other cases.
+"""Failure probabilities of test cases, learned from the results of other test cases.
 
 The features of a case come from the ego's three most critical neighbours in its most critical
 frame. The model is gradient boosting of trees (scikit-learn, the extra ``[learn]``), or else a
@@ -38,17 +38,17 @@ _TOGETHER: Final = 1 << 17
 
 
 def boosted() -> bool:
-    """True if gradient boosting is installed."""
+    """True if gradient boosting (an optional package) is installed."""
     return find_spec("sklearn") is not None
 
 
 def model_name() -> str:
-    """Return the name of the model in use."""
+    """Return the name of the statistical model: gradient boosting or logistic regression."""
     return "gradient boosting" if boosted() else "logistic regression on ranks"
 
 
 def features_of(units: Units, rows: Ints) -> Singles:
-    """Return features of the ego and its most critical neighbours in one frame of each unit.
+    """Return numbers of the ego and its most critical neighbours in one frame of each test case.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def features_of(units: Units, rows: Ints) -> Singles:
 
 
 def _filled(column: Any) -> Floats:
-    """Replace NULL by NaN, and clip a column to single precision."""
+    """Return a column with NaN instead of NULL, limited to the range of single precision."""
     most = float(np.finfo(np.float32).max)
     return np.clip(np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan), -most, most)
 
@@ -101,7 +101,7 @@ def _sql() -> str:
 
 
 def cross_fitted(x: Singles, failed: Bools, known: Bools, seed: int) -> Floats:
-    """Return failure probabilities of cases, (U,), by models that were not trained on their outcomes.
+    """Return the failure probability of each test case, (U,), by models trained on other test cases.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def cross_fitted(x: Singles, failed: Bools, known: Bools, seed: int) -> Floats:
 def learned_elsewhere(
     x: Singles, others: Singles, failed: Bools, known: Bools, seed: int
 ) -> Floats:
-    """Return failure probabilities of cases, (U,), learned from other cases.
+    """Return the failure probability of each test case, (U,), learned from another set of test cases.
 
     Raises
     ------
@@ -152,7 +152,7 @@ def _check(failed: Bools, known: Bools) -> None:
 
 
 def fitted(x: Singles, failed: Bools, asked: Singles, seed: int) -> Floats:
-    """Train a model on outcomes; return failure probabilities of other cases, (Q,)."""
+    """Train a model on test results, and return the failure probabilities of other test cases, (Q,)."""
     told = ~np.isnan(x).all(axis=0)  # boosting rejects columns without known values
     x, asked = x[:, told], asked[:, told]
     if len(np.unique(failed)) < 2 or not told.any():
@@ -182,7 +182,7 @@ def fitted(x: Singles, failed: Bools, asked: Singles, seed: int) -> Floats:
 
 
 def _logistic(x: Singles, failed: Bools, asked: Singles) -> Floats:
-    """Predict failures by a logistic regression on ranks (Newton's method, L2 penalty)."""
+    """Return failure probabilities by a logistic regression on ranks (Newton's method, L2 penalty)."""
     columns = [np.sort(column[~np.isnan(column)]) for column in x.T]
     known = _ranked(x, columns)
     weights, penalty = np.zeros(known.shape[1]), np.ones(known.shape[1])
@@ -204,7 +204,7 @@ _STEPS: Final = 50
 
 
 def _ranked(x: Singles, columns: Sequence[Singles]) -> Floats:
-    """Return a column of ones; and for each feature its rank (−½ … ½), and a flag for known values."""
+    """Return a column of ones, and for each feature its rank (−½ … ½) and a flag for known values."""
     parts = [np.ones(len(x))]
     for values, known in zip(x.T, columns, strict=True):
         there = ~np.isnan(values)

@@ -72,7 +72,7 @@ _OWN: Final = "of its class"
 
 
 class Priority(StrEnum):
-    """Rule of an order: by risk, by diversity, both, or by failure probability."""
+    """Rule for the order of test cases: risk, diversity, both, or learned failure probability."""
 
     risk = "risk"
     diverse = "diverse"
@@ -82,7 +82,7 @@ class Priority(StrEnum):
 
 @dataclass(frozen=True)
 class PrioritySpec:
-    """Specification of an order.
+    """Specification of an order of test cases: rule, measures and units.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class PrioritySpec:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Reject unknown measures.
+        """Raise an error for an unknown measure.
 
         Raises
         ------
@@ -130,7 +130,7 @@ class PrioritySpec:
             )
 
     def as_dict(self, query: str) -> dict[str, Any]:
-        """Return all values as plain values for a lock."""
+        """Return the specification as a dictionary of plain values, which a lock stores."""
         clip = self.unit is SelectionUnit.clip
         return {
             "query": query or None,
@@ -149,7 +149,7 @@ class PrioritySpec:
 
 @dataclass(frozen=True)
 class WorstValues:
-    """Worst value of a measure in each unit.
+    """Worst value of a criticality measure in each test case, with its frame and entity.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class WorstValues:
     blind: int = 0
 
     def ranks(self) -> Floats:
-        """Return one more than the number of worse units, (U,); unknown ones are last."""
+        """Return the rank of each test case, (U,): 1 for the worst value. Unknown values are last."""
         sign = _sign(self.name)
         filled = np.where(np.isnan(self.value), np.inf, sign * self.value)
         _, place, many = np.unique(filled, return_inverse=True, return_counts=True)
@@ -179,14 +179,14 @@ class WorstValues:
 
 
 def _sign(name: str) -> float:
-    """Return the sign that makes the worst value of a measure the least one: 1 or −1."""
+    """Return 1 if low values of a criticality measure are worse, otherwise −1."""
     known = (RANKED | LATER).get(name)
     return -1.0 if known is not None and known.worse == "high" else 1.0
 
 
 @dataclass(frozen=True)
 class Prioritized:
-    """Units in an order.
+    """Ordered test cases with the reasons for their places.
 
     Attributes
     ----------
@@ -221,17 +221,17 @@ class Prioritized:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the columns of :meth:`rows`."""
+        """Return the column names of the table of ordered test cases."""
         likely = ["probability"] * bool(len(self.chance))
         return ("place", "unit", "risk", *likely, *(one.name for one in self.worst), "reason")
 
     @property
     def types(self) -> tuple[str, ...]:
-        """Return the database types of these columns."""
+        """Return the database types of the columns in the table of ordered test cases."""
         return ("BIGINT", "VARCHAR", *["DOUBLE"] * (len(self.columns) - 3), "VARCHAR")
 
     def rows(self) -> Iterator[tuple[Any, ...]]:
-        """Yield the units in order, with reasons, made in chunks of some thousand.
+        """Yield the test cases in their order, each with its reason.
 
         The store is read once, before the first row.
         """
@@ -277,11 +277,11 @@ class Prioritized:
             yield from zip(places, names, risk, *columns, said, strict=True)
 
     def reasons(self) -> list[str]:
-        """Return reasons for the place of each unit, in the order of :attr:`picked`."""
+        """Return the reason for the place of each test case, in the order of the places."""
         return [row[-1] for row in self.rows()]
 
     def table(self) -> ReportTable:
-        """Return all of :meth:`rows` as a table: ``place``, ``unit``, ``risk``, the measures, ``reason``."""
+        """Return a table of the ordered test cases: ``place``, ``unit``, ``risk``, the measures, ``reason``."""
         return ReportTable(self.columns, list(self.rows()), self.said)
 
 
@@ -291,7 +291,7 @@ def prioritize(
     outcomes: Mapping[str, bool] | None = None,
     learn_from: ChosenFrames | None = None,
 ) -> Prioritized:
-    """Order units of some frames.
+    """Return test cases (frames, clips or traces) in an order that finds failures early.
 
     Parameters
     ----------
@@ -357,7 +357,7 @@ def _learned(
     outcomes: Mapping[str, bool],
     learn_from: ChosenFrames | None,
 ) -> tuple[Floats, str]:
-    """Return the failure probability of each unit, (U,), and a note about the training outcomes."""
+    """Return the learned failure probability of each test case, (U,), and a note about the training."""
     x = features_of(units, key)
     if learn_from is None:
         failed, known = outcomes_of(units, outcomes)
@@ -390,7 +390,7 @@ def _said(
 
 
 def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> list[str]:
-    """Return notes about missing data that can hide conflicts of the ego."""
+    """Return notes about missing data, because of which critical situations of the ego can be unknown."""
     told: list[str] = []
     of_pairs = bool({*spec.measures} & {*RANKED, *LATER}) or spec.by is Priority.learned
     if spec.by is Priority.diverse:
@@ -413,21 +413,22 @@ def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> 
 
 
 def _places(total: Floats, rank: Ints) -> Ints:
-    """Return the place of each value in ascending order, from 0, (U,); ``rank`` decides ties."""
+    """Return the place of each value in ascending order, (U,), from 0; ``rank`` decides between equal values.
+    """
     found = np.empty(len(total), np.int64)
     found[np.lexsort((rank, total))] = np.arange(len(total))
     return found
 
 
 def _in_rounds(order: Ints, code: Ints) -> Ints:
-    """Reorder units in rounds: the first of each class, then the second of each, and so on."""
+    """Return test cases in rounds: the first test case of each class, then the second of each, and so on."""
     turn = _turns(code[order])
     turn[code[order] == UNKNOWN] = len(order) + 1  # without a class: last
     return order[np.argsort(turn, kind="stable")]
 
 
 def _turns(code: Ints) -> Ints:
-    """Return for each unit the count of its class so far, itself included, (n,)."""
+    """Return for each test case the number of test cases of its class up to and including it, (n,)."""
     order = np.argsort(code, kind="stable")
     fresh = np.append(True, np.diff(code[order]) != 0)[: len(code)]
     places = np.arange(len(code))
@@ -437,7 +438,10 @@ def _turns(code: Ints) -> Ints:
 
 
 def _together(*orders: Ints) -> Ints:
-    """Merge several orders by the sum of places; the first order decides ties."""
+    """Return several orders of test cases merged into one, by the sum of their places.
+
+    The first order decides between equal sums.
+    """
     places = np.empty((len(orders), len(orders[0])), np.int64)
     for place, order in zip(places, orders, strict=True):
         place[order] = np.arange(len(order))
@@ -454,7 +458,7 @@ def _classes(units: Units, abstraction: str) -> Ints:
 def worst_values(
     units: Units, measures: Sequence[str], told: Situations | None = None
 ) -> tuple[WorstValues, ...]:
-    """Return the worst value of each measure in each unit.
+    """Return the worst value of each criticality measure in each test case.
 
     ``told`` receives the situations of frames, which are cheap in addition to numbers of pairs.
     """
@@ -465,7 +469,10 @@ def worst_values(
 
 
 def _most_critical(units: Units, worst: Sequence[WorstValues]) -> Ints:
-    """Return the row of the most critical frame of each unit, (U,), by its first known measure."""
+    """Return the index of the most critical frame of each test case, (U,).
+
+    The first measure with a known value in the test case decides.
+    """
     row = units.begin
     for one in reversed(worst):
         row = np.where(np.isnan(one.value), row, one.row)
@@ -473,7 +480,7 @@ def _most_critical(units: Units, worst: Sequence[WorstValues]) -> Ints:
 
 
 def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
-    """Return worst values of recorded measures; an encounter has one value for all common frames."""
+    """Return the worst values of measures of whole encounters; all frames of an encounter have one value."""
     if not measures:
         return {}
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
@@ -551,7 +558,7 @@ def _worst_of_pairs(
 
 
 def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues:
-    """Return the worst value of each unit from values of frames; inf means unknown."""
+    """Return the worst value of a measure in each test case, from values of frames (inf means unknown)."""
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
     least = np.minimum.reduceat(np.append(frames, np.inf), ranges)[::2]
     row = units.begin.copy()
@@ -562,7 +569,7 @@ def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues
 
 
 def _times(units: Units) -> Floats:
-    """Return the times of the frames of units since the start of their traces, (N,); s."""
+    """Return the times of all frames in seconds since the start of their trace, (N,)."""
     found = units.chosen.one_store.file.arrays("SELECT frame_id, t FROM frames ORDER BY frame_id")
     at = np.searchsorted(found["frame_id"].astype(np.int64), units.frame_id)
     return found["t"].astype(np.float64)[at]
@@ -582,7 +589,10 @@ def _reasons(
     who: Mapping[tuple[int, int], str],
     times: Floats,
 ) -> list[str]:
-    """Return a measure's reason for each unit; empty for unknown values."""
+    """Return a reason text for each test case: the worst value of a measure, its time and its entity.
+
+    An unknown value gives an empty text.
+    """
     name, value = worst.name, worst.value[part]
     when = times[worst.row[part]].tolist()
     known = RANKED | LATER
@@ -616,7 +626,7 @@ def locked_order(
     payloads: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
-    """Return the lock of units in an order, with the reasons.
+    """Return a lock (test cases with content digests) of ordered test cases, with their reasons.
 
     Parameters
     ----------
@@ -647,7 +657,7 @@ def locked_order(
 
 
 def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
-    """Return the known outcomes of the cases in their order: True for a failure.
+    """Return the known test results in the order of the test cases: True for a failure.
 
     Parameters
     ----------
@@ -666,7 +676,7 @@ def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
 
 
 def outcomes_of(units: Units, outcomes: Mapping[str, bool]) -> tuple[Bools, Bools]:
-    """Return masks (U,) of failed units, and of units with a known outcome.
+    """Return two masks (U,) of test cases: those with a failure, and those with a known result.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Families of sets as columns, and greedy choice.
+"""Families of sets (for set covers) as integer arrays, and the greedy selection of sets.
 
 A family has sets of elements, stored as columns.
 """
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def distinct(values: Ints) -> Ints:
-    """Return the distinct values, ascending; fast for almost sorted values."""
+    """Return the distinct integers of an array, ascending."""
     if (np.diff(values) <= 0).any():
         values = np.sort(values, kind="stable")
         values = values[np.append(True, np.diff(values) != 0)]
@@ -27,7 +27,7 @@ def distinct(values: Ints) -> Ints:
 
 
 def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
-    """Expand ranges to pairs of range index and integer."""
+    """Return all integers in some ranges, each with the index of its range."""
     many = end - begin
     unit = np.repeat(np.arange(len(many)), many)
     return unit, np.arange(len(unit)) + np.repeat(begin - (np.cumsum(many) - many), many)
@@ -35,7 +35,7 @@ def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True)
 class SetFamily:
-    """Family of sets of elements, with costs and needs.
+    """Family of sets for set covers: elements and cost of each set, and the sets that each element needs.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class SetFamily:
         need: int = 1,
         rank: Ints | None = None,
     ) -> SetFamily:
-        """Build a family from pairs (2, M) of set and element, in any order, with possible duplicates."""
+        """Return a family of sets from pairs (2, M) of set and element. Duplicates are allowed."""
         key = distinct(pairs[0].astype(np.int64) * max(elements, 1) + pairs[1])
         of_set, members = np.divmod(key, max(elements, 1))
         starts = np.searchsorted(of_set, np.arange(sets + 1))
@@ -90,12 +90,12 @@ class SetFamily:
 
     @property
     def whole(self) -> bool:
-        """True if all costs are integers."""
+        """True if the costs of all sets are integers."""
         return bool((self.cost == np.round(self.cost)).all())
 
     @property
     def set_of(self) -> Ints:
-        """Return the set of each of ``members``, (M,)."""
+        """Return the index of the set for each entry of the member array, (M,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.starts))
 
     def elements(self, one: int) -> Ints:
@@ -103,25 +103,25 @@ class SetFamily:
         return self.members[self.starts[one] : self.starts[one + 1]]
 
     def by_element(self) -> tuple[Ints, Ints]:
-        """Return the sets of each element in sequence, and their starts."""
+        """Return the sets that contain each element, as one array, and the start of each element in it."""
         order = np.argsort(self.members, kind="stable")
         starts = np.searchsorted(self.members[order], np.arange(len(self.need) + 1))
         return starts, self.set_of[order]
 
     def gains(self, open_: Bools) -> Floats:
-        """Return the weight of the uncovered elements of each set, (S,)."""
+        """Return for each set the total weight of its elements that are not covered yet, (S,)."""
         rows = open_[self.members]
         weight = self.weight[self.members[rows]].astype(np.float64)
         return np.bincount(self.set_of[rows], weight, len(self)).astype(np.float64)
 
     def covered(self, chosen: Ints) -> Ints:
-        """Return the number of chosen sets that hold each element, (E,)."""
+        """Return for each element the number of selected sets that contain it, (E,)."""
         taken = np.zeros(len(self), np.bool_)
         taken[chosen] = True
         return np.bincount(self.members[taken[self.set_of]], minlength=len(self.need))
 
     def part(self, sets: Ints, wanted: Bools, need: Ints) -> SetFamily:
-        """Return a smaller family: some sets, with renumbered wanted elements."""
+        """Return a smaller family of some sets and some elements, with new element numbers."""
         kept = np.zeros(len(self), np.bool_)
         kept[sets] = True
         rows = kept[self.set_of] & wanted[self.members]
@@ -144,7 +144,7 @@ def greedy(
     budget: float = math.inf,
     cheapened: Callable[[int], Iterable[tuple[int, float]]] | None = None,
 ) -> Ints:
-    """Choose sets one after another by gain of new elements per cost.
+    """Select sets one after another, each time the set with the most new elements per cost.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def greedy(
 
 
 def thinned(family: SetFamily, chosen: Ints, order: Ints | None = None) -> Ints:
-    """Remove sets that the others make redundant.
+    """Return the selected sets without those whose elements the other selected sets cover.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def thinned(family: SetFamily, chosen: Ints, order: Ints | None = None) -> Ints:
 
 
 def ordered(family: SetFamily, chosen: Ints) -> Ints:
-    """Order chosen sets by gain per cost; sets without gain are last."""
+    """Return the selected sets ordered by new elements per cost; sets without new elements are last."""
     chosen = np.sort(chosen)
     wanted = np.ones(len(family.need), np.bool_)
     need = np.minimum(family.need, family.covered(chosen))
@@ -229,12 +229,12 @@ def ordered(family: SetFamily, chosen: Ints) -> Ints:
 
 
 def met(family: SetFamily, chosen: Ints) -> int:
-    """Return the amount of met needs: for each element at most its need, times its weight."""
+    """Return the weighted amount of element needs that the selected sets cover."""
     return int((np.minimum(family.covered(chosen), family.need) * family.weight).sum())
 
 
 def or_alone(family: SetFamily, chosen: Ints, budget: float) -> Ints:
-    """Return the chosen sets, or the best single set within the budget if it meets more."""
+    """Return the selected sets, or the best single set within the budget if it covers more."""
     gain = family.gains(family.need > 0)
     single = np.flatnonzero(family.cost <= budget)
     best = single[np.lexsort((family.rank[single], -gain[single]))[:1]]

@@ -1,4 +1,4 @@
-"""Situations of the ego: the first possible conflict partner, its direction, and the place."""
+"""Situation of the ego in a frame: its nearest possible conflict, from which side, and the place."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ _SQL: Final = f"""
 
 
 def frames_in_parts(frames: Ints) -> Iterator[tuple[int, Ints]]:
-    """Yield chunks of ascending frames, each with the index of its first frame."""
+    """Yield chunks of ascending frame ids, each with the index of its first frame."""
     for start in range(0, len(frames), _FRAMES):
         yield start, frames[start : start + _FRAMES]
 
 
 def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
-    """Return the situation in one frame of each unit, (U,), as an index into a list of all.
+    """Return the situation of the ego in one frame of each test case, (U,), as an index into a list.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
 
 
 class Situations:
-    """Situations of frames by index; a frame without an entry has no other entity."""
+    """Situations of the ego (possible conflicts) by frame; frames without other entities have none."""
 
     def __init__(self, count: int, kinds: Sequence[str]) -> None:
         self._code = np.full(count, _NOBODY, np.int64)
@@ -87,16 +87,16 @@ class Situations:
 
     @classmethod
     def of_frames(cls, units: Units, count: int) -> Situations:
-        """Make an empty record for frames of a store."""
+        """Return an empty table of situations for the frames of a store."""
         sql = "SELECT unnest(enum_range(NULL::kind))::VARCHAR"
         return cls(count, [one for (one,) in units.chosen.one_store.file.rows(sql).values])
 
     def add(self, rows: Ints, codes: Any) -> None:
-        """Set the situations of some frames."""
+        """Store the situations of the ego in some frames."""
         self._code[rows] = codes
 
     def of(self, rows: Ints) -> tuple[Ints, list[str]]:
-        """Return the situations of some frames, as indices into a list."""
+        """Return the situations of the ego in some frames, as indices into a list of names."""
         used, code = np.unique(self._code[rows], return_inverse=True)
         names = list(map(self._name, used.tolist()))
         order = sorted(range(len(names)), key=names.__getitem__)

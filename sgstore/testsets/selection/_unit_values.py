@@ -1,4 +1,4 @@
-"""Numbers of frames, and the least one of each unit."""
+"""Value of an expression in each frame, and its lowest value in each test case."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
-    """Evaluate an expression to a number for each frame to select from.
+    """Return the ids of frames and the value of an expression (a number) in each frame.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
 
 
 def _condition_in(text: str) -> str | None:
-    """Return the condition in ``robustness(…)``, if the expression is nothing else."""
+    """Return the condition of an expression ``robustness(…)``; ``None`` for any other expression."""
     begun = "MATCH () RETURN "
     try:
         match = parse(begun + text)[-1]
@@ -77,7 +77,7 @@ def _condition_in(text: str) -> str | None:
 
 
 def least_values(units: Units, text: str) -> Floats:
-    """Return the least value of :func:`numbers_of_frames` in each unit, (U,); NaN if unknown."""
+    """Return the lowest value of an expression in each test case, (U,); NaN if unknown."""
     rows, value = numbers_of_frames(units, text)
     frames = np.full(len(units.frame_id), np.nan)
     frames[rows] = value
@@ -85,7 +85,7 @@ def least_values(units: Units, text: str) -> Floats:
 
 
 def _least(units: Units, frames: Floats) -> Floats:
-    """Return the least of a value of each frame of the units, (U,); NaN if unknown."""
+    """Return the lowest of the given frame values in each test case, (U,); NaN if unknown."""
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
     return np.fmin.reduceat(np.append(frames, np.nan), ranges)[::2]
 
@@ -94,12 +94,12 @@ _CHECK: Final = re.compile(r"\s*(DEFINE|USING|CHECK)\b", re.IGNORECASE)
 
 
 def is_check(text: str) -> bool:
-    """True if a text is a ``CHECK``."""
+    """True if a text is a ``CHECK`` statement, not an expression."""
     return bool(_CHECK.match(text))
 
 
 def least_of_check(units: Units, text: str) -> Floats:
-    """Return the least margin of each unit for a check, (U,); NaN if unknown.
+    """Return the lowest robustness margin of a check in each test case, (U,); NaN if unknown.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def least_of_check(units: Units, text: str) -> Floats:
 
 
 def _margins(units: Units, text: str) -> Floats:
-    """Return margins of a check in the frames of the units, (N,); NaN if unknown or not selected from."""
+    """Return the robustness margin of a check in each frame, (N,); NaN if unknown."""
     run = units.chosen.store.check(text)
     if len(run.names) > 1:
         raise ConfigError("several checks have no order together: give one of them")

@@ -1,4 +1,4 @@
-"""Units of a selection: frames, clips or whole traces, with their elements."""
+"""Units of a selection (frames, clips or whole traces), with the scene classes that each contains."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _CELLS: Final = 50_000_000
 
 
 class SelectionUnit(StrEnum):
-    """Unit of selection: a frame, consecutive frames of some seconds, or a whole trace."""
+    """Unit of a selection of test cases: a frame, a clip of some seconds, or a whole trace."""
 
     frame = "frame"
     clip = "clip"
@@ -55,7 +55,7 @@ Measure = Literal["units", "frames", "seconds", "bytes"]
 
 @dataclass(frozen=True)
 class Budget:
-    """Limit of a selection.
+    """Budget of a selection: an amount of time, bytes, frames or units.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Budget:
 
     @classmethod
     def parse(cls, text: str) -> Budget:
-        """Parse a budget: ``600s``, ``10min``, ``2h``, ``5GB``, ``300MiB``, ``1000frames``, ``40units``.
+        """Return the budget in a text, such as ``600s``, ``2h``, ``5GB``, ``1000frames`` or ``40units``.
 
         Raises
         ------
@@ -105,7 +105,7 @@ _MEASURES: Final[dict[str, tuple[float, Measure]]] = {
 
 @dataclass(frozen=True)
 class Units:
-    """Frames in units, which can overlap.
+    """Frames divided into selection units: single frames, clips (which can overlap) or whole traces.
 
     Attributes
     ----------
@@ -137,44 +137,44 @@ class Units:
 
     @property
     def total(self) -> int:
-        """Return the number of units, including omitted ones."""
+        """Return the number of selection units, including units that bundles left out."""
         return len(self) + self.others
 
     @property
     def overlap(self) -> bool:
-        """True if a frame is in several units."""
+        """True if a frame is in several clips."""
         return bool((self.begin[1:] < self.end[:-1]).any())
 
     @property
     def sizes(self) -> Ints:
-        """Return the number of frames of each unit, (U,)."""
+        """Return the number of frames in each selection unit (frame, clip or trace), (U,)."""
         return self.end - self.begin
 
     @property
     def first(self) -> Ints:
-        """Return the ids of the first frames of the units, (U,)."""
+        """Return the id of the first frame of each selection unit, (U,)."""
         return self.frame_id[self.begin]
 
     @property
     def last(self) -> Ints:
-        """Return the ids of the last frames of the units, (U,)."""
+        """Return the id of the last frame of each selection unit, (U,)."""
         return self.frame_id[self.end - 1]
 
     def codes(self, of: Classed) -> Ints:
-        """Return the class of each frame, (N,); unknown outside the frames to select from."""
+        """Return the scene class of each frame, (N,). Frames that the query did not select have none."""
         place = np.searchsorted(of.frame_id, self.frame_id)
         there = np.append(of.frame_id, -1)[place] == self.frame_id
         return np.where(there, np.append(of.code, UNKNOWN)[place], UNKNOWN)
 
     def rows_of(self, picked: Ints) -> Ints:
-        """Return the distinct rows of the frames of some units, ascending."""
+        """Return the indices of all frames in the given clips or traces, ascending, each once."""
         step = np.zeros(len(self.frame_id) + 1, np.int64)
         np.add.at(step, self.begin[picked], 1)
         np.add.at(step, self.end[picked], -1)
         return np.flatnonzero(np.cumsum(step)[:-1])
 
     def cases(self, picked: Ints, splits: Mapping[int, str] | None = None) -> list[CasePart]:
-        """Return units as ordered cases of a lock; ``splits``: the split of each unit."""
+        """Return selected clips or traces as test cases of a lock, each with its split."""
         found: list[CasePart] = []
         for unit in sorted(picked.tolist()):
             rows = slice(self.begin[unit], self.end[unit])
@@ -184,7 +184,7 @@ class Units:
         return found
 
     def members(self) -> Iterator[tuple[Ints, Ints]]:
-        """Yield units and rows of their frames, in chunks of whole units."""
+        """Yield chunks of pairs: the index of a clip or trace, and the index of a frame in it."""
         ends = np.cumsum(self.sizes)
         low = 0
         while low < len(self):
@@ -195,7 +195,7 @@ class Units:
             low = high
 
     def weights(self, measure: Measure) -> Floats:
-        """Return the cost of each frame, (N,); its duration is the median period of its trace."""
+        """Return the cost of each frame, (N,): 1, its duration in seconds, or the bytes of its messages."""
         match measure:
             case "units" | "frames":
                 return np.ones(len(self.frame_id))
@@ -210,13 +210,13 @@ class Units:
                 return found
 
     def costs(self, measure: Measure) -> Floats:
-        """Return the cost of each unit alone, (U,)."""
+        """Return the cost of each clip or trace by itself, (U,)."""
         if measure == "units":
             return np.ones(len(self))
         return self.summed(self.weights(measure), measure)
 
     def summed(self, weights: Floats, measure: Measure) -> Floats:
-        """Return the total weight of the frames of each unit, (U,); always positive."""
+        """Return the total weight of the frames in each clip or trace, (U,); always positive."""
         if not len(self):
             return np.zeros(0)
         ranges = np.stack([self.begin, self.end], axis=1).ravel()
@@ -225,7 +225,7 @@ class Units:
         return np.maximum(found, 1e-3 if measure == "seconds" else 1.0)
 
     def together(self, picked: Ints, measure: Measure) -> float:
-        """Return the total cost of units; a shared frame costs once."""
+        """Return the total cost of some clips or traces; a shared frame costs once."""
         if measure == "units":
             return float(len(picked))
         if not self.overlap:
@@ -233,7 +233,7 @@ class Units:
         return float(self.weights(measure)[self.rows_of(picked)].sum())
 
     def ranks(self, seed: int) -> Ints:
-        """Return a random order of the units, (U,), equal in all stores with the same traces."""
+        """Return a random order of the clips or traces, (U,), equal in all stores with the same traces."""
         mixed = _mixed(self.first.astype(np.uint64) + np.uint64(seed * int(_STEP) % (1 << 64)))
         order = np.lexsort((self.first, mixed))
         rank = np.empty(len(order), np.int64)
@@ -247,7 +247,7 @@ _STEP: Final = np.uint64(0x9E3779B97F4A7C15)
 def _mixed(
     words: np.ndarray[tuple[int], np.dtype[np.uint64]],
 ) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
-    """Mix the words with SplitMix64 (Steele, Lea, Flood, 2014)."""
+    """Return 64-bit words mixed to pseudo-random numbers by SplitMix64 (Steele, Lea, Flood, 2014)."""
     words = words + _STEP
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -257,7 +257,7 @@ def _mixed(
 def units_of(
     chosen: ChosenFrames, unit: SelectionUnit, clip_s: float = 2.0, stride_s: float | None = None
 ) -> Units:
-    """Divide frames into selection units: frames, clips or traces.
+    """Return frames divided into selection units: single frames, clips or traces.
 
     A clip is a part of a run of consecutive frames, of a given length. The first clip begins with
     the run, the others follow at the stride, until one reaches the end of the run; the last one may
@@ -313,7 +313,7 @@ def _ranges(fresh: Bools) -> tuple[Ints, Ints]:
 
 
 def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tuple[Ints, Ints]:
-    """Return begin and end of clips."""
+    """Return the index of the first frame of each clip, and the index after its last frame."""
     period = periods_of(frames.chosen.store, frames.frame_id)
     fresh = run_begins(frames.chosen.store, frames.frame_id, time_ns)
     starts, ends = _ranges(fresh)
@@ -335,7 +335,7 @@ def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tupl
 
 @dataclass(frozen=True)
 class Holdings:
-    """Elements of units: classes, or combinations of features.
+    """Elements of each selection unit: the scene classes, feature combinations or sequences in its frames.
 
     Attributes
     ----------
@@ -363,16 +363,16 @@ class Holdings:
 
     @property
     def total(self) -> int:
-        """Return the number of classes or combinations."""
+        """Return the number of scene classes, feature combinations or manoeuvre sequences."""
         return int(self.weight.sum())
 
     def family(self, units: Units, cost: Floats, need: int, rank: Ints) -> SetFamily:
-        """Return the units as sets of their elements."""
+        """Return a family of sets: each clip or trace is the set of the scene classes that it contains."""
         found = SetFamily.of(self.pairs, len(units), len(self.frames), cost, need, rank)
         return replace(found, weight=self.weight)
 
     def over(self, units: Units) -> Holdings:
-        """Return the elements of other units of the same frames.
+        """Return the scene classes or combinations in each of other clips of the same frames.
 
         Raises
         ------
@@ -389,7 +389,7 @@ class Holdings:
 
 
 def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = False) -> Holdings:
-    """Return the elements of units: classes, or combinations of features in their frames.
+    """Return the scene classes, or the combinations of k features, in each clip or trace.
 
     Parameters
     ----------
@@ -419,12 +419,12 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
 
 
 def kind_of(abstraction: str) -> str:
-    """Return the description of elements that are classes."""
+    """Return a description of the counted elements: classes in an abstraction."""
     return f"classes in {abstraction}"
 
 
 def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: float) -> Holdings:
-    """Return the elements of units: the sequences of k manoeuvres in their frames.
+    """Return the sequences of k manoeuvres in each clip or trace.
 
     Parameters
     ----------
@@ -461,7 +461,7 @@ def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: floa
 
 
 def classes_of(units: Units, of: Classed) -> Ints:
-    """Return pairs of a unit and a class in it, (2, M); classes count from 0."""
+    """Return pairs (2, M) of a clip or trace and a scene class that it contains."""
     present = of.present()
     number = np.full(len(of.names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
@@ -479,7 +479,10 @@ def classes_of(units: Units, of: Classed) -> Ints:
 
 
 def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
-    """Return distinct combinations by class, (classes, E), with multiplicity and frame counts."""
+    """Return the feature combinations of each scene class, with combinations of equal frames merged.
+
+    Also return the multiplicity and the number of frames of each.
+    """
     has = found.features.there
     there = np.flatnonzero(found.frames)
     number: dict[bytes, int] = {}
@@ -510,7 +513,7 @@ def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
 
 
 def _of_units(pairs: Ints, has: Bools) -> Ints:
-    """Return pairs of unit and element, from pairs of unit and class, and the elements of classes."""
+    """Return pairs of a clip and a feature combination, from the scene classes in each clip."""
     held = 0
     parts: list[Ints] = []
     unit, row = pairs
@@ -529,7 +532,7 @@ def _of_units(pairs: Ints, has: Bools) -> Ints:
 
 
 def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges of about ``step`` rows that end at a unit's end."""
+    """Yield ranges of about ``step`` array rows, none of which divides a clip or trace."""
     low = 0
     while low < len(unit):
         high = int(np.searchsorted(unit, unit[min(low + step, len(unit)) - 1], side="right"))
@@ -538,7 +541,7 @@ def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
 
 
 def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
-    """Return the number of kept elements after each picked unit."""
+    """Return the number of scene classes (or combinations) in the first n selected clips, for each n."""
     place = np.full(units, -1)
     place[picked] = np.arange(len(picked))
     rows = place[pairs[0]] >= 0
