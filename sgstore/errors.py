@@ -32,10 +32,25 @@ if TYPE_CHECKING:
 
 
 class SgstoreError(Exception):
-    """Base class of the errors of sgstore. The message names the fault and the remedy."""
+    """Base class of the errors of sgstore. The message names the fault and the remedy.
+
+    Examples
+    --------
+    >>> try:
+    ...     store.graph("town#999")
+    ... except sgstore.SgstoreError as error:
+    ...     print(type(error).__name__, error)
+    StoreError no frame #999 in 'town'; it has frames #0 … #749, 0 s … 74.9 s
+    """
 
     def as_dict(self) -> dict[str, object]:
-        """Return the error as data: ``error`` (class name), ``reason``, and the place if known."""
+        """Return the error as data: ``error`` (class name), ``reason``, and the place if known.
+
+        Examples
+        --------
+        >>> sgstore.TraceError("the file is empty", path="monday.mcap").as_dict()
+        {'error': 'TraceError', 'reason': 'the file is empty', 'path': 'monday.mcap'}
+        """
         reason = getattr(self, "reason", str(self))
         about: dict[str, object] = {"error": type(self).__name__, "reason": reason}
         for name in ("path", "channel", "time_ns", "offset", "road", "element", "extra"):
@@ -74,6 +89,12 @@ class TraceError(SgstoreError):
         Log time of the message at fault; ns.
     offset : int, optional
         Byte offset in the file.
+
+    Examples
+    --------
+    >>> raise sgstore.TraceError("the file is empty", path="monday.mcap")
+    Traceback (most recent call last):
+    sgstore.errors.TraceError: monday.mcap: the file is empty
     """
 
     def __init__(
@@ -153,6 +174,12 @@ class MapError(SgstoreError):
         Id of the road at fault.
     element : str, optional
         The element at fault, as a path of tags: ``road/lanes/laneSection``.
+
+    Examples
+    --------
+    >>> sgstore.read_map_file("none.xodr")
+    Traceback (most recent call last):
+    sgstore.errors.MapError: none.xodr: cannot be read as an OpenDRIVE map: No such file or directory
     """
 
     def __init__(self, reason: str, *, road: str | None = None, element: str | None = None) -> None:
@@ -165,11 +192,25 @@ class MapError(SgstoreError):
 
 
 class ConfigError(SgstoreError):
-    """A setting is unknown, of the wrong type, or out of range."""
+    """A setting is unknown, of the wrong type, or out of range.
+
+    Examples
+    --------
+    >>> sgstore.Config(rate=-1)
+    Traceback (most recent call last):
+    sgstore.errors.ConfigError: setting 'rate' is -1; expected 0 or more frames per second
+    """
 
 
 class StoreError(SgstoreError):
-    """A store cannot be opened, or lacks the requested data."""
+    """A store cannot be opened, or lacks the requested data.
+
+    Examples
+    --------
+    >>> sgstore.open("none.sgstore")
+    Traceback (most recent call last):
+    sgstore.errors.StoreError: none.sgstore: no such store; 'sgstore ingest' makes one
+    """
 
 
 def one_store_needed(collection: str | Path, why: str = "this asks one store") -> StoreError:
@@ -181,7 +222,14 @@ def one_store_needed(collection: str | Path, why: str = "this asks one store") -
 
 
 class SqlError(StoreError):
-    """The database rejects a user's SQL statement."""
+    """The database rejects a user's SQL statement.
+
+    Examples
+    --------
+    >>> store.sql("SELECT 1; SELECT 2")
+    Traceback (most recent call last):
+    sgstore.errors.SqlError: expected one statement, found 2
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,6 +264,15 @@ class QueryError(SgstoreError):
     -----
     The message shows the line with carets under the span, for a terminal. ``as_dict`` returns the same as data,
     for a user interface.
+
+    Examples
+    --------
+    >>> store.find("MATCH (e:Ego)-[:near_col]->(v:Vehicle)")
+    Traceback (most recent call last):
+    sgstore.errors.QueryNameError: unknown relation 'near_col'
+      MATCH (e:Ego)-[:near_col]->(v:Vehicle)
+                      ^^^^^^^^
+    did you mean 'near_coll'?
     """
 
     def __init__(
@@ -228,7 +285,16 @@ class QueryError(SgstoreError):
         super().__init__(_with_carets(reason, text, span, hint))
 
     def as_dict(self) -> dict[str, object]:
-        """Return error data: ``error``, ``reason``, ``hint``, ``start``, ``end``, ``line``, ``column``."""
+        """Return error data: ``error``, ``reason``, ``hint``, ``start``, ``end``, ``line``, ``column``.
+
+        Examples
+        --------
+        >>> try:
+        ...     store.find("MATCH (e:Ego)-[:near_col]->(v:Vehicle)")
+        ... except sgstore.QueryError as error:
+        ...     print(error.as_dict()["hint"])
+        did you mean 'near_coll'?
+        """
         line, column = position(self.text, self.span.start) if self.span else (None, None)
         return {
             "error": type(self).__name__,
@@ -250,11 +316,25 @@ class QueryNameError(QueryError):
 
 
 class AbstractionError(SgstoreError):
-    """An abstraction or a derived set of relations is missing, or its computation failed."""
+    """An abstraction or a derived set of relations is missing, or its computation failed.
+
+    Examples
+    --------
+    >>> store.graph("town#264", "RVS")
+    Traceback (most recent call last):
+    sgstore.errors.AbstractionError: no abstraction 'RVS'; did you mean 'RSV'?
+    """
 
 
 class ExportError(SgstoreError):
-    """A clip or another output file is not writable."""
+    """A clip or another output file is not writable.
+
+    Examples
+    --------
+    >>> sgstore.ClipAnimation(b"", "gif", ("town#250", "town#252"), 0).save("clip.mp4")
+    Traceback (most recent call last):
+    sgstore.errors.ExportError: clip.mp4: the animation is a gif; expected .gif
+    """
 
 
 class MissingExtraError(SgstoreError):
@@ -266,6 +346,11 @@ class MissingExtraError(SgstoreError):
         Feature that needs the package: ``drawing``.
     extra : str
         Extra that installs the package: ``viz``.
+
+    Examples
+    --------
+    >>> sgstore.MissingExtraError("drawing", "viz").extra
+    'viz'
     """
 
     def __init__(self, purpose: str, extra: str) -> None:

@@ -111,6 +111,14 @@ class Interval:
         Number of frames.
     values : dict
         Constant values of the interval: the binding, or the values after ``RETURN``.
+
+    Examples
+    --------
+    >>> interval = next(store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").intervals())
+    >>> interval.start, interval.end, interval.frames
+    (0.0, 5.7, 58)
+    >>> interval.values["v.name"]
+    'car 2'
     """
 
     trace: str
@@ -147,6 +155,16 @@ class Matches(Tabular):
         node-link form.
     of_match : bool
         True if the query returns one value that describes a whole match: ``MIN(x) OVER match``.
+
+    Examples
+    --------
+    >>> matches = store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)")
+    >>> print(matches.count(), "frames")
+    108 frames
+    >>> for row in matches.limit(2):
+    ...     print(row.trace, row.t, row.v_name)
+    town 0.0 car 2
+    town 0.1 car 2
     """
 
     of_match = False
@@ -218,6 +236,11 @@ class Matches(Tabular):
         ------
         ValueError
             The number is negative.
+
+        Examples
+        --------
+        >>> len(store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").limit(3).rows())
+        3
         """
         if most < 0:
             raise ValueError(f"limit is {most}, expected 0 or more")
@@ -232,12 +255,28 @@ class Matches(Tabular):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Names of the traces that lack data for the query. These traces are not searched."""
+        """Names of the traces that lack data for the query. These traces are not searched.
+
+        Examples
+        --------
+        >>> store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").left_out
+        ()
+        >>> store.find("MATCH (e:Ego) WHERE HAPPENS collision(e)").left_out
+        ('town',)
+        """
         return tuple(self.reasons)
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Reasons for the skipped traces in :attr:`left_out`: trace name → reason."""
+        """Reasons for the skipped traces in :attr:`left_out`: trace name → reason.
+
+        Examples
+        --------
+        >>> store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").reasons
+        {}
+        >>> store.find("MATCH (e:Ego) WHERE HAPPENS collision(e)").reasons
+        {'town': 'it does not record events of the kind collision'}
+        """
         return self._ready.reasons
 
     @contextmanager
@@ -254,7 +293,13 @@ class Matches(Tabular):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes, such as a text that equals no name in the store."""
+        """Notes on likely mistakes, such as a text that equals no name in the store.
+
+        Examples
+        --------
+        >>> store.find("MATCH (v:Vehicle {name: 'car 7'})").notes
+        ("nothing in the store has the name 'car 7'; the nearest is 'car 0'",)
+        """
         from sgstore.lang.help import compared_in_query
 
         with self._compiled() as compiled:
@@ -263,7 +308,14 @@ class Matches(Tabular):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Data that settings exclude from the searched traces; see :func:`sgstore.model.scope.scope_of`."""
+        """Data that settings exclude from the searched traces; see :func:`sgstore.model.scope.scope_of`.
+
+        Examples
+        --------
+        >>> scope = store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").scope
+        >>> scope["radius"], scope["states"], scope["beyond_radius"]
+        (50.0, 36189, 25349)
+        """
         with self._compiled() as compiled:
             chosen = {trace.trace_id for trace in compiled.chosen}
             traces = (one for one in self._file.traces() if one.trace_id in chosen)
@@ -279,11 +331,23 @@ class Matches(Tabular):
             yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
     def rows(self) -> list[Row]:
-        """Return all rows as a list."""
+        """Return all rows as a list.
+
+        Examples
+        --------
+        >>> store.find("MATCH (v:Bus) RETURN v.name AS name, count(*) AS frames").rows()
+        [Row(name='bus 3', frames=466)]
+        """
         return list(self._rows(whole=True))
 
     def count(self) -> int:
-        """Return the number of distinct matching frames."""
+        """Return the number of distinct matching frames.
+
+        Examples
+        --------
+        >>> store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").count()
+        108
+        """
         with self._compiled() as compiled:
             if compiled.limited_to_frames is not None:
                 return len({row[0] for row in self._frames()})
@@ -293,6 +357,13 @@ class Matches(Tabular):
         """Yield each matching frame once, ordered by trace name and frame number.
 
         Limited rows keep their order.
+
+        Examples
+        --------
+        >>> for frame in store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle) LIMIT 2").frames():
+        ...     print(frame.trace, frame.seq, frame.t)
+        town 0 0.0
+        town 1 0.1
         """
         for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
             yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
@@ -307,7 +378,15 @@ class Matches(Tabular):
             yield from dict.fromkeys(found)
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Return all bindings in one frame: variable name → node id. ``RETURN`` has no effect."""
+        """Return all bindings in one frame: variable name → node id. ``RETURN`` has no effect.
+
+        Examples
+        --------
+        >>> matches = store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)")
+        >>> frame = next(matches.frames())
+        >>> matches.bindings(frame)
+        [{'e': 0, 'v': 2}]
+        """
         bucket = frame.frame_id >> FRAME_BITS
         with self._compiled() as compiled:
             statement = compiled.bindings(Window(bucket, bucket + 1))
@@ -325,6 +404,14 @@ class Matches(Tabular):
         """Return the intervals in which each part of the pattern holds, for one binding.
 
         See :meth:`sgstore.Store.parts`.
+
+        Examples
+        --------
+        >>> matches = store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed < 5")
+        >>> for lane in matches.parts(next(matches.frames())).lanes:
+        ...     print(lane.part.text, lane.spans)
+        (e)-[:near_coll]->(v) ((197, 206),)
+        e.speed < 5 ((203, 359), (369, 425), (517, 524), (579, 632), (711, 749))
         """
         from sgstore.temporal.truth_lanes import (
             truth_lanes,  # imports numpy, which a query does not need
@@ -352,6 +439,14 @@ class Matches(Tabular):
         their relation as key and as attribute, and all known attributes; see :mod:`sgstore.lang.sql._compile`.
         The graph has the attributes ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``t``, and the other
         values of ``RETURN SUBGRAPHS``.
+
+        Examples
+        --------
+        >>> graph = next(store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").subgraphs())
+        >>> list(graph.edges(keys=True))
+        [(0, 2, 'near_coll')]
+        >>> graph.graph["trace"], graph.graph["seq"]
+        ('town', 0)
         """
         from sgstore.model.graph import graph_of_records
 
@@ -377,6 +472,14 @@ class Matches(Tabular):
         ----------
         bound : bool
             Return bindings, regardless of ``RETURN``: node ids by variable, and their names.
+
+        Examples
+        --------
+        >>> for one in store.find("MATCH (e:Ego)-[:near_coll]->(v:Truck|Van)").intervals():
+        ...     print(one.trace, one.start, one.end, one.values["v.name"])
+        town 51.1 52.0 van 13
+        town 55.9 56.0 van 141
+        town 68.8 68.9 truck 143
         """
         ask = Compiled.bound_intervals if bound else Compiled.intervals
         with self._compiled() as compiled:
@@ -392,6 +495,14 @@ class Matches(Tabular):
         ----------
         before, after : float
             Time added at each end; s. The offsets of ``RETURN CLIPS(-3s, +5s)`` override them.
+
+        Examples
+        --------
+        >>> for clip in store.find("MATCH (e:Ego)-[:near_coll]->(v:Truck|Van)").clips(before=1, after=2):
+        ...     print(clip)
+        Clip(trace='town', start_ns=50100000000, end_ns=54000000000)
+        Clip(trace='town', start_ns=54900000000, end_ns=58000000000)
+        Clip(trace='town', start_ns=67800000000, end_ns=70900000000)
         """
         start, end = round(before * 1e9), round(after * 1e9)
         with self._compiled() as compiled:
@@ -414,7 +525,14 @@ class Matches(Tabular):
         return {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
 
     def numpy(self) -> dict[str, NDArray[np.generic]]:
-        """Return all columns as arrays. NULL values are masked."""
+        """Return all columns as arrays. NULL values are masked.
+
+        Examples
+        --------
+        >>> columns = store.find("MATCH (e:Ego) RETURN frame.seq AS seq, e.speed AS speed").numpy()
+        >>> columns["seq"][:3], columns["speed"].shape
+        (array([0, 1, 2], dtype=int32), (750,))
+        """
         with self._compiled() as compiled:
             return self._file.arrays(**self._asked(compiled.rows()))
 
@@ -443,6 +561,11 @@ class Matches(Tabular):
         ------
         ExportError
             The file is not writable.
+
+        Examples
+        --------
+        >>> store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").parquet("near.parquet")
+        110
         """
         with closing(self._record_batches()) as found:
             columns = next(found, None)
@@ -495,7 +618,17 @@ class Matches(Tabular):
         return [*asked["given"], (made, asked["parameters"])]
 
     def explain(self) -> str:
-        """Explain the query stage by stage: parse, bind, rewrite, emit."""
+        """Explain the query stage by stage: parse, bind, rewrite, emit.
+
+        Examples
+        --------
+        >>> stages = store.find("MATCH (e:Ego) WHERE e.speed > 5").explain().split("---- ")
+        >>> print(stages[2].strip())
+        bind
+        node e: the ego
+        where (e.speed > 5)
+        return rows
+        """
         with self._compiled() as compiled:
             return compiled.stages()
 

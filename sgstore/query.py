@@ -44,6 +44,12 @@ class StoreFrame:
     ----------
     ref : FrameRef
         Ids, trace and times of the frame.
+
+    Examples
+    --------
+    >>> frame = store.frame("town#264")
+    >>> frame.ref.t
+    26.4
     """
 
     def __init__(self, store: Store, ref: FrameRef) -> None:
@@ -62,26 +68,58 @@ class StoreFrame:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Topics of the sensor messages that belong to the frame."""
+        """Topics of the sensor messages that belong to the frame.
+
+        Examples
+        --------
+        >>> store.frame("town#264").channels
+        ('/ego/camera/front/image', '/ego/lidar/points', 'ground_truth')
+        """
         sql = "SELECT channel FROM payloads WHERE frame_id = ? ORDER BY channel"
         return tuple(topic for (topic,) in self._store.file.rows(sql, [self.ref.frame_id]))
 
     def graph(self, abstraction: str | None = None) -> nx.MultiDiGraph[Any]:
-        """Return the scene graph of the frame, or its form in an abstraction; see :meth:`Store.graph`."""
+        """Return the scene graph of the frame, or its form in an abstraction; see :meth:`Store.graph`.
+
+        Examples
+        --------
+        >>> frame = store.frame("town#264")
+        >>> print(frame.graph())
+        MultiDiGraph with 96 nodes and 636 edges
+        >>> print(frame.graph("RSV"))
+        MultiDiGraph with 36 nodes and 312 edges
+        """
         return self._store.graph(self.ref, *filter(None, [abstraction]))
 
     def picture(self, channel: str | None = None) -> Image:
-        """Return the picture of a camera, by default of the first camera; see :meth:`Store.picture`."""
+        """Return the picture of a camera, by default of the first camera; see :meth:`Store.picture`.
+
+        Examples
+        --------
+        >>> store.frame("town#264").picture().size
+        (480, 270)
+        """
         from sgstore.draw import camera_of
 
         return self._store.picture(self.ref, channel or camera_of(self._store, self.ref.trace))
 
     def points(self, channel: str | None = None) -> NDArray[Any]:
-        """Return the points of a lidar or radar, by default of the first one; see :meth:`Store.points`."""
+        """Return the points of a lidar or radar, by default of the first one; see :meth:`Store.points`.
+
+        Examples
+        --------
+        >>> len(store.frame("town#264").points())
+        3671
+        """
         return self._store.points(self.ref, channel)
 
     def show(self, query: str | Pattern | nx.Graph[Any] | None = None, **look: Any) -> Image:
-        """Draw the frame as a bird's-eye view; see :meth:`Store.show`."""
+        """Draw the frame as a bird's-eye view; see :meth:`Store.show`.
+
+        Examples
+        --------
+        >>> store.frame("town#264").show(camera="none").save("frame.png")
+        """
         return self._store.show(self.ref, query, **look)
 
 
@@ -99,6 +137,11 @@ class ClipAnimation:
         The first and the last frame: ``town@25s`` or ``town#250``.
     marked : int
         Number of pictures in which the query matches.
+
+    Examples
+    --------
+    >>> store.animate("town#250..252", "MATCH (e:Ego)", camera="none").marked
+    3
     """
 
     data: bytes
@@ -122,6 +165,10 @@ class ClipAnimation:
         ------
         ExportError
             The file suffix does not match the form of the animation, or the file is not writable.
+
+        Examples
+        --------
+        >>> store.animate("town#250..252", camera="none").save("clip.gif")
         """
         from sgstore.base.output_files import write_bytes
         from sgstore.errors import ExportError
@@ -162,6 +209,16 @@ class Store:
     Attributes
     ----------
     file : StoreFile
+
+    Examples
+    --------
+    >>> import sgstore
+    >>> store = sgstore.Store("demo.sgstore")  # made by 'sgstore demo .'
+    >>> store.traces()
+    (<StoredTrace 'town': 750 frames, 74.9 s, ego 'ego', map 'town.xodr'>,)
+    >>> store.find("MATCH (e:Ego)-[:near_coll]->(p:Person)").count()
+    4
+    >>> store.close()
     """
 
     def __init__(
@@ -188,7 +245,14 @@ class Store:
 
     @classmethod
     def of(cls, file: StoreFile) -> Self:
-        """Return the store of an open file."""
+        """Return the store of an open file.
+
+        Examples
+        --------
+        >>> from sgstore.store import StoreFile
+        >>> sgstore.Store.of(StoreFile("demo.sgstore"))
+        Store('demo.sgstore')
+        """
         found = cls.__new__(cls)
         found.file = file
         return found
@@ -218,7 +282,15 @@ class Store:
         self.close()
 
     def close(self) -> None:
-        """Close the file now. A later query opens it again."""
+        """Close the file now. A later query opens it again.
+
+        Examples
+        --------
+        >>> store = sgstore.open("demo.sgstore")
+        >>> store.close()
+        >>> len(store.traces())  # opens the file again
+        1
+        """
         self.file.close()
 
     def ingest(
@@ -246,6 +318,13 @@ class Store:
             writable.
         MapError
             The road map file is not readable.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> with sgstore.open("new.sgstore", create=True) as store:
+        ...     store.ingest(bundled(), until=3)
+        [<TraceOutcome 'town': added, 31 frames, 0 losses>]
         """
         from sgstore.ingest import ingest, recordings
 
@@ -275,6 +354,14 @@ class Store:
         ------
         QueryError
             The text is not a query, or has an unknown name. The message gives the place and a hint.
+
+        Examples
+        --------
+        >>> store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").count()
+        108
+        >>> text = "MATCH (v:Bus) WHERE v.speed > $least RETURN v.name AS name, count(*) AS frames"
+        >>> store.find(text, least=5).rows()
+        [Row(name='bus 3', frames=276)]
         """
         if not isinstance(query, str):
             from sgstore.lang.syntax import Pattern
@@ -309,6 +396,12 @@ class Store:
         ------
         QueryError
             The text has no checks, or has an unknown name. The message gives the place.
+
+        Examples
+        --------
+        >>> for verdict in store.check("CHECK slow: ALWAYS ego.speed < $most", most=14):
+        ...     print(verdict)
+        <Verdict 'slow' of 'town': true>
         """
         from sgstore.temporal import CheckRun  # imports numpy: only on demand
 
@@ -319,7 +412,15 @@ class Store:
     def shrink(
         self, text: str, /, clip: str | None = None, **parameters: object
     ) -> Iterator[ShortestClip]:
-        """Yield the shortest clips that still match; see :func:`sgstore.temporal.shortest_clips`."""
+        """Yield the shortest clips that still match; see :func:`sgstore.temporal.shortest_clips`.
+
+        Examples
+        --------
+        >>> text = "MATCH (e:Ego) WHERE e.speed > 8 THEN WITHIN 5s MATCH (e) WHERE e.speed < 5"
+        >>> shortest = next(store.shrink(text))
+        >>> shortest.start, shortest.end, f"{shortest.frames} of {shortest.of} frames"
+        (50.6, 51.7, '12 of 750 frames')
+        """
         from sgstore.temporal import shortest_clips
 
         return shortest_clips(self.file, self.file.catalog, text, parameters, clip)
@@ -349,6 +450,14 @@ class Store:
             The text is not a single read-only statement, the database rejects it, or it runs for too long.
         QueryError
             A pattern in the statement is invalid.
+
+        Examples
+        --------
+        >>> store.sql("SELECT kind, count(*) FROM entities GROUP BY kind ORDER BY kind LIMIT 3").values
+        [('car', 19), ('truck', 2), ('van', 5)]
+        >>> near = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) RETURN v.kind AS kind"
+        >>> store.sql(f"SELECT kind, count(*) FROM sgql('{near}') GROUP BY kind ORDER BY kind").values
+        [('bus', 10), ('car', 86), ('truck', 2), ('van', 12)]
         """
         with self.file.snapshot():
             asked = UserStatement(self.find, self.catalog().tables, text)
@@ -389,6 +498,13 @@ class Store:
             The frame does not exist.
         AbstractionError
             The abstraction does not exist.
+
+        Examples
+        --------
+        >>> print(store.graph("town#264"))
+        MultiDiGraph with 96 nodes and 636 edges
+        >>> print(store.graph("town@26.4s", "RSV"))
+        MultiDiGraph with 36 nodes and 312 edges
         """
         from sgstore.graphs.abstractions import abstractions
         from sgstore.model.graph import named_graph
@@ -433,6 +549,12 @@ class Store:
             The abstraction does not exist.
         StoreError
             The trace does not exist, or another process uses the store for too long.
+
+        Examples
+        --------
+        >>> classes = store.classes("RSV")
+        >>> len(classes["frame_id"]), len(set(classes["class"]))
+        (750, 668)
         """
         return self.file.abstracted.classes(abstraction, trace)
 
@@ -469,6 +591,13 @@ class Store:
             The frame does not exist.
         AbstractionError
             The abstraction does not exist, or no name matches ``ignore``.
+
+        Examples
+        --------
+        >>> for run in store.like("town#264", limit=2):
+        ...     print(run)
+        <SimilarFrames from 'town#264': 1 frames, similarity 1>
+        <SimilarFrames from 'town#265': 1 frames, similarity 0.916>
         """
         from sgstore.store import Example
 
@@ -491,6 +620,15 @@ class Store:
             The frame does not exist.
         QueryError
             The frame has no ego, or no name matches ``ignore``.
+
+        Examples
+        --------
+        >>> text = store.pattern("town#749", ignore=["Person"])
+        >>> print(text)
+        MATCH (ego:Car&Ego)
+        WHERE EXISTS {(ego)-[:isIn]->(:Crosswalk)}
+        >>> store.find(text).count()
+        73
         """
         from sgstore.lang.syntax import pattern_of
 
@@ -507,6 +645,11 @@ class Store:
             The frame or channel does not exist, or the frame has no message of the channel.
         TraceError
             The recording is missing, replaced, or damaged at this position.
+
+        Examples
+        --------
+        >>> len(store.payload("town#264", "/ego/camera/front/image"))
+        16297
         """
         return self.file.payload(_ref(frame), channel)
 
@@ -534,6 +677,11 @@ class Store:
             The message contains no picture.
         MissingExtraError
             Pillow is not installed.
+
+        Examples
+        --------
+        >>> store.picture("town#264", "/ego/camera/front/image").size
+        (480, 270)
         """
         from sgstore.draw import camera_image
 
@@ -541,11 +689,6 @@ class Store:
 
     def points(self, frame: int | str | FrameRef, channel: str | None = None) -> NDArray[Any]:
         """Return the points of a lidar or radar at a frame, read from the recording.
-
-        ::
-
-            points = store.points("town#264")
-            near = points[points["z"] > -1]
 
         Parameters
         ----------
@@ -568,6 +711,14 @@ class Store:
             The recording is missing, replaced, or damaged at this position.
         ExportError
             The message contains no points.
+
+        Examples
+        --------
+        >>> points = store.points("town#264")
+        >>> points.dtype.names
+        ('x', 'y', 'z', 'intensity')
+        >>> len(points[points["z"] > 0])  # higher than the sensor
+        799
         """
         from sgstore.exporters import cloud_of
 
@@ -592,6 +743,11 @@ class Store:
         ------
         StoreError
             The frame does not exist.
+
+        Examples
+        --------
+        >>> store.frame("town#264")
+        <StoreFrame 'town#264' at 26.4 s>
         """
         return StoreFrame(self, self.file.frame(_ref(frame)))
 
@@ -625,6 +781,11 @@ class Store:
             The clip or channel does not exist, the query is invalid, or the recording is missing.
         MissingExtraError
             The packages for drawing are not installed.
+
+        Examples
+        --------
+        >>> store.animate("town@25s..25.5s", camera="none")
+        <ClipAnimation from 'town@25s' to 'town@25.5s': gif>
         """
         from sgstore.base.temporary_folders import working_folder
         from sgstore.draw import draw_clip
@@ -685,6 +846,11 @@ class Store:
             The frame or channel does not exist, the query is invalid, or the recording is missing.
         MissingExtraError
             The packages for drawing are not installed.
+
+        Examples
+        --------
+        >>> near = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
+        >>> store.show("town#264", near, camera="none").save("frame.png")
         """
         from sgstore.draw import frame_image
 
@@ -692,7 +858,13 @@ class Store:
         return frame_image(self, _ref(frame), matches, **look)
 
     def traces(self) -> tuple[StoredTrace, ...]:
-        """Return the traces of the store by name, in natural order (``run2`` before ``run10``)."""
+        """Return the traces of the store by name, in natural order (``run2`` before ``run10``).
+
+        Examples
+        --------
+        >>> store.traces()
+        (<StoredTrace 'town': 750 frames, 74.9 s, ego 'ego', map 'town.xodr'>,)
+        """
         return self.file.traces()
 
     def info(self) -> tuple[StoredTrace, ...]:
@@ -700,7 +872,17 @@ class Store:
         return self.traces()
 
     def explain(self, text: str, /, **parameters: object) -> str:
-        """Explain a query stage by stage: parse, bind, rewrite, emit."""
+        """Explain a query stage by stage: parse, bind, rewrite, emit.
+
+        Examples
+        --------
+        >>> stages = store.explain("MATCH (e:Ego) WHERE e.speed > 5").split("---- ")
+        >>> print(stages[2].strip())
+        bind
+        node e: the ego
+        where (e.speed > 5)
+        return rows
+        """
         return self.find(text, **parameters).explain()
 
     def why_not(
@@ -728,6 +910,12 @@ class Store:
             The text is not a query.
         StoreError
             The frame does not exist.
+
+        Examples
+        --------
+        >>> why = store.why_not("town#264", "MATCH (e:Ego)-[:near_coll]->(v:Bus) WHERE v.speed > 9")
+        >>> why.failed, why.nearest
+        ('(e)-[:near_coll]->(v)', {'e': 'car 0', 'v': 'bus 3'})
         """
         from sgstore.lang.help import (
             WhyNot,
@@ -778,6 +966,14 @@ class Store:
             The text is not a query, or lacks a variable of the binding.
         StoreError
             The frame does not exist.
+
+        Examples
+        --------
+        >>> text = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed < 5"
+        >>> for lane in store.parts(text, "town#264").lanes:
+        ...     print(lane.part.text, lane.spans)
+        (e)-[:near_coll]->(v) ((197, 206),)
+        e.speed < 5 ((203, 359), (369, 425), (517, 524), (579, 632), (711, 749))
         """
         with self.file.snapshot():
             matches, ref = self.find(text, **parameters), self.file.frame(_ref(frame))

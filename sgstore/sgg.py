@@ -110,6 +110,14 @@ class SceneGraphGenerator:
     -----
     Blocks come in the order of the trace. Between blocks, the generator stores only the facts that it needs
     about earlier entities (kinds, scenery). A block of one frame gives the same graph as a block of many.
+
+    Examples
+    --------
+    >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+    >>> frame = sgstore.Frame(0, ego="hero")
+    >>> frame.add("hero", "car", 0, 0, heading=0)
+    >>> generator.step(frame)
+    <SceneGraph online#0: 1 nodes, 0 edges>
     """
 
     def __init__(self, road_map: RoadMap | None, config: Config) -> None:
@@ -151,12 +159,34 @@ class SceneGraphGenerator:
 
     @property
     def parked(self) -> Codes:
-        """State of each entity over all graphs so far, (n,) int8: 1 parked, 0 not parked, -1 unknown."""
+        """State of each entity over all graphs so far, (n,) int8: 1 parked, 0 not parked, -1 unknown.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> from sgstore.readers import open_trace
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> with open_trace(bundled()) as trace:
+        ...     graphs = generator.block(next(trace.blocks()))
+        >>> generator.parked[:3]
+        array([0, 0, 0], dtype=int8)
+        """
         return self._parking.parked
 
     @property
     def world_parked(self) -> Codes:
-        """Parking state of each entity as in :attr:`parked`, including entities near but outside the graphs."""
+        """Parking state of each entity as in :attr:`parked`, including entities near but outside the graphs.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> from sgstore.readers import open_trace
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> with open_trace(bundled()) as trace:
+        ...     graphs = generator.block(next(trace.blocks()))
+        >>> generator.world_parked[:3]
+        array([0, 0, 0], dtype=int8)
+        """
         return self._parking.world_parked
 
     def pieces(self, frames: FrameBlock, egos: int = 1) -> Iterator[FrameBlock]:
@@ -167,6 +197,16 @@ class SceneGraphGenerator:
         frames : FrameBlock
         egos : int
             Number of egos, each with its own graphs.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> from sgstore.readers import open_trace
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> with open_trace(bundled()) as trace:
+        ...     block = next(trace.blocks())
+        >>> [len(piece) for piece in generator.pieces(block)]
+        [60]
         """
         entities = renamed(frames.entities, self._config.types)
         kinds = np.concatenate([self._kinds[: entities.first], entities.kind])
@@ -181,6 +221,16 @@ class SceneGraphGenerator:
             A relation of another package returns undeclared edges.
         ValueError
             A state has an unknown node, or new node ids are not consecutive. This is a defect of the reader.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> from sgstore.readers import open_trace
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> with open_trace(bundled()) as trace:
+        ...     graphs = generator.block(next(trace.blocks()))
+        >>> len(graphs), len(graphs.edges)
+        (60, 10648)
         """
         return self.blocks(frames, [frames.ego])[0]
 
@@ -203,11 +253,33 @@ class SceneGraphGenerator:
         ------
         ValueError
             As for :meth:`block`.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> from sgstore.readers import open_trace
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> with open_trace(bundled()) as trace:
+        ...     block = next(trace.blocks())
+        >>> (graphs,) = generator.blocks(block, [block.ego])
+        >>> len(graphs), len(graphs.edges)
+        (60, 10648)
         """
         return list(self.one_by_one(frames, egos))
 
     def one_by_one(self, frames: FrameBlock, egos: Sequence[Ints]) -> Iterator[GraphBlock]:
-        """Yield the same blocks as :meth:`blocks`, one at a time, to save memory."""
+        """Yield the same blocks as :meth:`blocks`, one at a time, to save memory.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> from sgstore.readers import open_trace
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> with open_trace(bundled()) as trace:
+        ...     block = next(trace.blocks())
+        >>> [len(graphs) for graphs in generator.one_by_one(block, [block.ego])]
+        [60]
+        """
         views, world = self._views(frames, egos)
         for view in views:
             yield self._graphs(view, world)
@@ -450,6 +522,14 @@ class SceneGraphGenerator:
         """Return the scene graph of the next frame, for a client with its own loop.
 
         The graph is the same as for a recording. For several egos, see :meth:`steps`.
+
+        Examples
+        --------
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, heading=0)
+        >>> generator.step(frame)
+        <SceneGraph online#0: 1 nodes, 0 edges>
         """
         return self.steps(frame)[0]
 
@@ -479,6 +559,15 @@ class SceneGraphGenerator:
         -----
         Memory does not grow with time: see :mod:`sgstore.graphs.online`. Steps and blocks are independent of
         each other.
+
+        Examples
+        --------
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> frame = sgstore.Frame(0)
+        >>> frame.add("a", "car", 0, 0, heading=0)
+        >>> frame.add("b", "car", 9, 0, heading=0)
+        >>> generator.steps(frame, ["a", "b"])
+        [<SceneGraph online#0: 2 nodes, 5 edges>, <SceneGraph online#0: 2 nodes, 5 edges>]
         """
         if self._online is None:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
@@ -491,7 +580,17 @@ class SceneGraphGenerator:
 
     @property
     def losses(self) -> list[Loss]:
-        """Losses of the steps so far: pairs in crowded frames, and implausible sizes and speeds."""
+        """Losses of the steps so far: pairs in crowded frames, and implausible sizes and speeds.
+
+        Examples
+        --------
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, length=-4.5)
+        >>> graph = generator.step(frame)
+        >>> [loss.reason for loss in generator.losses]
+        ["length of entity 'hero' is -4.5 m: missing in 1 states"]
+        """
         faults = self._online.faults.losses() if self._online is not None else []
         return [*self._crowds.losses(self._config), *faults]
 
@@ -516,6 +615,15 @@ class SceneGraphGenerator:
             The abstraction does not exist.
         ValueError
             There was no step yet.
+
+        Examples
+        --------
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, heading=0)
+        >>> graph = generator.step(frame)
+        >>> generator.class_of("RSV")
+        '6ecf69623467f5ffd11f63ad25b33ad5'
         """
         seen = self._seen(number)
         (found,) = self._classes.of(abstraction_named(abstraction).function(seen))
@@ -538,6 +646,17 @@ class SceneGraphGenerator:
         ------
         ValueError
             There was no step yet.
+
+        Examples
+        --------
+        >>> name, text = store.file.road_map_text("town")
+        >>> from sgstore.maps.opendrive import read_map
+        >>> generator = sgstore.SceneGraphGenerator(read_map(text, name), sgstore.Config())
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", -230, -1.75, heading=0, length=4.5, width=1.9)
+        >>> graph = generator.step(frame)
+        >>> sorted(generator.roles_of().values())
+        ['Ego Lane', 'Right 1 of Ego Lane']
         """
         _, lanes, roles = lane_roles(self._seen(number))
         return dict(zip(lanes.tolist(), roles, strict=True))
@@ -554,7 +673,18 @@ class SceneGraphGenerator:
 
     @property
     def kinds(self) -> Codes:
-        """Kinds of all entities so far, by node id: (n,) int8."""
+        """Kinds of all entities so far, by node id: (n,) int8.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> from sgstore.readers import open_trace
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> with open_trace(bundled()) as trace:
+        ...     graphs = generator.block(next(trace.blocks()))
+        >>> generator.kinds[:4]
+        array([0, 0, 0, 3], dtype=int8)
+        """
         return self._kinds
 
     def _learn(self, frames: FrameBlock) -> FrameBlock:

@@ -60,6 +60,9 @@ with sgstore.open("drives.sgstore", create=True) as store:
     picture = store.picture("town#264", "/ego/camera/front/image")  # Pillow
     store.show("town#264").save("frame.png")
 ```
+
+You can repeat the examples: `store` is `sgstore.open("demo.sgstore")`, which `sgstore demo .` writes.
+`sgstore collection pack demo.sgstore fleet` makes the collection `fleet`.
 """
 
 
@@ -135,8 +138,14 @@ def markdown(text: str) -> str:
     lines = [prose(blocks[0])]
     for title, block in zip(blocks[1::2], blocks[2::2], strict=True):
         lines.append(f"**{title}**\n")
-        lines.append(prose(block) if title in {"Notes", "Examples"} else entries(block))
+        written = {"Notes": prose, "Examples": console}.get(title, entries)
+        lines.append(written(block))
     return "\n\n".join(line.strip("\n") for line in lines if line.strip())
+
+
+def console(text: str) -> str:
+    """Examples of a docstring, as a block."""
+    return f"```pycon\n{text.strip()}\n```"
 
 
 def prose(text: str) -> str:

@@ -48,13 +48,6 @@ def open(  # noqa: PLR0913  those of a store, and those of a collection
 ) -> Store | Collection:
     """Open a store, or with ``engine`` a collection of stores.
 
-    ::
-
-        with sgstore.open("drives.sgstore", create=True) as store:
-            store.ingest("recordings/")
-        with sgstore.open("fleet/", engine="local:8") as fleet:
-            print(fleet.find("MATCH (e:Ego)-[:near_coll]->(p:Person)").count())
-
     Parameters
     ----------
     path : str or Path
@@ -70,6 +63,16 @@ def open(  # noqa: PLR0913  those of a store, and those of a collection
     ------
     StoreError
         The store or collection is missing, or has another version.
+
+    Examples
+    --------
+    >>> import sgstore
+    >>> with sgstore.open("demo.sgstore") as store:  # made by 'sgstore demo .'
+    ...     print(store.find("MATCH (e:Ego)-[:near_coll]->(p:Person)").count(), "frames")
+    4 frames
+    >>> with sgstore.open("fleet", engine="local") as fleet:  # made by 'sgstore collection pack'
+    ...     print(len(fleet.traces()), "trace")
+    1 trace
     """
     if not engine:
         return Store(

@@ -126,6 +126,12 @@ class Collection:
         Bundles that failed so far, each with the reason; only with ``partial``.
     opened : list of str
         Bundles that the last query used.
+
+    Examples
+    --------
+    >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+    >>> fleet.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").count()
+    108
     """
 
     def __init__(
@@ -155,10 +161,24 @@ class Collection:
         self.close()
 
     def close(self) -> None:
-        """Do nothing: files are closed after each query."""
+        """Do nothing: files are closed after each query.
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> fleet.close()
+        """
 
     def joined(self, tables: Mapping[str, object]) -> Collection:
-        """Return the same collection with other user tables: see the parameter ``tables``."""
+        """Return the same collection with other user tables: see the parameter ``tables``.
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> weather = fleet.joined({"weather": "weather.csv"})
+        >>> weather.find("MATCH (e:Ego) WHERE weather.rain > 0.5").count()
+        750
+        """
         engine, partial = self._engine_name, self._partial
         return Collection(self.place.url, engine=engine, tables=tables, partial=partial)
 
@@ -196,7 +216,14 @@ class Collection:
         return [one["bundle"] for one in ordered]
 
     def traces(self) -> tuple[dict[str, Any], ...]:
-        """Return the catalogue rows of traces, by name in natural order (``run2`` before ``run10``)."""
+        """Return the catalogue rows of traces, by name in natural order (``run2`` before ``run10``).
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> [trace["name"] for trace in fleet.traces()]
+        ['town']
+        """
         return self.snapshot.traces
 
     info = traces
@@ -211,6 +238,12 @@ class Collection:
         QueryError
             The text is not a query, uses unknown names, or needs values that some bundles lack; the
             error shows the place.
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> fleet.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").count()
+        108
         """
         if not isinstance(query, str):
             from sgstore.lang.syntax import Pattern
@@ -238,6 +271,12 @@ class Collection:
         ------
         QueryError
             The text has no checks, or uses unknown names; the error shows the place.
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> next(iter(fleet.check("CHECK slow: ALWAYS ego.speed < 14")))
+        <Verdict 'slow' of 'town': true>
         """
         about = {"sgsm_compat": sgsm_compat, "status": status}
         return PartedChecks(self, text, parameters, about)
@@ -255,6 +294,13 @@ class Collection:
         ------
         SqlError
             ``each`` is not set, or the database rejects the statement.
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> for bundle, frames in fleet.sql("SELECT count(*) FROM frames", each=True):
+        ...     print(frames)
+        750
         """
         if not each:
             raise SqlError(
@@ -278,6 +324,12 @@ class Collection:
         ------
         StoreError, AbstractionError
             As for a store.
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> fleet.like("town#264", limit=1)
+        [<SimilarFrames from 'town#264': 1 frames, similarity 1>]
         """
         about = {"ref": frame, "name": abstraction, "ignored": [*ignore]}
         example = self._at_home(frame, worker.example_in, about)
@@ -288,7 +340,15 @@ class Collection:
         return Example.best(found, limit)
 
     def pattern(self, frame: str, *, ignore: Sequence[str] = ()) -> str:
-        """Return a pattern that describes a frame around its ego; see :meth:`sgstore.Store.pattern`."""
+        """Return a pattern that describes a frame around its ego; see :meth:`sgstore.Store.pattern`.
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> print(fleet.pattern("town#749", ignore=["Person"]))
+        MATCH (ego:Car&Ego)
+        WHERE EXISTS {(ego)-[:isIn]->(:Crosswalk)}
+        """
         return self._at_home(frame, Store.pattern, {"frame": frame, "ignore": [*ignore]})
 
     def _at_home(self, frame: str, step: Callable[..., Any], values: dict[str, Any]) -> Any:
@@ -329,6 +389,16 @@ class Collection:
             values; its result must be plain JSON values.
         asked : mapping of str to mapping
             Bundle → plain values by parameter name.
+
+        Examples
+        --------
+        >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
+        >>> (bundle,) = fleet.snapshot.bundles
+        >>> asked = {bundle["bundle"]: {"frame": "town#749", "ignore": ["Person"]}}
+        >>> for _, text in fleet.each(sgstore.Store.pattern, asked):
+        ...     print(text)
+        MATCH (ego:Car&Ego)
+        WHERE EXISTS {(ego)-[:isIn]->(:Crosswalk)}
         """
         name = f"{step.__module__}:{step.__qualname__}"
         values = {bundle: {"values": dict(given)} for bundle, given in asked.items()}

@@ -123,6 +123,13 @@ class Frame:
         Kinds of events that the frame records. Events of other kinds are unknown.
     losses : list of (str, str)
         Id and fault of each implausible number, which is treated as missing: ``("7", "length is -4.5 m")``.
+
+    Examples
+    --------
+    >>> frame = sgstore.Frame(0, ego="hero")
+    >>> frame.add("hero", "car", 0, 0, heading=0, length=4.5, width=1.9)
+    >>> len(frame), frame.ego
+    (1, 'hero')
     """
 
     __slots__ = ("ego", "entities", "events", "losses", "recorded", "time_ns")
@@ -139,7 +146,17 @@ class Frame:
         return len(self.entities)
 
     def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
-        """Return the frame after applying the configured type mapping to its entities."""
+        """Return the frame after applying the configured type mapping to its entities.
+
+        Examples
+        --------
+        >>> from sgstore.model.config import from_dict
+        >>> config = from_dict({"types": {"trafficcone": {"kind": "prop", "subkind": "cone"}}})
+        >>> frame = sgstore.Frame(0)
+        >>> frame.add("c1", "unknown", 0, 0, type_name="trafficcone")
+        >>> frame.meant(config.types).entities[0].subkind
+        'cone'
+        """
         if not types:
             return self
         frame = Frame(self.time_ns, self.ego)
@@ -166,6 +183,13 @@ class Frame:
         ------
         ValueError
             The kind of event is unknown.
+
+        Examples
+        --------
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.happened("collision", "hero", "p7")
+        >>> frame.events
+        [('collision', 'hero', 'p7')]
         """
         self.events.append(
             (_one_of("kind of event", kind, tuple(EVENT_KINDS)), str(ident), str(other))
@@ -255,6 +279,14 @@ class Frame:
         A missing or infinite number is unknown, not 0. An entity without a size is a point. An entity without a
         heading has no front. Sizes below 0 or above 1 km and speeds above 150 m/s are unknown, too;
         :attr:`losses` lists them.
+
+        Examples
+        --------
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 10, 4, heading=90, length=4.6, width=1.9, vy=8)
+        >>> frame.add("tl3", "traffic_light", 12, 30, light_state="red")
+        >>> [entity.ident for entity in frame.entities]
+        ['hero', 'tl3']
         """
         pose = (x, y, z, heading, pitch, roll, vx, vy, vz, ax, ay, az, yaw_rate)
         pose = self._plausible(str(ident), (*pose, length, width, height))

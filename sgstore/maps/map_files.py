@@ -53,6 +53,15 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
     ------
     MapError
         The file is missing, or is not a road map.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> name, text = store.file.road_map_text("town")
+    >>> size = Path(name).write_text(text)
+    >>> road_map = sgstore.read_map_file(name)
+    >>> road_map.name, road_map.warnings
+    ('town.xodr', ())
     """
     path = Path(path)
     try:

@@ -550,6 +550,16 @@ class SceneGraph:
         Online: number of entities out of ``[range] world``, and so unknown.
     excluded : frozenset of str
         Online: kinds in the frame that the settings exclude.
+
+    Examples
+    --------
+    >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+    >>> frame = sgstore.Frame(0, ego="hero")
+    >>> frame.add("hero", "car", 0, 0, heading=0)
+    >>> frame.add("p7", "person", 6, 1)
+    >>> graph = generator.step(frame)
+    >>> [(src, relation, dst) for src, relation, dst, _ in graph.edges if src == graph.ego]
+    [(0, 'super_near', 1), (0, 'sees', 1)]
     """
 
     frame_id: int
@@ -574,6 +584,12 @@ class SceneGraph:
 
         Outside this graph, only the edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows`` and map edges
         exist.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#264")
+        >>> len(graph.nodes), len(graph.known().nodes)
+        (96, 252)
         """
         if self.around is None:
             return self
@@ -585,7 +601,14 @@ class SceneGraph:
         return f"<SceneGraph {self.trace}#{self.seq}: {size}>"
 
     def places(self) -> dict[int, list[tuple[int, float]]]:
-        """Positions along own lanes: node id → pairs of (lane, distance from its start); m."""
+        """Positions along own lanes: node id → pairs of (lane, distance from its start); m.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#3")
+        >>> [(lane, round(along, 1)) for lane, along in graph.places()[1]]
+        [(-5, 77.4)]
+        """
         found: dict[int, list[tuple[int, float]]] = {}
         for src, relation, dst, about in self.edges:
             if relation == "isIn" and about.get("is_own") and "along" in about:
@@ -597,6 +620,12 @@ class SceneGraph:
 
         Traffic lights and signs are at the stop positions of the lanes they control; see
         :mod:`sgstore.maps.roads._places`.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#3")
+        >>> [(lane, round(start, 1), round(end, 1)) for lane, start, end in graph.stretches()[1]]
+        [(-5, 77.4, 77.4)]
         """
         found: dict[int, list[tuple[int, float, float]]] = {}
         signals = {node for node, about in self.nodes.items() if about["kind"] in SIGNALS}
@@ -626,6 +655,14 @@ class SceneGraph:
         shortest route counts. A lane, road, junction or crosswalk occupies an interval of lanes, so the
         distance inside is 0. A light or sign is at the stop position of the lanes that it controls. ``None``
         means no route of at most 200 m. Routes do not change lanes.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#3")
+        >>> round(graph.lane_dist(0, 1), 1), round(graph.lane_dist(1, 0), 1)
+        (21.7, -21.7)
+        >>> graph.lane_dist(0, 2) is None  # on the lane beside
+        True
         """
         if self.reach is None:
             return None
@@ -638,6 +675,12 @@ class SceneGraph:
 
         ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
         means none within 200 m.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#3")
+        >>> round(graph.to_next(1, "junction"), 1)
+        192.6
         """
         return None if self.reach is None else self.reach.next(self.stretches().get(node, ()), what)
 
@@ -646,6 +689,12 @@ class SceneGraph:
 
         Mean over about a metre of the centre line; positive in a left turn of the lane's traffic. ``None``
         means no lane, or no map.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#173")
+        >>> round(graph.curvature(1), 3)  # a left turn
+        0.046
         """
         return self._course(node)[0]
 
@@ -654,6 +703,12 @@ class SceneGraph:
 
         Mean over about a metre; positive if the lane's traffic drives uphill. ``None`` means no lane, no map,
         or a map without heights.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#264")
+        >>> graph.slope(graph.ego)
+        0.0
         """
         return self._course(node)[1]
 
@@ -662,7 +717,15 @@ class SceneGraph:
         return (None, None) if self.reach is None or place is None else self.reach.course(*place)
 
     def primary_places(self) -> dict[int, tuple[int, float]]:
-        """Primary lane of each entity: node id → (lane, distance from its start); m."""
+        """Primary lane of each entity: node id → (lane, distance from its start); m.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#3")
+        >>> lane, along = graph.primary_places()[1]
+        >>> graph.nodes[lane]["kind"], round(along, 1)
+        ('lane', 77.4)
+        """
         return {
             src: (dst, about["along"])
             for src, relation, dst, about in self.edges
@@ -678,6 +741,12 @@ class SceneGraph:
             Node ids as nodes with their attributes; the key and the attribute ``relation`` of an edge are its
             relation. An edge between entities has the attribute ``lane_dist`` if known (:meth:`lane_dist`). The
             graph's attributes are ``frame_id``, ``trace``, ``seq``, ``time_ns`` and ``ego``.
+
+        Examples
+        --------
+        >>> graph = store.file.graph("town#264")
+        >>> print(graph.to_networkx())
+        MultiDiGraph with 96 nodes and 636 edges
         """
         import networkx as nx  # imports in half a second: only on demand
 

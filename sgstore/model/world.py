@@ -729,6 +729,12 @@ class Clip:
         Name of the trace in its store.
     start_ns, end_ns : int
         Log times; ns.
+
+    Examples
+    --------
+    >>> clip = sgstore.Clip("town", 1_000_000_000, 3_000_000_000)
+    >>> (clip.end_ns - clip.start_ns) / 1e9
+    2.0
     """
 
     trace: str
@@ -736,7 +742,13 @@ class Clip:
     end_ns: int
 
     def widened(self, by: int) -> Clip:
-        """Return the clip, extended by this time at both ends; ns."""
+        """Return the clip, extended by this time at both ends; ns.
+
+        Examples
+        --------
+        >>> sgstore.Clip("town", 1_000_000_000, 3_000_000_000).widened(500_000_000)
+        Clip(trace='town', start_ns=500000000, end_ns=3500000000)
+        """
         return Clip(self.trace, self.start_ns - by, self.end_ns + by)
 
 

@@ -28,6 +28,13 @@ def duckdb(path: str | Path) -> DuckDBPyConnection:
     ------
     StoreError
         The store does not exist, or a writer process uses it.
+
+    Examples
+    --------
+    >>> connection = sgstore.duckdb("demo.sgstore")
+    >>> connection.sql("SELECT trace, count(*) FROM frames GROUP BY trace").fetchall()
+    [('town', 750)]
+    >>> connection.close()
     """
     path = Path(path)
     refuse_special(path)

@@ -69,6 +69,12 @@ class Tabular:
         ------
         MissingExtraError
             pyarrow is not installed.
+
+        Examples
+        --------
+        >>> table = store.find("MATCH (v:Bus) RETURN v.name AS name, v.speed AS speed").arrow()
+        >>> table.num_rows, table.column_names
+        (466, ['name', 'speed'])
         """
         arrow = package("pyarrow")
         table = self._table()
@@ -90,6 +96,11 @@ class Tabular:
         ------
         MissingExtraError
             pandas is not installed.
+
+        Examples
+        --------
+        >>> store.find("MATCH (v:Bus) RETURN v.name AS name, v.speed AS speed").df().shape
+        (466, 2)
         """
         pandas = package("pandas")
         if (table := self._by_values()) is not None:
@@ -104,6 +115,11 @@ class Tabular:
         ------
         MissingExtraError
             polars is not installed.
+
+        Examples
+        --------
+        >>> store.find("MATCH (v:Bus) RETURN v.name AS name, v.speed AS speed").polars().shape
+        (466, 2)
         """
         polars = package("polars")
         if (table := self._by_values()) is not None:
@@ -127,6 +143,11 @@ class Tabular:
         ------
         ExportError
             The file is not writable.
+
+        Examples
+        --------
+        >>> store.sql("SELECT * FROM entities").parquet("entities.parquet")
+        146
         """
         names, types = self._described()
         return ParquetTable.write_rows(names, self, Path(path), types)
@@ -138,16 +159,16 @@ class Tabular:
         ------
         ExportError
             The file is not writable.
+
+        Examples
+        --------
+        >>> store.sql("SELECT kind, name FROM entities").csv("entities.csv")
+        146
         """
         return write_csv(self._described()[0], self, Path(path))
 
     def relation(self) -> duckdb.DuckDBPyRelation:
         """Return all rows as a DuckDB relation (SQL table object), for filters, joins, aggregates and plots.
-
-        ::
-
-            gaps = store.find("MATCH (e:Ego), (v:Vehicle) RETURN v.kind AS kind, gap(e, v) AS metres")
-            gaps.relation().filter("metres < 5").aggregate("kind, count(*) AS often").df()
 
         The rows are queried once and copied into a new database as the table ``answer``, in memory or on disk.
         Further relations are computed when they are fetched.
@@ -156,6 +177,13 @@ class Tabular:
         ------
         ExportError
             Disk and memory are too small for the rows.
+
+        Examples
+        --------
+        >>> gaps = store.find("MATCH (e:Ego), (v:Vehicle) RETURN v.kind AS kind, gap(e, v) AS metres")
+        >>> often = gaps.relation().filter("metres < 5").aggregate("kind, count(*) AS often")
+        >>> often.order("kind").fetchall()
+        [('bus', 246), ('car', 388), ('truck', 16), ('van', 83)]
         """
         return relation_of(self.parquet)
 
@@ -173,6 +201,15 @@ class Rows(Tabular):
         True if there were more rows than requested.
     reasons : mapping of str to str
         Reasons why a pattern in the statement skips traces, by trace name.
+
+    Examples
+    --------
+    >>> rows = store.sql("SELECT trace, count(*) AS frames FROM frames GROUP BY trace")
+    >>> rows
+    <1 rows of trace, frames>
+    >>> for row in rows:
+    ...     print(row)
+    ('town', 750)
     """
 
     def __init__(
@@ -189,7 +226,13 @@ class Rows(Tabular):
 
     @property
     def values(self) -> list[tuple[Any, ...]]:
-        """Rows as tuples. Enumeration values are ``str``; NULL is ``None``."""
+        """Rows as tuples. Enumeration values are ``str``; NULL is ``None``.
+
+        Examples
+        --------
+        >>> store.sql("SELECT trace, count(*) AS frames FROM frames GROUP BY trace").values
+        [('town', 750)]
+        """
         return self._values
 
     def __repr__(self) -> str:
@@ -214,7 +257,13 @@ class Rows(Tabular):
         return self.columns, self.types
 
     def dicts(self) -> list[dict[str, Any]]:
-        """Return each row of a result as a dict: column → value."""
+        """Return each row of a result as a dict: column → value.
+
+        Examples
+        --------
+        >>> store.sql("SELECT trace, count(*) AS frames FROM frames GROUP BY trace").dicts()
+        [{'trace': 'town', 'frames': 750}]
+        """
         return [dict(zip(self.columns, row, strict=True)) for row in self.values]
 
 

@@ -228,6 +228,12 @@ class FrameRef:
         Simulation time, and log time of its leading message; ns.
     t : float
         Time since the trace start; s.
+
+    Examples
+    --------
+    >>> frame = next(store.find("MATCH (e:Ego)").frames())
+    >>> frame.trace, frame.seq, frame.t
+    ('town', 0, 0.0)
     """
 
     frame_id: int

@@ -103,6 +103,12 @@ class Verdict:
         Robustness of the check, if it has ``ROBUSTNESS``.
     absent_frames : int
         For a ``true`` verdict: number of frames with an absent entity of the check.
+
+    Examples
+    --------
+    >>> verdict = next(iter(store.check("CHECK still: ALWAYS ego.speed < 1")))
+    >>> verdict.check, verdict.trace, verdict.verdict, len(verdict.violations)
+    ('still', 'town', 'false', 1)
     """
 
     check: str
@@ -135,17 +141,37 @@ class Verdict:
 
     @property
     def first_violation(self) -> Interval | None:
-        """First violation of the check in the trace, or ``None``."""
+        """First violation of the check in the trace, or ``None``.
+
+        Examples
+        --------
+        >>> verdict = next(iter(store.check("CHECK still: ALWAYS ego.speed < 1")))
+        >>> verdict.first_violation.start, verdict.first_violation.end
+        (0.0, 74.9)
+        """
         return self.violations[0] if self.violations else None
 
     @property
     def violated(self) -> bool:
-        """True if the trace certainly violates the check."""
+        """True if the trace certainly violates the check.
+
+        Examples
+        --------
+        >>> next(iter(store.check("CHECK still: ALWAYS ego.speed < 1"))).violated
+        True
+        """
         return self.verdict == "false"
 
     @property
     def statuses(self) -> tuple[str, ...]:
-        """Status of the check after each frame as a word, if requested; otherwise empty."""
+        """Status of the check after each frame as a word, if requested; otherwise empty.
+
+        Examples
+        --------
+        >>> run = store.check("CHECK still: ALWAYS ego.speed < 1", status=True)
+        >>> next(iter(run)).statuses[:2]
+        ('false', 'false')
+        """
         return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
 
 

@@ -119,6 +119,14 @@ class CheckRun:
     ------
     QueryError
         The text has no checks, or they are invalid. The message gives the place.
+
+    Examples
+    --------
+    >>> text = "CHECK slow: ALWAYS ego.speed < 14; CHECK still: ALWAYS ego.speed < 1"
+    >>> for verdict in store.check(text):
+    ...     print(verdict.check, verdict.trace, verdict.verdict)
+    slow town true
+    still town false
     """
 
     def __init__(
@@ -157,12 +165,26 @@ class CheckRun:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the checks in the text, in order."""
+        """Names of the checks in the text, in order.
+
+        Examples
+        --------
+        >>> store.check("CHECK slow: ALWAYS ego.speed < 14; CHECK ALWAYS ego.speed < 20").names
+        ('slow', 'check 2')
+        """
         return tuple(one.check.name for one in self._checks)
 
     @property
     def quantitative(self) -> bool:
-        """True if at least one check of the text requests its robustness."""
+        """True if at least one check of the text requests its robustness.
+
+        Examples
+        --------
+        >>> store.check("CHECK slow: ALWAYS ego.speed < 14").quantitative
+        False
+        >>> store.check("CHECK slow: ALWAYS ego.speed < 14 ROBUSTNESS").quantitative
+        True
+        """
         return any(one.check.robustness for one in self._checks)
 
     @property
@@ -170,17 +192,36 @@ class CheckRun:
         """True if each check of the text is a condition that all entities must meet in every frame.
 
         Frames then have margins.
+
+        Examples
+        --------
+        >>> store.check("CHECK slow: ALWAYS ego.speed < 14").lasting
+        True
+        >>> store.check("CHECK stops: EVENTUALLY ego.speed < 1").lasting
+        False
         """
         return all(kept_throughout(one.check) is not None for one in self._checks)
 
     @property
     def returned(self) -> dict[str, tuple[str, ...]]:
-        """``RETURN`` column names of each check: check name → column names."""
+        """``RETURN`` column names of each check: check name → column names.
+
+        Examples
+        --------
+        >>> store.check("CHECK apart: FORALL (v:Vehicle) ALWAYS gap(ego, v) > 1 RETURN v.kind").returned
+        {'apart': ('v.kind',)}
+        """
         return returned_by(one.check for one in self._checks)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes in the checks, such as a text that equals no name in the store."""
+        """Notes on likely mistakes in the checks, such as a text that equals no name in the store.
+
+        Examples
+        --------
+        >>> store.check("CHECK none: FORALL (v:Vehicle) ALWAYS NOT v.name = 'car 7'").notes
+        ("nothing in the store has the name 'car 7'; the nearest is 'car 0'",)
+        """
         with self._file.snapshot():
             compared = [pair for one in self._checks for pair in compared_in_check(one.check)]
             found = dict.fromkeys(compared)
@@ -188,7 +229,14 @@ class CheckRun:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Data that the settings excluded from the checked traces; see :func:`sgstore.model.scope.scope_of`."""
+        """Data that the settings excluded from the checked traces; see :func:`sgstore.model.scope.scope_of`.
+
+        Examples
+        --------
+        >>> scope = store.check("CHECK slow: ALWAYS ego.speed < 14").scope
+        >>> scope["world"], scope["states"], scope["beyond_world"]
+        (200.0, 36189, 3153)
+        """
         world = any(one.check.world for one in self._checks)
         with self._file.snapshot():
             return scope_of((one.report for one in self._file.traces()), world=world)
@@ -203,6 +251,14 @@ class CheckRun:
         """Yield the unknown verdicts of the traces that lack data for a check.
 
         Other traces are not evaluated.
+
+        Examples
+        --------
+        >>> list(store.check("CHECK slow: ALWAYS ego.speed < 14").unknown())
+        []
+        >>> for verdict in store.check("CHECK safe: ALWAYS NOT HAPPENS collision(ego)").unknown():
+        ...     print(verdict)
+        <Verdict 'safe' of 'town': unknown, it does not record events of the kind collision>
         """
         with self._file.snapshot():
             for one in compile_checks(self._text, self._catalog(), self._parameters):
@@ -218,6 +274,13 @@ class CheckRun:
         frame_ids : (F,) int64
             Frame ids of an answerable trace.
         margins : (F,) or (1,) float64
+
+        Examples
+        --------
+        >>> run = store.check("CHECK slow: ALWAYS ego.speed < 14 ROBUSTNESS")
+        >>> for frames, margins in run.margins():
+        ...     print(len(frames), "frames, margin", round(float(margins.min()), 2))
+        750 frames, margin 1.8
         """
         with self._file.snapshot():
             (one,) = compile_checks(self._text, self._catalog(), self._parameters)
@@ -227,7 +290,14 @@ class CheckRun:
                     yield trace.frame_ids, check.margins(trace)
 
     def explain(self) -> str:
-        """Return a text with the evaluation plan of each check: temporal formula and single-frame queries."""
+        """Return a text with the evaluation plan of each check: temporal formula and single-frame queries.
+
+        Examples
+        --------
+        >>> plan = store.check("CHECK slow: ALWAYS ego.speed < 14").explain()
+        >>> plan.splitlines()[1]
+        'formula NOT (TRUE UNTIL (a1 OR a2-))'
+        """
         parts = [
             StoreCheck(self._file, one, compat=False, status=False).text() for one in self._checks
         ]

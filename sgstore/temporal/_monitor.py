@@ -224,6 +224,15 @@ class Monitor:
     -----
     If the graphs cannot have a relation (such as a lane relation without a map), a check that uses it has the
     verdict ``unknown``, and a pattern has no matches.
+
+    Examples
+    --------
+    >>> monitor = sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14")
+    >>> frame = sgstore.Frame(0, ego="hero")
+    >>> frame.add("hero", "car", 0, 0, vx=20, vy=0)
+    >>> for event in monitor.step(frame):
+    ...     print(event.kind, event.name)
+    violated slow
     """
 
     def __init__(  # noqa: PLR0913 - most have names
@@ -303,6 +312,14 @@ class Monitor:
         ------
         ValueError
             The frame is inconsistent; see :meth:`sgstore.sgg.SceneGraphGenerator.steps`. It is ignored.
+
+        Examples
+        --------
+        >>> monitor = sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14")
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, vx=20, vy=0)
+        >>> [event.kind for event in monitor.step(frame)]
+        ['violated']
         """
         with GcPaused():  # the graphs are freed inside
             return self._step(frame)
@@ -321,6 +338,15 @@ class Monitor:
             One graph for each of :attr:`egos`.
         classed : bool
             True for the last graphs of :attr:`generator`, which can then return their classes.
+
+        Examples
+        --------
+        >>> monitor = sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14")
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, vx=20, vy=0)
+        >>> graph = monitor.generator.step(frame)
+        >>> [event.kind for event in monitor.look([graph])]
+        ['violated']
         """
         here, people = self._ask(graphs, classed=classed)
         events = self._tell(here, people)
@@ -372,12 +398,25 @@ class Monitor:
 
     @property
     def egos(self) -> tuple[str, ...]:
-        """Ids of the monitored egos. An empty id means the ego of the frame."""
+        """Ids of the monitored egos. An empty id means the ego of the frame.
+
+        Examples
+        --------
+        >>> monitor = sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14")
+        >>> monitor.egos
+        ('',)
+        """
         return tuple(self._egos)
 
     @property
     def patterns(self) -> dict[str, Query]:
-        """Monitored patterns: name → query with resolved names."""
+        """Monitored patterns: name → query with resolved names.
+
+        Examples
+        --------
+        >>> list(sgstore.Monitor("MATCH (v:Vehicle)", called="cars").patterns)
+        ['cars']
+        """
         return {follow.name: follow.query for _, follow, _ in self._follows}
 
     @property
@@ -385,6 +424,15 @@ class Monitor:
         """Return the status of each check: ``true``, ``false``, ``presumably_true`` or ``presumably_false``.
 
         The ``presumably`` values are the verdicts if the trace ended now. The status can also be ``unknown``.
+
+        Examples
+        --------
+        >>> monitor = sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14")
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, vx=20, vy=0)
+        >>> events = monitor.step(frame)
+        >>> monitor.status
+        {'slow': 'false'}
         """
         known = {
             watch.name: "unknown" if waiting.reason else watch.status()
@@ -394,7 +442,17 @@ class Monitor:
 
     @property
     def robustness(self) -> dict[str, Robustness]:
-        """Return the robustness of each check with ``ROBUSTNESS`` if the trace ends now: name → robustness."""
+        """Return the robustness of each check with ``ROBUSTNESS`` if the trace ends now: name → robustness.
+
+        Examples
+        --------
+        >>> monitor = sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14 ROBUSTNESS")
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, vx=20, vy=0)
+        >>> events = monitor.step(frame)
+        >>> monitor.robustness["slow"].value
+        -6.0
+        """
         watches = self._watches if self._last is not None else []
         told = ((w.name, w.robustness) for _, w, waiting in watches if not waiting.reason)
         return {name: one for name, one in told if one is not None}
@@ -409,6 +467,14 @@ class Monitor:
         frames : iterable of Frame
         duration_s : float, optional
             Simulation time to process; s. Default: all frames.
+
+        Examples
+        --------
+        >>> monitor = sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14")
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, vx=20, vy=0)
+        >>> monitor.run([frame])
+        (<Verdict 'slow' of 'online': false, 1 violation>,)
         """
         try:
             for frame in frames:
@@ -423,6 +489,15 @@ class Monitor:
         """End the trace, and return the verdicts of the checks.
 
         A store with the same trace gives the same verdicts.
+
+        Examples
+        --------
+        >>> monitor = sgstore.Monitor("CHECK slow: ALWAYS ego.speed < 14")
+        >>> frame = sgstore.Frame(0, ego="hero")
+        >>> frame.add("hero", "car", 0, 0, vx=20, vy=0)
+        >>> events = monitor.step(frame)
+        >>> monitor.finish()
+        (<Verdict 'slow' of 'online': false, 1 violation>,)
         """
         if self._last is None:
             return ()

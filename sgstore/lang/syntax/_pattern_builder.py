@@ -27,17 +27,6 @@ _RESERVED: Final = frozenset({"label", "kind", "where", "relation", "name"})
 class Pattern:
     """Query pattern that is built step by step. Each method returns a new pattern.
 
-    ::
-
-        crossing = (
-            Pattern()
-            .node("e", "Ego")
-            .node("p", "Person", special="child")
-            .edge("e", "near|very_near", "p")
-            .where("abs(bearing(e, p)) < 45")
-        )
-        store.find(crossing)
-
     Attributes
     ----------
     parts : tuple of str
@@ -48,6 +37,14 @@ class Pattern:
         Text after ``RETURN``; empty for whole matches.
     parameters : mapping
         Values of the parameters ``$name`` in the text.
+
+    Examples
+    --------
+    >>> crossing = sgstore.Pattern().node("e", "Ego").node("p", "Person").edge("e", "near_coll", "p")
+    >>> print(crossing)
+    MATCH (e:Ego), (p:Person), (e)-[:near_coll]->(p)
+    >>> store.find(crossing).count()
+    4
     """
 
     parts: tuple[str, ...] = ()
@@ -71,6 +68,14 @@ class Pattern:
         ------
         QueryError
             Invalid name or label.
+
+        Examples
+        --------
+        >>> print(sgstore.Pattern().node("p", "Person").node("v", "Vehicle&!Ego"))
+        MATCH (p:Person), (v:Vehicle&!Ego)
+        >>> pattern = sgstore.Pattern().node("l", "TrafficLight", light_state="red")
+        >>> print(pattern, dict(pattern.parameters))
+        MATCH (l:TrafficLight {light_state: $l_light_state}) {'l_light_state': 'red'}
         """
         inside = _checked(name, _NAME, "a name") + _label(label)
         parts, values = self._properties(name, properties)
@@ -105,6 +110,12 @@ class Pattern:
         ------
         QueryError
             One of the arguments is invalid in a pattern.
+
+        Examples
+        --------
+        >>> pair = sgstore.Pattern().node("e", "Ego").node("p", "Person")
+        >>> print(pair.edge("e", "near|very_near", "p"))
+        MATCH (e:Ego), (p:Person), (e)-[:near|very_near]->(p)
         """
         ends = [_checked(end, _NAME, "a name") for end in (src, dst)]
         inside = (_checked(name, _NAME, "a name") if name else "") + _label(relation)
@@ -114,11 +125,24 @@ class Pattern:
         return self._with(part=f"({ends[0]})-[{inside}]-{'' if both else '>'}({ends[1]})")
 
     def where(self, condition: str, /, **parameters: Any) -> Pattern:
-        """Return a new pattern with an additional condition, written as after ``WHERE``."""
+        """Return a new pattern with an additional condition, written as after ``WHERE``.
+
+        Examples
+        --------
+        >>> fast = sgstore.Pattern().node("v", "Vehicle").where("v.speed > $least", least=9)
+        >>> print(fast)
+        MATCH (v:Vehicle) WHERE (v.speed > $least)
+        """
         return self._with(condition=f"({condition})", values=parameters)
 
     def returns(self, what: str, /) -> Pattern:
-        """Return a new pattern with values to return, written as after ``RETURN``."""
+        """Return a new pattern with values to return, written as after ``RETURN``.
+
+        Examples
+        --------
+        >>> print(sgstore.Pattern().node("v", "Vehicle").returns("v.name, v.speed"))
+        MATCH (v:Vehicle) RETURN v.name, v.speed
+        """
         return Pattern(self.parts, self.conditions, what, self.parameters)
 
     def __repr__(self) -> str:
@@ -148,6 +172,16 @@ class Pattern:
         ------
         QueryError
             A part of the graph is invalid in a pattern.
+
+        Examples
+        --------
+        >>> import networkx as nx
+        >>> graph = nx.DiGraph()
+        >>> graph.add_node("e", label="Ego")
+        >>> graph.add_node("p", label="Person")
+        >>> graph.add_edge("e", "p", relation="near_coll")
+        >>> print(sgstore.Pattern.of(graph))
+        MATCH (e:Ego), (p:Person), (e)-[:near_coll]->(p)
         """
         names = {node: _name_of(node, number) for number, node in enumerate(graph.nodes)}
         pattern = cls()

@@ -293,6 +293,14 @@ class Config:
 
     Equal configs give equal graphs. The comment of each field, ``docs/parameters.md`` and ``sgstore config``
     explain the settings.
+
+    Examples
+    --------
+    >>> config = sgstore.Config(ego="hero", rate=5.0)
+    >>> config
+    Config(ego='hero', rate=5.0)
+    >>> config.range.radius
+    50.0
     """
 
     range: RangeSettings = field(default_factory=RangeSettings)
@@ -379,13 +387,27 @@ class Config:
 
     @property
     def signs(self) -> Signs:
-        """Settings for reading the signals of a road map with :func:`sgstore.maps.opendrive.read_map`."""
+        """Settings for reading the signals of a road map with :func:`sgstore.maps.opendrive.read_map`.
+
+        Examples
+        --------
+        >>> from sgstore.model.config import from_dict
+        >>> from_dict({"types": {"board": {"kind": "sign"}}}).signs
+        Signs(kinds=(('board', 'sign'),), orientation='asam')
+        """
         kinds = tuple((name, of.kind) for name, of in self.types.items() if of.kind in SIGNALS)
         return Signs(kinds, self.orientation)
 
     @property
     def notes(self) -> list[str]:
-        """Return notes on user-defined relation names that resemble a built-in name, perhaps by mistake."""
+        """Return notes on user-defined relation names that resemble a built-in name, perhaps by mistake.
+
+        Examples
+        --------
+        >>> from sgstore.model.config import from_dict
+        >>> from_dict({"proximity": {"names": ["nearr"], "upper": [10.0]}}).notes
+        ["setting 'proximity.names': 'nearr' is a relation of your own; did you mean 'near'?"]
+        """
         return [
             f"setting '{table}.names': {name!r} is a relation of your own; did you mean {like!r}?"
             for table, known in (("proximity", PROXIMITY), ("direction", DIRECTIONS))
@@ -394,7 +416,15 @@ class Config:
         ]
 
     def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
-        """Return the counts of the type names without a mapping."""
+        """Return the counts of the type names without a mapping.
+
+        Examples
+        --------
+        >>> from sgstore.model.config import from_dict
+        >>> config = from_dict({"types": {"vehicle.rickshaw": {"kind": "bicycle"}}})
+        >>> config.unknown_of({"vehicle.rickshaw": 3, "vehicle.tuktuk": 2})
+        {'vehicle.tuktuk': 2}
+        """
         return {name: n for name, n in types.items() if name.lower() not in self.types}
 
     def __repr__(self) -> str:
@@ -409,7 +439,13 @@ class Config:
         return f"Config({', '.join(told)})"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the settings as plain values, as in TOML and JSON."""
+        """Return the settings as plain values, as in TOML and JSON.
+
+        Examples
+        --------
+        >>> sgstore.Config().as_dict()["range"]["radius"]
+        50.0
+        """
         return asdict(self)
 
 
