@@ -16,6 +16,7 @@ import duckdb
 import pytest
 import thorough
 import typer
+import verb_lines
 from children import FOLDERS
 from test_cli_streams import SLOTS
 from verb_lines import LINES, verbs
@@ -89,38 +90,40 @@ ENDLESS = {
 """Questions that take longer than the deadline, however fast the machine is."""
 
 
-@pytest.fixture
-def bounded_run() -> Callable[[list[str]], int]:
-    """Runs a command line in a process of its own: what comes too late ends that one, and no other test."""
+@pytest.fixture(scope="module")
+def late(town_store: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Of each endless question: exit code, length of stdout, stderr, and its folder.
 
-    def bounded(line: list[str]) -> int:
-        command = [sys.executable, "-m", "sgstore", *line]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
-        sys.stdout.write(done.stdout)
-        sys.stderr.write(done.stderr)
-        return done.returncode
-
-    return bounded
+    Each runs in a process of its own, forked from one that imported all: what comes too late ends that one.
+    """
+    folders = {verb: tmp_path_factory.mktemp(verb.replace(" ", "-")) for verb in ENDLESS}
+    asked = []
+    for verb, line in ENDLESS.items():
+        names = {"store": town_store, "new": folders[verb] / "new"}
+        words = [*verb.split(), *(part.format(**names) for part in line), "--timeout", "200ms"]
+        asked.append([(words, "")])
+    done = subprocess.run(
+        [sys.executable, verb_lines.__file__],
+        input=json.dumps(asked),
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=600,
+    )
+    ends = map(json.loads, done.stdout.splitlines())
+    return {verb: (*end, folders[verb]) for verb, end in zip(ENDLESS, ends, strict=True)}
 
 
 @pytest.mark.parametrize("verb", ENDLESS)
 def test_a_question_ends_at_its_deadline_and_leaves_nothing(
-    verb: str,
-    town_store: Path,
-    tmp_path: Path,
-    bounded_run: Callable[[list[str]], int],
-    capsys: pytest.CaptureFixture[str],
+    verb: str, late: dict[str, Any]
 ) -> None:
-    names = {"store": town_store, "new": tmp_path / "new"}
-    line = [*verb.split(), *(part.format(**names) for part in ENDLESS[verb])]
+    code, _, err, folder = late[verb]
 
-    assert bounded_run([*line, "--timeout", "200ms"]) == 2
-
-    err = capsys.readouterr().err
+    assert code == 2
     assert "stopped after 0.2 s" in err
     assert "give it more time, or ask for less" in err
-    assert not list(tmp_path.iterdir())
-    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert not list(folder.iterdir())
 
 
 ONE_STEP = "SELECT count(*) FROM nodes a, nodes b, nodes c WHERE a.x + b.x + c.x > 3"
@@ -197,14 +200,22 @@ def in_a_process(code: str, store: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")
 
 
-@pytest.mark.parametrize("face", ENDLESS_IN_PYTHON)
+FACES = [[face] for face in ENDLESS_IN_PYTHON] if thorough.LONG else [[*ENDLESS_IN_PYTHON]]
+"""Questions that one process asks; in ``make oracle`` each has a process of its own."""
+
+
+@pytest.mark.parametrize("faces", FACES, ids=", ".join)
 def test_what_a_handler_of_signals_raises_ends_a_question_of_the_library(
-    face: str, town_store: Path
+    faces: list[str], town_store: Path
 ) -> None:
     code = f"""
 from test_cli_ending import ENDLESS_IN_PYTHON
-alarmed(lambda: ENDLESS_IN_PYTHON[{face!r}](store))
-assert store.sql("SELECT count(*) FROM frames").values == [(750,)]
+for face in {faces!r}:
+    try:
+        alarmed(lambda: ENDLESS_IN_PYTHON[face](store))
+        assert store.sql("SELECT count(*) FROM frames").values == [(750,)]
+    except BaseException as error:
+        raise AssertionError(face) from error
 print("done")
 """
     in_a_process(code, town_store)
