@@ -1,1 +1,1 @@
-"""Tools that know nothing about driving: files, logs, quoting, markup, geometry, plugins, processes."""
+"""General tools without knowledge of driving: files, logs, quoting, markup, geometry, plugins, processes."""

@@ -24,7 +24,7 @@ _CELL: Final = "text-align:{align};padding:0.15em 0.8em;white-space:pre-wrap"
 
 
 def cell(value: Any, longest: int = LONGEST) -> str:
-    """Format a value as one line with at most this number of characters."""
+    """Format a value as one line of text with at most ``longest`` characters."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -39,7 +39,7 @@ def cell(value: Any, longest: int = LONGEST) -> str:
 def html_table(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], caption: str = "", below: str = ""
 ) -> str:
-    """Return an HTML table with a caption above and a text below.
+    """Return an HTML table with a caption above it and a text below it.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def _html_cell(tag: str, value: Any) -> str:
 
 
 def html_media(data: bytes, kind: str, text: str = "") -> str:
-    """Return HTML with an embedded picture or video, and a text below.
+    """Return HTML with an embedded picture or video, and a text below it.
 
     Parameters
     ----------

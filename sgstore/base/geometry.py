@@ -1,4 +1,4 @@
-"""Plane geometry on arrays, and the conventions of the project.
+"""Plane geometry of points, angles and boxes on arrays, with the axis conventions of the project.
 
 Conventions
 -----------
@@ -25,14 +25,14 @@ Floats: TypeAlias = "NDArray[np.float64]"
 
 
 def wrapped(angle: Floats) -> Floats:
-    """Return angles wrapped into (-π, π]; rad. An infinite angle becomes NaN."""
+    """Wrap angles into (-π, π]; rad. An infinite angle becomes NaN."""
     with np.errstate(invalid="ignore"):
         turned = angle - 2 * np.pi * np.ceil((angle - np.pi) / (2 * np.pi))
     return np.minimum(turned, np.pi)  # Rounding can exceed π slightly.
 
 
 def corners(boxes: Floats) -> Floats:
-    """Return the four corners of each box.
+    """Return the four corners of each box (rectangle given by centre, heading, length and width).
 
     Parameters
     ----------
@@ -54,20 +54,20 @@ def corners(boxes: Floats) -> Floats:
 
 
 def offsets(dx: Floats, dy: Floats, heading: Floats) -> tuple[Floats, Floats]:
-    """Return the longitudinal (ahead) and lateral (left) parts of vectors in axes rotated by ``heading``."""
+    """Split vectors into a part ahead and a part to the left, in axes rotated by ``heading``."""
     cos, sin = np.cos(heading), np.sin(heading)
     return dx * cos + dy * sin, dy * cos - dx * sin
 
 
 def bearings(dx: Floats, dy: Floats, heading: Floats) -> Floats:
-    """Return the directions of vectors relative to ``heading``, in (-π, π]; rad. Zero vectors give 0."""
+    """Return the directions of vectors relative to a heading, in (-π, π]; rad. Zero vectors give 0."""
     # The difference of two angles is exact for common headings (0, π/2, π). The angle of rotated components
     # is not: the cosine of the double nearest to π/2 is 6e-17.
     return np.where((dx == 0) & (dy == 0), 0 * heading, wrapped(np.arctan2(dy, dx) - heading))
 
 
 def gap_to_points(boxes: Floats, x: Floats, y: Floats) -> Floats:
-    """Return the shortest distance between each box and its point; 0 in or on the box.
+    """Return the shortest distance between each box and its point; 0 if the point is in the box.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ Corner = Sequence[float]
 
 
 def is_simple(corners: Sequence[Corner]) -> bool:
-    """True if the polygon does not cross or touch itself."""
+    """Return True if a polygon does not cross or touch itself."""
     sides = list(zip(corners, (*corners[1:], corners[0]), strict=True))
     folded_back = any(
         _turn(*one, other[1]) == 0 and not _between(*one, other[1], ahead=True)
@@ -101,7 +101,7 @@ def is_simple(corners: Sequence[Corner]) -> bool:
 
 
 def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
-    """True if two sides have a common point."""
+    """Return True if two sides of a polygon have a common point."""
     ends = ((*one, other[0]), (*one, other[1]), (*other, one[0]), (*other, one[1]))
     turns = [_turn(*three) for three in ends]
     if turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0:
@@ -110,7 +110,7 @@ def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
 
 
 def _between(a: Corner, b: Corner, c: Corner, *, ahead: bool = False) -> bool:
-    """True if c lies between a and b on their line. With ``ahead``: true if c lies beyond b."""
+    """Return True if point c lies between points a and b on their line; with ``ahead``, if c lies beyond b."""
     if ahead:
         return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
     return all(min(p, q) <= r <= max(p, q) for p, q, r in zip(a, b, c, strict=True))

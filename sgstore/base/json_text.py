@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def json_text(value: object, word: Callable[[float], str | None] = lambda _: None) -> str:
-    """Return a value as compact JSON. Infinite numbers and NaN are replaced as in :func:`finite`."""
+    """Return a value as compact JSON text. Infinite numbers and NaN are replaced."""
     try:
         return json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
     except (TypeError, ValueError):
@@ -21,7 +21,7 @@ def json_text(value: object, word: Callable[[float], str | None] = lambda _: Non
 
 
 def finite(value: Any, word: Callable[[float], str | None] = lambda _: None) -> Any:
-    """Return a value in JSON types, with infinite numbers and NaN replaced by ``word(number)``.
+    """Convert a value to JSON types. Infinite numbers and NaN are replaced by ``word(number)``.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def float32(number: float) -> float | None:
 
 
 def shortest(number: float | None) -> float | None:
-    """Return the float64 with the shortest text that rounds to the same float32."""
+    """Return the float64 number with the shortest decimal text that rounds to the same float32 number."""
     if number is None or not math.isfinite(number):
         return number
     texts = (f"{number:.{digits}g}" for digits in range(6, 10))

@@ -1,4 +1,4 @@
-"""Loggers named ``sgstore.*`` for Python's logging. They cost nothing without a listener.
+"""Loggers named ``sgstore.*`` for Python's logging module. Without handlers, they cost almost no time.
 
 Use standard logging: ``logging.basicConfig(level="DEBUG")``, or a level and a handler for
 ``logging.getLogger("sgstore")``. The option ``--verbose`` of the command line does the same. A null handler
@@ -14,7 +14,7 @@ __all__ = ["logger"]
 
 
 class _Logger:
-    """Logger of one topic. It is created at the first message, if logging is in use.
+    """Logger for one topic, such as ``sgstore.store``, created at its first message.
 
     A program that listens has imported ``logging``. Otherwise sgstore does not import it.
     """
@@ -28,7 +28,7 @@ class _Logger:
         self._tell("debug", text, values)
 
     def info(self, text: str, *values: object) -> None:
-        """Log a completed task."""
+        """Log the completion of a task."""
         self._tell("info", text, values)
 
     def _tell(self, level: str, text: str, values: tuple[object, ...]) -> None:
@@ -44,5 +44,5 @@ class _Logger:
 
 
 def logger(room: str) -> _Logger:
-    """Return the logger of a topic: ``sgstore.store`` for ``store``."""
+    """Return the logger for a topic, for example ``sgstore.store`` for the topic ``store``."""
     return _Logger(room)

@@ -1,4 +1,4 @@
-"""Safe parser of untrusted XML, element by element, with bounds on time and memory.
+"""Safe parser of untrusted XML, element by element, with limits on time and memory.
 
 The parser is expat of the standard library, without a tree. It rejects document type declarations and thus
 entities, so texts cannot expand. Depth and the numbers of elements and attributes are limited.
@@ -17,7 +17,7 @@ MAX_ATTRIBUTES: Final = 64
 
 
 class MarkupError(ValueError):
-    """Invalid XML, or XML beyond a size limit; ``element`` is the tag that exceeded the limit."""
+    """Error: XML text is invalid, or exceeds a size limit."""
 
     def __init__(self, reason: str, element: str = "") -> None:
         self.element = element
@@ -25,7 +25,7 @@ class MarkupError(ValueError):
 
 
 class MarkupParser:
-    """Incremental XML parser. It calls back at the start and end of each element.
+    """Incremental XML parser. It calls functions at the start and end of each element.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class MarkupParser:
             self._parser.CharacterDataHandler = text
 
     def feed(self, data: str | bytes, *, last: bool = False) -> None:
-        """Parse the next piece of the text.
+        """Parse the next piece of an XML text.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Loops compiled by numba, if it is installed: the extra ``[fast]``.
+"""Compilation of loops by numba, if it is installed (optional dependency ``[fast]``).
 
 Without numba, numpy computes the same results. Loops only add, multiply, divide, take roots and compare, with
 the same rounding as numpy; numpy computes all angles. Numba takes 0.5 s to start, and loops save 12 to 35 ns
@@ -25,17 +25,17 @@ _seen: dict[str, float] = {"pairs": 0, "enough": WORTH}
 
 
 def count(pairs: int) -> None:
-    """Add to the number of processed pairs of bodies."""
+    """Add to the number of pairs of objects that this process has handled."""
     _seen["pairs"] += pairs
 
 
 def worth() -> bool:
-    """True if compiled loops are worthwhile: after many pairs of bodies, and with numba installed."""
+    """Return True if compiled loops save time: after many pairs of objects, and with numba installed."""
     return _seen["pairs"] >= _seen["enough"] and _numba() is not None
 
 
 def use_loops(after: float = WORTH) -> bool:
-    """Use compiled loops after this number of pairs. True if numba is installed."""
+    """Use compiled loops after a number of pairs of objects. Return True if numba is installed."""
     _seen.update(pairs=0, enough=after)
     return _numba() is not None
 

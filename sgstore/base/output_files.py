@@ -1,4 +1,4 @@
-"""Atomic output: files appear complete or not at all.
+"""Atomic output files: a file appears complete or not at all.
 
 A file is written under a temporary name, then renamed. A full disk, a crash or an interrupt does not damage the
 previous file, and readers never see half a file. Places that a rename cannot replace (a pipe, a device,
@@ -49,11 +49,11 @@ def without_controls(text: str) -> str:
 
 
 class ReaderGoneError(ExportError):
-    """The reader closed the output pipe, as ``head`` does. The work can stop."""
+    """Error: the reading program closed the output pipe, as ``head`` does. The work can stop."""
 
 
 class Stream(io.RawIOBase):
-    """Writable stream on a file descriptor. Errors are raised as :class:`ExportError` with the file name.
+    """Writable stream on a file descriptor. Errors become :class:`ExportError` with the file name.
 
     Parameters
     ----------
@@ -81,11 +81,11 @@ class Stream(io.RawIOBase):
         self.lost = False
 
     def writable(self) -> bool:
-        """True: the stream is writable."""
+        """Return True: the stream is writable."""
         return True
 
     def seekable(self) -> bool:
-        """True if the stream supports seeking."""
+        """Return True if the stream supports seeking."""
         try:
             os.lseek(self._descriptor, 0, os.SEEK_CUR)
         except OSError:
@@ -93,19 +93,19 @@ class Stream(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Move to an offset in bytes, and return the new position."""
+        """Move to a byte offset in the stream, and return the new position."""
         return os.lseek(self._descriptor, offset, whence)
 
     def fileno(self) -> int:
-        """Return the file descriptor."""
+        """Return the file descriptor of the stream."""
         return self._descriptor
 
     def isatty(self) -> bool:
-        """True if the stream is a terminal."""
+        """Return True if the stream is a terminal."""
         return os.isatty(self._descriptor)
 
     def write(self, data: Any, /) -> int:
-        """Write all bytes, and return their number."""
+        """Write all bytes to the stream, and return their number."""
         left = memoryview(data).cast("B")
         size = len(left)
         while left and not self.lost:
@@ -139,7 +139,7 @@ class Stream(io.RawIOBase):
 
 
 class OutputFile:
-    """Output file that appears in its place only when complete.
+    """Output file that gets its final name only when it is complete.
 
     Parameters
     ----------
@@ -173,14 +173,17 @@ class OutputFile:
             return self._stack.enter_context(working_folder("output"))
 
     def path(self) -> Path:
-        """Return the temporary path of the file. :meth:`keep` moves the file to its final place."""
+        """Return a temporary path for the content. :meth:`keep` moves this file to its final path."""
         if self._path is None:
             with _told(self._to):
                 self._path = self._stack.enter_context(working_folder("output")) / "output"
         return self._path
 
     def stream(self) -> BinaryIO:
-        """Return a byte stream for the content, instead of :meth:`path`. It closes with the output."""
+        """Return a byte stream for the content of the output file.
+
+        It closes with the output; use it instead of :meth:`path`.
+        """
         with _told(self._to):
             if self._path is None:
                 descriptor = _descriptor(self._to)
@@ -190,7 +193,7 @@ class OutputFile:
         return self._stream
 
     def keep(self) -> None:
-        """Complete the output, and move it to its final place.
+        """Complete the output file, and move it to its final path.
 
         Raises
         ------
@@ -221,7 +224,7 @@ class OutputFile:
             _copy(place, target, str(self._to))
 
     def discard(self) -> None:
-        """Discard the output. The previous file does not change."""
+        """Discard the new output file. An older file at the final path stays unchanged."""
         if self._stream is not None and not self._stream.closed:
             raw = self._stream.raw
             if isinstance(raw, Stream):
@@ -232,7 +235,7 @@ class OutputFile:
 
 @contextmanager
 def _complete(to: str | Path) -> Generator[OutputFile]:
-    """Yield an output. It is kept at the end of the block, or discarded after an exception."""
+    """Context manager that yields an output file. It is kept at the end, or discarded after an exception."""
     output = OutputFile(to)
     try:
         yield output
@@ -243,7 +246,7 @@ def _complete(to: str | Path) -> Generator[OutputFile]:
 
 @contextmanager
 def written(to: str | Path) -> Generator[BinaryIO]:
-    """Yield a byte stream. The file appears complete at the end of the block, or not at all.
+    """Context manager that yields a byte stream. The file appears complete at the end, or not at all.
 
     Raises
     ------
@@ -256,7 +259,10 @@ def written(to: str | Path) -> Generator[BinaryIO]:
 
 @contextmanager
 def written_text(to: str | Path) -> Generator[TextIO]:
-    """Yield a UTF-8 text stream, as :func:`written` does. Line ends stay; invalid characters become escapes."""
+    """Context manager that yields a UTF-8 text stream.
+
+    The file appears complete at the end. Line ends stay, and invalid characters become escapes.
+    """
     with written(to) as stream:
         text = io.TextIOWrapper(stream, "utf-8", errors="backslashreplace", newline="")
         yield text
@@ -265,7 +271,7 @@ def written_text(to: str | Path) -> Generator[TextIO]:
 
 @contextmanager
 def written_at(to: str | Path) -> Generator[Path]:
-    """Yield a temporary path for a new file. The file moves to its final place at the end of the block.
+    """Context manager that yields a temporary path. The file moves to its final path at the end.
 
     Raises
     ------
@@ -277,7 +283,7 @@ def written_at(to: str | Path) -> Generator[Path]:
 
 
 def write_bytes(to: str | Path, data: bytes) -> None:
-    """Write a whole file atomically.
+    """Write a whole file atomically: it appears complete or not at all.
 
     Raises
     ------
@@ -299,7 +305,7 @@ def _told(to: Path) -> Generator[None]:
 
 
 def _target(to: Path) -> Path | None:
-    """Return the file to replace, with links resolved. ``None`` means a pipe, a device or an open stream."""
+    """Return the file that the output replaces, with links resolved. ``None``: a pipe or open stream."""
     try:
         about = to.stat()
     except FileNotFoundError:
@@ -314,7 +320,7 @@ def _target(to: Path) -> Path | None:
 
 
 def _open_here(to: Path, about: os.stat_result) -> int | None:
-    """Return the open descriptor for a name such as ``/dev/stdout``, or ``None``."""
+    """Return the open file descriptor for a name such as ``/dev/stdout``, or ``None``."""
     named = _DESCRIPTOR.fullmatch(str(to))
     if named:
         return int(named[1] or named[2])
@@ -326,7 +332,7 @@ def _open_here(to: Path, about: os.stat_result) -> int | None:
 
 
 def _descriptor(to: Path) -> int:
-    """Open a descriptor to write into an existing pipe, device or stream."""
+    """Open an existing pipe, device or stream for writing, and return the file descriptor."""
     mine = _open_here(to, to.stat())
     if mine is None:
         return os.open(to, os.O_WRONLY)
@@ -337,7 +343,7 @@ def _descriptor(to: Path) -> int:
 
 
 def _copy(place: Path, to: Path, name: str) -> None:
-    """Copy a file into an existing file or stream that is not replaceable."""
+    """Copy a file into an existing file or stream that cannot be replaced."""
     about = to.stat()
     plain = stat.S_ISREG(about.st_mode) and _open_here(to, about) is None
     descriptor = os.open(to, os.O_WRONLY | os.O_TRUNC) if plain else _descriptor(to)
@@ -346,7 +352,7 @@ def _copy(place: Path, to: Path, name: str) -> None:
 
 
 def _as_before(place: Path, target: Path) -> None:
-    """Give the new file the owner and mode of the old one, and flush it to disk."""
+    """Give a new file the owner and mode of the old file, and flush it to disk."""
     about = target.stat()
     with suppress(OSError):
         os.chown(place, about.st_uid, about.st_gid)

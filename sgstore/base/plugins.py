@@ -1,4 +1,4 @@
-"""Registries of extensions: readers, relations, abstractions, exporters.
+"""Registries of extensions (readers, relations, abstractions, exporters), also from other packages.
 
 A registry lists the objects of this package by name and place. An object is loaded at its first use. Other
 packages add objects as entry points of the same groups (``pyproject.toml``)::
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def entry_points(group: str) -> Iterable[EntryPoint]:
-    """Return the entry points of a group, of all installed packages."""
+    """Return the Python entry points of a group, from all installed packages."""
     from importlib import metadata  # The search is slow, and most processes do not need it.
 
     return metadata.entry_points(group=group)
@@ -31,7 +31,7 @@ def entry_points(group: str) -> Iterable[EntryPoint]:
 
 @dataclass(frozen=True, slots=True)
 class Registry:
-    """Objects of one kind by name: first those of this package, then those of other packages.
+    """Registry of extensions of one kind by name: those of sgstore, then those of other packages.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Registry:
     _loaded: dict[str, Any] = field(default_factory=dict[str, Any], compare=False)
 
     def others(self) -> dict[str, EntryPoint]:
-        """Return the entry points of other packages by name."""
+        """Return the entry points (extensions) of other packages by name."""
         found: dict[str, EntryPoint] = {}
         for entry in entry_points(self.group):
             if entry.name not in self.own:
@@ -57,14 +57,14 @@ class Registry:
         return found
 
     def load(self, name: str) -> Any:
-        """Load and return the object of this package with the given name."""
+        """Import the extension of sgstore with the given name, and return it."""
         if name not in self._loaded:
             module, _, attribute = self.own[name].partition(":")
             self._loaded[name] = getattr(import_module(module), attribute)
         return self._loaded[name]
 
     def load_other(self, entry: EntryPoint, error: type[SgstoreError]) -> Any:
-        """Load and return the object of another package.
+        """Import an extension of another package, and return it.
 
         Raises
         ------
@@ -78,7 +78,7 @@ class Registry:
             raise error(reason) from fault
 
     def every(self, error: type[SgstoreError]) -> Iterator[tuple[str, Any]]:
-        """Yield all names and objects, those of this package first; see :meth:`load_other`."""
+        """Yield name and object of all extensions: those of sgstore first, then those of other packages."""
         for name in self.own:
             yield name, self.load(name)
         for name, entry in self.others().items():

@@ -1,4 +1,4 @@
-"""Commands for isolated Python child processes with the packages of this process.
+"""Commands that start isolated Python child processes with the packages of this process.
 
 A normal child process imports modules from the current folder and from ``PYTHONPATH``. It would run a
 ``duckdb.py`` next to the recordings. These children are isolated (``python -I``) and get the package folders of
@@ -37,7 +37,7 @@ def command(module: str) -> list[str]:
 
 
 def folders() -> list[str]:
-    """Return the package folders of :data:`NEEDED`: of imported packages, or else found on ``sys.path``.
+    """Return the folders of the Python packages that a child process needs.
 
     The current folder is included only if a package was imported from it.
     """

@@ -12,7 +12,7 @@ _STATEMENT: Final = re.compile(
 
 
 def is_statement(text: str) -> bool:
-    """True if the text is a SQL statement, judged by its first word after comments."""
+    """Return True if a text is an SQL statement, according to its first word after comments."""
     return _STATEMENT.match(text) is not None
 
 

@@ -1,4 +1,4 @@
-"""Tables as dataclasses with one field per column: row selection, concatenation and sorting.
+"""Tables as dataclasses with one array per column: row selection, concatenation and sorting.
 
 A column is an array or a tuple. Any other field is constant for all rows; concatenation takes it from the first
 table.
@@ -21,7 +21,7 @@ Table = TypeVar("Table")
 
 
 def taken(table: Table, rows: NDArray[Any]) -> Table:
-    """Return rows of a table in the given order. ``rows`` is an index array or a mask."""
+    """Return selected rows of a table. ``rows`` is an index array or a mask."""
     columns = (getattr(table, name) for name in _names(table))
     return type(table)(*(_taken(column, rows) for column in columns))
 
@@ -37,7 +37,7 @@ def _taken(column: Any, rows: NDArray[Any]) -> Any:
 
 
 def chained(tables: Sequence[Table]) -> Table:
-    """Concatenate tables of one type."""
+    """Concatenate the rows of tables of one type."""
     columns = ([getattr(one, name) for one in tables] for name in _names(tables[0]))
     return type(tables[0])(*map(_chained, columns))
 
@@ -49,7 +49,7 @@ def _chained(parts: list[Any]) -> Any:
 
 
 def ascending(numbers: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Return the stable sort order of non-negative integers, by a radix sort of 16 bits per pass."""
+    """Return the stable sort order of non-negative integers (indices that sort them)."""
     order = np.argsort(numbers.astype(np.uint16), kind="stable")
     for shift in range(16, int(numbers.max(initial=0)).bit_length(), 16):
         digits = (numbers[order] >> shift).astype(np.uint16)

@@ -1,4 +1,4 @@
-"""Temporary folders that end with their owner process.
+"""Temporary folders that are removed when their process ends.
 
 Each folder is locked while its process lives, and is removed at exit. The next process that needs a folder in
 the same place removes the folders of killed processes. It removes a folder only if its lock is free. On a file
@@ -33,7 +33,7 @@ _FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOF
 
 
 class HeldFolder:
-    """New folder with a lock that its process holds until exit.
+    """New temporary folder with a lock that its process holds until exit.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class HeldFolder:
             raise
 
     def _locked(self) -> bool:
-        """Lock the folder. False if another process removed it before the lock."""
+        """Lock the folder. Return False if another process has already removed it."""
         if fcntl is None:
             return True
         try:
@@ -100,7 +100,7 @@ class HeldFolder:
         self.remove()
 
     def remove(self) -> None:
-        """Remove the folder and its content. A forked child process does nothing."""
+        """Remove the temporary folder and its content. A forked child process does nothing."""
         if os.getpid() != self._owner:
             return
         shutil.rmtree(self.path, ignore_errors=True)
@@ -114,7 +114,7 @@ class HeldFolder:
 
 
 def sweep(parent: Path, prefix: str, undo: Callable[[Path], None] | None = None) -> None:
-    """Remove the folders of :class:`HeldFolder` without a living process. Call ``undo`` before each removal."""
+    """Remove the temporary folders of processes that no longer run. ``undo`` is called before each removal."""
     if fcntl is None:
         return
     names: list[str] = []
@@ -138,7 +138,7 @@ def _remove_dead(folder: Path, undo: Callable[[Path], None] | None) -> None:
 
 
 def sweep_temporary() -> None:
-    """Remove the folders for temporary files whose processes are gone."""
+    """Remove the folders for temporary files whose processes have ended."""
     sweep(_root(), PREFIX)
 
 
@@ -170,7 +170,7 @@ def new_place(name: str) -> Path:
 
 @contextmanager
 def working_folder(name: str) -> Generator[Path]:
-    """Create a temporary folder. It is removed at the end of the block.
+    """Context manager that creates a temporary folder, and removes it at the end.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""Scene graphs from states: relations, abstractions, and the online mode."""
+"""Scene graphs: computation of relations, abstractions (simpler labelled graphs), and online generation."""

@@ -1,4 +1,4 @@
-"""Online generation of scene graphs, frame by frame.
+"""Online generation of scene graphs, frame by frame, for example from a running simulator.
 
 Frames are built from plain values by a client, or from a recording.
 """
@@ -73,7 +73,7 @@ _ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
 
 
 class Entity(NamedTuple):
-    """State of one entity in a frame: angles in radians, codes as in :class:`sgstore.model.world.States`."""
+    """Object in a frame with id, kind, pose, size and motion; angles in radians."""
 
     ident: str
     kind: int
@@ -88,11 +88,11 @@ class Entity(NamedTuple):
 
     @property
     def constants(self) -> tuple[int, str, str]:
-        """Attributes that must stay the same while the entity exists."""
+        """Attributes that must stay the same while the object exists."""
         return self.kind, self.special, self.subkind
 
     def meant(self, told: TypeMeaning | None) -> Entity:
-        """Return the entity with the kind in the type mapping; unchanged for ``None``."""
+        """Return the object with the kind from the type mapping; unchanged without a mapping."""
         if told is None:
             return self
         kind = KIND_CODE[told.kind]
@@ -100,7 +100,7 @@ class Entity(NamedTuple):
 
 
 class Frame:
-    """Instant of a scene. The caller adds its entities, lights and events.
+    """Moment of a scene: time, objects, lights and events, added by the caller.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class Frame:
         return len(self.entities)
 
     def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
-        """Return the frame after applying the configured type mapping to its entities.
+        """Return the frame with the kinds of its objects replaced as in the type mapping of the settings.
 
         Examples
         --------
@@ -170,7 +170,7 @@ class Frame:
         return f"Frame({self.time_ns}, ego={self.ego!r}, {len(self)} entities)"
 
     def happened(self, kind: str, ident: str | int = "", other: str | int = "") -> None:
-        """Add an event: ``HAPPENS kind(a, b)`` becomes true in this frame.
+        """Add an event to the frame. The query ``HAPPENS kind(a, b)`` is true in this frame.
 
         Parameters
         ----------
@@ -230,7 +230,7 @@ class Frame:
         map_ref: str = "",
         trailer: str | int = "",
     ) -> None:
-        """Add an entity.
+        """Add an object (such as a vehicle) to the frame.
 
         Parameters
         ----------
@@ -308,7 +308,7 @@ class Frame:
         )
 
     def _plausible(self, ident: str, pose: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the pose numbers without implausible ones, which are added to the losses."""
+        """Return pose and motion values without implausible ones, which are reported as lost."""
         if is_plausible(*pose[6:9], *pose[13:]):
             return pose
         kept, faults = without_implausible(np.array([pose], np.float64))
@@ -317,7 +317,7 @@ class Frame:
 
 
 def _inside(name: str, value: float) -> float:
-    """Return a number in internal units: angles in radians, NaN for infinite values."""
+    """Convert a number to internal units: degrees to radians, infinite values to NaN."""
     value = float(value)
     if not math.isfinite(value):
         return _NAN
@@ -352,7 +352,7 @@ def _one_of(what: str, name: str, known: Sequence[str]) -> str:
 
 
 def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iterator[Frame]:
-    """Yield the frames of a recording in order, each with its events.
+    """Yield the frames of a recording in order, each with its events, for the online generator.
 
     Parameters
     ----------
@@ -386,7 +386,7 @@ def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iter
 
 
 def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
-    """Add the events to a frame, and their kinds to ``known``. Return the frame."""
+    """Add events to a frame, and their kinds to the known kinds. Return the frame."""
     frame.events += [(event.kind, event.ident, event.other) for event in events]
     known.update(kind for kind, _, _ in frame.events)
     frame.recorded = frozenset(known)
@@ -394,7 +394,7 @@ def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
 
 
 class Replay:
-    """Converter of the blocks of a recording into single :class:`Frame` objects.
+    """Converter from blocks of recorded frames to single :class:`Frame` objects.
 
     The frames are the same as those of a client at the simulator. Memory grows with the number of distinct
     entities, as for any reader.
@@ -405,7 +405,7 @@ class Replay:
         self._trailers: list[str] = []
 
     def frames(self, block: FrameBlock) -> Iterator[Frame]:
-        """Yield the frames of the next block of a recording, with unchanged numbers."""
+        """Yield the frames of the next block of a recording, with unchanged values."""
         new = block.entities
         columns = (new.ident, new.kind.tolist(), new.special, new.subkind, new.type_name)
         columns = (*columns, new.static.tolist(), new.map_ref)
@@ -457,7 +457,7 @@ _MAP_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit
 
 
 class EntityConstants(NamedTuple):
-    """Constant attributes of an entity."""
+    """Constant attributes of an object, such as id, kind and type name."""
 
     node: int
     ident: str
@@ -468,7 +468,7 @@ class EntityConstants(NamedTuple):
     lifetime: int = 1
 
     def attributes(self, *, is_ego: bool, is_static: bool) -> Attributes:
-        """Return the attributes in the form of a scene graph."""
+        """Return the constant attributes of an object as node attributes of a scene graph."""
         texts = {
             "type_name": self.type_name,
             "special": self.special,
@@ -486,7 +486,7 @@ class EntityConstants(NamedTuple):
 
 
 class Records:
-    """Converter of graph blocks into :class:`sgstore.model.graph.SceneGraph` records.
+    """Converter from blocks of graphs in columns to single scene graphs.
 
     Parameters
     ----------
@@ -505,7 +505,7 @@ class Records:
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:
-        """Store the attributes of a static entity, because its pose is given only once."""
+        """Store the attributes of a static object, because its pose is given only once."""
         numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
         numbers["heading"] = _degrees(states.heading[row : row + 1])[0]
         about = known.attributes(is_ego=False, is_static=True)
@@ -514,7 +514,7 @@ class Records:
     def graph(
         self, graph: GraphBlock, outer: Ints, known: dict[int, EntityConstants]
     ) -> SceneGraph:
-        """Return the scene graph of a block with one frame.
+        """Convert a block of one frame to a scene graph.
 
         Parameters
         ----------
@@ -545,7 +545,7 @@ class Records:
         outer: Ints,
         known: dict[int, EntityConstants],
     ) -> SceneGraph:
-        """Return the scene graph of one or more parts, for example with its surroundings."""
+        """Return one scene graph from the graph of a frame and, if given, the objects around it."""
         frames = graph.frames
         states = chained([part.frames.states for part in parts])
         presence = chained([part.presence for part in parts])
@@ -578,7 +578,7 @@ class Records:
 
 
 def _map_node(road_map: RoadMap, node: int) -> Attributes:
-    """Return the attributes of a map node."""
+    """Return the scene graph attributes of a road map node."""
     nodes, row = road_map.nodes, -1 - node
     texts = {name: getattr(nodes, name)[row] for name in _MAP_TEXTS}
     numbers = {name: float(getattr(nodes, name)[row]) for name in _MAP_NUMBERS}
@@ -597,7 +597,7 @@ def _map_node(road_map: RoadMap, node: int) -> Attributes:
 
 
 def _moving(states: States) -> list[Attributes]:
-    """Return the attributes of each state, in output units (degrees, m/s)."""
+    """Return the node attributes of each object state, in output units (degrees, m/s)."""
     columns: dict[str, Floats] = {
         name: getattr(states, name) for name in (*_BOX, *_MOTION, *INPUTS[:3])
     }
@@ -619,7 +619,7 @@ def _moving(states: States) -> list[Attributes]:
 
 
 def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float) -> Attributes:
-    """Return the attributes with coded values: lights, derived flags, gear and hand brake."""
+    """Return node attributes from codes: vehicle lights, derived values, gear and hand brake."""
     about: Attributes = {}
     if lights >= 0:
         about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}
@@ -633,7 +633,7 @@ def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float
 
 
 def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
-    """Yield frame, source, target and attributes of each ``isIn`` edge."""
+    """Yield frame, source, target and attributes of each ``isIn`` edge (object on a lane)."""
     told = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
     columns = (
         *(lanes.frame.tolist(), _outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
@@ -653,7 +653,7 @@ def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attr
 
 
 def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
-    """Yield frame, source, target and attributes of each ``follows`` edge."""
+    """Yield frame, source, target and attributes (gap) of each ``follows`` edge."""
     src, dst = _outward(gaps.src, outer).tolist(), _outward(gaps.dst, outer).tolist()
     for frame, a, b, gap in zip(
         gaps.frame.tolist(), src, dst, number(gaps.gap).tolist(), strict=True
@@ -662,12 +662,12 @@ def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attribut
 
 
 def _outward(nodes: Whole, outer: Ints) -> Ints:
-    """Return the node ids of the records for node ids of a block."""
+    """Convert node ids of a block to the node ids of the returned scene graphs."""
     return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
 
 
 def _degrees(heading: Floats) -> list[float]:
-    """Return headings in degrees, in (-180, 180]."""
+    """Convert headings from radians to degrees, in (-180, 180]."""
     return np.degrees(wrapped(heading)).tolist()
 
 
@@ -689,20 +689,20 @@ SPARE: Final = 2048
 
 
 class Generator(Protocol):
-    """Protocol of the graph generator; see :class:`sgstore.sgg.SceneGraphGenerator`."""
+    """Interface of the scene graph generator that works on blocks of frames."""
 
     @property
     def kinds(self) -> Codes:
-        """Kinds of all entities so far, by node id."""
+        """Kinds of all objects so far, as codes by node id."""
         ...
 
     def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
-        """Return the graphs of the next frames, one block per ego."""
+        """Return the graphs of the next frames as columns, one block per ego."""
         ...
 
 
 class Stepper:
-    """Online generator: one frame in, its scene graphs out.
+    """Online generator of scene graphs: each call takes one frame, and returns its graphs.
 
     Parameters
     ----------
@@ -780,7 +780,7 @@ class Stepper:
             return [replace(one, events=happened) for one in found]
 
     def _happened(self, frame: Frame) -> dict[str, list[tuple[int | None, int | None]]]:
-        """Return the events of a frame by kind, with node ids. Each recorded kind has an entry."""
+        """Return the events of a frame by kind, with node ids. Every kind recorded so far has an entry."""
         found: dict[str, list[tuple[int | None, int | None]]] = {k: [] for k in frame.recorded}
         for kind, *idents in frame.events:
             a, b = (self._node_of(ident) for ident in idents)
@@ -793,7 +793,7 @@ class Stepper:
         return self._moving[ident].last.entity.node if ident in self._moving else None
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
-        """Return the moving entities of a frame, and its new static entities.
+        """Return the moving objects of a frame, and its new static objects.
 
         All checks come first: a rejected frame changes nothing.
         """
@@ -832,7 +832,7 @@ class Stepper:
         return known
 
     def _follow(self, entity: Entity, time_ns: int) -> None:
-        """Record the place of an entity. An id that has returned starts a new entity."""
+        """Record the position of an object. An id that returns after a gap is a new object."""
         lives = self._moving[entity.ident]
         place = (_NAN,) * 3 if entity.whole[_LIGHT] >= 0 else entity.numbers[:3]
         here = Sight(place, time_ns, self._run)
@@ -840,7 +840,7 @@ class Stepper:
         self._moving.move_to_end(entity.ident)
 
     def _block(self, frame: Frame, moving: list[Entity], standing: list[Entity]) -> FrameBlock:
-        """Return a frame as a block with the node ids of the generator."""
+        """Convert a frame to a block in columns, with node ids."""
         first = self._introduced
         new = [*standing, *(e for e in moving if self._node(e) not in self._inner)]
         self._introduced += len(new)
@@ -863,7 +863,7 @@ class Stepper:
         )
 
     def _kept(self, block: FrameBlock) -> FrameBlock:
-        """Round the numbers of a block as a store does."""
+        """Round the values of a block of frames to the precision of a store."""
         self._origin = self._origin or origin_of(block)
         return quantize(block, self._origin or Origin(0.0, 0.0, 0.0))
 
@@ -886,7 +886,7 @@ class Stepper:
 
 
 def check_entities(frame: Frame, is_static: Callable[[str], bool | None]) -> None:
-    """Raise if a frame contradicts itself or earlier frames.
+    """Raise an error if a frame contradicts itself or earlier frames.
 
     Parameters
     ----------
@@ -911,7 +911,7 @@ def check_entities(frame: Frame, is_static: Callable[[str], bool | None]) -> Non
 
 
 class GcPaused:
-    """Context manager that pauses garbage collection, if it is enabled.
+    """Context manager that pauses Python's garbage collection.
 
     The records of a graph are thousands of small objects and no garbage. Python would scan them several times
     during their creation, and every few frames all objects of the client: 30 ms and more. Objects freed inside

@@ -87,6 +87,8 @@ class Recording(Protocol):
     ) -> Iterator[Messages]:
         """Yield all messages of the recording, in groups of consecutive messages.
 
+        Unreadable parts are added to ``report``.
+
         ``wanted``: true for the offset of a chunk to read. ``keep``: true for a channel whose messages a later
         walk needs again. ``rank``: order number of a channel. With it, messages come in order of time; messages
         of equal time come in the order of the ranks. Without it, they come in file order. A file without log

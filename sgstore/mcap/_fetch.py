@@ -156,7 +156,7 @@ def _listed(path: Path) -> list[str]:
 
 
 def read_metadata(text: str) -> dict[str, list[str]]:
-    """Parse the YAML metadata of a bag: key → file names or storage format.
+    """Parse the YAML metadata of a bag: key → file names or storage format. An absent key has no values.
 
     Other keys and their nested values are skipped.
     """

@@ -216,7 +216,10 @@ class OrderCheck:
 
 @dataclass(slots=True)
 class _IndexBlock:
-    """Part of the sort index of a file: one entry per message, for consecutive messages."""
+    """Part of the sort index of a file: one entry per message, for consecutive messages.
+
+    ``first`` is the number of the first message.
+    """
 
     first: int
     entries: NDArray[np.void]
@@ -291,7 +294,10 @@ class TimeOrder:
     def _blocks(
         self, runs: Iterable[Messages], keeps: Callable[[int], bool], codes: bytearray
     ) -> Iterator[_IndexBlock]:
-        """Yield the parts of the sort index, each sorted by log time."""
+        """Yield the parts of the sort index, each sorted by log time.
+
+        Codes of message sizes are added to ``codes``.
+        """
         waiting, first = bytearray(), 0
         for run in runs:
             self._note(run, keeps)
@@ -323,6 +329,8 @@ class TimeOrder:
         self, report: Findings, wanted: Callable[[int], bool] | None = None
     ) -> Iterator[Messages]:
         """Yield the messages of a file in order of time, in groups.
+
+        Losses and warnings are added to ``report``.
 
         ``wanted``: true for the offset of a chunk to read; other chunks are skipped.
         """

@@ -56,7 +56,10 @@ MOST_BUFFERS: Final = 128
 
 
 class Buffers:
-    """Memory buffers for decompressed chunks, used again for later chunks."""
+    """Memory buffers for decompressed chunks, used again for later chunks.
+
+    One thread owns the buffers; other threads may fill them.
+    """
 
     def __init__(self) -> None:
         self._kept: list[bytearray] = []
@@ -295,7 +298,10 @@ class Spool:
 
 
 def _reader(starts: dict[int, int], data: memoryview, anew: Callable[[], Read]) -> Read:
-    """Return a function that reads the bytes of a cached message by position."""
+    """Return a function that reads the bytes of a cached message by position.
+
+    ``starts`` maps record offsets to offsets in ``data``.
+    """
     whole: list[Read] = []
 
     def read(position: int, length: int) -> memoryview:

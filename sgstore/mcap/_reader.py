@@ -243,6 +243,8 @@ class McapFile:
     ) -> Iterator[Messages]:
         """Yield all messages of the file, in groups, one chunk at a time.
 
+        Unreadable parts are added to ``report``.
+
         Parameters
         ----------
         report : Findings
@@ -287,7 +289,10 @@ class McapFile:
                     pass
 
     def _time_order(self, ranks: ChannelRanks, keep: Callable[[int], bool] | None) -> TimeOrder:
-        """Return a sort index of all messages of the file."""
+        """Return a sort index of all messages of the file.
+
+        The reading is repeated if a channel definition came after its messages.
+        """
         while True:
             findings, known = Findings(), len(self.channels)
             runs = self._in_file_order(findings, None, keep)
@@ -446,7 +451,10 @@ class McapFile:
             walk.position = resume
 
     def _chunk(self, walk: _FileWalk, place: RecordPlace, astray: int | None) -> Iterator[Messages]:
-        """Yield the messages of a chunk."""
+        """Yield the messages of one chunk (compressed block) of an MCAP file.
+
+        ``astray`` is the offset of another listed chunk that starts inside the chunk, or ``None``.
+        """
         if walk.wanted is not None and not walk.wanted(place.offset):
             return
         walk.chunks += 1
@@ -725,7 +733,10 @@ class McapBag(McapFile):
         self.profile, self.library = first.profile, first.library
 
     def _open(self, part: BagPart) -> None:
-        """Read the schemas, channels and summary of one file of the bag."""
+        """Read the schemas, channels and summary of one file of the bag.
+
+        The file is open only during the reading.
+        """
         name = part.path.name
         if part.size < 0:
             self._faults.append(Loss(f"{name}: {METADATA} lists it, but there is no such file"))

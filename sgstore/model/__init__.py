@@ -1,1 +1,1 @@
-"""The data model: states of the world, scene graphs, vocabulary, settings, numbers of pairs."""
+"""Data model: states of objects, scene graphs, vocabulary, settings, and measures of object pairs."""

@@ -1,4 +1,4 @@
-"""Ids of frames: trace id, bucket number and frame number in the bucket, as bits of one number.
+"""Frame ids: trace id, bucket number (64 frames) and frame number in the bucket, in one integer.
 
 Also the text form of a range of frames.
 """
@@ -30,7 +30,7 @@ SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
 
 
 def trace_bucket(trace_id: int, seq: Ints) -> Ints:
-    """Return the bucket of each frame number of a trace."""
+    """Return the bucket number (group of 64 frames) of each frame number of a trace."""
     return (trace_id << BUCKET_BITS) + seq // BUCKET_FRAMES
 
 
@@ -40,7 +40,7 @@ def frame_ids(trace_id: int, seq: Ints) -> Ints:
 
 
 def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
-    """Return the frame ids in bucket masks, and the row of each frame."""
+    """Return the frame ids in bit masks of 64 frames, and the mask's row for each frame id."""
     ids: list[Ints] = []
     rows: list[Ints] = []
     for bit in range(BUCKET_FRAMES):
@@ -56,13 +56,13 @@ def trace_of(frame_id: Ints) -> Ints:
 
 
 def seq_of(frame_id: Ints) -> Ints:
-    """Return the frame number of each frame id."""
+    """Return the frame number (in its trace) of each frame id."""
     bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
     return bucket * BUCKET_FRAMES + (frame_id & ((1 << FRAME_BITS) - 1))
 
 
 def begins(frame_id: Ints) -> Bools:
-    """Return a mask (N,) of the frames that do not directly follow the previous row's frame."""
+    """Return a mask (N,) of the frames that do not directly follow the frame in the previous row."""
     trace, seq = trace_of(frame_id), seq_of(frame_id)
     found = np.ones(len(frame_id), np.bool_)
     found[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)
@@ -73,7 +73,7 @@ _RANGE: Final = re.compile(r"(.+)([@#])(\d+(?:\.\d+)?s?)\.\.(\d+(?:\.\d+)?s?)")
 
 
 def range_of(text: str) -> tuple[str, str] | None:
-    """Parse a frame range such as ``TRACE@12s..18s`` or ``TRACE#120..180``; ``None`` for a single frame.
+    """Parse a text of a frame range, ``TRACE@12s..18s`` or ``TRACE#120..180``; ``None`` for a single frame.
 
     >>> range_of("town@12.5s..18s")
     ('town@12.5s', 'town@18s')

@@ -1,4 +1,4 @@
-"""Scene graphs as columns: blocks of frames for the store, single frames for callers and networkx."""
+"""Scene graphs as columns (blocks of frames, for the store) and as single frames (for callers, networkx)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ IS_IN, LEADS, FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "foll
 
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """Edges of the graphs of a block, one row per edge and frame; shape (E,).
+    """Edges of scene graphs as columns, one row per edge and frame; shape (E,).
 
     Attributes
     ----------
@@ -58,18 +58,18 @@ class Edges:
         return len(self.frame)
 
     def distinct(self) -> Edges:
-        """Return each edge once, ordered by frame, source, relation and destination."""
+        """Return each edge once, sorted by frame, source, relation and destination."""
         every, new = _ordered(self)
         return taken(every, new)
 
     def differing(self, other: Edges) -> Edges:
-        """Return the edges that only one of the two tables has, in the order of :meth:`distinct`."""
+        """Return the edges that only one of two edge tables has."""
         every, new = _ordered(Edges.chained([self.distinct(), other.distinct()]))
         return taken(every, new & np.append(new[1:], True)[: len(new)])
 
     @classmethod
     def chained(cls, parts: Sequence[Edges]) -> Edges:
-        """Concatenate edge tables into int32 columns. Without parts, the result is empty."""
+        """Concatenate tables of edges. Without tables, the result is an empty table."""
         none = np.empty(0, np.int8)
         parts = [cls(none, none, none, none), *parts]
         frame, src, dst = (
@@ -82,7 +82,7 @@ class Edges:
 
 
 def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
-    """Return the sorted edges, and a mask of the rows that differ from the row before."""
+    """Return sorted edges, and a mask of the rows that differ from the previous row."""
     order = np.lexsort((edges.dst, edges.relation, edges.src, edges.frame))
     every = taken(edges, order)
     columns = (every.frame, every.src, every.relation, every.dst)
@@ -93,7 +93,7 @@ def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
 
 @dataclass(frozen=True, slots=True)
 class LaneGaps:
-    """Gaps along the lanes between a follower and its leader: attributes of both edges; shape (K,).
+    """Gaps along lanes between a following object and the object ahead; shape (K,).
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class LaneGaps:
 
 @dataclass(frozen=True, slots=True)
 class StaticPresence:
-    """Pairs of a frame and a static node in its graph; shape (M,).
+    """Pairs of a frame and a static node (static object or map part) in its graph; shape (M,).
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class StaticPresence:
 
 @dataclass(frozen=True, slots=True)
 class LaneStates:
-    """States of entities in lanes: the attributes of their ``isIn`` edges; shape (K,).
+    """Positions of objects on lanes: attributes of ``isIn`` edges (overlap, offset, …); shape (K,).
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ class LaneStates:
 
 @dataclass(frozen=True, slots=True)
 class WorldBlock:
-    """Data outside the graphs of a block, up to the distance ``[range] world``.
+    """Nodes and edges outside the graphs of a block of frames, for queries about distant objects.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class WorldBlock:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Numbers of recorded states excluded from the graphs by settings. Static objects do not count.
+    """Counts of recorded object states that the settings exclude from the graphs. Static objects do not count.
 
     Attributes
     ----------
@@ -220,7 +220,7 @@ class LeftOut:
     excluded: tuple[tuple[int, int], ...] = ()
 
     def more(self, other: LeftOut) -> LeftOut:
-        """Return the sum of both counts."""
+        """Return the sum of two counts of excluded object states."""
         excluded = dict(self.excluded)
         for code, many in other.excluded:
             excluded[code] = excluded.get(code, 0) + many
@@ -234,7 +234,7 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True)
 class GraphBlock:
-    """Scene graphs of the frames of a block.
+    """Scene graphs of a block of consecutive frames, as columns.
 
     Attributes
     ----------
@@ -276,7 +276,7 @@ class GraphBlock:
 def graph_of_records(
     nodes: Iterable[Mapping[str, Any]], edges: Iterable[Mapping[str, Any]], **about: Any
 ) -> nx.MultiDiGraph[Any]:
-    """Return a graph in node-link form as a ``networkx.MultiDiGraph``.
+    """Return a ``networkx.MultiDiGraph`` from records of nodes and edges (node-link form).
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def graph_of_records(
 def named_graph(
     nodes: Mapping[str, str], edges: Iterable[tuple[str, str, str]], **about: Any
 ) -> nx.MultiDiGraph[str]:
-    """Return a graph of names and labels, as in the literature, as a ``networkx.MultiDiGraph``.
+    """Return a ``networkx.MultiDiGraph`` from node labels and named edges, as in the literature.
 
     Parameters
     ----------
@@ -331,7 +331,7 @@ def named_graph(
 
 
 class LaneDistances:
-    """Lane starts measured along other lanes: the table for distances along the lanes of a map.
+    """Distances along the lanes of a map: between lanes, to map parts, with curvature and slope.
 
     Parameters
     ----------
@@ -392,7 +392,7 @@ class LaneDistances:
 
     @cached_property
     def _of_lanes(self) -> dict[int, list[tuple[float, float, float | None]]]:
-        """Lane → its stretches, ascending: start (m), curvature (1/m) and slope of each."""
+        """Intervals of each lane with constant curvature: start (m), curvature (1/m) and slope."""
         found: dict[int, list[tuple[float, float, float | None]]] = {}
         for lane, start, curvature, slope in self._courses:
             known = None if slope is None or math.isnan(slope) else slope
@@ -402,7 +402,7 @@ class LaneDistances:
         return found
 
     def tells(self, what: str) -> bool:
-        """True if the map has values of this kind: ``ways``, ``curvature`` or ``slope``."""
+        """Return True if the map has data of a kind: ``ways`` (connections), ``curvature`` or ``slope``."""
         return what in self._told
 
     @cached_property
@@ -420,20 +420,20 @@ class LaneDistances:
         return stretches[bisect_right(stretches, max(along, 0.0), key=itemgetter(0)) - 1][1:]
 
     def stretches(self, node: int) -> Stretches:
-        """Return the lanes of a map element, with its start and end along each lane; m."""
+        """Return the lanes that a map part covers, with its start and end along each lane; m."""
         return self._of_parts.get(node, ())
 
     def stretches_of(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
-        """Return the start and end, along a lane, of each map element of one kind; m."""
+        """Return start and end along a lane for each map part of a kind (such as crosswalk); m."""
         return self._on_lanes.get((what, lane), ())
 
     def distance(self, one: Places, other: Places) -> float | None:
-        """Return the distance between two entities from their lane positions; m."""
+        """Return the distance along lanes between two objects; m. ``None`` means without a connection."""
         ends = ([(lane, along, along) for lane, along in places] for places in (one, other))
         return self.between(*ends)
 
     def between(self, one: Stretches, other: Stretches) -> float | None:
-        """Return the gap between two stretches along the lanes; m.
+        """Return the gap along lanes between two lane intervals; m. ``None`` means without a connection.
 
         Overlap gives 0; a stretch behind is negative.
         """
@@ -451,7 +451,7 @@ class LaneDistances:
         return nearest if abs(nearest) <= self.FARTHEST else None
 
     def next(self, one: Stretches, what: str) -> float | None:
-        """Return the driving distance to the next map element of one kind, 0 on the element; m."""
+        """Return the driving distance to the next map part of a kind (such as crosswalk); m; 0 on the part."""
         found = math.inf
         for lane, first, last in one:
             for to, way in self._onward.get(lane, ()):
@@ -462,7 +462,7 @@ class LaneDistances:
 
 
 class EdgeColumns(Sequence["EdgeRecord"]):
-    """Edges of one graph, stored as columns. A record is created on access.
+    """Edges of one scene graph, stored as columns. An edge object is created on access.
 
     A record takes about 250 bytes, a row ten. The object equals any sequence of the same records.
 
@@ -522,7 +522,7 @@ class EdgeColumns(Sequence["EdgeRecord"]):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class SceneGraph:
-    """Scene graph of one frame as records: ``(V, E, Ego, kind, rel, att)`` of the paper.
+    """Scene graph of one frame: nodes (objects, map parts), edges (relations) and the ego.
 
     Attributes
     ----------
@@ -580,7 +580,7 @@ class SceneGraph:
     excluded: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
 
     def known(self) -> SceneGraph:
-        """Graph of all known objects: this graph, extended to the distance ``[range] world``.
+        """Return the scene graph of all known objects, also of those outside the range of this graph.
 
         Outside this graph, only the edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows`` and map edges
         exist.
@@ -601,7 +601,7 @@ class SceneGraph:
         return f"<SceneGraph {self.trace}#{self.seq}: {size}>"
 
     def places(self) -> dict[int, list[tuple[int, float]]]:
-        """Positions along own lanes: node id → pairs of (lane, distance from its start); m.
+        """Return positions of objects along their lanes: node id → pairs (lane, distance from its start); m.
 
         Examples
         --------
@@ -616,7 +616,7 @@ class SceneGraph:
         return found
 
     def stretches(self) -> dict[int, Stretches]:
-        """Stretches of lanes that entities occupy: node id → (lane, start, end); m.
+        """Return the lane intervals that objects occupy: node id → (lane, start, end); m.
 
         Traffic lights and signs are at the stop positions of the lanes they control; see
         :mod:`sgstore.maps.roads._places`.
@@ -639,7 +639,7 @@ class SceneGraph:
         return dict(found)
 
     def _stops(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
-        """Return the stop positions of a lane before a signal."""
+        """Return the stop positions along a lane before traffic signals of a kind."""
         known = self.reach.stretches_of(what, lane) if self.reach is not None else ()
         about = self.nodes.get(lane, {})
         if not known and ("junction" in about or "length" in about):
@@ -648,7 +648,7 @@ class SceneGraph:
         return known
 
     def lane_dist(self, a: int, b: int) -> float | None:
-        """Return the distance along the lanes between two entities or map elements; m.
+        """Return the distance along lanes between two objects or map parts; m. ``None`` means unknown.
 
         Measured from centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and
         the lanes connected by ``travelsTo``. Positive if the route leads from a to b, negative from b to a; the
@@ -671,7 +671,7 @@ class SceneGraph:
         return self.reach.between(*ends)
 
     def to_next(self, node: int, what: str) -> float | None:
-        """Return the distance along the lanes to the next map element of one kind, 0 on the element; m.
+        """Return the distance along lanes to the next map part of a kind (such as crosswalk); m.
 
         ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
         means none within 200 m.
@@ -685,7 +685,7 @@ class SceneGraph:
         return None if self.reach is None else self.reach.next(self.stretches().get(node, ()), what)
 
     def curvature(self, node: int) -> float | None:
-        """Return the curvature of an entity's primary lane at its position; 1/m.
+        """Return the curvature of an object's primary lane at the object's position; 1/m.
 
         Mean over about a metre of the centre line; positive in a left turn of the lane's traffic. ``None``
         means no lane, or no map.
@@ -699,7 +699,7 @@ class SceneGraph:
         return self._course(node)[0]
 
     def slope(self, node: int) -> float | None:
-        """Return the slope of an entity's primary lane at its position: rise over run, 0.05 for 5 %.
+        """Return the slope of an object's primary lane at the object's position: 0.05 for 5 % uphill.
 
         Mean over about a metre; positive if the lane's traffic drives uphill. ``None`` means no lane, no map,
         or a map without heights.
@@ -717,7 +717,7 @@ class SceneGraph:
         return (None, None) if self.reach is None or place is None else self.reach.course(*place)
 
     def primary_places(self) -> dict[int, tuple[int, float]]:
-        """Primary lane of each entity: node id → (lane, distance from its start); m.
+        """Return the primary lane of each object: node id → (lane, distance from its start); m.
 
         Examples
         --------
@@ -733,7 +733,7 @@ class SceneGraph:
         }
 
     def to_networkx(self) -> nx.MultiDiGraph[int]:
-        """Return the graph as a ``networkx.MultiDiGraph``.
+        """Return the scene graph as a ``networkx.MultiDiGraph``.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Selection of a part of a trace: a time span and a lower frame rate.
+"""Selection of frames of a trace: a time span, and a lower frame rate.
 
 The selected frames get new numbers.
 """
@@ -34,7 +34,7 @@ _SLACK: Final = _SLACK_NS / 1e9
 
 @dataclass(frozen=True, slots=True)
 class TracePart:
-    """Part of a trace: a time span and a frame rate.
+    """Selected part of a trace: a time span and a frame rate.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class TracePart:
     rate: float = 0.0
 
     def blocks(self, blocks: Iterator[FrameBlock], size: int) -> Iterator[FrameBlock]:
-        """Yield the frames of the part in blocks of ``size`` frames.
+        """Yield the selected frames of a trace in blocks of ``size`` frames.
 
         The last block and blocks with many messages are smaller. Entities keep their node ids. Entities that
         appear only in dropped frames stay in the list of entities.
@@ -82,7 +82,7 @@ class TracePart:
 
 
 class _Clock:
-    """Selector of frames by time span and rate, one block after another."""
+    """Selector of frames by time span and frame rate, one block of frames after another."""
 
     def __init__(self, part: TracePart) -> None:
         self._part = part
@@ -93,7 +93,10 @@ class _Clock:
         self.over = False
 
     def within(self, time_ns: int) -> bool:
-        """True if a time is in the part. Earlier frames must have been processed before."""
+        """Return True if a time belongs to the selected part of a trace.
+
+        Earlier frames must have been processed before.
+        """
         since = (time_ns - (self._zero or 0)) / 1e9
         part = self._part
         return (
@@ -103,7 +106,7 @@ class _Clock:
         )
 
     def kept(self, time_ns: Ints) -> Bools:
-        """Return a mask of the frames to keep."""
+        """Return a mask of the frames that the time span and frame rate select."""
         part = self._part
         self._zero = int(time_ns[0]) if self._zero is None else self._zero
         since = (time_ns - self._zero) / 1e9
@@ -130,7 +133,7 @@ class _Clock:
 
 
 class _KeptFrames:
-    """Buffer of selected frames, with their messages, entities and events."""
+    """Buffer of selected frames, with their messages, objects and events."""
 
     def __init__(self) -> None:
         self._blocks: list[FrameBlock] = []
@@ -149,7 +152,7 @@ class _KeptFrames:
         self.messages += len(block.messages)
 
     def take(self, count: int, first: int) -> FrameBlock:
-        """Remove and return the first frames as one block, with all buffered messages, entities and events."""
+        """Remove the first frames from the buffer, and return them as one block."""
         whole = _joined(self._blocks)
         now = _sliced(whole, 0, count)
         rest = _sliced(whole, count, len(whole))

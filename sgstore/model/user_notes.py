@@ -1,4 +1,4 @@
-"""Tags and notes of users, in a CSV file next to the store.
+"""Tags and notes of users about frames, in a CSV file next to the store.
 
 The store is only a cache, so it does not contain them. Each line is one tag: ``trace,seq,tag,note,who,at``.
 Lines are only appended. The removal of a tag appends the same line with ``-`` before the tag. Two users can
@@ -39,7 +39,7 @@ LONGEST: Final = {"tag": 100, "note": 2000}
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Tag of one frame, with an optional note.
+    """Tag that a user gave to one frame, with an optional note.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ COLUMNS: Final = tuple(field.name for field in fields(Note))
 
 
 class NotesFile:
-    """File with the tags of a store.
+    """CSV file with the tags of users about the frames of a store.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ class NotesFile:
         self.path = store.with_name(store.name + ENDING)
 
     def stamp(self) -> tuple[int, int]:
-        """Return the size (bytes) and modification time (ns) of the file; zeros if it is missing."""
+        """Return the size (bytes) and modification time (ns) of the tag file; zeros if it is missing."""
         try:
             found = self.path.stat()
         except OSError:
@@ -83,7 +83,7 @@ class NotesFile:
         return found.st_size, found.st_mtime_ns
 
     def add(self, note: Note, *, gone: bool = False) -> Note:
-        """Append a tag, or its removal if ``gone``, and return the written note.
+        """Append a tag (or the removal of a tag) to the file, and return it.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class NotesFile:
             os.close(file)
 
     def read(self) -> list[Note]:
-        """Return the current tags, without removed ones. Invalid lines are skipped.
+        """Return the current tags of all frames, without removed ones. Invalid lines are skipped.
 
         Raises
         ------
@@ -145,7 +145,7 @@ class NotesFile:
 
 
 def write_table(notes: list[Note], to: Path) -> None:
-    """Write tags as a CSV table for queries: one row per frame, its tags separated by commas."""
+    """Write tags of frames as a CSV table for queries: one row per frame, tags separated by commas."""
     frames: dict[tuple[str, int], list[Note]] = {}
     for note in notes:
         frames.setdefault((note.trace, note.seq), []).append(note)

@@ -1,4 +1,4 @@
-"""Catalogue of names: kinds, relations and light states.
+"""Catalogue of names: kinds of objects and map parts, relations, and traffic light states.
 
 A *kind* is the type of an entity or a map element; a *relation* is the name of an edge. Readers, settings,
 imports and stores can add kinds of entities, relations and light states (:func:`add_kind`,
@@ -152,7 +152,7 @@ LIGHT_STATE_CODE: Final[Mapping[str, int]] = _light_state_code
 
 
 def normalize_name(name: str) -> str:
-    """Return a name in lower case without underscores, for comparison."""
+    """Return a name in lower case without underscores, to compare names."""
     return name.replace("_", "").lower()
 
 
@@ -204,7 +204,7 @@ _asked: Final[ContextVar[Mapping[str, Sequence[str]] | None]] = ContextVar("aske
 
 
 def learn(enum: str, name: str) -> int:
-    """Return the code of a name from a store, even if another store has a similar name.
+    """Register a name (kind, relation or light state) read from a store, and return its code.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def learn(enum: str, name: str) -> int:
 
 
 def add_relation(name: str) -> int:
-    """Register a relation in this process, and return its code.
+    """Register a user-defined relation in this process, and return its code.
 
     Raises
     ------
@@ -248,7 +248,7 @@ def add_relation(name: str) -> int:
 
 
 def add_kind(name: str) -> int:
-    """Register a kind of entity in this process, and return its code.
+    """Register a user-defined kind of object in this process, and return its code.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def add_kind(name: str) -> int:
 
 
 def add_light_state(name: str) -> int:
-    """Register a traffic light state in this process, and return its code.
+    """Register a user-defined traffic light state in this process, and return its code.
 
     Raises
     ------
@@ -284,7 +284,7 @@ def _made(enum: str, name: str) -> int:
 
 
 def _refuse_like_own(enum: str, name: str) -> None:
-    """Reject a new name that equals a built-in name, except for case and underscores."""
+    """Raise an error for a new name that equals a built-in name except for case and underscores."""
     folded, like = normalize_name(name), ""
     if enum == "light_state" and folded in _OWN_FOLDED[enum]:
         like = f"the state {_OWN_FOLDED[enum][folded]!r}"
@@ -298,7 +298,7 @@ def _refuse_like_own(enum: str, name: str) -> None:
 
 @contextmanager
 def asking(names: Mapping[str, Sequence[str]] | None) -> Generator[None]:
-    """Limit name lookup inside the block to one store's names, built-in names and registered names.
+    """Context manager that limits valid names to those of one store, built-in and registered names.
 
     Parameters
     ----------
@@ -314,12 +314,12 @@ def asking(names: Mapping[str, Sequence[str]] | None) -> Generator[None]:
 
 
 def known_names(enum: str) -> tuple[str, ...]:
-    """Return all names of an enumeration that are valid here, built-in names first."""
+    """Return all valid names of a sort (kinds, relations or light states), built-in names first."""
     return (*_OWN[enum], *_others(enum))
 
 
 def _others(enum: str) -> Sequence[str]:
-    """Return the valid names that are not built in, names of the queried store first."""
+    """Return all valid names that are not built in; names of the queried store come first."""
     asked = _asked.get()
     if asked is None:
         return NAMES[enum][len(_OWN[enum]) :]
@@ -328,7 +328,7 @@ def _others(enum: str) -> Sequence[str]:
 
 
 def _meant(enum: str, word: str) -> str | None:
-    """Return the known name for a user's word: an exact match, a built-in name, or a similar name."""
+    """Return the known name for a word in a query: the same name, a built-in name, or a similar one."""
     others, folded = _others(enum), normalize_name(word)
     if word in others:
         return word
@@ -343,7 +343,7 @@ def _camel(name: str) -> str:
 
 
 def entity_kinds() -> frozenset[str]:
-    """Return all currently known kinds of entities."""
+    """Return all known kinds of objects (such as car or pedestrian), without map parts."""
     return frozenset(_entity_kinds)
 
 
@@ -351,7 +351,7 @@ _MAPPED: Final = range(len(OWN_ENTITY_KINDS), len(OWN_KINDS))
 
 
 def are_entities(codes: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Return a mask of the kind codes of entities. Other codes are map elements."""
+    """Return a mask of the kind codes of objects. Other codes are kinds of map parts."""
     return (codes < _MAPPED.start) | (codes >= _MAPPED.stop)
 
 
@@ -363,7 +363,7 @@ def _add_plugins() -> None:
 
 
 def relation_named(name: str) -> str | None:
-    """Return the relation for a user's word, or ``None`` if unknown."""
+    """Return the name of a relation for a word in a query, or ``None`` if unknown."""
     found = _meant("relation", name)
     if found is None:
         _add_plugins()  # the search takes time
@@ -372,7 +372,10 @@ def relation_named(name: str) -> str | None:
 
 
 def kinds_labelled(label: str) -> tuple[str, ...] | None:
-    """Return the kinds with a label, or ``None`` for an unknown label. ``Ego`` is not a label of kinds."""
+    """Return the kinds that a label (such as ``Vehicle``) covers, or ``None`` for an unknown label.
+
+    ``Ego`` is not a label of kinds.
+    """
     own = _OWN_LABELS_FOLDED.get(normalize_name(label))
     if own is not None and label not in _others("kind"):
         return tuple(own)
@@ -381,7 +384,7 @@ def kinds_labelled(label: str) -> tuple[str, ...] | None:
 
 
 def kind_named(word: str) -> str | None:
-    """Return the kind for a word or its synonym. ``None`` means no kind, or several kinds.
+    """Return the kind for a word or its synonym. ``None`` means an unknown or ambiguous word.
 
     ``vehicle`` means the kind of that name here, although the label covers all vehicle kinds.
     """
@@ -393,7 +396,7 @@ def kind_named(word: str) -> str | None:
 
 
 def vague_kind(type_name: str) -> str:
-    """Return the kind of an unmapped type name: ``vehicle`` for vehicle types, else ``unknown``.
+    """Return a kind for a simulator type name without a mapping: ``vehicle`` or ``unknown``.
 
     OSI uses ``TYPE_VEHICLE``; names of CARLA and nuScenes begin with ``vehicle.``.
     """
@@ -403,13 +406,13 @@ def vague_kind(type_name: str) -> str:
 
 
 def labels() -> tuple[str, ...]:
-    """Return all labels for patterns in CamelCase, ``Ego`` first."""
+    """Return all node labels for query patterns in CamelCase, ``Ego`` first."""
     names = dict.fromkeys((*known_names("kind"), *SUPER_KINDS, *LABEL_ALIASES))
     return ("Ego", *map(_camel, names))
 
 
 def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
-    """Return a sort key for trace names in natural order: ``run2`` before ``run10``.
+    """Return a sort key for trace names in natural order (``run2`` before ``run10``).
 
     Digits compare as numbers, letters without case. The characters decide between names that are still equal.
     """
@@ -420,7 +423,7 @@ def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
 
 
 def suggestion(name: str, known: Iterable[str], alike: float = 0.6) -> str | None:
-    """Return the known name most similar to ``name``.
+    """Return the known name most similar to a given name, or ``None`` if none is similar.
 
     ``None`` means no similarity of at least ``alike`` (0 to 1).
     """
@@ -431,7 +434,7 @@ def suggestion(name: str, known: Iterable[str], alike: float = 0.6) -> str | Non
 
 @dataclass(frozen=True, slots=True)
 class TypeMeaning:
-    """Meaning of a simulator type name.
+    """Meaning of a simulator's type name: kind, subkind and special role of the object.
 
     Attributes
     ----------
@@ -450,7 +453,7 @@ class TypeMeaning:
 
 @cache
 def type_meanings() -> Mapping[str, TypeMeaning]:
-    """Return the built-in mapping of simulator types: type name in lower case → meaning."""
+    """Return the built-in mapping of simulator type names: type name in lower case → meaning."""
     text = resources.files("sgstore.model").joinpath("vocabulary.toml").read_text(encoding="utf-8")
     return {
         name.lower(): TypeMeaning(**meaning)

@@ -1,4 +1,4 @@
-"""Simulator data: the frames of a trace as arrays, and the file positions of its messages.
+"""Input data of scene graphs: object states of a trace as arrays, events, and message positions.
 
 Readers pass these values to the scene graph generator and to the store. The store rounds them. Conventions of
 axes, units and signs are those of :mod:`sgstore.base.geometry`: OpenDRIVE's inertial axes, metres, radians,
@@ -49,7 +49,7 @@ TOLERANCE_SHARE: Final = 100
 
 
 def seconds_of(ns: int) -> float:
-    """Return a time in nanoseconds as seconds, rounded to whole microseconds.
+    """Convert nanoseconds to seconds, rounded to whole microseconds.
 
     Simulator clocks lose the last nanosecond: 7.499999999 s means 7.5 s.
     """
@@ -58,7 +58,7 @@ def seconds_of(ns: int) -> float:
 
 
 def tolerance_ns(period_ns: int) -> int:
-    """Return the largest clock jitter of a trace: times this near count as equal; ns.
+    """Return the clock tolerance of a trace: times this close count as equal; ns.
 
     All comparisons of time use this tolerance in favour of equality: ``>= 3 s`` is true for 2.9999 s, ``< 3 s``
     is false.
@@ -77,7 +77,7 @@ def tolerance_ns(period_ns: int) -> int:
 
 
 def derivable_ns(period_ns: float) -> float:
-    """Return the longest gap between frames over which motion is derived: three median periods; ns."""
+    """Return the longest gap between frames over which speeds are derived from positions; ns."""
     return 3 * period_ns + tolerance_ns(int(period_ns))
 
 
@@ -113,7 +113,11 @@ _SIZES: Final = slice(POSE.index("length"), POSE.index("height") + 1)
 
 
 def implausible(values: Floats) -> Bools:
-    """Return a mask of impossible sizes and velocities. All flavours and the online mode use this check.
+    """Return a mask of impossible sizes and velocities of objects.
+
+    All readers and the online mode use this check.
+
+    All readers and the online mode use this check.
 
     Parameters
     ----------
@@ -136,7 +140,7 @@ def implausible(values: Floats) -> Bools:
 def is_plausible(
     vx: float, vy: float, vz: float, length: float, width: float, height: float
 ) -> bool:
-    """Fast test of one entity. False if :func:`implausible` may reject one of its values."""
+    """Return True if the size and velocity of an object are surely plausible (fast test)."""
     # A comparison with NaN is false.
     if any(size < 0 or size > LARGEST for size in (length, width, height)):
         return False
@@ -144,7 +148,7 @@ def is_plausible(
 
 
 def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
-    """Return the values with NaN in place of impossible sizes and velocities, and their faults.
+    """Return values with NaN in place of impossible sizes and velocities, and fault texts.
 
     Parameters
     ----------
@@ -176,7 +180,7 @@ def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
 
 
 class FaultTally:
-    """Impossible values by entity: the first value, and the number of states with such values."""
+    """Counts of impossible values (sizes, velocities) by object, with the first value of each."""
 
     MOST: Final = 1000
     """Number of listed faults. Further faults are only counted."""
@@ -186,7 +190,7 @@ class FaultTally:
         self._more = 0
 
     def add(self, ident: str, words: str) -> None:
-        """Count one fault, such as ``length is -4.5 m``."""
+        """Count one impossible value of an object, such as ``length is -4.5 m``."""
         number, _, value = words.partition(" ")
         what = f"{number} of entity {ident!r}"
         if what not in self._found and len(self._found) == self.MOST:
@@ -196,7 +200,7 @@ class FaultTally:
         self._found[what] = first, count + 1
 
     def losses(self) -> list[Loss]:
-        """Return one loss for each faulty attribute of an entity."""
+        """Return one report entry for each object attribute with impossible values."""
         reasons = [
             f"{what} {first}: missing in {count} states"
             for what, (first, count) in self._found.items()
@@ -207,7 +211,7 @@ class FaultTally:
 
 
 def is_leap(away: float, seconds: float) -> bool:
-    """True if the distance is too long for any body to cover in this time.
+    """Return True if a distance is too long for an object to move in the given time.
 
     Parameters
     ----------
@@ -220,7 +224,7 @@ def is_leap(away: float, seconds: float) -> bool:
 
 
 def leaps(away: Floats, seconds: Floats) -> Bools:
-    """Vectorised form of :func:`is_leap`."""
+    """Return a mask of distances that are too long for objects to move in the given times."""
     return (seconds > 0) & (away > FASTEST * seconds + LEAP)
 
 
@@ -234,7 +238,7 @@ AnyEntity = TypeVar("AnyEntity")
 
 
 class Sight(NamedTuple):
-    """Place and time of an observation of an entity.
+    """Position and time of one observation of an object.
 
     Attributes
     ----------
@@ -257,14 +261,14 @@ class Sight(NamedTuple):
 
 
 class Life(NamedTuple, Generic[AnyEntity]):
-    """Entity that shares its id with others over time. ``seen`` is its last place; ``None`` means unknown."""
+    """Object that shares its id with other objects over time, with its last position."""
 
     entity: AnyEntity
     kind: int
     seen: Sight | None = None
 
     def goes_on(self, kind: int | None, here: Sight) -> bool:
-        """True if the observation can belong to this entity.
+        """Return True if an observation can belong to this object: same kind, and possible distance.
 
         The kinds must be equal (``None``: uncertain kind), and the distance must be possible. After a clock
         jump, any distance is possible.
@@ -280,7 +284,7 @@ class Life(NamedTuple, Generic[AnyEntity]):
         return not is_leap(away, (here.time_ns - seen.time_ns) / 1e9)
 
     def is_recent(self, here: Sight) -> bool:
-        """True if the entity disappeared only a short time ago, or if the clock was reset since."""
+        """Return True if the object disappeared only a short time ago, or before a clock jump."""
         seen = self.seen
         if seen is None or seen.run != here.run:
             return True
@@ -288,7 +292,7 @@ class Life(NamedTuple, Generic[AnyEntity]):
 
 
 class Lives(Generic[AnyEntity]):
-    """Entities that have used one id, one after another.
+    """Objects that have used the same id, one after another.
 
     If an id returns with another kind, or at an impossible distance, it denotes another entity from then on.
     Entities that use one id in turns continue.
@@ -317,7 +321,7 @@ class Lives(Generic[AnyEntity]):
     def follow(
         self, kind: int, here: Sight, enter: Callable[[], AnyEntity], *, sure_kind: bool = True
     ) -> AnyEntity:
-        """Return the entity that uses the id in this observation.
+        """Return the object that uses the id in an observation. It may be a new object.
 
         Parameters
         ----------
@@ -352,7 +356,7 @@ HIGHEST_GEAR: Final = 127
 
 @dataclass(frozen=True, slots=True)
 class Entities:
-    """Constant properties of the new entities of a block, ordered by node id.
+    """Constant properties of the objects that are new in a block of frames, by node id.
 
     Attributes
     ----------
@@ -394,7 +398,7 @@ class Entities:
 
 @dataclass(frozen=True, slots=True)
 class States:
-    """States of entities, one row per entity and time. All arrays have shape (N,).
+    """States of objects (pose, size, motion, lights) as columns, one row per object and time; shape (N,).
 
     Attributes
     ----------
@@ -463,12 +467,12 @@ class States:
         return len(self.node)
 
     def take(self, rows: NDArray[np.intp] | Bools) -> States:
-        """Return the selected rows in the given order."""
+        """Return selected rows of object states in the given order."""
         return taken(self, rows)
 
     @classmethod
     def of(cls, **columns: NDArray[np.generic]) -> States:
-        """Return states from the given columns.
+        """Make a table of object states from given columns.
 
         ``node`` is required; other columns default to missing values.
         """
@@ -489,7 +493,7 @@ class States:
 
 @dataclass(frozen=True, slots=True)
 class MessageRefs:
-    """Positions of messages in the recording, one row per message; shape (M,).
+    """File positions of recorded messages, one row per message; shape (M,).
 
     Attributes
     ----------
@@ -517,7 +521,11 @@ class MessageRefs:
 
 @dataclass(frozen=True, slots=True)
 class FrameBlock:
-    """Consecutive frames of a trace. Frame f has the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
+    """Block of consecutive frames of a trace, with object states, new objects, messages and events.
+
+    Frame f has the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
+
+    Frame f has the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
 
     Attributes
     ----------
@@ -566,13 +574,13 @@ class FrameBlock:
 
     @property
     def frame_of(self) -> Ints:
-        """(N,) int64: the index of the frame of each state in this block."""
+        """Index of the frame of each object state in the block, (N,) int64."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """Message channel of a recording.
+    """Message channel of a recording: topic, schema, encoding and role.
 
     Attributes
     ----------
@@ -597,7 +605,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class TraceInfo:
-    """Properties of a recording that are known before its frames are read.
+    """Properties of a recording that are known before its frames are read, such as channels and ego.
 
     Attributes
     ----------
@@ -639,7 +647,7 @@ class TraceInfo:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Event reported by a simulator, for a vehicle or for weather and light.
+    """Event reported by a simulator, such as a collision or a change of weather.
 
     Attributes
     ----------
@@ -694,7 +702,11 @@ def nearest_frames(events: Sequence[Event], time_ns: Any, log_time_ns: Any) -> I
 
 @dataclass(slots=True)
 class TraceReport(Findings):
-    """Findings from the reading of a trace. The reader adds findings block by block.
+    """Report of the reading of a trace: counts, warnings, lost messages and events.
+
+    The reader extends the report block by block.
+
+    The reader extends the report block by block.
 
     Attributes
     ----------
@@ -742,7 +754,7 @@ class Clip:
     end_ns: int
 
     def widened(self, by: int) -> Clip:
-        """Return the clip, extended by this time at both ends; ns.
+        """Return the time interval, extended at both ends by a time; ns.
 
         Examples
         --------
@@ -767,7 +779,7 @@ _HAND_BRAKE: Final = KEPT.index("hand_brake")
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Reference point of the positions of a trace; whole metres."""
+    """Coordinate origin to which the positions of a trace are relative; whole metres."""
 
     x: float
     y: float
@@ -775,7 +787,7 @@ class Origin:
 
 
 def origin_of(frames: FrameBlock) -> Origin | None:
-    """Return the median position in the first frame with positions, in whole metres.
+    """Return a coordinate origin for a trace: the median position in its first frame, in whole metres.
 
     The result does not depend on the ego. Without moving entities, the scenery counts. ``None`` means no
     positions yet.
@@ -796,7 +808,12 @@ def _middle(states: States) -> Origin:
 
 
 def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
-    """Round values as the store does. Graphs are then equal before and after storage."""
+    """Round the object states of frames to the precision of the store.
+
+    Graphs are then equal before and after storage.
+
+    Graphs are then equal before and after storage.
+    """
     return replace(
         frames,
         states=_as_kept(frames.states, origin),
@@ -805,7 +822,11 @@ def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
 
 
 def _as_kept(states: States, origin: Origin) -> States:
-    """Return states as float32 relative to an origin. A second call, or storage, changes nothing.
+    """Convert object states to float32 relative to the coordinate origin, as in the store.
+
+    A second call, or storage, changes nothing.
+
+    A second call, or storage, changes nothing.
 
     A float32 has 24 significant bits. The sum with the origin may round off low bits in float64; the difference
     to the origin then still fits into 24 bits.
@@ -830,13 +851,13 @@ def _as_kept(states: States, origin: Origin) -> States:
 
 
 def turned(heading: Floats) -> Floats:
-    """Return headings in (-π, π], also after rounding to float32."""
+    """Wrap headings into (-π, π], also after rounding to float32."""
     # The largest float32 that is not above π: the float32 nearest to π is.
     largest = float(np.nextafter(np.float32(np.pi), np.float32(0)))
     return np.clip(wrapped(heading), -largest, largest)
 
 
 def number(values: Floats) -> NDArray[np.float32]:
-    """Return values as float32. A value beyond its range becomes infinite."""
+    """Convert values to float32. A value beyond the float32 range becomes infinite."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)

@@ -451,7 +451,9 @@ class MessageTrace:
         raise NotImplementedError
 
     def blocks(self, size: int = 60) -> Iterator[FrameBlock]:
-        """Yield the frames of the recording in blocks of ``size`` frames.
+        """Yield the frames of the recording in blocks of consecutive frames.
+
+        Block i begins at frame ``i * size``. The last block may be shorter.
 
         Raises
         ------
@@ -816,7 +818,10 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         self._warn_of_egos(_NO_EGO)
 
     def _check(self, frame: object) -> None:
-        """Raise an error if a frame contradicts earlier frames of the recording."""
+        """Raise an error if a frame contradicts earlier frames of the recording.
+
+        The state of the decoder does not change.
+        """
         if not isinstance(frame, Frame):
             raise TypeError(f"{type(frame).__name__} is no Frame")
         if abs(frame.time_ns) >= _LATEST:

@@ -687,7 +687,10 @@ class LifetimeTracker:
         self._warnings: list[str] = []
 
     def follow(self, frames: list[FrameRows], sizes: list[int]) -> list[FrameRows]:
-        """Return the next frames with final node ids, also for ids reused by other objects."""
+        """Return the next frames with final node ids, also for ids reused by other objects.
+
+        ``sizes`` is the number of known ids at each frame.
+        """
         runs: list[int] = []
         for frame in frames:
             seconds = self._seconds(frame.time_ns)
@@ -988,7 +991,10 @@ def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floa
 
 
 def _accelerations(values: Floats, rows: slice, steps: Steps, moving: Steps) -> Floats:
-    """Return accelerations from velocities, only over time steps with plausible speeds."""
+    """Return accelerations from velocities, only over time steps with plausible speeds.
+
+    ``moving`` contains these time steps.
+    """
     velocity = values[:, _VELOCITY : _VELOCITY + 3]
     position = values[:, _X : _X + 3]
     before, behind, since, until = moving

@@ -46,7 +46,10 @@ RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile
 
 
 class RecordingReader(Protocol):
-    """Interface of a reader: a callable that opens a recording of one type, such as CARLA or OSI."""
+    """Interface of a reader: a callable that opens a recording of one type, such as CARLA or OSI.
+
+    The argument ``mapping`` is optional.
+    """
 
     name: str
 

@@ -51,7 +51,10 @@ LENGTH: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """ROS type: number or boolean of ``size`` bytes."""
+    """ROS type: number or boolean of ``size`` bytes.
+
+    ``code`` is its type code in :mod:`struct` and numpy.
+    """
 
     code: str
     size: int
@@ -59,7 +62,10 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """ROS type: string, with an optional maximum number of bytes."""
+    """ROS type: string, with an optional maximum number of bytes.
+
+    ``bound`` is the maximum; -1 means unlimited.
+    """
 
     bound: int
 
@@ -442,7 +448,10 @@ class _MessageReader:
         return _unpacker(self.order + kind.code)(self.values, start)[0]
 
     def length(self, least_size: int, bound: int, what: str) -> int:
-        """Read the length of a sequence or string, and check that the message is long enough."""
+        """Read the length of a sequence or string, and check that the message is long enough.
+
+        Each element has at least ``least_size`` bytes.
+        """
         count = _unpacker(self.order + "I")(self.values, self.take(LENGTH, LENGTH))[0]
         left = len(self.values) - self.place
         if count * least_size > left:

@@ -89,7 +89,10 @@ class TraceClasses:
         return self._columns(self._named(seen), trace_id, seq)
 
     def ingested(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
-        """Return the frame classes of a block of frames as columns of the table ``frame_class``."""
+        """Return the frame classes of a block of frames as columns of the table ``frame_class``.
+
+        Frames with equal content use the same cached classes.
+        """
         contents = contents_of(seen)
         rows = {content: row for row, content in enumerate(contents) if content not in self._known}
         fresh = sorted(rows.values())

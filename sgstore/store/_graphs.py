@@ -182,6 +182,8 @@ class Graphs:
     ) -> tuple[list[tuple[NDArray[np.int64], GraphColumns]], int]:
         """Return the graphs of some frames, grouped by road map, and the number of edges.
 
+        Frames without a map form one group.
+
         Without frames, the result is an empty graph if ``trace_id`` is given.
         """
         by_frame, by_mask = _asked(ids, (trace_id or 0) << SEQ_BITS)

@@ -147,6 +147,8 @@ def shared_instance(
 class OpenFile:
     """Store file in this process: the DuckDB instance, the readers and the locks of the file.
 
+    Changes require the lock ``changed``.
+
     Attributes
     ----------
     instance : DuckDBPyConnection, AttachedFile or None

@@ -162,7 +162,10 @@ class PartFile:
 
     @staticmethod
     def of_rows(columns: Mapping[str, str], rows: Iterable[Sequence[Any]], to: Path) -> PartFile:
-        """Write rows of Python values to a file, as a partial query result."""
+        """Write rows of Python values to a file, as a partial query result.
+
+        ``columns`` maps column names to database types.
+        """
         names, types = [f"c{number}" for number in range(len(columns))], (*columns.values(),)
         return PartFile(to, tuple(columns), types, ParquetTable.write_rows(names, rows, to, types))
 
@@ -178,7 +181,10 @@ class PartFile:
     def merged_arrays(
         parts: Parts, words: Mapping[str, Sequence[str]], sql: str, values: Sequence[Any]
     ) -> dict[str, NDArray[np.generic]]:
-        """Run SQL over the query results of several stores, and return its columns as arrays."""
+        """Run SQL over the query results of several stores, and return its columns as arrays.
+
+        NULL values are masked.
+        """
         with _tables(parts, words) as connection:
             return arrays(connection, sql, _numbered(values))
 

@@ -182,7 +182,10 @@ def node_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
 def edge_columns(
     graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds
 ) -> Iterator[Columns]:
-    """Yield rows of the store table ``edge`` as columns, about :data:`EDGE_ROWS` rows at a time."""
+    """Yield rows of the store table ``edge`` as columns, about :data:`EDGE_ROWS` rows at a time.
+
+    Relations and kinds are codes.
+    """
     edges = graph.edges
     count = -(-len(edges) // EDGE_ROWS)
     if count <= 1:

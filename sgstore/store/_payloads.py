@@ -138,7 +138,10 @@ def _messages_of(
 def _own(
     frames: FrameTimes, messages: Callable[[], Iterable[Columns]], leading: list[int]
 ) -> Columns:
-    """Return the ground-truth message from which each frame was read."""
+    """Return the ground-truth message from which each frame was read.
+
+    Frames of equal time keep the order of the messages.
+    """
     parts = list(_messages_of(messages, leading))
     if not parts:
         return {name: np.zeros(0, np.int64) for name in ("frame", "channel", *_PLACE)}
@@ -188,7 +191,10 @@ def _none(count: int) -> Ints:
 
 
 def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
-    """Choose between two messages for each frame: the later or the earlier by log time."""
+    """Choose between two messages for each frame: the later or the earlier by log time.
+
+    At equal times, the message with the later file position is chosen.
+    """
     further = np.zeros(one.shape[1], np.bool_)
     same = np.ones(one.shape[1], np.bool_)
     for mine, theirs in zip(one[1:], other[1:], strict=True):
@@ -268,7 +274,10 @@ class Happenings:
         )  # the last frame so far: simulation time, log time, id
 
     def of(self, frames: FrameBlock) -> Columns:
-        """Assign events to the frames of a block, and return rows of the store table ``event``."""
+        """Assign events to the frames of a block, and return rows of the store table ``event``.
+
+        Events that a later frame may be nearer to are held back.
+        """
         ids = frame_ids(self._trace_id, frames.seq)
         known = np.hstack([self._last, np.stack([frames.time_ns, frames.log_time_ns, ids])])
         self._last = known[:, -1:]

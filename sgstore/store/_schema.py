@@ -214,7 +214,10 @@ def about_store(
 
 
 def schema_of(objects: Objects) -> str:
-    """Return the name of the database schema that has the store's tables."""
+    """Return the name of the database schema that has the store's tables.
+
+    Old stores have tables and views in one schema.
+    """
     return INSIDE if INSIDE in _info_of(objects) else "main"
 
 

@@ -75,7 +75,10 @@ class SimilarFrames:
 
 @dataclass(slots=True)
 class _FrameRun:
-    """Run of consecutive frames of a trace with equal graph features and equal similarity to the example."""
+    """Run of consecutive frames of a trace with equal graph features and equal similarity to the example.
+
+    If the frames match all features, their class is equal, too.
+    """
 
     key: tuple[Any, ...]
     similarity: float

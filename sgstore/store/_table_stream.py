@@ -83,7 +83,10 @@ class TableFile:
     def append(
         self, table: str, columns: Columns, texts: Mapping[str, list[str]] | None = None
     ) -> Piece:
-        """Append rows of a table to the file, and return their position."""
+        """Append rows of a table to the file, and return their position.
+
+        ``texts`` maps each text column to the texts behind its indices.
+        """
         rows = len(next(iter(columns.values())))
         about: dict[str, dict[str, Any]] = {}
         body: list[NDArray[Any]] = []
@@ -221,7 +224,10 @@ class TableFile:
 
 
 def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None]:
-    """Convert an array to a smaller integer type, or to its single value, to save disk space."""
+    """Convert an array to a smaller integer type, or to its single value, to save disk space.
+
+    Return the description of the column, and the array to write.
+    """
     kind = values.dtype.newbyteorder("<").str
     values = np.ascontiguousarray(values)
     if values.dtype.kind == "f":

@@ -315,7 +315,10 @@ def located(
 def stored_traces(
     connection: DuckDBPyConnection, store: Path | None = None, root: str | Path | None = None
 ) -> tuple[StoredTrace, ...]:
-    """Return all traces of a store, sorted by name in natural order (``run2`` before ``run10``)."""
+    """Return all traces of a store, sorted by name in natural order (``run2`` before ``run10``).
+
+    :func:`located` finds the recordings.
+    """
     found = run(connection, _TRACES).dicts()
     texts = connection.execute("SELECT config_id, settings FROM config").fetchall()
     try:

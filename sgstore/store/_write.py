@@ -287,7 +287,10 @@ class Segment:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return counts of the object states that the settings have excluded so far, for the report."""
+        """Return counts of the object states that the settings have excluded so far, for the report.
+
+        An import excludes none.
+        """
         counts, settings = self._left_out, json.loads(self._identity.settings)
         if not counts.states:
             return {}

@@ -1,4 +1,4 @@
-"""Abstractions reduce scene graphs to labelled graphs from the literature, with a class for each graph.
+"""Abstractions: simpler labelled graphs from the literature, made from scene graphs, with a class per graph.
 
 An abstraction is a function from columns (:class:`GraphColumns`) to columns (:class:`Labelled`).
 :data:`ABSTRACTIONS` lists the built-in ones. Users add their own with :func:`register`, or as an

@@ -1,4 +1,4 @@
-"""Canonical forms and class identifiers of labelled graphs.
+"""Classes of labelled graphs: two isomorphic graphs have the same class identifier (canonical form).
 
 The search finds an order of the nodes that depends on the graph only, even if colours do not
 distinguish all nodes.
@@ -46,12 +46,12 @@ _DEEPEST: Final = 150
 
 
 class TooSymmetricError(Exception):
-    """Raised inside the package if the search exceeds its work limit."""
+    """Error: the search for the canonical node order of a graph exceeds its work limit."""
 
 
 @dataclass(slots=True)
 class SymmetrySearch:
-    """Search for the canonical order of one graph.
+    """Search for the canonical node order of one graph, which is the same for isomorphic graphs.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class SymmetrySearch:
             return None
 
     def _canonical(self, arcs: Arcs, colour: dict[int, int]) -> list[int]:
-        """Return the order of a graph: refine it, split it into components, order each."""
+        """Return the canonical node order of a graph: refine colours, order each component."""
         colour = self._refined(arcs, colour)
         sizes = Counter(colour.values())
         alone = sorted((n for n in colour if sizes[colour[n]] == 1), key=colour.__getitem__)
@@ -103,7 +103,7 @@ class SymmetrySearch:
         return alone + [node for _, order in parts for node in order]
 
     def _connected(self, arcs: Arcs, colour: dict[int, int]) -> list[int]:
-        """Return the order of a connected graph with stable colours."""
+        """Return the canonical node order of a connected graph with stable colours."""
         cells: dict[int, list[int]] = defaultdict(list)
         for node, of in colour.items():
             cells[of].append(node)
@@ -130,7 +130,7 @@ class SymmetrySearch:
         return tried[min(tried)]
 
     def _refined(self, arcs: Arcs, colour: dict[int, int]) -> dict[int, int]:
-        """Return stable colours: ranks with the same meaning in every graph."""
+        """Return stable node colours (colour refinement), with the same meaning in every graph."""
         back: Arcs = {node: {} for node in arcs}
         for src, to in arcs.items():
             for dst, label in to.items():
@@ -164,7 +164,7 @@ class SymmetrySearch:
 
 
 def _telling(arcs: Arcs, colour: dict[int, int], sizes: Counter[int]) -> Arcs:
-    """Return the edges of a graph that distinguish nodes of one cell."""
+    """Return the edges of a graph that distinguish nodes of the same colour."""
     many = Counter(
         (colour[src], label, colour[dst]) for src, to in arcs.items() for dst, label in to.items()
     )
@@ -206,7 +206,7 @@ def _components_of_graph(arcs: Arcs) -> list[Arcs]:
 
 
 def _form(arcs: Arcs, colour: dict[int, int], order: Sequence[int]) -> Form:
-    """Return a coloured graph as its ordered nodes, and its edges by places in this order."""
+    """Return a graph as its ordered node colours, and its edges by positions in this order."""
     place = {node: i for i, node in enumerate(order)}
     edges = sorted(
         (place[src], place[dst], label) for src, to in arcs.items() for dst, label in to.items()
@@ -253,7 +253,7 @@ _EDGE: Final = np.dtype([("src", "<u4"), ("dst", "<u4"), ("low", "<u8"), ("high"
 
 
 def classes_of(graphs: Labelled, work: int = WORK) -> list[str]:
-    """Return the class of each frame's graph: 32 hexadecimal digits, or empty above the ``work`` limit.
+    """Return a class per graph: 32 hexadecimal digits, or empty for a too symmetric graph.
 
     Raises
     ------
@@ -264,7 +264,7 @@ def classes_of(graphs: Labelled, work: int = WORK) -> list[str]:
 
 
 class Classes:
-    """Classes of graphs, with a cache.
+    """Cache for the classes of graphs: isomorphic graphs have the same class.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ class Classes:
         self._known: OrderedDict[bytes, str] = OrderedDict()
 
     def of(self, *graphs: Labelled) -> list[str]:
-        """Return the classes of several blocks of graphs in one pass, as :func:`classes_of`."""
+        """Return the class of each graph, for several blocks of labelled graphs at once."""
         block = _Block.beside([_Block.of(one) for one in graphs])
         contents = block.contents()
         fresh = {content: i for i, content in enumerate(contents) if content not in self._known}
@@ -295,7 +295,7 @@ _TOLD[[RELATION_CODE[name] for name in OF_JUNCTION]] = True
 
 
 def contents_of(seen: GraphColumns) -> list[bytes]:
-    """Return 256 bits per frame; equal bits mean equal classes in the abstractions of ingest.
+    """Return a 256-bit hash per frame. Equal hashes mean equal classes in all standard abstractions.
 
     The bits cover the nodes, the edges of ``junction``, and the lanes relative to the ego. Two
     equal frames have the same classes in ``E``, ``EL``, ``ER``, ``RSV`` and ``junction``; only one
@@ -313,7 +313,7 @@ def contents_of(seen: GraphColumns) -> list[bytes]:
 
 
 def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
-    """Add two hash words for each row to the sums of its frame; ``sort`` distinguishes tables."""
+    """Add hash values of table rows to the hash sums of their frames."""
     if not len(frame):
         return
     words = np.full(len(frame), sort, np.uint64)
@@ -327,7 +327,7 @@ def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
 
 @dataclass(frozen=True)
 class _Block:
-    """Graphs in columns: nodes ordered by graph, edges ordered by their ends.
+    """Labelled graphs of several frames in columns, with nodes sorted by graph.
 
     Parallel edges are merged: the words of the label are the sums of their words, which still
     distinguish any two sets. ``low`` and ``high`` are the two words of the digests of labels.
@@ -374,7 +374,7 @@ class _Block:
 
     @classmethod
     def beside(cls, blocks: Sequence[_Block]) -> _Block:
-        """Concatenate several blocks."""
+        """Concatenate the graphs of several blocks."""
         if len(blocks) == 1:
             return blocks[0]
         graphs = np.cumsum([0, *(block.graphs for block in blocks)])
@@ -396,7 +396,7 @@ class _Block:
         return cls(int(graphs[-1]), *map(np.concatenate, zip(*columns, strict=True)))
 
     def contents(self) -> list[bytes]:
-        """Return 128 bits per graph, equal if nodes, edges and labels are equal."""
+        """Return a 128-bit hash per graph, equal for graphs with equal nodes, edges and labels."""
         of_node = _mixed(self.node.view(np.uint64) * _A + self.node_low)
         src, dst = self.node[self.src].view(np.uint64), self.node[self.dst].view(np.uint64)
         of_edge = _mixed(_mixed(src * _B + self.low) + dst * _C)
@@ -413,7 +413,7 @@ class _Block:
         return [blake2b(row.astype("<u8").tobytes(), digest_size=16).digest() for row in sums]
 
     def taken(self, rows: list[int]) -> _Block:
-        """Return these graphs, in ascending order."""
+        """Return selected graphs of the block, in ascending order."""
         if len(rows) == self.graphs:
             return self
         number = np.full(self.graphs, -1)
@@ -436,14 +436,14 @@ class _Block:
         )
 
     def classes(self, work: int) -> list[str]:
-        """Return the class of each graph."""
+        """Return the class of each graph in the block."""
         order, known = _ordered(self, _refined(self), work)
         return _hashed(self, order, known)
 
 
 @lru_cache(maxsize=64)
 def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
-    """Return 128 bits of each label as two words, (L, 2); read-only."""
+    """Return a 128-bit hash of each label as two words, (L, 2)."""
     raw = b"".join(
         blake2b(label.encode("utf-8", "surrogatepass"), digest_size=16).digest() for label in labels
     )
@@ -451,7 +451,7 @@ def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
 
 
 def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
-    """Return the hash words of labels and bundles, for sums over edges."""
+    """Return hash words of edge labels and of sets of labels."""
     words = _mixed(words)
     several = bundles[::-1]
     flat = np.array([label for bundle in several for label in bundle], np.int64)
@@ -469,7 +469,7 @@ def _mixed(words: Words) -> Words:
 
 
 def _sums(owner: Ints, values: Words, count: int) -> Words:
-    """Return sums of values by owner, modulo 2⁶⁴; owners must ascend."""
+    """Return sums of hash words per graph or node, modulo 2⁶⁴."""
     total = np.zeros(count, np.uint64)
     if len(owner):
         starts = np.flatnonzero(np.append(True, owner[1:] != owner[:-1]))
@@ -478,7 +478,7 @@ def _sums(owner: Ints, values: Words, count: int) -> Words:
 
 
 def _refined(block: _Block) -> Words:
-    """Return stable colours of the nodes.
+    """Return stable node colours (colour refinement) for all graphs of a block, as hash words.
 
     Each graph stops independently, when a round distinguishes no more nodes. Therefore its number
     of rounds and its colours depend on the graph alone. A loop is part of the first colour.
@@ -507,7 +507,7 @@ def _refined(block: _Block) -> Words:
 
 
 def _cells(block: _Block, colour: Words) -> Ints:
-    """Return the number of colours in each graph."""
+    """Return the number of different node colours in each graph."""
     order = np.lexsort((colour, block.graph))
     graph, of = block.graph[order], colour[order]
     fresh = np.ones(len(of), np.bool_)
@@ -516,7 +516,7 @@ def _cells(block: _Block, colour: Words) -> Ints:
 
 
 def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
-    """Return the nodes in canonical order, graph after graph, and a mask of ordered graphs."""
+    """Return the nodes of each graph in canonical order, and a mask of the ordered graphs."""
     nodes = len(block.graph)
     order = np.lexsort((colour, block.graph))
     cell = np.zeros(nodes, np.int64)
@@ -543,7 +543,7 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
 
 
 def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
-    """Return for each node the smallest row in its component of distinguishing edges."""
+    """Return a component number for each node, by the edges that distinguish equal colours."""
     part = np.arange(len(cell))
     src, dst = block.src, block.dst
     rows = np.flatnonzero((src != dst) & (size[cell[src]] > 1) & (size[cell[dst]] > 1))
@@ -572,7 +572,7 @@ def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
 
 
 def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> Ints | None:
-    """Return rows of the nodes of one graph in canonical order, by individualisation."""
+    """Return the nodes of one graph in canonical order, by a search over nodes of equal colour."""
     first, last = np.searchsorted(block.edge_graph, [number, number + 1])
     src, dst = block.src[first:last], block.dst[first:last]
     low, high = block.low[first:last].tolist(), block.high[first:last].tolist()
@@ -591,7 +591,7 @@ def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> 
 
 
 def _hashed(block: _Block, order: Ints, known: Bools) -> list[str]:
-    """Return the hashes of graphs with their nodes in this order."""
+    """Return a hash per graph, from the canonical node order."""
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     nodes = np.stack([block.node_low[order], block.node_high[order]], axis=1).astype("<u8")

@@ -1,4 +1,4 @@
-"""Input and output of abstractions: graphs of many frames as columns, with lane roles.
+"""Input and output of abstractions: scene graphs and labelled graphs of many frames as columns.
 
 An abstraction is a function from :class:`GraphColumns`, the nodes and edges of scene graphs, to
 :class:`Labelled`, one directed multigraph per frame with labels on nodes and edges.
@@ -54,7 +54,7 @@ _LANE: Final = KIND_CODE["lane"]
 
 @dataclass(frozen=True, eq=False)
 class MapColumns:
-    """Parts of a road map, and the edges among them: row i has node id -1 - i.
+    """Nodes and edges of a road map as columns. Row i has node id -1 - i.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class MapColumns:
 
     @classmethod
     def of(cls, road_map: RoadMap) -> MapColumns:
-        """Return the columns of a road map's nodes and edges, cached while the map is in use."""
+        """Return the nodes and edges of a road map as columns. The result is cached with the map."""
         if (known := _MAPS.get(road_map)) is not None:
             return known
         nodes, edges = road_map.nodes, road_map.edges
@@ -105,7 +105,7 @@ class MapColumns:
 
     @cached_property
     def driving(self) -> Bools:
-        """Return a mask (K,) of the driving lanes."""
+        """Mask (K,) of the map nodes that are driving lanes."""
         return (self.kind == _LANE) & np.array([of in DRIVING for of in self.lane_type], np.bool_)
 
 
@@ -115,7 +115,7 @@ _MAPS: Final[WeakKeyDictionary[RoadMap, MapColumns]] = WeakKeyDictionary()
 
 @dataclass(frozen=True, eq=False)
 class GraphColumns:
-    """Nodes and edges of the scene graphs of many frames.
+    """Scene graphs of many frames as columns: nodes with kind and pose, and edges.
 
     Attributes
     ----------
@@ -157,13 +157,13 @@ class GraphColumns:
 
     @classmethod
     def sorted(cls, frames: int, nodes: Mapping[str, Any], **columns: Any) -> GraphColumns:
-        """Sort nodes in any order (``node_frame, node, kind, is_ego, x, y, z, heading``) into columns."""
+        """Sort node columns by frame and node id, and return the graphs."""
         order = np.lexsort((nodes["node"], nodes["node_frame"]))
         return cls(frames, **{name: of[order] for name, of in nodes.items()}, **columns)
 
     @classmethod
     def of(cls, graph: GraphBlock, kinds: Codes, grounds: MapColumns | None) -> GraphColumns:
-        """Convert a block of scene graphs to columns.
+        """Convert a block of scene graphs to columns for abstractions.
 
         Parameters
         ----------
@@ -204,7 +204,7 @@ class GraphColumns:
         )
 
     def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
-        """Return edges among parts of the map, for each frame that contains both ends.
+        """Return map edges for each frame that contains both end nodes.
 
         Returns
         -------
@@ -228,12 +228,12 @@ class GraphColumns:
 
     @cached_property
     def is_traffic(self) -> Bools:
-        """Return a mask (N,) of traffic entities, without scenery."""
+        """Mask (N,) of the nodes that are traffic objects, without scenery such as buildings."""
         return are_entities(self.kind) & ~_SMALL[self.kind]
 
     @cached_property
     def pairs(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Return ordered pairs of traffic entities, each once per frame, with all their relations.
+        """Pairs of traffic objects with a relation, once per frame, with all their relations as bits.
 
         Returns
         -------
@@ -258,7 +258,7 @@ class GraphColumns:
         return frame, node[starts[frame] + a], node[starts[frame] + b], bits
 
     def taken(self, frames: Ints) -> GraphColumns:
-        """Return these frames, in ascending order."""
+        """Return the graphs of selected frames, in ascending order."""
         if len(frames) == self.frames:
             return self
         number = np.full(self.frames, -1)
@@ -280,12 +280,12 @@ class GraphColumns:
         return some
 
     def row_of(self, frame: Ints, node: Ints) -> Ints:
-        """Return rows of nodes in frames; -1 for nodes outside the graph."""
+        """Return the row of a node in a frame's graph; -1 for nodes outside the graph."""
         return found(self.node_frame, self.node, frame, node)
 
 
 def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
-    """Return the distinct cells, ascending, and the union of each cell's bits."""
+    """Return distinct keys in ascending order, and the bitwise OR of each key's bits."""
     if bound <= _CELLS:
         sums = np.bincount(cell, weights=np.exp2(bit))
         cells = np.flatnonzero(sums)
@@ -300,7 +300,7 @@ def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
 
 
 def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
-    """Return the row of each (frame, node) in sorted columns, or -1."""
+    """Return the row of each (frame, node) pair in sorted columns; -1 if it is missing."""
     if not len(nodes):
         return np.full(len(node), -1)
     low, span = int(nodes.min()), int(nodes.max()) - int(nodes.min()) + 1
@@ -332,7 +332,7 @@ _CELLS: Final = 1 << 23
 
 @dataclass(frozen=True)
 class Labelled:
-    """Directed multigraph of each frame, with labels on nodes and edges.
+    """Labelled graphs of many frames as columns: the result of an abstraction.
 
     Attributes
     ----------
@@ -378,7 +378,7 @@ class Labelled:
         names: Mapping[int, str] | None = None,
         bundles: Sequence[Sequence[int]] = (),
     ) -> Labelled:
-        """Build graphs from parts: nodes ``(frame, node, label)``, edges ``(frame, src, label, dst)``.
+        """Build labelled graphs from parts: nodes ``(frame, node, label)``, edges ``(frame, src, label, dst)``.
 
         Labels are indices into ``labels``, which may repeat texts; a negative one represents a
         bundle. Nodes may have any order. A node that occurs twice in a frame is merged.
@@ -409,7 +409,7 @@ class Labelled:
         )
 
     def related(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Return edges whose label is a relation, one row each: frame, source, relation code, destination."""
+        """Return edges whose label is a relation: frame, source, relation code, destination."""
         code = {name: i for i, name in enumerate(RELATIONS)}
         parts = [(code.get(text, -1),) for text in self.labels]
         bundles = [tuple(parts[label][0] for label in bundle) for bundle in self.bundles]
@@ -427,7 +427,7 @@ class Labelled:
         return self.frame[edge], self.src[edge], relation[known], self.dst[edge]
 
     def named(self, number: int) -> tuple[dict[str, str], list[tuple[str, str, str]]]:
-        """Return one frame by names: nodes ``name → label``, and edges ``(name, label, name)``.
+        """Return one graph by names: nodes ``name → label``, and edges ``(name, label, name)``.
 
         The ego and unique nodes are named by their label, parts of the map by their name, and all
         others ``label_node``, such as ``car_12``.
@@ -461,7 +461,7 @@ def _columns(parts: Iterable[Part], count: int) -> list[NDArray[Any]]:
 
 
 def repeated(columns: Part) -> Bools:
-    """Return a mask of the rows that repeat an earlier row."""
+    """Return a mask of the rows that are equal to an earlier row."""
     again = np.zeros(len(columns[0]), np.bool_)
     if len(again):
         order = np.lexsort(columns)
@@ -474,7 +474,7 @@ def repeated(columns: Part) -> Bools:
 
 @dataclass(frozen=True, slots=True)
 class EgoLanes:
-    """Lanes of many frames, relative to the ego of each frame.
+    """Lanes of many frames with their role relative to the ego, such as left neighbour.
 
     Attributes
     ----------
@@ -498,7 +498,7 @@ class EgoLanes:
     off_road: Part
 
     def taken(self, number: Ints) -> EgoLanes:
-        """Return the lanes of selected frames; ``number`` has each frame's new number, or -1."""
+        """Return the lanes of selected frames, with new frame numbers."""
 
         def some(frame: Ints, *columns: Ints) -> Part:
             rows = np.flatnonzero(number[frame] >= 0)

@@ -1,4 +1,4 @@
-"""Features of labelled graphs: counts of nodes by label, and of edges by the labels of edge and ends.
+"""Features of labelled graphs for similarity: counts of nodes by label, and of edges by labels.
 
 The weighted Jaccard index (Ruzicka's similarity) compares two graphs as multisets of features:
 ``sum(min) / sum(max)`` over the counts. It is 1 for isomorphic graphs, and for few others; 0
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class GraphFeatures:
-    """Features of the graphs of many frames, one row per frame and feature.
+    """Label counts of many graphs, one row per frame and feature (node label, or edge with end labels).
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class GraphFeatures:
 
     @classmethod
     def of(cls, graphs: Labelled) -> GraphFeatures:
-        """Compute the features of labelled graphs."""
+        """Count the node labels and edge labels of labelled graphs."""
         label = graphs.node_label.astype(np.int64)
         frame, src, edge, dst = _single(graphs)
         ends = [label[found(graphs.node_frame, graphs.node, frame, end)] for end in (src, dst)]
@@ -60,13 +60,13 @@ class GraphFeatures:
         return cls(graphs.frames, texts, at, feature, count)
 
     def counts(self, number: int) -> Counter[str]:
-        """Return the features of one frame."""
+        """Return the label counts (features) of one frame's graph."""
         rows = np.flatnonzero(self.frame == number)
         names = (self.texts[i] for i in self.feature[rows].tolist())
         return Counter(dict(zip(names, self.count[rows].tolist(), strict=True)))
 
     def likeness(self, example: Counter[str]) -> NDArray[np.float64]:
-        """Return the weighted Jaccard index of each frame and an example, (frames,); 1 if both are empty."""
+        """Return the similarity (weighted Jaccard index) of each frame to an example, (frames,)."""
         wanted = np.array([example[text] for text in self.texts] or [0])
         both = np.minimum(self.count, wanted[self.feature])
         shared = np.bincount(self.frame, both, self.frames)
@@ -74,7 +74,7 @@ class GraphFeatures:
         return np.divide(shared, either, out=np.ones(self.frames), where=either > 0)
 
     def digests(self) -> NDArray[np.uint64]:
-        """Return a hash per frame, (frames,): equal for frames with equal features (except for collisions)."""
+        """Return a hash per frame, (frames,): equal for frames with equal label counts."""
         mixed = np.array([_hash(text) for text in self.texts] or [0], np.uint64)
         sums = np.zeros(self.frames, np.uint64)
         np.add.at(sums, self.frame, mixed[self.feature] * self.count.astype(np.uint64))
@@ -82,7 +82,7 @@ class GraphFeatures:
 
 
 def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
-    """Remove labels from graphs: nodes with their edges, and edges.
+    """Return labelled graphs without the given labels: nodes with their edges, and edges.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
 
 
 def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
-    """Empty the graphs of the frames outside ``chosen``."""
+    """Return labelled graphs in which the graphs of all frames not chosen are empty."""
     nodes, edges = chosen[graphs.node_frame], chosen[graphs.frame]
     return replace(
         graphs,

@@ -40,7 +40,7 @@ UNNAMED: Final = -(1 << 21)
 
 
 class Strands:
-    """Strands of a map, and their neighbours.
+    """Strands of a map (chains of consecutive lanes), with their left and right neighbours.
 
     Attributes
     ----------
@@ -60,7 +60,11 @@ class Strands:
         self._roles: OrderedDict[int, dict[int, int]] = OrderedDict()
 
     def roles(self, ego: int) -> dict[int, int]:
-        """Map strands to roles: 0 the ego's, n the n-th on its left, -n the n-th on its right."""
+        """Return the role of each strand (chain of lanes).
+
+        The role is 0 for the ego's strand, n for the n-th on its left, and -n for the n-th on its
+        right.
+        """
         if ego not in self._roles:
             roles = {ego: 0}
             for beside, sign in ((self._left, 1), (self._right, -1)):
@@ -74,7 +78,7 @@ class Strands:
         return self._roles[ego]
 
     def _beside(self, grounds: MapColumns, relation: str) -> defaultdict[int, set[int]]:
-        """Map each strand to the strands next to it on one side with the same direction."""
+        """Return the neighbours of each strand (chain of lanes) on one side, in the same direction."""
         against = grounds.relation == RELATION_CODE["opposes"]
         pairs = set(zip(grounds.src[against].tolist(), grounds.dst[against].tolist(), strict=True))
         rows = np.flatnonzero(grounds.relation == RELATION_CODE[relation])
@@ -91,14 +95,14 @@ _STRANDS: Final[WeakKeyDictionary[MapColumns, Strands]] = WeakKeyDictionary()
 
 
 def strands_of(grounds: MapColumns) -> Strands:
-    """Return the strands of a map's lanes."""
+    """Return the strands (chains of consecutive lanes) of a map."""
     if grounds not in _STRANDS:
         _STRANDS[grounds] = Strands(grounds)
     return _STRANDS[grounds]
 
 
 def _strands(grounds: MapColumns) -> Ints:
-    """Compute :attr:`Strands.of`."""
+    """Return the strand (chain of consecutive lanes) of each map node; 0 for other nodes."""
     on = grounds.relation == RELATION_CODE["travelsTo"]
     src, dst = -1 - grounds.src[on], -1 - grounds.dst[on]
     driven = grounds.driving
@@ -122,7 +126,7 @@ def _strands(grounds: MapColumns) -> Ints:
 
 
 def role_name(role: int) -> str:
-    """Return the name of a lane's role in the literature."""
+    """Return the name of a lane role, such as ``Left 1 of Ego Lane``."""
     if role == 0:
         return "Ego Lane"
     if role >= OPPOSING:
@@ -147,7 +151,7 @@ _ROLES: Final = {
 
 
 def _role_named(name: str) -> int:
-    """Parse a role name; the inverse of :func:`role_name`."""
+    """Parse the name of a lane role, such as ``Left 1 of Ego Lane``."""
     text = name.lower()
     if beside := _BESIDE.fullmatch(text):
         return int(beside[2]) * (1 if beside[1] == "left" else -1)
@@ -168,7 +172,7 @@ _NONE: Final = np.zeros(0, np.int64)
 
 
 def ego_lanes(seen: GraphColumns) -> EgoLanes:
-    """Return the lanes relative to the ego of each frame; empty without a map."""
+    """Return the lanes of each frame with their role relative to the ego; empty without a map."""
     if seen not in LANES_OF:
         LANES_OF[seen] = _found(seen)
     return LANES_OF[seen]
@@ -190,7 +194,7 @@ def _found(seen: GraphColumns) -> EgoLanes:
 
 
 def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
-    """Return roles of the lanes of each frame, relative to the ego, in ``RSV``; without unnamed lanes.
+    """Return frame, lane and role name for each lane with a role relative to the ego.
 
     Returns
     -------
@@ -220,7 +224,7 @@ def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
 
 
 def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
-    """Return frames, traffic entities, and their lanes."""
+    """Return (frame, traffic object, lane) for all objects on lanes."""
     rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
     entity = seen.row_of(seen.frame[rows], seen.src[rows])
     rows = rows[(entity >= 0) & seen.is_traffic[entity]]
@@ -228,7 +232,7 @@ def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
 
 
 def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints]:
-    """Return the lanes of each frame and their roles: ``(frame, strand, role)``."""
+    """Return (frame, lane strand, role) for the lanes of each frame."""
     frame, src, strand = inside
     ego = np.where(seen.ego_lane < 0, strands.of[-1 - seen.ego_lane], 0)
     present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
@@ -254,7 +258,7 @@ def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, In
 
 
 def _numbered(seen: GraphColumns, inside: Part, lanes: Part) -> Ints:
-    """Return roles of lanes; opposing lanes are numbered by the distance of their nearest entity."""
+    """Return lane roles. Opposing lanes are numbered by the distance of their nearest object from the ego."""
     here_frame, here, role = lanes
     distance, has_ego = _from_ego(seen)
     rows = np.flatnonzero(role == OPPOSING)
@@ -281,7 +285,7 @@ def _numbered(seen: GraphColumns, inside: Part, lanes: Part) -> Ints:
 
 
 def _from_ego(seen: GraphColumns) -> tuple[NDArray[np.float64], Bools]:
-    """Return plane distances of nodes from the ego (infinite if unknown), and a mask of frames with ego."""
+    """Return the distance of each node from the ego (infinite if unknown), and a mask of frames with ego."""
     x, y = (np.full(seen.frames, np.nan) for _ in range(2))
     ego = np.flatnonzero(seen.is_ego)
     x[seen.node_frame[ego]], y[seen.node_frame[ego]] = seen.x[ego], seen.y[ego]

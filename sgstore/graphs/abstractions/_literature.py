@@ -1,4 +1,4 @@
-"""Abstractions from the literature, including the one of RoadScene2Vec.
+"""Abstractions from the literature: functions from scene graphs to simpler labelled graphs.
 
 They are ``E``, ``EL``, ``ER``, ``RSV``, ``junction`` and ``SG``.
 
@@ -70,34 +70,34 @@ _ON_ROADS[[RELATION_CODE[r] for r in OF_JUNCTION if r not in BETWEEN_ENTITIES]] 
 
 
 def _kind_labels() -> tuple[str, ...]:
-    """Return the labels of nodes: the kinds by their codes, then the ego."""
+    """Return the node labels of abstractions: the kinds by their codes, then the ego."""
     return (*KINDS, EGO)
 
 
 def entities(seen: GraphColumns) -> Labelled:
-    """Return ``E``: the entities."""
+    """Abstraction ``E``: only the traffic objects, without edges."""
     return Labelled.assembled(seen.frames, [_entities(seen)], [], _kind_labels())
 
 
 def related(seen: GraphColumns) -> Labelled:
-    """Return ``ER``: the entities and their relations."""
+    """Abstraction ``ER``: the traffic objects and the relations between them."""
     labels = (*_kind_labels(), *RELATIONS)
     edges, bundles = _relations(seen)
     return Labelled.assembled(seen.frames, [_entities(seen)], [edges], labels, bundles=bundles)
 
 
 def in_lanes(seen: GraphColumns) -> Labelled:
-    """Return ``EL``: the entities, and their lanes relative to the ego."""
+    """Abstraction ``EL``: the traffic objects, and the lanes that they are in, relative to the ego."""
     return _with_lanes(seen, related=False)
 
 
 def road_scene(seen: GraphColumns) -> Labelled:
-    """Return ``RSV``: the entities with their relations, and their lanes relative to the ego."""
+    """Abstraction ``RSV``: the traffic objects with their relations, and their lanes relative to the ego."""
     return _with_lanes(seen, related=True)
 
 
 def whole(seen: GraphColumns) -> Labelled:
-    """Return ``SG``: the complete scene graph."""
+    """Abstraction ``SG``: the complete scene graph."""
     label = np.where(seen.is_ego, len(KINDS), seen.kind)
     first = len(_kind_labels())
     frame, relation, src, dst = seen.lasting(range(len(RELATIONS)))
@@ -116,7 +116,7 @@ def whole(seen: GraphColumns) -> Labelled:
 def _with_roles(
     seen: GraphColumns, grounds: MapColumns, label: Ints, first: int
 ) -> tuple[Ints, list[str]]:
-    """Return node labels and label texts, with lanes labelled by the role in their name."""
+    """Return node labels. A lane whose name contains a role relative to the ego gets this role as label."""
     named = strands_of(grounds).named
     roles = np.unique(named[named != UNNAMED])
     if not len(roles):
@@ -129,7 +129,7 @@ def _with_roles(
 
 
 def junction(seen: GraphColumns) -> Labelled:
-    """Return ``junction``: the entities with their relations; lanes, roads and junctions of the map."""
+    """Abstraction ``junction``: traffic objects with their relations; lanes, roads and junctions."""
     grounds = seen.grounds
     first = len(_kind_labels())
     wanted = [RELATION_CODE[name] for name in OF_JUNCTION]
@@ -162,7 +162,7 @@ def junction(seen: GraphColumns) -> Labelled:
 
 
 def _drawn(seen: GraphColumns, kept: Bools, columns: Part, whose: Ints | None) -> Part:
-    """Return edges between representative nodes, each once and without loops."""
+    """Return edges after nodes are merged, each edge once and without loops."""
     frame, relation, src, dst = columns
     a, b = seen.row_of(frame, src), seen.row_of(frame, dst)
     both = (a >= 0) & (b >= 0) & kept[a] & kept[b]
@@ -185,7 +185,7 @@ def _standing_for(whose: Ints, node: Ints) -> Ints:
 
 @lru_cache(maxsize=_MAPS)
 def _merged(grounds: MapColumns) -> Ints:
-    """Map each part to its representative node id: for a lane in several sections, the greatest."""
+    """Return the node id that represents each map node. All sections of a lane share one id."""
     found = -1 - np.arange(len(grounds.kind))
     lanes = np.flatnonzero(grounds.kind == KIND_CODE["lane"])
     first: dict[tuple[str, int, str], int] = {}
@@ -200,7 +200,7 @@ def _merged(grounds: MapColumns) -> Ints:
 
 @lru_cache(maxsize=_MAPS)
 def _ground_labels(grounds: MapColumns, first: int) -> tuple[Ints, list[str]]:
-    """Return the label of each part of the map, counted from ``first``, and the label texts."""
+    """Return the label of each map node (such as ``Lane`` or a lane type), and the label texts."""
     words = {"road": "Road", "junction": "Junction", "off_road": "Off Road"}
     text: list[str] = [
         ("Lane" if driven else f"Lane ({kind_of_lane or 'none'})")
@@ -219,7 +219,7 @@ def _ground_labels(grounds: MapColumns, first: int) -> tuple[Ints, list[str]]:
 
 @lru_cache(maxsize=_MAPS)
 def _names(grounds: MapColumns | None) -> dict[int, str]:
-    """Return names of parts of the map as in the literature, by node id."""
+    """Return the names of map nodes as in the literature: node id → name."""
     if grounds is None:
         return {}
     names: dict[int, str] = {}
@@ -248,7 +248,7 @@ def _entities(seen: GraphColumns) -> Part:
 
 
 def _relations(seen: GraphColumns) -> tuple[Part, list[list[int]]]:
-    """Return edges between entities, and their bundles of relation labels."""
+    """Return edges between traffic objects, and the relation labels of each edge."""
     frame, src, dst, bits = seen.pairs
     distinct, number = np.unique(bits, return_inverse=True)
     first = len(_kind_labels())
@@ -272,7 +272,7 @@ def _with_lanes(seen: GraphColumns, *, related: bool) -> Labelled:
 
 
 def _lanes(seen: GraphColumns, first: int) -> tuple[list[Part], list[Part], list[str]]:
-    """Return nodes, ``isIn`` edges and labels of lanes relative to the ego; labels count from ``first``."""
+    """Return nodes, ``isIn`` edges and labels of lanes relative to the ego."""
     is_in = len(_kind_labels()) + _IS_IN
     lanes = ego_lanes(seen)
     roots = np.unique(lanes.frame)
@@ -358,7 +358,7 @@ _LANE_NODES: Final = ROOT_ROAD - 1 - np.arange(len(LANES))
 
 
 def roadscene2vec(seen: GraphColumns) -> Labelled:
-    """Return ``roadscene2vec``: actors, related to the ego, in three lanes."""
+    """Abstraction ``roadscene2vec``: objects with relations to the ego, in three lanes."""
     label = np.where(seen.is_ego, _LABEL["ego_car"], _ACTOR[seen.kind])
     rows = np.flatnonzero(label >= 0)
     frames = np.arange(seen.frames)
@@ -382,7 +382,7 @@ def _all(rows: NDArray[np.signedinteger], label: str) -> NDArray[np.signedintege
 
 
 def _of_ego(seen: GraphColumns, rows: NDArray[np.signedinteger]) -> list[Part]:
-    """Return the lanes of actors with a known place, and their relations to the ego."""
+    """Return edges of objects with a known position: to one of three lanes, and to the ego."""
     ego = np.full(seen.frames, -1)
     own = np.flatnonzero(seen.is_ego)
     ego[seen.node_frame[own]] = own

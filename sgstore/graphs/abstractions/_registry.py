@@ -1,4 +1,4 @@
-"""Registry of abstractions: functions that reduce scene graphs to labelled graphs.
+"""Registry of abstractions (functions that reduce scene graphs to labelled graphs).
 
 An abstraction is a function from columns (:class:`GraphColumns`) to columns (:class:`Labelled`).
 :data:`ABSTRACTIONS` lists the built-in ones. Users add their own with :func:`register`, or as an
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Abstraction:
-    """Named function from scene graphs to labelled graphs.
+    """Named function that reduces scene graphs to labelled graphs.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ def register(name: str, function: Callable[[GraphColumns], Labelled]) -> Abstrac
 
 
 def check_name(name: str) -> None:
-    """Reject invalid names of abstractions and of sets of relations.
+    """Raise an error for an invalid name of an abstraction or a derived set of relations.
 
     Raises
     ------
@@ -90,7 +90,7 @@ _LONGEST: Final = 64
 
 
 def abstractions() -> dict[str, Abstraction]:
-    """Return all abstractions by folded name: built-in, registered, and entry points of other packages."""
+    """Return all abstractions by name: built-in, registered, and those of other packages."""
     known = _OWN | _REGISTERED
     for name, entry in plugins.ABSTRACTIONS.others().items():
         if normalize_name(name) not in known:
@@ -100,7 +100,7 @@ def abstractions() -> dict[str, Abstraction]:
 
 
 def abstraction_named(name: str) -> Abstraction:
-    """Return the abstraction with this name.
+    """Return the abstraction with a given name.
 
     Raises
     ------

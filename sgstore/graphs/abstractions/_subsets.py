@@ -1,4 +1,4 @@
-"""Abstractions that are subsets of the scene graph; queries use them by name, without arrays."""
+"""Abstractions that only drop nodes and edges of the scene graph, so that queries need no new tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OF_JUNCTION: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Subset:
-    """Subset of the scene graph for queries under an abstraction without new nodes or edges.
+    """Node kinds and relations that an abstraction keeps from the scene graph.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Subset:
 
     @property
     def kinds(self) -> frozenset[str] | None:
-        """Return the kinds of its nodes known so far; ``None`` means all."""
+        """Node kinds that the abstraction keeps; ``None`` means all kinds."""
         return None if self.parts is None else (entity_kinds() - {*SCENERY}) | self.parts
 
 

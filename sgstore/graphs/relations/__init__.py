@@ -1,4 +1,4 @@
-"""Relations of scene graphs: one object each, computed by a pure array function over many frames.
+"""Relations (edge types) of scene graphs, each computed by an array function over many frames.
 
 A relation has one file in this package and one line in :mod:`sgstore.base.plugins`, or one file in
 another package and one entry point. The registration adds it to the vocabulary, the generator, the

@@ -1,4 +1,4 @@
-"""Direction of a body relative to another one: ahead, behind, left or right.
+"""Direction relations: an object is ahead of, behind, left or right of another one.
 
 An edge leads from the seen body to the viewer: *b is in direct front of a* is b → a, by the bearing
 of b's centre in a's axes. Without a heading of a there is no edge.
@@ -58,7 +58,7 @@ DOUBT: Final = 4e-6
 
 
 def _wanted(scene: BlockScene) -> Bools | None:
-    """Return a mask of the pairs with direction relations; ``None`` means all pairs."""
+    """Return a mask of the object pairs that can have direction relations; ``None`` means all pairs."""
     settings, pairs = scene.config.direction, scene.pairs
     wanted: Bools | None = None
     if settings.within > 0:
@@ -90,13 +90,13 @@ def _direction_edges(scene: BlockScene) -> Edges:
 
 
 def _in_loops(scene: BlockScene) -> bool:
-    """True if the numba loops can compute directions: they support no limit by distance or kind."""
+    """Return True if compiled loops can compute the directions: no limit by distance or kind."""
     settings = scene.config.direction
     return scene.pairs.in_loops and not settings.kinds and not settings.within > 0
 
 
 def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
-    """Return edges of some pairs, from the seen body to the viewer."""
+    """Return direction edges for some pairs, from the seen object to the viewing object."""
     a, b = scene.pairs.some(rows)
     return edges_between(scene, codes, b, a)
 
@@ -104,7 +104,7 @@ def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
 def _sectors(
     scene: BlockScene, bounds: tuple[Floats, Floats], names: Codes
 ) -> tuple[Columns, int, Rows]:
-    """Return edges of directions, their number, and the pairs that need the exact bearing."""
+    """Return direction edges of object pairs, and the pairs that need an exact angle."""
     pairs = scene.pairs
     codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
     ahead, left = pairs.offsets
@@ -128,7 +128,7 @@ def _sectors(
 
 
 def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows, Rows]:
-    """Return rows and sectors of some pairs by bearing; a pair on a bound can have two sectors."""
+    """Return direction sectors of object pairs from exact angles. A pair on a limit can be in two sectors."""
     bearing = pairs.bearings(rows)
     known = ~np.isnan(bearing)
     rows, bearing = rows[known], bearing[known]
@@ -144,7 +144,7 @@ def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows
 
 
 def _behind(bearing: Floats) -> Bools:
-    """Return a mask of bearings that CARLASGG puts into the rear sector at a bound.
+    """Return a mask of angles that CARLASGG puts into the rear sector at the sector's limit.
 
     CARLASGG tests its sectors in the order direct front, side front, direct rear, side rear; all of
     them include both bounds. Straight left is 180° in its count; straight right is 360°, not 0°.
@@ -179,7 +179,7 @@ def _side_edges(scene: BlockScene) -> Edges:
 
 
 def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Columns, int, Rows]:
-    """Return edges of sides, their number, and the pairs that need the exact bearing."""
+    """Return left and right edges of object pairs, and the pairs that need an exact angle."""
     pairs = scene.pairs
     ahead, left = pairs.offsets
     codes, beside = np.empty(len(pairs), np.int8), np.float32(BESIDE)
@@ -198,7 +198,7 @@ def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Columns, 
 
 
 def sector(name: str, legend: str = "") -> Relation:
-    """Return the relation of a sector by its name."""
+    """Return the direction relation with the given name, such as ``inFrontOf``."""
 
     def asked(config: Config) -> bool:
         return name in config.direction.names

@@ -1,4 +1,4 @@
-"""Pairs of bodies that touch or overlap: collisions, in a simulator.
+"""Pairs of objects that touch or overlap, such as collisions in a simulator.
 
 Footprints touch if their gap is 0. Boxes must also touch in height: a car under a bridge touches
 nothing. If a height is missing, both must be on one storey (:data:`sgstore.model.pair_numbers.STOREY`).
@@ -48,7 +48,7 @@ PLAIN: Final = 1e8
 
 
 def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
-    """Yield each unordered pair of bodies of a frame that touch.
+    """Yield each pair of objects that touch in a frame.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
 
 
 def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
-    """Return the bodies that the ego touches in selected frames."""
+    """Return the objects that the ego touches in selected frames."""
     mine = ego[bodies.frame]
     near = frames[bodies.frame] & (mine >= 0) & (mine != np.arange(len(bodies)))
     others = np.flatnonzero(near & ~IS_SIGNAL[bodies.kind])
@@ -83,7 +83,7 @@ def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
 
 
 def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
-    """Return the pairs that touch, compared in height if it is known."""
+    """Return the object pairs that touch, compared in height if it is known."""
     close = bodies.moves[a] | bodies.moves[b]
     a, b = a[close], b[close]
     level = solid_pairs(bodies, a, b) & heights_meet(bodies, a, b)
@@ -96,7 +96,7 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
 
 
 def _separation(bodies: Bodies, a: Rows, b: Rows) -> Floats:
-    """Return the largest separation of two footprints along a side's normal; negative for an overlap; m.
+    """Return the separation of two footprints (ground rectangles); negative for an overlap; m.
 
     The gap is at least as large. NaN if rounding or a missing size requires the exact gap.
     """

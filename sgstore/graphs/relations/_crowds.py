@@ -1,4 +1,4 @@
-"""Crowded frames: bounded pieces of blocks, and a record of frames with too many pairs."""
+"""Frames with very many objects: blocks are split, and frames with too many object pairs are reported."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _WIDEST: Final = 1 << 20
 
 
 def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Iterator[FrameBlock]:
-    """Split a block into consecutive blocks with a bounded number of pairs; usually one block.
+    """Split a block of frames so that each part has a bounded number of object pairs; usually one part.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Itera
 
 
 def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
-    """Return an upper bound of the near pairs of each frame, (F,), by counting adjacent cells."""
+    """Return an upper bound for the number of near object pairs in each frame, (F,)."""
     states = frames.states
     reach = max(config.pairs.within, 1.0)
     size = np.nan_to_num(np.hypot(states.length, states.width)[rows])
@@ -95,7 +95,7 @@ def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
 
 
 def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
-    """Return some frames of a block; only the first frames keep the block's new entities and messages."""
+    """Return some frames of a block. The first part keeps the new objects and messages of the block."""
     first, last = int(frames.offsets[start]), int(frames.offsets[stop])
     entities, scenery, messages = frames.entities, frames.scenery, frames.messages
     events = frames.events
@@ -125,13 +125,13 @@ def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
 
 
 class Crowds:
-    """Record of frames of a trace with too many pairs."""
+    """Record of the frames of a trace that have too many object pairs."""
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[int, int, int, Loss]] = {}
 
     def see(self, graph: GraphBlock) -> None:
-        """Register the crowded frames of a block."""
+        """Record the frames of a block that have too many object pairs."""
         for what, frame, bodies in graph.crowded:
             time = int(graph.frames.log_time_ns[frame])
             count, seq, most, loss = self._found.get(what) or (
@@ -142,7 +142,7 @@ class Crowds:
             self._found[what] = count + 1, seq, most, span
 
     def losses(self, config: Config) -> list[Loss]:
-        """Return the omitted pairs as losses: by kind, with first frame, bodies and setting."""
+        """Return report entries for the omitted object pairs of crowded frames."""
         found: list[Loss] = []
         for what, (count, seq, bodies, span) in self._found.items():
             if what == NEAR:

@@ -1,4 +1,4 @@
-"""Part of the world in the graphs: the range of an ego, as areas of the plane and a band of heights.
+"""Range of a scene graph: the area around the ego, and the storey, in which objects become nodes.
 
 An area is a disc, the inside of a polygon in the ego's axes, or a strip along lines (the lanes
 ahead). An entity is in the area if its footprint touches it, or if its centre is in it, depending
@@ -45,7 +45,7 @@ CHUNK: Final = 1 << 18
 
 @dataclass(frozen=True, slots=True)
 class EgoPoses:
-    """Poses of the egos of some frames; shape (F,). NaN for a missing ego.
+    """Poses of the ego in F frames. NaN means a missing ego.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class LaneHeights:
 
     @classmethod
     def of(cls, road_map: RoadMap) -> LaneHeights:
-        """Compute the heights of the lanes of a map."""
+        """Compute the heights of all lanes of a map."""
         whole = float(road_map.ribbons.lengths.sum())
         points = road_map.waypoints(max(STEP, whole / MOST_POINTS))
         first = np.searchsorted(points.lane, np.arange(len(road_map.ribbons) + 1))
@@ -97,7 +97,7 @@ class LaneHeights:
 
 
 class Extent:
-    """Range of egos, defined by the settings.
+    """Range of scene graphs around the ego, as defined by the settings.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class Extent:
             self._driving = np.array([t in DRIVING for t in road_map.nodes.lane_type], np.bool_)
 
     def areas(self, egos: EgoPoses) -> Areas:
-        """Return the areas around egos."""
+        """Return the areas around the ego in several frames."""
         areas = self._areas(egos)
         areas.heights = self._heights
         return areas
@@ -135,7 +135,7 @@ class Extent:
         return Outlines(settings, egos, np.array(corners))
 
     def _lines(self, egos: EgoPoses) -> tuple[Rows, Floats]:
-        """Return pieces of corridor lines: frames, and ends (S, 2, 2)."""
+        """Return the line pieces of the ego's corridor (lanes ahead): frames, and ends (S, 2, 2)."""
         length = self.settings.length
         there = np.flatnonzero(_exist(egos, turned=True))
         none = np.zeros(0, np.intp), np.zeros((0, 2, 2))
@@ -147,7 +147,7 @@ class Extent:
         return np.concatenate([owner, lost]), np.concatenate([ends, straight])
 
     def _lane_lines(self, road_map: RoadMap, egos: EgoPoses, there: Rows) -> tuple[Rows, Floats]:
-        """Return centre lines of the lanes of egos, in their direction, and of the following lanes."""
+        """Return centre lines of the ego's lane and of the following lanes, as pieces."""
         points = np.column_stack([egos.x[there], egos.y[there], np.zeros((len(there), 3))])
         points[:, 2] = egos.heading[there]
         hits = road_map.lanes_of(points, egos.ground[there])
@@ -172,7 +172,7 @@ class Extent:
 
 
 class Areas:
-    """Ranges of egos in some frames, as areas of the plane.
+    """Areas around the ego in several frames. Objects inside become nodes of the scene graph.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ class Areas:
         self.exist = _exist(egos, turned=turned)
 
     def near(self, x: Floats, y: Floats, extent: Floats) -> tuple[Rows, Rows]:
-        """Return frames and rows of objects that may be in range: a generous filter by circles.
+        """Return pairs of a frame and an object that may be inside the area: a fast first test.
 
         Parameters
         ----------
@@ -223,7 +223,7 @@ class Areas:
         static: bool = False,
         hung: Bools | None = None,
     ) -> Bools:
-        """Return a mask of the footprints in range.
+        """Return a mask of the object footprints inside the area of their frame.
 
         Parameters
         ----------
@@ -252,7 +252,7 @@ class Areas:
         return inside
 
     def parts(self, road_map: RoadMap) -> Bools:
-        """Return a mask (F, K) of the map nodes that are in range; column i is node -1 - i.
+        """Return a mask (F, K) of the map nodes inside the area of each frame.
 
         Roads and junctions have no shape: they are in range if one of their lanes is. ``off_road``
         never is.
@@ -278,15 +278,15 @@ class Areas:
         return inside
 
     def _meet(self, frame: Ints, boxes: Floats) -> Bools:
-        """Return a mask of the boxes that touch the areas of their frames."""
+        """Return a mask of the boxes that touch the area of their frame."""
         raise NotImplementedError
 
     def _meet_map(self, road_map: RoadMap) -> tuple[Rows, Ints]:
-        """Return frames, and nodes of the map that touch their areas."""
+        """Return pairs of a frame and a map node that touches the area of the frame."""
         raise NotImplementedError
 
     def _level(self, frame: Ints, away: Floats, height: Floats, hung: Bools | None = None) -> Bools:
-        """Return a mask of the places on the storey of their frame's ego, by height and distance."""
+        """Return a mask of the positions on the same storey as the ego, by height and distance."""
         rise = height - self.egos.ground[frame]
         lowest, highest = self.settings.height
         if hung is not None:  # the lowest possible height
@@ -295,7 +295,7 @@ class Areas:
         return ~off | (np.abs(rise) < self.settings.grade * away) | ~self.exist[frame]
 
     def _keep_storey(self, road_map: RoadMap, heights: LaneHeights, inside: Bools) -> None:
-        """Remove map nodes on other storeys: lanes by their points, other nodes by their height.
+        """Return a mask of map nodes without those on other storeys than the ego.
 
         A lane is on the storey if one of its points within reach is. If no point is within reach,
         the nearest point counts.
@@ -318,7 +318,7 @@ class Areas:
         inside[frame[~kept], 1 + lane[~kept]] = False
 
     def _touch_storey(self, heights: LaneHeights, frame: Ints, lane: Ints) -> Bools:
-        """Return a mask of the lanes with a point on the storey of the ego of a frame."""
+        """Return a mask of the lanes with a point on the ego's storey."""
         points, count = heights.points, np.diff(heights.first)[lane]
         owner, point = spread(heights.first[lane], count)
         at = frame[owner]
@@ -331,7 +331,7 @@ class Areas:
 
 
 class Discs(Areas):
-    """Discs around the ego's centre."""
+    """Areas around the ego: circles."""
 
     def __init__(self, settings: RangeSettings, egos: EgoPoses, radius: float) -> None:
         super().__init__(settings, egos, radius, turned=False)
@@ -346,7 +346,7 @@ class Discs(Areas):
 
 
 class Outlines(Areas):
-    """Polygons in the ego's axes.
+    """Areas around the ego: polygons in the ego's axes.
 
     Parameters
     ----------
@@ -379,7 +379,7 @@ class Outlines(Areas):
         return inside
 
     def _inside(self, frame: Ints, x: Floats, y: Floats) -> Bools:
-        """Return a mask of the points inside: a ray to the left crosses an odd number of sides."""
+        """Return a mask of the points inside the polygon of their frame."""
         odd = np.zeros(len(x), np.bool_)
         ends = np.roll(self._corners, -1, axis=1)
         for side in range(self._corners.shape[1]):
@@ -397,7 +397,7 @@ class Outlines(Areas):
 
 
 class Strips(Areas):
-    """Strips around lines, with half a width on each side.
+    """Areas around the ego: strips of fixed width along lines (corridors).
 
     Parameters
     ----------
@@ -450,14 +450,14 @@ def _exist(egos: EgoPoses, *, turned: bool) -> Bools:
 
 
 def _as_boxes(ends: Floats) -> Floats:
-    """Return lines (S, 2, 2) as boxes without width, (S, 5)."""
+    """Convert lines (S, 2, 2) to boxes without width, (S, 5)."""
     x, y = (ends[:, 0] + ends[:, 1]).T / 2
     dx, dy = (ends[:, 1] - ends[:, 0]).T
     return np.stack([x, y, np.arctan2(dy, dx), np.hypot(dx, dy), np.zeros(len(ends))], axis=1)
 
 
 def _along(road_map: RoadMap, lane: Ints, x: Floats, y: Floats) -> Floats:
-    """Return the length of each lane's centre line up to the place nearest to its point; m."""
+    """Return, for each point, the length along a lane's centre line to its nearest position; m."""
     ribbons = road_map.ribbons
     first, count = ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1
     owner, row = spread(first, count)
@@ -475,7 +475,7 @@ def _along(road_map: RoadMap, lane: Ints, x: Floats, y: Floats) -> Floats:
 
 
 def _pieces(road_map: RoadMap, lane: Ints, begin: Floats, end: Floats) -> tuple[Rows, Floats]:
-    """Cut centre lines between two lengths into pieces: owners, and ends (S, 2, 2)."""
+    """Return the straight pieces of centre lines between two lengths: line index, and ends (S, 2, 2)."""
     ribbons = road_map.ribbons
     owner, row = spread(ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1)
     here = (ribbons.along[row] < end[owner]) & (ribbons.along[row + 1] > begin[owner])

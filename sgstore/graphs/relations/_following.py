@@ -1,4 +1,4 @@
-"""Relations ``leads`` and ``follows``, and parked vehicles.
+"""Relations ``leads`` and ``follows``: the next vehicle ahead on the same lanes.
 
 ``leads`` is from the next vehicle ahead along the lanes, ``follows`` is to it.
 
@@ -51,7 +51,7 @@ SAME_WAY: Final = np.pi / 4
 
 @dataclass(frozen=True, slots=True)
 class OwnLanes:
-    """Vehicles on their own lanes, sorted by frame, lane and place along it; shape (N,).
+    """Vehicles on their own lanes, sorted by frame, lane and position along the lane; shape (N,).
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class OwnLanes:
     along: Floats
 
     def first_in(self, key: Ints, but: Rows) -> tuple[Rows, Rows]:
-        """Find the first other vehicle on each lane; return pairs of query row and vehicle row."""
+        """Find the first other vehicle on each lane. Return pairs of query row and vehicle row."""
         place = np.searchsorted(self.key, key)
         last = max(len(self.key) - 1, 0)
         itself = (self.row[np.minimum(place, last)] == but) & (place <= last)
@@ -81,7 +81,7 @@ class OwnLanes:
 
 
 def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
-    """Return a mask of the lane hits that are on a body's own lanes."""
+    """Return a mask of the touched lanes that are the object's own lanes."""
     lane = -2 - hits.lane
     junction = np.full(len(bodies), -1)
     junction[hits.row[hits.primary]] = net.junction[lane[hits.primary]]
@@ -106,7 +106,7 @@ def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
 
 
 def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -> Column:
-    """Return pairs of a body and the next one ahead, as rows of bodies, and the gap; each pair once.
+    """Return pairs of a vehicle and the next one ahead, with the gap along the lanes.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
 
 
 def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
-    """Find the next vehicles ahead of the last vehicle on each lane, lane after lane."""
+    """Find the next vehicle ahead of the last vehicle on each lane, on the following lanes."""
     source = np.flatnonzero(np.append(own.key[1:] != own.key[:-1], True)[: len(own.key)])
     at, base = own.lane[source], own.key[source] - own.lane[source]
     distance = net.lengths[at] - own.along[source]
@@ -163,7 +163,7 @@ def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
 
 
 def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
-    """Return the search fronts that are nearer than the best so far, and the updated best."""
+    """Keep the search states that are nearer than the best result so far, and update the best."""
     known, least = best
     place = np.minimum(np.searchsorted(known, key), max(len(known) - 1, 0))
     again = known[place] == key if len(known) else np.zeros(len(key), np.bool_)
@@ -179,7 +179,7 @@ def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
 
 
 def gaps(bodies: Bodies, ground: MapContext | None) -> LaneGaps:
-    """Return pairs of a follower and its leader, by node ids, and the gaps."""
+    """Return the pairs of a following and a leading vehicle, by node ids, and the gaps along lanes."""
     none = np.zeros(0, np.intp)
     a, b, gap = (none, none, np.zeros(0)) if ground is None else ground.following
     return LaneGaps(bodies.frame[a], bodies.node[a], bodies.node[b], gap)

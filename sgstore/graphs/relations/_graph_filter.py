@@ -1,4 +1,4 @@
-"""Filters of a config for graphs, and the entity kinds that a config renames."""
+"""Filter of scene graphs by the settings (kinds, relations, map parts), and renamed kinds of objects."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Columns = TypeVar("Columns", "Edges", "LaneStates", "LaneGaps")
 
 
 class Keeping:
-    """Filter of nodes and relations under a config.
+    """Filter of graph nodes and relations according to the settings.
 
     Parameters
     ----------
@@ -91,18 +91,18 @@ class Keeping:
         return kept & (used | ~larger)
 
     def names(self, computed: Iterable[Relation], *, with_map: bool) -> set[str]:
-        """Return the relations that graphs can hold: computed ones, and those of the map."""
+        """Return the names of the relations that the filtered graphs can have."""
         kept = {one.name for one in computed} - self._without
         of_map = {one.name for one in relations() if one.of_map} if with_map else set[str]()
         lost = {one.name for one in relations() if self._no_lanes and one.needs_lanes}
         return (kept | of_map) - lost - ({"isIn"} if self._no_map else set())
 
     def entities(self, kind: Codes) -> Bools:
-        """Return a mask of the kept entities by their kinds."""
+        """Return a mask of the objects that the settings keep, by kind."""
         return self._kinds[kind]
 
     def edges(self, edges: Edges) -> Edges:
-        """Return the edges of kept relations between kept nodes."""
+        """Return the edges whose relation and end nodes the settings keep."""
         if self._everything:
             return edges
         kept = self._relations[edges.relation]
@@ -117,7 +117,7 @@ class Keeping:
         return taken(merged, np.sort(np.unique(key, axis=0, return_index=True)[1]))
 
     def lane_states(self, lanes: LaneStates) -> LaneStates:
-        """Filter lane states by kept lanes; of merged sections the one with the largest overlap counts."""
+        """Return the positions on lanes that the settings keep. Of merged lane sections, one counts."""
         if self._everything:
             return lanes
         kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
@@ -133,12 +133,12 @@ class Keeping:
         return replace(merged, overlap=overlap)
 
     def gaps(self, gaps: LaneGaps) -> LaneGaps:
-        """Return the gaps if ``leads`` or ``follows`` is kept."""
+        """Return the gaps along lanes, or none if the settings drop ``leads`` and ``follows``."""
         wanted = self._relations[[RELATION_CODE["leads"], RELATION_CODE["follows"]]].any()
         return gaps if wanted else taken(gaps, np.zeros(0, np.intp))
 
     def present(self, present: Bools) -> Bools:
-        """Return a mask (F, K) of the map nodes in graphs, from those in range."""
+        """Return a mask (F, K) of the map nodes in the graphs, from those in range of the ego."""
         present = present & self.parts
         if self._same is None:
             return present
@@ -149,7 +149,7 @@ class Keeping:
         return present
 
     def _standing_for(self, node: Ints) -> Ints:
-        """Replace lane nodes by the common node of all their sections."""
+        """Replace lane nodes by the common node of all sections of the lane."""
         if self._same is None:
             return node
         return np.where(node < 0, -1 - self._same[np.where(node < 0, -1 - node, 0)], node)
@@ -159,7 +159,7 @@ class Keeping:
 
 
 def renamed(entities: Entities, types: Mapping[str, TypeMeaning]) -> Entities:
-    """Apply the configured mapping of type names (lower case) to kinds."""
+    """Return objects with the kinds that the settings define for their type names."""
     if not types or not len(entities):
         return entities
     kind = entities.kind.copy()

@@ -1,4 +1,4 @@
-"""Trailers and riders with their carriers, and the relation ``tows``.
+"""Relation ``tows``, and the carriers of trailers and riders.
 
 A trailer and its tractor touch all the time, as a rider and the bicycle do. This is not a
 collision, and neither follows the other. Therefore they are not a pair: only relations of direction
@@ -54,7 +54,7 @@ _IS_TWO_WHEELER: Final = kinds_mask(tuple(SUPER_KINDS["two_wheeler"]))
 
 
 class Hitches:
-    """Record of the carriers in a trace; memory grows with entities, not with time."""
+    """Record of the carriers in a trace: towing vehicles of trailers, and bicycles of riders."""
 
     def __init__(self) -> None:
         self._kind: Codes = np.zeros(0, np.int8)
@@ -64,7 +64,7 @@ class Hitches:
         self._said: dict[str, int] = {}
 
     def learn(self, entities: Entities) -> None:
-        """Register entities on their first appearance."""
+        """Record new objects of the trace, in order of node id."""
         count = len(entities)
         self._kind = np.append(self._kind, entities.kind)
         self._seen = np.append(self._seen, np.zeros(count, np.bool_))
@@ -78,7 +78,7 @@ class Hitches:
             self._carrier[self._vehicles[trailer]] = self._said.pop(trailer)
 
     def see(self, frames: FrameBlock, bodies: Callable[[Rows], Bodies]) -> Ints:
-        """Return the carrier of each state of the next block: node id, or -1.
+        """Return the carrier of each object state in a block: node id, or -1.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class Hitches:
         return self._parted(bodies, frames, rows, found) if len(rows) else found
 
     def _meet(self, bodies: Callable[[Rows], Bodies], rows: Rows, node: Ints) -> None:
-        """Find pairs that touch in the first frame that has both."""
+        """Find carriers: pairs of objects that touch in the first frame with both objects."""
         of = bodies(rows)
         first = _first(of.node, of.frame, len(self._seen))
         first[self._seen] = -1
@@ -119,7 +119,7 @@ class Hitches:
             self._carrier[of.node[one[order]]] = of.node[other[order]]
 
     def _fits(self, of: Bodies, one: Rows, other: Rows) -> Bools:
-        """Return a mask of pairs where the second body can carry the first."""
+        """Return a mask of object pairs in which the second object can carry the first."""
         dx, dy = of.x[other] - of.x[one], of.y[other] - of.y[one]
         ahead, _ = offsets(dx, dy, of.heading[one])
         pulled = (of.kind[one] == _TRAILER) & IS_VEHICLE[of.kind[other]] & (ahead > 0)
@@ -133,7 +133,7 @@ class Hitches:
     def _parted(
         self, bodies: Callable[[Rows], Bodies], frames: FrameBlock, rows: Rows, carrier: Ints
     ) -> Ints:
-        """Return the carriers of a block, without pairs that separate in it."""
+        """Return the carriers in a block of frames, without pairs that separate in the block."""
         states, frame = frames.states, frames.frame_of
         count = len(self._seen)
         key = frame * count + states.node
@@ -150,7 +150,7 @@ class Hitches:
 
 
 def new_frames(frames: FrameBlock, new: Bools) -> Bools:
-    """Return a mask of the states in frames with a new entity."""
+    """Return a mask of the object states in frames with a new object."""
     first = _first(frames.states.node[new], frames.frame_of[new], int(frames.states.node.max()) + 1)
     wanted = np.zeros(len(frames), np.bool_)
     wanted[first[first >= 0]] = True
@@ -158,7 +158,7 @@ def new_frames(frames: FrameBlock, new: Bools) -> Bools:
 
 
 def _first(node: Ints, frame: Ints, count: int) -> Ints:
-    """Return the first frame of each node, or -1 for an absent node, (count,)."""
+    """Return the first frame of each node (count,); -1 for an absent node."""
     first = np.full(count, -1)
     order = np.lexsort((-frame, node))
     first[node[order]] = frame[order]

@@ -1,4 +1,4 @@
-"""Lanes as a graph, and places along their centre lines."""
+"""Graph of lanes and successors, and positions along lane centre lines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class LaneNet:
-    """Graph of the lanes of a map; lanes are counted from 0.
+    """Graph of the lanes of a map and their successors. Lanes are counted from 0.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class LaneNet:
         return owner, self._next[index]
 
     def upstream(self, lane: int, along: float, limit: float) -> Ints:
-        """Return the lane of a place and the lanes that end up to ``limit`` m before it."""
+        """Return the lane of a position, and the lanes that end at most ``limit`` metres before it."""
         nearest: dict[int, float] = {lane: 0.0}
         queue, settled = [(along, lane)], set[int]()
         while queue:
@@ -82,7 +82,7 @@ RUN: Final = 8
 
 
 class Centrelines:
-    """Centre lines of all lanes, for look-ups of places along them.
+    """Centre lines of all lanes, for look-ups of positions along lanes.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Centrelines:
         np.maximum.at(self._radius, run, far)
 
     def along(self, lane: Ints, x: Floats, y: Floats) -> Floats:
-        """Return the length along each lane's centre line to the point nearest to a place; m.
+        """Return the length along each lane's centre line to the point nearest to a position; m.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class Centrelines:
         return before + np.where(out, onward, share[at]) * (after - before)
 
     def _near(self, lane: Ints, x: Floats, y: Floats) -> tuple[Rows, Rows]:
-        """Return pairs of a place and a piece of its lane that may be the nearest."""
+        """Return pairs of a position and a piece of its lane that may be the nearest piece."""
         first, count = self._first_run[lane], self._runs[lane]
         owner, run = spread(first, count)
         away = np.hypot(

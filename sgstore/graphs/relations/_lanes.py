@@ -1,4 +1,4 @@
-"""Relation ``isIn``, and the lanes that signals control.
+"""Relation ``isIn`` (object on a lane), and relations between signals and the lanes that they control.
 
 Bodies are on lanes of any type, waypoints, crosswalks, or off the road.
 

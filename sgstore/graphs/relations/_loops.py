@@ -1,4 +1,4 @@
-"""Loops over bodies, for numba: near pairs, edges of pairs, and sight of the ego.
+"""Compiled loops (numba) for near object pairs, edges of pairs, and objects visible to the ego.
 
 ``_pairs``, ``_proximity``, ``_bearing`` and ``_sight`` have the same in numpy, with explanations.
 Arrays come in tuples: positions ``x, y, z``, turns ``cos, sin`` of headings, sizes ``length, width,
@@ -34,7 +34,7 @@ def near_pairs(
     limit: float,
     found: tuple[Ints, Ints],
 ) -> tuple[int, int]:
-    """Write near pairs of bodies into ``found``, from place ``first`` on; return count and next place.
+    """Write near object pairs into an array; return their number, and where to continue.
 
     ``order`` has the rows by frame and ``x``, ``end`` has the end of its frame for each place.
     Returns the number of pairs, and the place where the room may have run out.
@@ -69,7 +69,7 @@ def rungs(
     codes: Codes,
     columns: Columns,
 ) -> int:
-    """Write the proximity edges of pairs in both directions; return their number.
+    """Write the proximity edges of object pairs in both directions, and return their number.
 
     ``wanted``: mask of pairs; empty means all pairs.
     """
@@ -110,7 +110,7 @@ def sectors(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Write the direction edges of pairs, and the pairs that need the exact bearing; return both counts.
+    """Write the direction edges of object pairs, and the pairs that need an exact angle; return both counts.
 
     ``bounds`` are sines and cosines. Pairs from ``len(a)`` on are mirror images.
     """
@@ -157,7 +157,7 @@ def sides(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Write the left and right edges of pairs with a distance from the axis above ``least``."""
+    """Write the left and right edges of object pairs, and return their number."""
     x, y, _ = place
     cos, sin = turn
     frame, node = ends
@@ -190,7 +190,7 @@ def along(
     pieces: Ints,
     line: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
 ) -> Floats:
-    """Return the lengths of lanes up to the nearest points of places; see ``_following.Centrelines``."""
+    """Return the lengths along lane centre lines to the points nearest to given positions; m."""
     at_x, at_y, run_x, run_y, squared, length = line
     found = np.empty(len(lane))
     for i in range(len(lane)):
@@ -220,7 +220,7 @@ def sight(
     signal: Bools,
     graze: float,
 ) -> Bools:
-    """Return a mask of the bodies that the ego of their frame sees; ``order`` and ``starts`` group rows."""
+    """Return a mask of the objects that the ego of their frame can see."""
     seen = np.zeros(len(place[0]), np.bool_)
     for f in range(len(starts) - 1):
         rows = order[starts[f] : starts[f + 1]]
@@ -283,7 +283,7 @@ def _views(
     signal: Bools,
     graze: float,
 ) -> tuple[Ints, Floats, Floats, Floats, Bools]:
-    """Return bodies relative to the eye: rows, points, boxes, and a mask of opaque bodies.
+    """Return objects relative to the ego's eye: rows, points, boxes, and a mask of opaque objects.
 
     A box is ``cos, sin``, half of length and width, height of points, lower and upper side, and a
     radius.
@@ -325,7 +325,7 @@ def _views(
 
 @compiled
 def _blocked(x: float, y: float, box: Floats, to_x: float, to_y: float, height: float) -> bool:
-    """True if a box at ``x, y`` blocks the line to a point; see ``_sight._blocked``."""
+    """Return True if a box blocks the sight line to a point."""
     cos, sin = box[0], box[1]
     enters, leaves = 0.0, 1.0
     start_x, run_x = -x * cos - y * sin, to_x * cos + to_y * sin

@@ -1,4 +1,4 @@
-"""Relations among lanes that come with a road map; :mod:`sgstore.maps.roads` reads or derives them.
+"""Relations between lanes that come from the road map, such as ``travelsTo`` and ``toLeftOf``.
 
 The relations of this file cannot be omitted: :data:`sgstore.model.vocabulary.MAP_ONLY`.
 """

@@ -1,4 +1,4 @@
-"""Queries of the road map for the generator: map parts under bodies, and map parts in graphs.
+"""Look-ups in the road map for the graph generator: map parts below objects, and map parts in graphs.
 
 The look-up of lanes under a footprint is the most expensive query. Therefore it runs only for
 footprints that have moved: traffic often waits, parks or queues, and scenery never moves.
@@ -46,7 +46,7 @@ DEPTH: Final = 3
 
 
 class LaneContact:
-    """Road map queries for one trace, block after block.
+    """Look-ups in the road map for the objects of one trace, one block of frames after another.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class LaneContact:
         self._affects: tuple[Ints, Ints] = (none, none)
 
     def learn(self, entities: Entities, scenery: States) -> None:
-        """Register new entities and their poses, in order of node id."""
+        """Record new objects and the poses of static ones, in order of node id."""
         places = dict(
             zip(scenery.node.tolist(), zip(scenery.x, scenery.y, strict=True), strict=True)
         )
@@ -116,7 +116,7 @@ class LaneContact:
         self._affects = _appended(self._affects, affects)
 
     def _column(self, key: tuple[bool, str], place: tuple[float, float]) -> int | None:
-        """Return the column of a referenced map signal or object; the place selects one of several."""
+        """Return the map node that an object refers to (such as a traffic light), or ``None``."""
         columns = self._columns.get(key, [])
         if len(columns) < 2:
             return columns[0] if columns else None
@@ -126,7 +126,7 @@ class LaneContact:
         return columns[at] if apart[at] <= SAME_PLACE else None
 
     def standing(self, bodies: Bodies) -> Standing:
-        """Return the map parts under the bodies of a block; call once per block."""
+        """Return the map parts (lanes, crosswalks) below the objects of a block of frames."""
         hits, along, parts = self._footing.of(bodies)
         if self._waypoints is not None:
             rows, nodes = self._waypoints.of(hits, along, bodies)
@@ -143,7 +143,7 @@ class LaneContact:
         return Standing(hits, along, own, parts, off_road)
 
     def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> MapContext:
-        """Return the map under bodies, and around the egos.
+        """Return the map parts below objects, and those in range of the egos.
 
         Parameters
         ----------
@@ -170,7 +170,7 @@ class LaneContact:
         )
 
     def present(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Bools:
-        """Return a mask (F, K) of the map nodes in each graph; see :meth:`ground`.
+        """Return a mask (F, K) of the map nodes in the graph of each frame.
 
         A lane or crosswalk under a body is present even if it begins just out of range; so are its
         road and junction. ``off_road`` is present if a body is in it. A signal or object of the map
@@ -201,7 +201,7 @@ Table = tuple["NDArray[Any]", ...]
 
 
 class _Footing:
-    """Lanes and crosswalks under footprints; results are reused until a footprint moves."""
+    """Cache of lanes and crosswalks below objects. A result is used again until the object moves."""
 
     def __init__(self, road_map: RoadMap, lines: Centrelines) -> None:
         self._map = road_map
@@ -211,7 +211,7 @@ class _Footing:
         self._lanes, self._crosswalks = self._ask(np.zeros(0, np.intp), self._box)
 
     def of(self, bodies: Bodies) -> tuple[LaneHits, Floats, tuple[Ints, Ints]]:
-        """Return lanes that bodies touch, places along them, and crosswalks, by rows; none for signals."""
+        """Return the lanes that objects touch, the positions along them, and the crosswalks below objects."""
         rows = np.flatnonzero(~IS_SIGNAL[bodies.kind])
         known = len(self._node)
         node = np.concatenate([self._node, bodies.node[rows]])
@@ -246,7 +246,7 @@ class _Footing:
 
 
 def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
-    """Return for each row the first row with the same unchanged box, and each node's last row."""
+    """Return, for each row, the first row of the same unchanged box, and each node's last row."""
     order = np.lexsort((frame, node))
     node, bits = (
         node[order],
@@ -263,6 +263,6 @@ def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
 
 
 def _looked_up(table: Table, wanted: Rows) -> Table:
-    """Return the lines of a table for selected rows, with new row numbers."""
+    """Return table rows for selected objects, with new row numbers."""
     owner, index = joined(table[0], wanted)
     return (owner, *(column[index] for column in table[1:]))

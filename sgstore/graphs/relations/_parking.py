@@ -1,4 +1,4 @@
-"""Parked vehicles, found after the whole trace is read."""
+"""Detection of parked vehicles, after a whole trace is read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOVED: Final = 0.3
 
 
 class Parking:
-    """Record of a trace's vehicles that finds parked ones; memory grows with vehicles, not with time.
+    """Record of the vehicles of a trace that detects parked ones. Memory grows with vehicles, not time.
 
     A vehicle is parked if the simulator marks it as static. It is also parked if it does not move
     in the whole trace and a lane for driving is never its primary lane. Without a map, or without
@@ -35,7 +35,7 @@ class Parking:
         self._place: Floats = np.zeros((0, 2))
 
     def learn(self, entities: Entities) -> None:
-        """Register entities on their first appearance."""
+        """Record new vehicles of the trace, in order of node id."""
         no: Bools = np.zeros(len(entities), np.bool_)
         self._vehicle = np.append(self._vehicle, IS_VEHICLE[entities.kind])
         self._static = np.append(self._static, entities.static)
@@ -47,7 +47,7 @@ class Parking:
         self._place = np.concatenate([self._place, np.full((len(entities), 2), np.nan)])
 
     def see(self, states: States) -> None:
-        """Register positions, in the order of frames."""
+        """Record the positions of vehicles in the next frames."""
         place = np.column_stack([states.x, states.y])
         node = states.node
         known = np.flatnonzero(np.isfinite(place).all(axis=1))
@@ -60,7 +60,7 @@ class Parking:
     def stand(
         self, bodies: Bodies, standing: Standing, driving: Bools, *, beyond: bool = False
     ) -> None:
-        """Register the map parts under bodies; ``driving`` is the mask of driving lanes among the map nodes.
+        """Record the lanes and other map parts below vehicles in the next frames.
 
         ``beyond``: the bodies are all known ones, not only those in graphs.
         """
@@ -71,12 +71,12 @@ class Parking:
 
     @property
     def parked(self) -> Codes:
-        """Return the parked state of each entity in graphs: 1 parked, 0 not, -1 unknown or no vehicle."""
+        """Return the parked state of each object in graphs: 1 parked, 0 not, -1 unknown or no vehicle."""
         return self._parked(0)
 
     @property
     def world_parked(self) -> Codes:
-        """Return the parked state of each entity from all known states; codes as in :meth:`parked`."""
+        """Return the parked state of each object, from states inside and outside the graphs."""
         return self._parked(1)
 
     def _parked(self, row: int) -> Codes:

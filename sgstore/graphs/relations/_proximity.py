@@ -1,4 +1,4 @@
-"""Proximity relations of bodies: at most one of several distance ranges.
+"""Proximity relations of object pairs, such as ``near``: at most one of several distance ranges holds.
 
 The distance is between the centres of the boxes, in space; in the plane if a height is unknown.
 There is no relation between storeys, to a flat body, or between a carried body and its carrier.
@@ -55,7 +55,7 @@ def _edges(scene: BlockScene) -> Edges:
 
 
 def rung(name: str) -> Relation:
-    """Return the relation of a distance range by its name."""
+    """Return the proximity relation with the given name, such as ``near``."""
 
     def asked(config: Config) -> bool:
         return name in config.proximity.names

@@ -1,4 +1,4 @@
-"""All relations, and the filter of a config: relations, kinds and parts of the map in its graphs."""
+"""Registry of all relations (edge types), and the relations that the settings request."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def relations() -> tuple[Relation, ...]:
 
 
 def relations_under(config: Config) -> tuple[Relation, ...]:
-    """Return the relations that a config requests, with a map; including its own rungs and sectors."""
+    """Return the relations that the settings request, including those with user-defined names."""
     known = {one.name for one in relations()}
     own = [rung(name) for name in config.proximity.names if name not in known]
     own += [sector(name) for name in config.direction.names if name not in known]
@@ -56,7 +56,7 @@ Edges of a scene graph, by name. What a relation needs and a recording lacks mak
 
 
 def as_markdown() -> str:
-    """Return the page ``docs/relations.md``: the built-in relations."""
+    """Return the documentation page of the built-in relations, as Markdown."""
     own = [plugins.RELATIONS.load(name) for name in plugins.RELATIONS.own]
     rows = [f"| `{one.name}` | {'a map' if one.needs_map else ''} | {one.doc} |" for one in own]
     return PAGE.format(rows="\n".join(rows))

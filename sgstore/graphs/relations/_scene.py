@@ -1,4 +1,4 @@
-"""Input of relation families: bodies, pairs and map context of a block.
+"""Input for the computation of relations: objects, object pairs and map parts of a block of frames.
 
 Overlapping intervals of a line give candidates without testing all pairs.
 """
@@ -47,7 +47,7 @@ _ROUNDING: Final = 1e-15
 
 
 def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows]]:
-    """Yield each unordered pair of overlapping intervals of one group, and some that almost overlap.
+    """Yield the pairs of overlapping intervals in the same group, and some that almost overlap.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows
 
 
 def parts(count: Ints) -> Iterator[slice]:
-    """Yield consecutive slices of counts with sums of about :data:`CHUNK`."""
+    """Yield consecutive slices of an array of counts, each with about :data:`CHUNK` items in total."""
     total = np.cumsum(count)
     bounds = np.searchsorted(total, np.arange(CHUNK, int(total[-1]), CHUNK)) if len(total) else []
     for begin, end in zip([0, *bounds], [*bounds, len(count)], strict=True):
@@ -97,7 +97,7 @@ def parts(count: Ints) -> Iterator[slice]:
 
 @dataclass(frozen=True, slots=True)
 class Bodies:
-    """Entities in the graphs of a block, one row per entity and frame, in any order; shape (N,).
+    """Objects in the graphs of a block of frames, one row per object and frame; shape (N,).
 
     Attributes
     ----------
@@ -133,27 +133,27 @@ class Bodies:
         return len(self.node)
 
     def take(self, rows: NDArray[np.intp]) -> Bodies:
-        """Return these rows, in this order."""
+        """Return the objects of the given rows, in this order."""
         return taken(self, rows)
 
     @property
     def bottom(self) -> Floats:
-        """Return the height of the lower side of the box, (N,); m. Without a height it is ``z``."""
+        """Height of the lower side of each object, (N,); m. Without a known height it is ``z``."""
         return self.z - np.nan_to_num(self.height) / 2
 
     @property
     def low_and_high(self) -> tuple[Floats, Floats]:
-        """Return heights of lower and upper side, (N,); see :func:`sgstore.model.pair_numbers.low_and_high`."""
+        """Heights of the lower and upper side of each object, (N,); m."""
         return low_and_high(self.z, self.height, IS_SIGNAL[self.kind], IS_UPRIGHT[self.kind])
 
     @property
     def boxes(self) -> Floats:
-        """Return ``x, y, heading, length, width``, (N, 5)."""
+        """Footprints of the objects: ``x, y, heading, length, width``, (N, 5)."""
         return np.stack([self.x, self.y, self.heading, self.length, self.width], axis=1)
 
 
 class BodyPairs:
-    """Related ordered pairs of bodies: each pair, then the mirror image of each; shape (K,).
+    """Ordered pairs (a, b) of objects that can have relations; the second half mirrors the first; K pairs.
 
     Parameters
     ----------
@@ -173,17 +173,17 @@ class BodyPairs:
 
     @cached_property
     def a(self) -> Rows:
-        """Return the first body of each pair as rows of :class:`Bodies`, (K,)."""
+        """Row of the first object of each pair in :class:`Bodies`, (K,)."""
         return np.concatenate(self._halves)
 
     @cached_property
     def b(self) -> Rows:
-        """Return the second body of each pair as rows of :class:`Bodies`, (K,)."""
+        """Row of the second object of each pair in :class:`Bodies`, (K,)."""
         return np.concatenate(self._halves[::-1])
 
     @cached_property
     def span(self) -> Floats:
-        """Return comparable distances of the first half of the pairs, (K / 2,); see :func:`spans`."""
+        """Comparable distances (such as squares) of the first half of the pairs, (K / 2,)."""
         half = self._half
         found = np.empty(half)
         for part in even_parts(half):
@@ -194,29 +194,29 @@ class BodyPairs:
 
     @cached_property
     def distance(self) -> Floats:
-        """Return distances by the configured measure; m."""
+        """Distance of each object pair, as defined by the settings; m."""
         distance = self.span if self._between == "footprints" else np.sqrt(self.span)
         return np.concatenate([distance, distance])
 
     @cached_property
     def bearing(self) -> Floats:
-        """Return bearings of b from a, in (-π, π]; rad. NaN without a's heading; 0 in the same place."""
+        """Angle of b seen from a, in (-π, π]; rad. NaN without a's heading; 0 at the same position."""
         return self.bearings(np.arange(len(self)))
 
     def bearings(self, rows: Rows) -> Floats:
-        """Return bearings of these pairs; rad."""
+        """Return the angles of b seen from a for selected pairs; rad."""
         of, (a, b) = self._bodies, self.some(rows)
         return bearings(of.x[b] - of.x[a], of.y[b] - of.y[a], of.heading[a])
 
     def some(self, rows: Rows) -> tuple[Rows, Rows]:
-        """Return both bodies of these pairs as rows."""
+        """Return the rows of both objects for selected pairs."""
         first, second = (half[rows % max(self._half, 1)] for half in self._halves)
         mirrored = rows >= self._half
         return np.where(mirrored, second, first), np.where(mirrored, first, second)
 
     @cached_property
     def offsets(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return b's distance ahead of a and to its left; fast, error below 1e-6 of the distance; m.
+        """Distance of b ahead of a, and to the left of a; m. The error is below 1e-6 of the distance.
 
         NaN without a's heading, or with a heading beyond :data:`MOST_TURNED`.
         """
@@ -237,7 +237,7 @@ class BodyPairs:
 
     @cached_property
     def for_loops(self) -> Looped:
-        """Return the input of the pair loops: halves, frames and nodes, positions and turns."""
+        """Arrays of the pairs for compiled loops: rows, frames, nodes, positions and headings."""
         of = self._bodies
         return (
             *self._halves,
@@ -248,7 +248,7 @@ class BodyPairs:
 
     @cached_property
     def of_bodies(self) -> Bools:
-        """Return a mask (K / 2,) of the pairs accepted by :func:`meet_as_bodies`; empty means all."""
+        """Mask (K / 2,) of the pairs of solid objects on the same level; empty means all."""
         of = self._bodies
         plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
         levels = of.low_and_high
@@ -258,7 +258,7 @@ class BodyPairs:
 
     @property
     def in_loops(self) -> bool:
-        """True if numba loops can process the pairs; they do not support footprints."""
+        """True if compiled loops can process the pairs; they do not support footprints."""
         return self._between != "footprints" and worth()
 
     @cached_property
@@ -269,7 +269,7 @@ class BodyPairs:
 
     @cached_property
     def ends(self) -> tuple[Nodes, Nodes, Nodes]:
-        """Return frames, and node ids of a and b, of the pairs; int32."""
+        """Frames, and node ids of a and b, for each pair; int32."""
         frame, node = self._bodies.frame.astype(np.int32), self._bodies.node.astype(np.int32)
         frame, one, other = frame[self._halves[0]], node[self._halves[0]], node[self._halves[1]]
         return (
@@ -287,13 +287,13 @@ EVEN_PART: Final = 1 << 13
 
 
 def by_frame(frame: Ints, frames: int) -> tuple[Rows, Ints]:
-    """Return rows sorted by frame, and the start of each frame in them."""
+    """Return row numbers sorted by frame, and the start of each frame in them."""
     order = np.argsort(frame, kind="stable")
     return order, np.searchsorted(frame[order], np.arange(frames + 1))
 
 
 def turns(bodies: Bodies) -> tuple[Floats, Floats]:
-    """Return cosines and sines of the headings."""
+    """Return the cosines and sines of the headings of objects."""
     return np.cos(bodies.heading), np.sin(bodies.heading)
 
 
@@ -304,7 +304,7 @@ def even_parts(count: int) -> Iterator[slice]:
 
 
 def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
-    """Return distances of pairs of bodies by the measure :attr:`sgstore.model.config.Proximity.between`; m.
+    """Return the distances of object pairs, by centres or by footprints as in the settings; m.
 
     The origin of a moving vehicle is on the ground, that of other bodies in the centre of the box,
     as in CARLA. A footprint without extent or heading is a point.
@@ -314,7 +314,7 @@ def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
 
 
 def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
-    """Return numbers that sort like distances: their squares, or gaps of footprints."""
+    """Return values that sort like the distances of object pairs: squares, or gaps of footprints."""
     if between == "footprints":
         boxes = bodies.boxes
         boxes[np.isnan(boxes).any(axis=1), 2:] = 0
@@ -326,7 +326,7 @@ def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
 
 
 def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the pairs of bodies that overlap in height; True if it is unknown."""
+    """Return a mask of the object pairs that overlap in height; True if a height is unknown."""
     low, high = bodies.low_and_high
     reach = np.fmax(low[b] - high[a], low[a] - high[b])
     solid = high > low
@@ -334,7 +334,7 @@ def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the pairs of bodies on the same storey; True if it is unknown.
+    """Return a mask of the object pairs on the same storey; True if it is unknown.
 
     Two bodies are on one storey if they overlap in height, or if a climbing road can join them.
     """
@@ -348,25 +348,25 @@ def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def meet_as_bodies(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the pairs of solid bodies on one level; see :func:`solid_pairs`."""
+    """Return a mask of the pairs of solid objects on the same storey."""
     return solid_pairs(bodies, a, b) & on_one_level(bodies, a, b)
 
 
 def solid_pairs(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the pairs of solid bodies, without a carrier and its load."""
+    """Return a mask of the pairs of solid objects, except a carrier and its load."""
     flat = ~IS_UPRIGHT[bodies.kind] & (bodies.height == 0)
     return ~(flat[a] | flat[b] | carried_by(bodies, a, b))
 
 
 def carried_by(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the pairs with a carrier and its load, or with a common carrier."""
+    """Return a mask of the object pairs with a carrier and its load, or with a common carrier."""
     carrier, node = bodies.carrier, bodies.node
     bound = (carrier[a] == node[b]) | (carrier[b] == node[a])
     return bound | (carrier[a] >= 0) & (carrier[a] == carrier[b])
 
 
 def levels(bodies: Bodies, between: str) -> Floats:
-    """Return the heights used for distances; m."""
+    """Return the heights of objects that are used for distances; m."""
     if between != "origins":
         return bodies.z
     on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
@@ -374,7 +374,7 @@ def levels(bodies: Bodies, between: str) -> Floats:
 
 
 def span_up_to(distance: float, between: str) -> float:
-    """Return the greatest span whose rounded distance does not exceed this distance."""
+    """Return the greatest comparable distance (such as a square) for a distance limit."""
     if between == "footprints":
         return distance
     span = distance * distance
@@ -387,7 +387,7 @@ def span_up_to(distance: float, between: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Parts of the map under bodies, independent of the ego.
+    """Map parts (lanes, crosswalks) below the objects of a block, independent of the ego.
 
     Attributes
     ----------
@@ -411,7 +411,7 @@ class Standing:
     off_road: NDArray[np.intp]
 
     def take(self, place: NDArray[np.intp]) -> Standing:
-        """Return the map parts of some bodies; ``place`` (N,) has their new rows, or -1."""
+        """Return the map parts below selected objects, with new row numbers."""
         hits, (rows, nodes) = self.hits, self.parts
         kept, there = place[hits.row] >= 0, place[rows] >= 0
         hits = taken(hits, kept)
@@ -427,7 +427,7 @@ class Standing:
 
 @dataclass(frozen=True, slots=True)
 class MapContext:
-    """The map under the bodies of a block, and around its egos.
+    """Map parts below the objects of a block of frames, and map parts in range of the egos.
 
     Attributes
     ----------
@@ -457,7 +457,7 @@ def _columns_of(count: int) -> Columns:
 
 
 class EdgeRoom:
-    """Shared columns that the families of relations fill with the edges of a block.
+    """Preallocated arrays into which all relations write the edges of a block of frames.
 
     Therefore edges are written once. A family can also return its own columns, which are copied at
     the end.
@@ -474,7 +474,7 @@ class EdgeRoom:
         self._used = 0
 
     def rest(self, count: int) -> Columns:
-        """Return columns with room for ``count`` edges, to be filled from the start."""
+        """Return arrays with room for ``count`` edges."""
         if self._used + count > len(self._columns[0]):
             return _columns_of(count)
         frame, relation, src, dst = self._columns
@@ -482,7 +482,7 @@ class EdgeRoom:
         return frame[first:], relation[first:], src[first:], dst[first:]
 
     def filled(self, columns: Columns, count: int, more: Edges | None = None) -> Edges:
-        """Return the filled part of shared columns as edges, with ``more`` edges appended."""
+        """Return the written part of preallocated arrays as edges, with ``more`` edges appended."""
         if more is not None and len(more):
             if count + len(more) > len(columns[0]):
                 return Edges.chained([self.filled(columns, count), more])
@@ -495,7 +495,7 @@ class EdgeRoom:
         return edges
 
     def chained(self, parts: Sequence[Edges]) -> Edges:
-        """Concatenate the edges of all parts; parts in the shared columns are not copied."""
+        """Concatenate edges. Edges that are already in the preallocated arrays are not copied."""
         others = [part for part in parts if not any(part is own for own in self._parts)]
         count = self._used + sum(map(len, others))
         if len(parts) - len(others) < len(self._parts) or count > len(self._columns[0]):
@@ -521,7 +521,7 @@ def _fill(columns: Columns, first: int, edges: Edges) -> None:
 
 @dataclass(frozen=True, slots=True)
 class BlockScene:
-    """Frames of a block, prepared for the families of relations.
+    """Frames of a block with objects, object pairs, contacts and map parts, for all relations.
 
     Attributes
     ----------
@@ -547,18 +547,18 @@ class BlockScene:
     room: EdgeRoom = field(default_factory=EdgeRoom)
 
     def parameters(self, relation: Relation) -> Mapping[str, Any]:
-        """Return the settings of a relation: those of the config, and defaults for the others."""
+        """Return the parameters of a relation: those of the settings, and defaults for the others."""
         return {**relation.parameters, **self.config.relations.get(relation.name, {})}
 
 
 def always(config: Config) -> bool:
-    """Return True: every config requests the relation."""
+    """Return True: the relation is part of the graphs under all settings."""
     return True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Relation:
-    """Complete declaration of a relation.
+    """Declaration of a relation (edge type) of scene graphs, with the function that computes it.
 
     Attributes
     ----------
@@ -603,19 +603,19 @@ class Relation:
     legend: str = ""
 
     def asked(self, config: Config) -> bool:
-        """True if a config requests the relation, with a map if it needs one."""
+        """Return True if the settings request the relation."""
         return self.settings(config) and (not self.of_pairs or relates_pairs(config))
 
 
 def relates_pairs(config: Config) -> bool:
-    """True if the settings relate any pairs."""
+    """Return True if the settings request at least one relation between objects."""
     return config.pairs.ego or config.pairs.within > 0
 
 
 def edges_between(
     scene: BlockScene, relation: str | Codes, src: NDArray[np.intp], dst: NDArray[np.intp]
 ) -> Edges:
-    """Return edges from body to body (rows), with one relation or one code each."""
+    """Return edges from object to object, given by rows, with one relation or one code each."""
     bodies = scene.bodies
     return Edges(
         bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], bodies.node[dst]
@@ -625,7 +625,7 @@ def edges_between(
 def edges_of_pairs(
     scene: BlockScene, codes: Codes, holds: Bools, *, seen_by_a: bool = False
 ) -> tuple[Columns, int]:
-    """Return the edges of the pairs in a mask: from a to b, or with ``seen_by_a`` from b to a.
+    """Return the edges of the object pairs in a mask, with a relation code for each pair.
 
     Parameters
     ----------
@@ -659,7 +659,7 @@ def edges_of_pairs(
 def edges_to_map(
     scene: BlockScene, relation: str, src: NDArray[np.intp] | Ints, dst: Ints
 ) -> Edges:
-    """Return edges from bodies (rows) to nodes of the map (node ids)."""
+    """Return edges from objects (rows) to map nodes (node ids), with one relation."""
     bodies = scene.bodies
     return Edges(bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], dst)
 
@@ -671,7 +671,7 @@ def _relation_codes(relation: str | Codes, count: int) -> Codes:
 
 
 def kinds_mask(names: tuple[str, ...]) -> Bools:
-    """Return a table of bool by kind code: True for the named kinds."""
+    """Return a lookup array: kind code → True for the named kinds."""
     table = np.zeros(MOST_KINDS, np.bool_)
     table[[KIND_CODE[name] for name in names]] = True
     return table
@@ -684,7 +684,7 @@ IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
 
 
 def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Expand ranges into arrays of owner and index.
+    """Expand index ranges: return the range number and the index for each element.
 
     Returns
     -------
@@ -697,6 +697,6 @@ def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 def joined(keys: Ints, wanted: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return all matches of ``wanted`` in ascending ``keys``: rows of ``wanted``, and rows of ``keys``."""
+    """Return all pairs of equal values in two arrays, as rows of ``wanted`` and rows of ``keys``."""
     start = np.searchsorted(keys, wanted)
     return spread(start, np.searchsorted(keys, wanted, side="right") - start)

@@ -1,4 +1,4 @@
-"""Bodies that the ego sees: all bodies that no other body hides.
+"""Relation ``sees``: objects that the ego sees, because no other object hides them.
 
 The eye is above the centre of the ego, at the height of its roof. A body is seen if a straight line
 to its centre, or to a corner of its footprint at that height, is free. A body blocks a line that
@@ -56,7 +56,7 @@ POINTS: Final = 5
 
 
 def seen(bodies: Bodies, ego: Rows) -> Rows:
-    """Return rows of the bodies that the ego of their frame sees.
+    """Return the rows of the objects that the ego of their frame sees.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def _seen_in_loops(bodies: Bodies, ego: Rows) -> Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Views:
-    """Bodies relative to the eye, in the axes of the map; shape (N,).
+    """Objects relative to the ego's eye, in map axes; shape (N,).
 
     Attributes
     ----------
@@ -170,7 +170,7 @@ def _views(bodies: Bodies, rows: Rows, eye: Rows) -> _Views:
 
 
 def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]:
-    """Yield pairs of a body and a nearer body in the same direction, which may hide it."""
+    """Yield pairs of an object and a nearer object in the same direction, which may hide it."""
     # Ranges beyond π occur a second time, from the other side.
     again = np.flatnonzero(views.high > np.pi)
     rows = np.concatenate([np.arange(len(views.low)), again])
@@ -184,7 +184,7 @@ def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]
 
 
 def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
-    """Return a mask of the sight lines to a point of the target that the cover blocks."""
+    """Return a mask of the sight lines to a point of an object that a nearer object blocks."""
     cos, sin = views.cos[cover], views.sin[cover]
     x, y = views.x[cover, 0], views.y[cover, 0]
     to_x, to_y = views.x[target, point], views.y[target, point]
@@ -209,7 +209,7 @@ def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
 def _within(
     start: Floats, run: Floats, half: Floats, enters: Floats | float, leaves: Floats | float
 ) -> tuple[Floats, Floats]:
-    """Clip a line to the part where a coordinate is within ±``half``; return start and end shares."""
+    """Clip a line to the part where a coordinate is within ±``half``; return start and end fractions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - start) / run, (half - start) / run
     return (

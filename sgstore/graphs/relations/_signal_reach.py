@@ -1,4 +1,4 @@
-"""Lanes that a signal may affect: the lanes that lead up to it."""
+"""Relation ``mayAffect``: the lanes that lead to a traffic signal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class SignalReach:
-    """Lanes upstream of the signals of a map, computed on first use.
+    """Lanes that lead to each traffic signal of a map, computed on first use.
 
     A signal is on each lane that it controls, at the foot of its place. It may affect this lane,
     and the lanes that end at most the given distance before it.
@@ -42,7 +42,7 @@ class SignalReach:
         self._known: dict[int, Ints] = {}
 
     def of(self, signal: str, place: tuple[float, float]) -> Ints:
-        """Return node ids of the lanes that a signal may affect; empty if its lanes are unknown.
+        """Return node ids of the lanes that a traffic signal may affect; empty if its lanes are unknown.
 
         Parameters
         ----------
@@ -59,7 +59,7 @@ class SignalReach:
         return self._upstream(-2 - self._map.lanes_of_signal(signal), *place)
 
     def of_map(self, present: Bools) -> tuple[Ints, Ints]:
-        """Return node ids of map signals that are present in any frame, and of lanes that they may affect.
+        """Return pairs of node ids: a map signal present in any frame, and a lane that it may affect.
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class SignalReach:
         return self._known[column]
 
     def _upstream(self, controlled: Ints, x: float, y: float) -> Ints:
-        """Return node ids of these lanes and the lanes before them."""
+        """Return node ids of the given lanes and of the lanes that lead to them."""
         places = np.zeros(len(controlled))
         if np.isfinite(x) and np.isfinite(y):
             here = np.ones(len(controlled))

@@ -1,4 +1,4 @@
-"""Points of lanes as nodes: a map at the granularity of waypoints."""
+"""Waypoints (points along lanes) as map nodes of scene graphs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MOST: Final = 500_000
 
 
 class Waypoints:
-    """Waypoints of a map.
+    """Waypoints (points along lanes) of a map, added to the map as nodes with edges.
 
     Parameters
     ----------
@@ -117,11 +117,11 @@ class Waypoints:
         )
 
     def _inside(self, points: LanePoints) -> tuple[Ints, Ints]:
-        """Return pairs of a waypoint and its lane, as node columns."""
+        """Return pairs of a waypoint and its lane, as node rows."""
         return self._first[0] + np.arange(len(points.lane)), FIRST_LANE + points.lane
 
     def _onward(self, edges: MapEdges) -> tuple[Ints, Ints]:
-        """Return pairs of a waypoint and the next waypoint, as node columns."""
+        """Return pairs of a waypoint and the next waypoint along the lane, as node rows."""
         total = int(self._counts.sum())
         begin = int(self._first[0]) if len(self._first) else 0
         column = begin + np.arange(total)
@@ -136,7 +136,7 @@ class Waypoints:
         )
 
     def of(self, hits: LaneHits, along: Floats, bodies: Bodies) -> tuple[Ints, Ints]:
-        """Return pairs of a body row and the node id of its waypoint, ordered by body.
+        """Return pairs of an object row and the node id of its nearest waypoint, sorted by object.
 
         Parameters
         ----------
@@ -163,7 +163,7 @@ _KNOWN: WeakKeyDictionary[RoadMap, tuple[LaneSettings, Waypoints]] = WeakKeyDict
 
 
 def waypoints_of(road_map: RoadMap | None, lanes: LaneSettings) -> Waypoints | None:
-    """Return the waypoints of a map if the settings request them; cached per map."""
+    """Return the waypoints (points along lanes) of a map, if the settings request them."""
     if road_map is None or lanes.granularity != "waypoint":
         return None
     known = _KNOWN.get(road_map)

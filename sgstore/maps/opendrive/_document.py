@@ -231,7 +231,10 @@ class Document:
             table.road = table.road[kept]
 
     def _records(self, kind: str, rows: Ints) -> list[Record]:
-        """Convert rows of a table to references (road, kind, number in the road)."""
+        """Convert rows of a table to references (road, kind, number in the road).
+
+        The rows of a road are contiguous.
+        """
         road = self.tables[kind].road
         within = rows - np.searchsorted(road, road[rows])
         numbers = [self.ordinals[row] for row in road[rows].tolist()]

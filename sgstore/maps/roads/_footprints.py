@@ -204,7 +204,10 @@ def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _Shapes:
-    """Footprints (ground rectangles) of N objects: position, heading, half size and height."""
+    """Footprints (ground rectangles) of N objects: position, heading, half size and height.
+
+    ``a`` and ``b`` are half of length and width, ``z`` is the height.
+    """
 
     x: Floats
     y: Floats

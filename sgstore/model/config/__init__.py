@@ -1,4 +1,4 @@
-"""Settings of an ingest: each with its default, range of values and comment; TOML in and out; presets."""
+"""Settings of the scene graph generator, with defaults, limits and comments; read from and written to TOML."""
 
 from sgstore.model.config._files import MAX_CONFIG_BYTES, configured, from_dict, load
 from sgstore.model.config._presets import PRESETS, preset

@@ -1,4 +1,4 @@
-"""Configs from TOML files, plain values and keyword arguments."""
+"""Reading of settings from TOML files, plain values and keyword arguments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MAX_CONFIG_BYTES: Final = 1 << 20
 
 
 def load(path: str | Path) -> Config:
-    """Read a config from a TOML file. Missing settings come from its preset, or keep their defaults.
+    """Read settings from a TOML file. Missing settings come from the file's preset, or keep their defaults.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def load(path: str | Path) -> Config:
 
 
 def from_dict(values: Mapping[str, Any]) -> Config:
-    """Return the config described by plain values.
+    """Return the settings for a dict of plain values.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def from_dict(values: Mapping[str, Any]) -> Config:
 
 
 def configured(**settings: Any) -> Config:
-    """Return the config described by keyword arguments. Tables are mappings or settings objects.
+    """Return the settings for keyword arguments. A table of settings is a mapping or an object.
 
     ::
 

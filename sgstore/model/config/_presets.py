@@ -1,4 +1,4 @@
-"""Presets: the default config, and configs that reproduce other tools."""
+"""Presets of the settings: the default, and presets that reproduce other tools."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Named config.
+    """Named set of settings for the scene graph generator, with a description.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ PRESETS: Final[Mapping[str, Preset]] = {
 
 
 def preset(name: str) -> Config:
-    """Return the config of a preset.
+    """Return the settings of a preset by name.
 
     Raises
     ------

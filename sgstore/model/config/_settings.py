@@ -124,12 +124,17 @@ class RangeSettings:
             check_polygon("range.polygon", self.polygon)
 
     def beyond(self) -> RangeSettings | None:
-        """Circle of the known data outside the graphs. ``None`` means no such data."""
+        """Return the circle around the ego with known objects outside the graphs.
+
+        ``None`` means no such objects.
+
+        ``None`` means no such objects.
+        """
         return replace(self, shape="radius", radius=self.world) if self.world else None
 
     @property
     def boundless(self) -> bool:
-        """True if the known data cover the whole recording."""
+        """True if the store has all objects of the recording, at any distance from the ego."""
         return self.world >= MOST_LENGTH
 
 
@@ -400,7 +405,7 @@ class Config:
 
     @property
     def notes(self) -> list[str]:
-        """Return notes on user-defined relation names that resemble a built-in name, perhaps by mistake.
+        """Return hints about user-defined relation names that resemble a built-in name, perhaps by mistake.
 
         Examples
         --------
@@ -416,7 +421,7 @@ class Config:
         ]
 
     def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
-        """Return the counts of the type names without a mapping.
+        """Return the counts of the type names for which the settings define no kind.
 
         Examples
         --------
@@ -439,7 +444,7 @@ class Config:
         return f"Config({', '.join(told)})"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the settings as plain values, as in TOML and JSON.
+        """Return the settings as a dict of plain values, as in TOML and JSON.
 
         Examples
         --------
@@ -459,7 +464,7 @@ def _make_known(name: str, add: Callable[[str], int], new: str) -> None:
 def check_steps(
     name: str, names: tuple[str, ...], upper: tuple[float, ...], known: tuple[str, ...], bounds: int
 ) -> None:
-    """Reject relation names that are reserved or repeated, and bounds that do not ascend.
+    """Raise an error for reserved or repeated relation names, or for bounds that do not ascend.
 
     New names are registered in this process.
     """
@@ -474,7 +479,12 @@ def check_steps(
 
 
 def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
-    """Reject labels that no kind has. ``Ego`` is valid if ``ego`` is true."""
+    """Raise an error for labels (such as ``Car``) that no kind of object has.
+
+    ``Ego`` is valid if ``ego`` is true.
+
+    ``Ego`` is valid if ``ego`` is true.
+    """
     known = [label for label in labels() if ego or label != "Ego"]
     for label in given:
         if not (kinds_labelled(label) or (ego and normalize_name(label) == "ego")):
@@ -482,14 +492,14 @@ def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
 
 
 def check_pairs(name: str, pairs: tuple[tuple[str, ...], ...]) -> None:
-    """Reject a list with anything but pairs of valid labels."""
+    """Raise an error unless a setting is a list of pairs of valid labels."""
     for i, pair in enumerate(pairs):
         check(len(pair) == 2, f"{name}[{i}]", pair, "two labels")
         check_labels(f"{name}[{i}]", pair, ego=True)
 
 
 def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
-    """Reject corners that do not form a simple polygon."""
+    """Raise an error if corners do not form a simple polygon."""
     pairs = all(len(corner) == 2 and all(map(math.isfinite, corner)) for corner in corners)
     right = f"3 to {MOST_CORNERS} corners [ahead, to the left], in metres"
     check(pairs and 3 <= len(corners) <= MOST_CORNERS, name, corners, right)
@@ -506,7 +516,7 @@ def _check_length(holds: bool, name: str, value: float, right: str) -> None:  # 
 
 
 def _check_name(setting: str, name: str, known: Iterable[str], more: str = "") -> None:
-    """Reject an unknown name, and suggest the most similar known name."""
+    """Raise an error for an unknown name, and suggest the most similar known name."""
     known = list(known)
     if name not in known:
         alias = relation_named(name)
@@ -531,7 +541,7 @@ def _checked_types(types: Mapping[str, TypeMeaning]) -> dict[str, TypeMeaning]:
 
 
 def _checked_relations(given: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the settings of relations, with defaults for missing values."""
+    """Return the parameters of relations from the settings, with defaults for missing values."""
     registry, checked = plugins.RELATIONS, dict[str, dict[str, Any]]()
     others = registry.others() if given else {}
     for name, values in sorted(given.items()):

@@ -1,4 +1,4 @@
-"""Configs as commented TOML, and the page of all settings."""
+"""Settings as commented TOML text, and the documentation page of all settings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WIDTH: Final = 98
 
 
 def as_toml(config: Config) -> str:
-    """Return the whole config as TOML, each setting with its comment. :func:`load` restores the config."""
+    """Return all settings as TOML text, each with its comment. :func:`load` reads this text."""
     lines = ["# Settings of sgstore. Lengths are metres, angles degrees, times seconds.", ""]
     tables: list[str] = []
     for one in fields(config):

@@ -1,4 +1,4 @@
-"""Settings tables from plain values, with errors for unknown names and wrong types."""
+"""Conversion of plain values to tables of settings, with errors for unknown names and wrong types."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: F
 
 
 def one_of(words: Iterable[str]) -> str:
-    """Format words as ``'a', 'b' or 'c'``."""
+    """Format words as an enumeration: ``'a', 'b' or 'c'``."""
     *most, last = (f"'{word}'" for word in words)
     return f"{', '.join(most)} or {last}"
 
 
 def changed(config: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """Return a copy of a settings table with some values changed."""
+    """Return a copy of a table of settings with some values changed."""
     hints = get_type_hints(type(config))
     known = {f.name for f in fields(config)}
     for name in values:
@@ -104,7 +104,7 @@ def _table(cls: Any, value: Any, name: str, default: Any) -> Any:
 
 
 def _built(cls: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    """Build a record from plain values. Fields without a default are required."""
+    """Build a settings object from plain values. Fields without a default are required."""
     hints = get_type_hints(cls)
     for name in values:
         if name not in hints:

@@ -1,4 +1,4 @@
-"""Measures of criticality that need the later recording: how two entities met or missed each other.
+"""Criticality measures that need the whole recording: closest encounter, post-encroachment time and so on.
 
 Measures that predict from one frame are numbers of pairs (:mod:`sgstore.model.pair_numbers`), also for
 patterns and the monitor. The measures here need the complete drive: the tracks of two entities

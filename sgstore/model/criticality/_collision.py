@@ -1,4 +1,4 @@
-"""TTC*: time until the recorded footprints first touch, from each frame on.
+"""Measure TTC*: time until two recorded objects first touch, from each frame on.
 
 ttc_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprints of both at t′ overlap or touch }.
 Source: Lin and Althoff, CommonRoad-CriMe, IV 2023. There the road's edge counts too; here it does
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def ttc_recorded(of: Encounter) -> Floats:
-    """Return the time to the recorded collision from each common frame, (T,); s. NaN without a collision."""
+    """Return the time until two objects touch in the recording, for each frame, (T,); s. NaN for never."""
     times = of.times
     met = np.where(of.numbers["gap"] <= 0, times, np.inf)
     first = np.minimum.accumulate(met[::-1])[::-1]

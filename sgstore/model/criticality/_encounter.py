@@ -1,4 +1,4 @@
-"""Tracks of two entities, and the times when they cover the same place."""
+"""Tracks (recorded states) of two objects, and the times when they cover the same position."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TOGETHER: Final = 256
 
 @dataclass(frozen=True)
 class Track:
-    """States of an entity in its frames of a trace.
+    """Track of an object in a trace: position, heading, size and motion in each of its frames.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Track:
 
     @cached_property
     def circles(self) -> tuple[Floats, Floats, Floats]:
-        """Return centre and radius of a circle around the footprints of each block of states."""
+        """Circles around the object's footprints, one per block of consecutive frames: centre and radius."""
         count = -(-len(self) // _BLOCK)
         rows = np.minimum(np.arange(count * _BLOCK), len(self) - 1).reshape(count, _BLOCK)
         x, y = self.states[rows, 0], self.states[rows, 1]
@@ -56,7 +56,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Encounter:
-    """Tracks of two entities of one trace; the measures judge a.
+    """Tracks of two objects a and b of one trace. The criticality measures apply to a.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Encounter:
 
     @cached_property
     def together(self) -> tuple[Ints, Ints]:
-        """Return the rows of a and of b in their common frames."""
+        """Row numbers of a and of b in the frames that have both objects."""
         _, rows_a, rows_b = np.intersect1d(
             self.a.times, self.b.times, assume_unique=True, return_indices=True
         )
@@ -77,22 +77,22 @@ class Encounter:
 
     @property
     def times(self) -> Floats:
-        """Return the times of the common frames, (T,); s."""
+        """Times of the frames that have both objects, (T,); s."""
         return self.a.times[self.together[0]]
 
     @cached_property
     def numbers(self) -> PairNumbers:
-        """Return the numbers of the pair in their common frames."""
+        """Measures of the object pair (gap, closing speed, …) in the frames that have both objects."""
         rows_a, rows_b = self.together
         return PairNumbers(self.a.states[rows_a], self.b.states[rows_b])
 
     @cached_property
     def known(self) -> bool:
-        """True if the footprints are known in every frame."""
+        """True if the sizes and positions of both objects are known in every frame."""
         return not any(np.isnan(one.states[:, [0, 1, 3, 4, 5]]).any() for one in (self.a, self.b))
 
     def crossings(self) -> Iterator[tuple[Ints, Ints]]:
-        """Yield rows of a and of b whose footprints overlap or touch at different times, in chunks."""
+        """Yield rows of a and of b in which both objects cover a common area at different times."""
         if not self.known:
             return
         (x1, y1, r1), (x2, y2, r2) = self.a.circles, self.b.circles
@@ -106,7 +106,7 @@ class Encounter:
                 yield self._touching(first + blocks_a[part], blocks_b[part])
 
     def _touching(self, blocks_a: Ints, blocks_b: Ints) -> tuple[Ints, Ints]:
-        """Return rows in pairs of blocks whose footprints overlap or touch."""
+        """Return rows of a and of b, among pairs of blocks, in which the footprints touch or overlap."""
         inner = np.arange(_BLOCK)
         rows_a = (blocks_a[:, None] * _BLOCK + inner)[:, :, None]
         rows_b = (blocks_b[:, None] * _BLOCK + inner)[:, None, :]
@@ -118,7 +118,7 @@ class Encounter:
 
 
 def _touch(a: Floats, b: Floats) -> Bools:
-    """Return a mask of the pairs of boxes that overlap or touch, (K,)."""
+    """Return a mask (K,) of the pairs of boxes that touch or overlap."""
     apart = np.hypot(a[:, 0] - b[:, 0], a[:, 1] - b[:, 1])
     reach = (np.hypot(a[:, 4], a[:, 5]) + np.hypot(b[:, 4], b[:, 5])) / 2
     found = apart <= reach * (1 + 1e-9)

@@ -1,4 +1,4 @@
-"""Encroachment: times when both entities were in their conflict area.
+"""Encroachment: times at which two objects are in their conflict area (area that both cross).
 
 The conflict area of two tracks is the area that both footprints cover, at any time. An entity is in
 it while its footprint overlaps any footprint of the other entity, at any time. It enters with the
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Encroachment:
-    """Times of both entities in their conflict area; s. NaN means no area or an unknown time.
+    """Entry and exit times of two objects in their conflict area; s. NaN means unknown, or no such area.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Encroachment:
 
 
 def encroachment(of: Encounter) -> Encroachment:
-    """Return entry and exit times of both entities in their conflict area.
+    """Return entry and exit times of two objects in their conflict area (area that both cross).
 
     An entry is unknown if the first frame is in the area, and an exit if the last frame is.
     """
@@ -61,7 +61,7 @@ def _span(track: Track, inside: Bools) -> tuple[float, float]:
 
 
 def pet(of: Encounter) -> float:
-    """Return the post-encroachment time; s.
+    """Return the post-encroachment time: from the first object's exit to the second's entry; s.
 
     NaN without a conflict area, if both were in it at once, or if the recording begins or ends in
     it.
@@ -75,6 +75,6 @@ def pet(of: Encounter) -> float:
 
 
 def et_recorded(of: Encounter) -> float:
-    """Return the encroachment time: how long a was in the area; s. NaN for an unknown entry or exit."""
+    """Return the encroachment time: how long object a is in the conflict area; s. NaN if unknown."""
     when = encroachment(of)
     return when.leaves_a - when.enters_a

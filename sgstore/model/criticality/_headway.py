@@ -1,4 +1,4 @@
-"""Recorded headway: time until a is at b's present place.
+"""Recorded headway: time until object a is at the present position of object b.
 
 headway_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprint of a at t′ touches the one of b at t
 }. Source: Jansson, Collision Avoidance Theory, 2005. Here the path is the recorded one, so that it
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def headway_recorded(of: Encounter) -> Floats:
-    """Return the time until a reaches b's present place, from each common frame, (T,); s; NaN for never."""
+    """Return the time until object a reaches b's present position, for each frame, (T,); s. NaN for never."""
     comes = np.full(len(of.b), np.inf)
     for rows_a, rows_b in of.crossings():
         later = of.a.times[rows_a] - of.b.times[rows_b]

@@ -1,4 +1,4 @@
-"""Crash potential index: probability that braking alone would not be enough.
+"""Crash potential index (CPI): probability that braking alone is not enough to avoid a crash.
 
 CPI = mean over frames of P(MADR < −a_long_req). The maximum available deceleration MADR has a
 normal distribution around 8.45 m/s² with a deviation of 1.40 m/s², between 4.23 and 12.68 m/s².
@@ -24,7 +24,7 @@ _MOST: Final = 12.68
 
 
 def _below(deceleration: float) -> float:
-    """Return the probability that a vehicle's braking limit is below this deceleration."""
+    """Return the probability that the braking limit of a vehicle is below a deceleration (m/s²)."""
     return (1 + math.erf((deceleration - _MEAN) / _DEVIATION / math.sqrt(2))) / 2
 
 
@@ -38,7 +38,7 @@ def crash_probability(deceleration: Floats) -> Floats:
 
 
 def cpi(of: Encounter) -> float:
-    """Return the crash potential index, 0 … 1.
+    """Return the crash potential index of an encounter of two objects, 0 … 1.
 
     Frames without b ahead in a's path count as 0, frames with contact and without separation as 1;
     frames with an unknown required deceleration do not count. NaN if no frame counts.

@@ -1,4 +1,4 @@
-"""Recorded measures by name, and their values in a store for the ego and each possible partner."""
+"""Recorded criticality measures by name, and their values for the ego and all other objects of a store."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _STATES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class RecordedMeasure:
-    """Measure of an encounter, implemented by the function of this package with the same name.
+    """Criticality measure of two objects over a whole recording, with description and unit.
 
     Attributes
     ----------
@@ -47,11 +47,11 @@ class RecordedMeasure:
 
     @property
     def meaning(self) -> str:
-        """Return the documentation in one line."""
+        """Return the description and unit of the measure in one line."""
         return f"{self.doc}; {self.unit}; of what was recorded: the same in each frame of a trace"
 
     def value(self, encounter: Encounter) -> float:
-        """Return the value of an encounter; NaN means unknown or undefined."""
+        """Return the measure for two tracks; NaN means unknown or undefined."""
         of = getattr(import_module("sgstore.model.criticality"), self.name)
         found = np.atleast_1d(of(encounter))
         if self.least:
@@ -118,7 +118,7 @@ KNOWN: Final = "known "
 
 
 def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:
-    """Return tracks of entities by node id, with the kind and True for an ego.
+    """Convert table columns to the tracks of objects: node id, kind, True for an ego, track.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:
 
 
 class _Asked(Protocol):
-    """File of a store, with the methods used here."""
+    """Interface of a store file: the methods that the recorded measures use."""
 
     def arrays(self, sql: str, parameters: Sequence[object] | None = None) -> Mapping[str, Any]: ...
     def rows(self, sql: str) -> Any: ...
@@ -157,7 +157,7 @@ class _Store(Protocol):
 
 
 def encounters(store: _Store, trace: str) -> Iterator[tuple[int, int, str, Encounter]]:
-    """Yield the ego of a trace with each possible partner: node ids of both, kind, tracks.
+    """Yield each pair of the ego and another object of a trace: node ids, kind and tracks.
 
     The states include known ones outside the graphs, up to ``[range] world``.
 
@@ -178,7 +178,7 @@ def encounters(store: _Store, trace: str) -> Iterator[tuple[int, int, str, Encou
 
 
 def recorded(store: _Store, measures: Sequence[str] = tuple(RECORDED)) -> Any:
-    """Return the recorded measures of each ego with each possible partner, one row per pair and trace.
+    """Return a table of recorded criticality measures: one row per trace, ego and other object.
 
     The values come from the view ``encounters``.
 

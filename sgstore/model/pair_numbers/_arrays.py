@@ -1,4 +1,4 @@
-"""Numbers of pairs as arrays: numpy evaluates their SQL expressions."""
+"""Measures of object pairs on arrays: numpy evaluates the SQL expressions of the measures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLUMNS: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy", "ax",
 
 
 class PairNumbers(dict[str, "Floats"]):
-    """Numbers of many ordered pairs by name, each computed on first use; (K,) float64.
+    """Measures of K object pairs (a, b) by name, each computed on first use; (K,) float64.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class PairNumbers(dict[str, "Floats"]):
 
 
 def gap(a: Floats, b: Floats) -> Floats:
-    """Return the shortest distance between the boxes of each pair; 0 if they touch or overlap.
+    """Return the shortest distance between two boxes for each pair; m. 0 if they touch or overlap.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ _AS_PYTHON: Final = tuple(
 
 
 def _case(*parts: Any) -> Any:
-    """Return the first value whose condition is true, else the last value, or NaN."""
+    """Evaluate an SQL ``CASE`` on arrays: the first value whose condition is true, else the last, or NaN."""
     pairs, found = len(parts) // 2, parts[-1] if len(parts) % 2 else np.nan
     for i in reversed(range(pairs)):
         found = np.where(parts[2 * i], parts[2 * i + 1], found)
@@ -124,7 +124,7 @@ def _is_known(value: Any, _: Any) -> Any:
 
 @cache
 def _functions() -> Mapping[str, Callable[..., Any]]:
-    """Return the functions of expressions by name."""
+    """Return numpy functions for the SQL functions in expressions, by name."""
     return {
         "case": _case,
         **{
@@ -163,7 +163,7 @@ def _operators() -> Mapping[type[ast.AST], Callable[..., Any]]:
 
 @cache
 def _compiled(name: str) -> Formula:
-    """Compile the formula of a number of pairs.
+    """Compile the SQL expression of a measure of object pairs to a numpy function.
 
     An unknown condition counts as false; this is equivalent, because conditions are never negated.
     """

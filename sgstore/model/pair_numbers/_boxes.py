@@ -1,4 +1,4 @@
-"""Positions, velocities and footprints of two entities: gaps, angles, and contact times of two boxes."""
+"""Measures of object pairs from positions, velocities and boxes: gaps, angles and contact times."""
 
 from __future__ import annotations
 

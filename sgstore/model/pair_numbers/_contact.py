@@ -1,4 +1,4 @@
-"""Gap or overlap depth of two footprints."""
+"""Measure of object pairs: gap between two footprints, or depth of their overlap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Crossing paths: arrival times at the conflict area, and severity of an impact."""
+"""Measures of object pairs on crossing paths: arrival times at the conflict area, impact severity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Closest encounter and worst case: time of the least distance, or of the first possible contact."""
+"""Measures of object pairs: time of the smallest distance (closest encounter), and worst-case contact time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HALVES: Final = ((1, "la", 1, 2), (2, "wa", 2, 1), (3, "lb", 3, 4), (4, "wb", 4
 
 
 def _after_3s(text: str) -> str:
-    """Replace b's position in an expression by its position after 3 s."""
+    """Replace the position of object b in an SQL expression by its position after 3 s."""
     return _MOVED.sub(r"\1_3s", text)
 
 

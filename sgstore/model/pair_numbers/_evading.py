@@ -1,4 +1,4 @@
-"""Room for evasion: by acceleration, and until a stop."""
+"""Measures of object pairs: remaining time or distance to evade by acceleration or braking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Following: times and accelerations along a's axis, and sideways for overtaking."""
+"""Measures of object pairs that follow each other: headways, and needed accelerations."""
 
 from __future__ import annotations
 

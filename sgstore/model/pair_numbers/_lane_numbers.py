@@ -1,4 +1,4 @@
-"""Numbers that are looked up from lanes: distances along them, curvature and slope."""
+"""Measures from the lanes of a map: distance along lanes, curvature and slope."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ OF_ONE: Final = (*NEXT_PARTS, *COURSES)
 
 
 def as_written(name: str, a: str, b: str) -> str:
-    """Return a number of a pair as written in the language, with the names of both entities."""
+    """Return the query text of a measure of two objects, such as ``ttc(a, b)``."""
     if name in OF_ONE:
         return f"{name}({a})"
     return f"{LANE_DIST if name == PART_DIST else name}({a}, {b})"

@@ -1,4 +1,4 @@
-"""Heights of a body's lower and upper side, to distinguish storeys and flat objects from bodies.
+"""Heights of the lower and upper side of objects, to distinguish storeys (bridges) and flat objects.
 
 Signals hang over the road and belong to no storey: they have no such heights. An upright kind never
 has height 0: there 0 means an unrecorded height, as in recordings without heights.
@@ -57,7 +57,7 @@ UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_st
 
 
 def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None) -> bool:
-    """True if no two compared bodies are on different storeys.
+    """Return True if all compared objects are on the same storey (for example no bridge between them).
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None)
 
 
 def climb(distance: Floats, pitch_a: Floats, pitch_b: Floats) -> Floats:
-    """Return the height that a road may climb between two bodies; m.
+    """Return the possible height difference of a road between two objects, from their pitch; m.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def climb(distance: Floats, pitch_a: Floats, pitch_b: Floats) -> Floats:
 
 
 def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tuple[Floats, Floats]:
-    """Return the heights of the lower and the upper side of bodies.
+    """Return the heights of the lower and the upper side of objects; m.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def low_and_high(z: Floats, height: Floats, hung: Bools, upright: Bools) -> tupl
 
 
 def low_and_high_sql(column: Callable[[str], str], *, upright: bool = False) -> dict[str, str]:
-    """Return :func:`low_and_high` as SQL, from the SQL of the columns ``z``, ``height`` and ``kind``.
+    """Return SQL expressions for the heights of the lower and the upper side of an object.
 
     ``upright``: all bodies are known to be upright and not signals.
     """

@@ -1,4 +1,4 @@
-"""Declaration of numbers of two entities."""
+"""Declaration of a measure of an object pair: name, unit, description and SQL expression."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class PairFunction:
-    """Declaration of a number of two entities a and b.
+    """Declaration of a measure of two objects a and b, such as gap or time to collision.
 
     Attributes
     ----------
@@ -46,12 +46,12 @@ class PairFunction:
 
     @property
     def meaning(self) -> str:
-        """Return the documentation in one line."""
+        """Return the description of the measure in one line."""
         return f"{self.doc}; {self.unit}" + (f"; {self.note}" if self.note else "")
 
 
 def measure(
     doc: str, unit: str, sql: str, note: str, source: str, alias: str = "", worse: str = "low"
 ) -> PairFunction:
-    """A measure of criticality."""
+    """Declare a criticality measure of two objects, such as time to collision."""
     return PairFunction(doc, unit, sql, note, source, "criticality", alias=alias, worse=worse)

@@ -1,4 +1,4 @@
-"""Safe distances of Responsibility-Sensitive Safety (RSS)."""
+"""Measures of object pairs: safe distances of Responsibility-Sensitive Safety (RSS)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All numbers of pairs by name, and their SQL."""
+"""Table of all measures of object pairs: name → declaration, with SQL expressions."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ Marks = frozenset[str]
 
 @cache
 def expression_of(name: str, without: Marks) -> str:
-    """Return the SQL of a number or part, without the marks that no pair needs."""
+    """Return the SQL expression of a measure, without the tests for special pairs in ``without``."""
     text = EXPRESSIONS[name]
     for mark in without:
         text = text.replace(f" + {mark}", "").replace(f"{mark} > 0 OR ", "")
@@ -57,13 +57,13 @@ def expression_of(name: str, without: Marks) -> str:
 
 @cache
 def parts_of(name: str, without: Marks = frozenset()) -> tuple[str, ...]:
-    """Return the numbers, parts and columns that a number of a pair uses."""
+    """Return the names (measures, parts and columns) in the SQL expression of a measure."""
     return tuple(sorted({*NAME.findall(expression_of(name, without))}))
 
 
 @cache
 def stage_of(name: str, without: Marks = frozenset()) -> int:
-    """Return the number of layers below a number of a pair; 0 for a column of an entity."""
+    """Return the nesting depth of a measure's SQL expression; 0 for a column of an object."""
     if name not in EXPRESSIONS:
         return 0
     return 1 + max(stage_of(part, without) for part in parts_of(name, without))
@@ -71,7 +71,7 @@ def stage_of(name: str, without: Marks = frozenset()) -> int:
 
 @cache
 def needed_for(name: str, without: Marks = frozenset()) -> frozenset[str]:
-    """Return a number with all its inputs, recursively; empty for a number that is looked up.
+    """Return a measure with the names of all its inputs, recursively; empty for a map look-up.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def needed_for(name: str, without: Marks = frozenset()) -> frozenset[str]:
 
 
 def columns_needed(name: str) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the required columns of a and of b, without the optional columns of heights."""
+    """Return the columns that a measure needs of object a and of object b, except heights."""
     raw = [part for part in needed_for(name, MARKS) if part not in EXPRESSIONS]
     raw = [part for part in raw if part[2:] not in {*OPTIONAL, "z"}]
     a, b = (frozenset(part[2:] for part in raw if part[0] == one) for one in "ab")

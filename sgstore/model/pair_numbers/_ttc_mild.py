@@ -1,4 +1,4 @@
-"""Mild case: first possible contact of two boxes without hard steering, braking or acceleration."""
+"""Measure of object pairs: earliest possible contact if both accelerate only mildly."""
 
 from __future__ import annotations
 

@@ -91,7 +91,10 @@ CLASS_COLUMNS: Final = (*_UUID, *_CLASSES)
 
 @dataclass(slots=True)
 class ObjectLead(Lead):
-    """Channel with lists of objects in an Autoware recording, as a candidate for the frames of the trace."""
+    """Channel with lists of objects in an Autoware recording, as a candidate for the frames of the trace.
+
+    ``order`` is the priority of its list type, ``objects`` its total number of objects.
+    """
 
     order: int = 0
     objects: int = 0
@@ -114,7 +117,10 @@ def idents_of(table: Floats) -> list[str]:
 
 
 def labels_of(table: Floats) -> list[str]:
-    """Return the most probable class of each Autoware object."""
+    """Return the most probable class of each Autoware object.
+
+    The columns of the table are as in :func:`idents_of`.
+    """
     classes = table[:, len(_UUID) : len(CLASS_COLUMNS)].reshape(len(table), _MOST_CLASSES, 2)
     likely = np.argmax(np.nan_to_num(classes[:, :, 1], nan=-1.0), axis=1)
     label = np.nan_to_num(classes[np.arange(len(table)), likely, 0]).astype(np.int64)

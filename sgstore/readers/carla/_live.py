@@ -391,7 +391,10 @@ def _described(handle: Any, map_ref: str) -> _Actor:
 
 
 def _box(box: Any) -> tuple[float, ...]:
-    """Return centre, half extents and yaw of a CARLA actor's bounding box; NaN without a box."""
+    """Return centre, half extents and yaw of a CARLA actor's bounding box; NaN without a box.
+
+    A traffic light or a box of size 0 also gives NaN.
+    """
     if box is None or not (box.extent.x or box.extent.y or box.extent.z):
         return _NO_BOX
     place, half = box.location, box.extent
@@ -464,7 +467,10 @@ def in_world(point: tuple[float, float, float], transform: Any) -> tuple[float, 
 
 
 def _controls(actor: _Actor) -> dict[str, Any]:
-    """Return the control inputs (steering, throttle, brake, …) of a CARLA vehicle."""
+    """Return the control inputs (steering, throttle, brake, …) of a CARLA vehicle.
+
+    The sign of the steering is inverted.
+    """
     if not actor.type_name.startswith("vehicle."):
         return {}
     control = actor.handle.get_control()
@@ -525,7 +531,10 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 
 @dataclass(frozen=True, slots=True)
 class SensorPicture:
-    """Camera picture of a CARLA sensor: (height, width, 3) uint8, RGB, with the field of view."""
+    """Camera picture of a CARLA sensor: (height, width, 3) uint8, RGB.
+
+    ``fov`` is the horizontal field of view; degrees.
+    """
 
     pixels: np.ndarray[Any, np.dtype[np.uint8]]
     fov: float

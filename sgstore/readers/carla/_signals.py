@@ -154,7 +154,10 @@ class _Near(NamedTuple):
 
 
 def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
-    """Assign traffic lights to map signals by position: row of the light → row of the signal."""
+    """Assign traffic lights to map signals by position: row of the light → row of the signal.
+
+    The columns are ``x, y, z, heading``.
+    """
     found: dict[int, int] = {}
     best = _Rule(TURNS[0], FORWARD, 0.0)
     first = True

@@ -43,7 +43,10 @@ Place = tuple[float, float, float]
 
 
 class State(NamedTuple):
-    """State of a CommonRoad obstacle at a time step: position, heading, speed, …; NaN means unknown."""
+    """State of a CommonRoad obstacle at a time step: position, heading, speed, …; NaN means unknown.
+
+    The units are m, rad, m/s, m/s² and rad/s.
+    """
 
     x: float
     y: float

@@ -117,6 +117,8 @@ class CommonRoadFile(MessageFile):
     ) -> Iterator[Messages]:
         """Yield all messages of the scenario: the map, then one per time step.
 
+        Lost parts are added to ``report``.
+
         The ``offset`` of a message is its number. ``keep`` has no effect, because messages are already in
         memory.
         """
@@ -195,7 +197,10 @@ def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[byt
 
 
 def _steps(scenario: TrafficScenario) -> list[int]:
-    """Return the time steps of a scenario with obstacle states, in order."""
+    """Return the time steps of a scenario with obstacle states, in order.
+
+    A scenario with only static obstacles has one step.
+    """
     moving = {step for one in scenario.obstacles.values() if not one.static for step in one.states}
     if not moving and scenario.obstacles:
         return [0]

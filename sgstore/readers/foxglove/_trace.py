@@ -346,7 +346,10 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
     def _take_scene(
         self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int, *, goes_on: bool
     ) -> None:
-        """Update the current scene objects from a scene message."""
+        """Update the current scene objects from a scene message.
+
+        With ``goes_on``, the message adds to a message of another channel.
+        """
         standing = self._standing.setdefault(channel, {})
         if self._mapping.scene.snapshot and not goes_on:
             standing.clear()

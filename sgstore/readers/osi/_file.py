@@ -366,7 +366,10 @@ class _MessageRun:
 
 
 class _Stream:
-    """Splits the bytes of an OSI file into messages, also after damaged parts."""
+    """Splitter of the bytes of an OSI file into messages, also after damaged parts.
+
+    ``mark`` contains the first bytes common to all messages, if known.
+    """
 
     def __init__(self, mark: bytes) -> None:
         self._mark = mark
@@ -383,7 +386,10 @@ class _Stream:
         self._buffer += piece
 
     def take(self, report: Findings, *, ends: bool) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the complete messages in the bytes added so far."""
+        """Yield the complete messages in the bytes added so far.
+
+        ``ends`` is true after the last bytes of the file.
+        """
         at = 0
         while (left := len(self._buffer) - at) >= PREFIX.size or (ends and left):
             length = PREFIX.unpack_from(self._buffer, at)[0] if left >= PREFIX.size else 0

@@ -523,7 +523,10 @@ def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
 
 
 def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -> Floats:
-    """Return points (n, 3) of a line at given positions s along it."""
+    """Return points (n, 3) of a line at given positions s along it.
+
+    ``side`` selects the value at a jump of the line.
+    """
     at = np.searchsorted(s, cuts, side)
     at = np.minimum(at, len(s) - 1) if side == "left" else np.maximum(at - 1, 0)
     between = np.column_stack([np.interp(cuts, s, column) for column in line.T])

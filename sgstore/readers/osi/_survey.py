@@ -72,7 +72,7 @@ def _names_or_none(moving_object: Any) -> list[str]:
 
 
 def hosts_of(message: Any) -> list[int]:
-    """Return the possible ids of the host vehicle (ego) in an OSI message, most reliable first."""
+    """Return the possible ids of the host vehicle (ego) in an OSI message, best first; 0 is a valid id."""
     told = [getattr(message, part) if part else message for part in _telling(type(message))]
     return [part.host_vehicle_id.value for part in told if part.HasField("host_vehicle_id")]
 

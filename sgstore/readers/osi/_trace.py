@@ -79,7 +79,10 @@ class Environment:
             self._class = None
 
     def look(self, ground: Any, time_ns: int, log_time_ns: int, seq: int) -> None:
-        """Update the weather and light conditions from an OSI message, and report changes as events."""
+        """Update the weather and light conditions from an OSI message, and report changes as events.
+
+        Missing conditions keep their values.
+        """
         told = getattr(ground, "environmental_conditions", b"")
         if not told or told == self._told or self._class is None:
             return
@@ -225,7 +228,10 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         self._frames = 0
 
     def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
-        """Return the raw frame that an OSI message starts; ``None`` for any other message."""
+        """Return the raw frame that an OSI message starts; ``None`` for any other message.
+
+        Other contents of the message are stored.
+        """
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()

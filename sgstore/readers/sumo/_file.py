@@ -150,7 +150,7 @@ class SumoFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """Yield all time steps of a SUMO file as messages, in order.
+        """Yield all time steps of a SUMO file as messages, in order. Lost parts are added to ``report``.
 
         ``offset`` of a message is its position in the file.
         """
