@@ -124,7 +124,7 @@ class BudgetTracker:
 
 
 class Strategy(StrEnum):
-    """Strategy by which test cases are selected."""
+    """Strategy for the selection of test cases."""
 
     every = "every"
     minimal = "minimal"

@@ -390,7 +390,7 @@ def _said(
 
 
 def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> list[str]:
-    """Return notes about missing data, because of which critical situations of the ego can be unknown."""
+    """Return notes about missing data that can hide critical situations of the ego."""
     told: list[str] = []
     of_pairs = bool({*spec.measures} & {*RANKED, *LATER}) or spec.by is Priority.learned
     if spec.by is Priority.diverse:
@@ -413,8 +413,7 @@ def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> 
 
 
 def _places(total: Floats, rank: Ints) -> Ints:
-    """Return the place of each value in ascending order, (U,), from 0; ``rank`` decides between equal values.
-    """
+    """Return the place of each value in ascending order, (U,), from 0. Ties are ordered by ``rank``."""
     found = np.empty(len(total), np.int64)
     found[np.lexsort((rank, total))] = np.arange(len(total))
     return found

@@ -532,7 +532,7 @@ def _of_units(pairs: Ints, has: Bools) -> Ints:
 
 
 def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges of about ``step`` array rows, none of which divides a clip or trace."""
+    """Yield ranges of about ``step`` array rows that never divide a clip or trace."""
     low = 0
     while low < len(unit):
         high = int(np.searchsorted(unit, unit[min(low + step, len(unit)) - 1], side="right"))
