@@ -1,4 +1,4 @@
-"""Pictures of frames and maps, as PNG or SVG by the file ending.
+"""Pictures of frames, clips, maps and results, as PNG, SVG, GIF or video by the file ending.
 
 A frame is seen from above, with the ego in the middle and its heading up. The legend explains every
 sign in a picture, and only these, for readers who do not know this project. An existing file is

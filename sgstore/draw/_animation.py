@@ -1,4 +1,4 @@
-"""Animations: each picture is written at its time, so that memory does not grow with the length."""
+"""Writers of animations (GIF, MP4, WebM). Each picture is written at once, so that memory is bounded."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _KEPT_FREE: Final = 32
 
 
 class Animation(ABC):
-    """Writer of consecutive pictures; a context manager.
+    """Writer of an animation file, picture by picture; a context manager.
 
     Parameters
     ----------
@@ -92,7 +92,10 @@ class Animation(ABC):
             self._output.discard()
 
     def add(self, pixels: Pixels, time_s: float) -> None:
-        """Show a picture (height, width, 3) from a time on; s. All have one size; times ascend."""
+        """Add a picture (height, width, 3) to the animation, shown from a time in seconds.
+
+        All pictures have one size, and times ascend.
+        """
         start = round(time_s * self.TICKS)
         if self._waiting is not None:
             before, since = self._waiting
@@ -102,19 +105,19 @@ class Animation(ABC):
 
     @abstractmethod
     def _write(self, pixels: Pixels, delay: int) -> None:
-        """Write a frame with its display time."""
+        """Write a picture to the animation file, with its display time."""
 
     @abstractmethod
     def _end(self) -> None:
-        """Write the end of the file after the last frame."""
+        """Write the end of the animation file after the last picture."""
 
     @abstractmethod
     def _drop(self) -> None:
-        """Release all resources except the file itself."""
+        """Release all resources of the animation writer except its file."""
 
 
 def animation(to: Path) -> Animation:
-    """Return the writer of an animation for this file ending.
+    """Return a writer of an animation, in the format of the file ending.
 
     Raises
     ------
@@ -132,7 +135,7 @@ def animation(to: Path) -> Animation:
 
 
 class Gif(Animation):
-    """Writer of an endlessly repeating GIF."""
+    """Writer of a GIF animation that repeats endlessly."""
 
     TICKS = 100
 
@@ -149,7 +152,7 @@ class Gif(Animation):
         """Do nothing: the output closes its stream itself."""
 
     def _write(self, pixels: Pixels, delay: int) -> None:
-        """Write a frame with its display time in hundredths of a second."""
+        """Write a picture to the GIF file, with its display time in hundredths of a second."""
         if self._last is None:
             height, width, _ = pixels.shape
             # The frames have their own palettes: the palette of the file is not used.
@@ -171,7 +174,7 @@ class Gif(Animation):
 
 
 class Video(Animation):
-    """Writer of a video: H.264 in MP4, VP9 in WebM; a picture is encoded when the next one arrives."""
+    """Writer of a video file: H.264 in MP4, or VP9 in WebM. A picture is encoded when the next one arrives."""
 
     TICKS = 1000
 
@@ -202,7 +205,7 @@ class Video(Animation):
         self.frames += 1
 
     def _begun(self, height: int, width: int) -> tuple[OutputContainer, VideoStream]:
-        """Open the file and choose the codec."""
+        """Open the video file, and return its container and its stream."""
         import av
 
         kind = self._to.suffix.lower()
@@ -226,7 +229,7 @@ class Video(Animation):
     def _mux(
         self, container: OutputContainer, stream: VideoStream, frame: VideoFrame | None
     ) -> None:
-        """Encode a picture, or flush with ``None``, and write the finished packets."""
+        """Encode a picture, and write the finished packets to the video file. ``None`` ends the stream."""
         for packet in stream.encode(frame):
             packet.duration = self._delays.popleft()
             container.mux(packet)
@@ -245,7 +248,7 @@ class Video(Animation):
 
     @contextmanager
     def _told(self) -> Generator[None]:
-        """Convert errors of the encoder to :class:`ExportError`."""
+        """Context manager that converts errors of the video encoder to :class:`ExportError`."""
         from av.error import FFmpegError
 
         try:
@@ -255,7 +258,7 @@ class Video(Animation):
 
 
 def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
-    """Return left, top, right and bottom of the changed part of a picture; at least one pixel."""
+    """Return the rectangle (left, top, right, bottom) in which two pictures differ; at least one pixel."""
     height, width, _ = now.shape
     if before is None:
         return 0, 0, width, height
@@ -267,7 +270,9 @@ def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
 
 
 class LastingPalette:
-    """Palette of 256 colours for consecutive pictures; it grows, and starts again when it is full.
+    """Palette of at most 256 colours that the pictures of an animation share.
+
+    New colours are added. A full palette is replaced.
 
     Areas keep their colours if there are enough places. A mixed colour changes at most as much as
     in :func:`sgstore.draw._page.indexed`.
@@ -278,7 +283,7 @@ class LastingPalette:
         self._places = np.full(1 << 24, -1, np.int16)  # index of each known colour
 
     def indexed(self, picture: Pixels) -> Image.Image:
-        """Convert an RGB picture (height, width, 3) to an indexed one."""
+        """Return an RGB picture (height, width, 3) as a picture with palette colours."""
         whole = packed(picture)
         places = self._places.take(whole)
         unknown = places < 0
@@ -292,7 +297,7 @@ class LastingPalette:
         return with_palette(places.astype(np.uint8), self._colours)
 
     def _begins(self, whole: NDArray[np.int32]) -> bool:
-        """Make a palette of a picture; return False for too many colours."""
+        """Create the palette from the colours of a picture; return False for more than 256 colours."""
         found, many = np.unique(whole, return_counts=True)
         if len(found) > MOST_COLOURS:
             return False
@@ -309,7 +314,7 @@ class LastingPalette:
         return True
 
     def _grows(self, unknown: NDArray[np.int32]) -> bool:
-        """Add new colours to the palette; return False without enough places."""
+        """Add new colours to the palette; return False if they do not fit."""
         found, many = np.unique(unknown, return_counts=True)
         areas = np.flatnonzero(many > _AREA)
         if len(found) > _MOST_NEW or len(self._colours) + len(areas) > PLACES:

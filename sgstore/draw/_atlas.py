@@ -1,4 +1,4 @@
-"""Page with a road map and a side panel.
+"""Picture of a complete road map, with a side panel for lengths and the legend.
 
 The right side of the page: camera picture, matches, and the ego's surroundings as text.
 """
@@ -40,7 +40,7 @@ _TOLD: Final = 11
 
 
 def paint_atlas(page: Page, road_map: RoadMap, window: Rect, side: Rect) -> str:
-    """Draw a map in a window with its figures and legend; return a one-line summary.
+    """Draw a road map in a window, with a panel for lengths and legend; return a one-line summary.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def paint_atlas(page: Page, road_map: RoadMap, window: Rect, side: Rect) -> str:
 
 
 def _whole(road_map: RoadMap) -> GroundView:
-    """Return a view of the complete map."""
+    """Return a view that shows the complete road map, north up."""
     outlines = list(road_map.outlines())
     bounds = [o.bounds for o in outlines if o is not None and not o.is_empty]
     if not bounds:
@@ -87,7 +87,7 @@ def _travelled(ground: GroundView) -> list[int]:
 
 
 def _paint_signals(stage: Stage, ground: GroundView) -> list[str]:
-    """Paint a dot for each signal of the map; return the kinds that occur."""
+    """Draw a dot for each signal of the road map; return the kinds of signals that occur."""
     nodes = ground.nodes
     found: list[str] = []
     for kind in SIGNALS:
@@ -115,7 +115,7 @@ def _paint_signals(stage: Stage, ground: GroundView) -> list[str]:
 
 
 def _paint_names(stage: Stage, ground: GroundView, reserved: Iterable[Rect]) -> None:
-    """Paint ids of junctions, and of roads if they are few, at their lanes."""
+    """Write the ids of junctions, and of roads if they are few, at their lanes."""
     placer = Placer(stage.rect(*stage.half, (0.0, 0.0)))
     for rect in reserved:
         placer.block(rect)
@@ -137,7 +137,7 @@ def _paint_names(stage: Stage, ground: GroundView, reserved: Iterable[Rect]) -> 
 
 
 def _middles(ground: GroundView, rows: list[int], names: tuple[str, ...]) -> dict[str, Floats]:
-    """Return for each road or junction the mean position of its lanes; picture axes."""
+    """Return for each road or junction the mean position of its lanes, in picture coordinates."""
     grouped: dict[str, list[int]] = {}
     for row in rows:
         grouped.setdefault(names[row], []).append(row)
@@ -149,7 +149,7 @@ def _middles(ground: GroundView, rows: list[int], names: tuple[str, ...]) -> dic
 
 
 def _paint_figures(panel: Panel, ground: GroundView) -> None:
-    """Write the length of each lane type."""
+    """Write the total length of each lane type into the side panel of a map picture."""
     nodes = ground.nodes
     lanes = [row for row in ground.rows if KINDS[nodes.kind[row]] == "lane"]
     panel.head("Lanes by type")

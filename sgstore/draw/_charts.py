@@ -46,7 +46,7 @@ AT_RANDOM: Final[Mapping[str, Any]] = {
 def _page(
     to: Path, title: str, below: str, width: float = _WIDTH, height: float = _HEIGHT
 ) -> Generator[Page]:
-    """Yield a page with a title and a subtitle of at most two lines; write it at the end.
+    """Yield a page with a title and a subtitle, and write it to a file at the end.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def _page(
 def _chart(
     to: Path, title: str, below: str, names: tuple[str, str], right: float = _RIGHT
 ) -> Generator[Axes]:
-    """Yield the axes of a chart that fills a page, with axis titles; see :func:`_page`."""
+    """Yield the axes of a chart that fills a page, with axis titles, and write the page at the end."""
     with _page(to, title, below) as page:
         axes = page.plot(_LEFT, _BELOW, page.width - right, page.height - _ABOVE)
         axes.set_xlabel(names[0], fontsize=8, color=INK, parse_math=False)
@@ -81,7 +81,7 @@ def _chart(
 
 
 def _number_axes(axes: Axes) -> None:
-    """Write the numbers of both axes in short form (``25 k``), at round values, from 0 on."""
+    """Write short numbers (``25 k``) at round values on both axes of a chart, from 0 on."""
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     for axis in (axes.xaxis, axes.yaxis):
@@ -92,7 +92,7 @@ def _number_axes(axes: Axes) -> None:
 
 
 def _key(axes: Axes) -> None:
-    """Paint the legend of lines above the chart, outside the lines."""
+    """Draw the legend of the lines of a chart above the chart."""
     axes.legend(
         loc="lower right", bbox_to_anchor=(1, 1), ncols=4, fontsize=7, labelcolor=INK, frameon=False
     )
@@ -108,7 +108,7 @@ MOST_FEATURES: Final = 120
 def draw_rank_sizes(
     sizes: Sequence[int], cumulative: Sequence[float], to: Path, *, unit: str, title: str
 ) -> None:
-    """Draw class sizes by rank on logarithmic axes, and their cumulative share.
+    """Draw a chart of class sizes by rank, on logarithmic axes, with their cumulative share.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def draw_growth(
     title: str,
     below: str = "",
 ) -> None:
-    """Draw the number of classes in the first n units, compared with n random units.
+    """Draw a chart of the number of scene classes in the first n frames, and in n random frames.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def draw_matrix(
     groups: Sequence[str] = (),
     most: int = MOST_FEATURES,
 ) -> None:
-    """Draw a matrix of feature pairs: frames with both, and gaps (wanted pairs without frames).
+    """Draw a matrix of feature pairs: the number of frames with both features, and missing pairs.
 
     Each pair has one place, below the diagonal.
 
@@ -289,7 +289,7 @@ def draw_matrix(
 def _one_direction(
     names: Sequence[str], frames: NDArray[np.int64], wanted: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return one feature of each group with the same frames, preferably the ego's."""
+    """Return the indices of features without duplicates: of features in the same frames, one is kept."""
     order = np.array(
         sorted(range(len(names)), key=lambda i: not names[i].startswith("ego ")), np.intp
     )
@@ -299,7 +299,10 @@ def _one_direction(
 
 
 def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return colours (F, F, 3): darker for more frames, orange for a gap."""
+    """Return the cell colours (F, F, 3) of a matrix of feature pairs.
+
+    A cell is darker for more frames, and orange for a missing pair.
+    """
     from matplotlib.colors import to_rgb
 
     weight = np.log1p(frames) / max(float(np.log1p(frames).max(initial=0)), 1e-12)
@@ -311,7 +314,7 @@ def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.f
 
 
 def _explain_colours(page: Page, gaps: NDArray[np.bool_], *, cannot: bool) -> None:
-    """Explain the colours below the matrix."""
+    """Draw the legend of the cell colours below a matrix of feature pairs."""
     from matplotlib.patches import Patch
 
     many = int(np.triu(gaps, 1).sum())
@@ -339,7 +342,7 @@ def draw_curve(
     below: str,
     words: tuple[str, str] = ("kept", "selected"),
 ) -> None:
-    """Draw coverage, or the number of found failures, against selection size.
+    """Draw a chart of covered classes, or of found failures, by the number of selected test cases.
 
     Parameters
     ----------

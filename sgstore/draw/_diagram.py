@@ -1,4 +1,4 @@
-"""Node-link diagram of a scene graph: content, layout and look.
+"""Diagram of a scene graph (nodes and edges): selection of its content, layout and style.
 
 The first part selects the nodes and edges of a diagram, and the edges that share a line.
 
@@ -49,7 +49,7 @@ _TIERS: Final[dict[str, Tier]] = {"road": "road", "junction": "junction", "round
 
 @dataclass(frozen=True, slots=True)
 class DiagramLine:
-    """Edges between two nodes, drawn as one line with an arrow from ``a`` to ``b``.
+    """Edges between two nodes of a scene graph, drawn as one line with an arrow from ``a`` to ``b``.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class DiagramLine:
 
     @property
     def text(self) -> str:
-        """Return the text on the line; empty if its colour and style are enough."""
+        """Return the text on a line of a diagram; empty if the colour and style of the line are enough."""
         if self.family in {"isIn", "part", "light"}:
             return ""
         there, back = (", ".join(words[:MOST_WORDS]) for words in (self.relations, self.back))
@@ -81,7 +81,7 @@ class DiagramLine:
 def excerpt_of(
     graph: SceneGraph, matched: frozenset[int], relations: Relations
 ) -> tuple[dict[int, Tier], list[DiagramLine]]:
-    """Select the nodes and lines of a diagram.
+    """Return the nodes and lines of a scene graph that a diagram shows.
 
     Parameters
     ----------
@@ -109,13 +109,13 @@ def excerpt_of(
 
 
 def tier_of(graph: SceneGraph, node: int) -> Tier:
-    """Return the tier of a node in the diagram."""
+    """Return the tier of a node in a diagram: entities, lanes, roads or junctions."""
     kind = str(graph.nodes[node].get("kind"))
     return "entity" if kind in ENTITY_KINDS else _TIERS.get(kind, "lane")
 
 
 def _entities(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> list[int]:
-    """Return the ego, the matched entities, and the nearest others."""
+    """Return the entities that a diagram shows: the ego, matched entities, and the nearest others."""
     ego = graph.ego if graph.ego in graph.nodes else None
     first = [n for n in ([] if ego is None else [ego]) + sorted(matched) if n in graph.nodes]
     first = [n for n in dict.fromkeys(first) if tier_of(graph, n) == "entity"]
@@ -137,7 +137,10 @@ def _entities(graph: SceneGraph, matched: frozenset[int], relations: Relations) 
 
 
 def _close(graph: SceneGraph) -> set[int]:
-    """Return entities with a proximity relation to the ego; any relation, if the graph has no proximity."""
+    """Return the entities with a proximity relation to the ego.
+
+    In a graph without proximity relations, any relation counts.
+    """
     near: set[int] = set()
     any_way: set[int] = set()
     for src, relation, dst, _ in graph.edges:
@@ -151,7 +154,7 @@ def _close(graph: SceneGraph) -> set[int]:
 def _lanes(
     graph: SceneGraph, entities: list[int], matched: frozenset[int]
 ) -> tuple[list[int], list[int]]:
-    """Return primary lanes of entities, and their other map parts, such as crosswalks."""
+    """Return the primary lanes of entities, and the other map parts of the entities, such as crosswalks."""
     within: dict[int, list[tuple[bool, int]]] = {}
     other: list[int] = []
     wanted = set(entities)
@@ -170,7 +173,7 @@ def _lanes(
 
 
 def _lights(graph: SceneGraph, lanes: list[int], matched: frozenset[int]) -> list[int]:
-    """Return the signals that control the ego's lane, or a matched lane."""
+    """Return the signals that control the lane of the ego or a matched lane."""
     asked = {n for n in lanes if n in matched} | {ego_lane(graph)}
     return sorted(
         {
@@ -182,7 +185,7 @@ def _lights(graph: SceneGraph, lanes: list[int], matched: frozenset[int]) -> lis
 
 
 def _parts(graph: SceneGraph, lanes: list[int]) -> list[int]:
-    """Return the roads and junctions of lanes."""
+    """Return the roads and junctions that contain some lanes."""
     inside: dict[int, list[int]] = {}
     for src, relation, dst, _ in graph.edges:
         if relation == "isIn" and src < 0 and dst in graph.nodes:
@@ -213,7 +216,10 @@ def _lines(
 
 
 def _together(a: Tier, b: Tier, matched: bool) -> Family | None:  # noqa: FBT001
-    """Return the family of two nodes whose relations in both directions share a line, or None."""
+    """Return the family of relations that is drawn as one line for both directions between two nodes.
+
+    ``None`` means that each direction has its own line.
+    """
     if a == b == "lane":
         return "map"
     return "matched" if a == b == "entity" and matched else None
@@ -253,7 +259,7 @@ _PULL: Final = 0.06
 
 
 def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> Floats:
-    """Place nodes by their positions, without overlaps if there is room.
+    """Return places for the nodes of a diagram, near their real positions and without overlaps.
 
     Parameters
     ----------
@@ -289,7 +295,7 @@ def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> F
 
 
 def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
-    """Push overlapping nodes apart along the shorter way, and pull all back to their places."""
+    """Return node places in which overlapping nodes are pushed apart, but stay near their real positions."""
     count = len(wanted)
     low = np.array(box[:2]) + sizes / 2
     high = np.array(box[2:]) - sizes / 2
@@ -317,7 +323,7 @@ def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
 
 
 def _freed(spots: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
-    """Move each node that still overlaps an earlier one to the nearest free place, if there is one."""
+    """Return node places in which each overlapping node is moved to the nearest free place, if any."""
     low, high = np.array(box[:2]), np.array(box[2:])
     spots = spots.copy()
     for node in range(pinned, len(spots)):
@@ -337,7 +343,7 @@ def _freed(spots: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
 
 
 def rows(order: Floats, widths: Floats, box: Rect) -> tuple[Floats, int]:
-    """Place nodes side by side in rows, ordered from left to right.
+    """Return places for nodes side by side in rows, ordered from left to right, and the number of rows.
 
     Parameters
     ----------
@@ -405,7 +411,7 @@ _QUIET: Final[dict[str, tuple[str, float, dict[str, Any]]]] = {
 
 
 def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations) -> str:
-    """Draw a scene's graph in a window of a page; return a summary of the shown part.
+    """Draw the diagram of a scene graph in a window; return a summary of the shown nodes.
 
     Parameters
     ----------
@@ -433,7 +439,7 @@ def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations
 
 
 def diagram_entries() -> list[Entry]:
-    """Return the legend entries of diagrams."""
+    """Return the legend entries of scene graph diagrams."""
     lane, road = palette.DIAGRAM_TINTS["lane"], palette.DIAGRAM_TINTS["road"]
     return [
         Entry("area", "lane, crosswalk", lane),
@@ -443,7 +449,7 @@ def diagram_entries() -> list[Entry]:
 
 
 class _Diagram:
-    """Window with its nodes in their places."""
+    """Diagram of a scene graph in a window, with a place for each node."""
 
     def __init__(
         self,
@@ -469,7 +475,7 @@ class _Diagram:
             self._placer.block((left - 2, bottom - 2, right + 2, top + 2))
 
     def paint(self) -> int:
-        """Draw nodes, lines and words; return the number of lines without room for words."""
+        """Draw the nodes, lines and texts of the diagram; return the number of lines without room for text."""
         for line in self._lines:
             self._paint_line(line)
         # The most important line is written first.
@@ -479,7 +485,7 @@ class _Diagram:
         return written.count(False)
 
     def _placed(self, tiers: dict[int, Tier]) -> dict[int, Point]:
-        """Return places from the bottom up: junctions, roads, lanes with their arcs, then entities."""
+        """Return the place of each node by tier: junctions at the bottom, then roads, lanes and entities."""
         left, bottom, right, top = self._box
         floor = bottom + 6
         spots: dict[int, Point] = {}
@@ -503,7 +509,7 @@ class _Diagram:
         return spots | {n: (x, y) for n, (x, y) in zip(nodes, found.tolist(), strict=True)}
 
     def _aside(self, node: int) -> float:
-        """Return the position of a map part to the right of the ego, at its nearest point; m."""
+        """Return the distance in metres of a map part to the right of the ego, at its nearest point."""
         ground = self._scene.ground
         if ground is not None:
             near = ground.nearest(node, (0.0, 4.0))
@@ -517,7 +523,7 @@ class _Diagram:
         return (x - width / 2, y - height / 2, x + width / 2, y + height / 2)
 
     def _border(self, node: int, towards: Point) -> Point:
-        """Return the point where the line from a node to another point leaves the node."""
+        """Return the point where a line from a node to another point crosses the border of the node."""
         (x, y), half = self._spots[node], self._sizes[node] / 2
         dx, dy = towards[0] - x, towards[1] - y
         steps = [h / abs(d) for h, d in zip(half.tolist(), (dx, dy), strict=True) if abs(d) > 1e-9]
@@ -530,7 +536,7 @@ class _Diagram:
         return self._scene.name(node) + ("" if light is None else f": {clean(light, 12)}")
 
     def _course(self, line: DiagramLine) -> Floats:
-        """Return start, control point and end of a line's curve, (3, 2)."""
+        """Return the start, control point and end of a curved line between two nodes, (3, 2)."""
         a, b = self._spots[line.a], self._spots[line.b]
         if line.family != "map":
             start, end = self._border(line.a, b), self._border(line.b, a)
@@ -569,13 +575,13 @@ class _Diagram:
         self._page.add(self._page.sheet, arrow)
 
     def _along(self, line: DiagramLine, shares: Floats) -> Floats:
-        """Return points of a line's curve, (N, 2)."""
+        """Return points on a curved line between two nodes, (N, 2)."""
         start, control, end = self._course(line)
         t = shares[:, None]
         return (1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end
 
     def _paint_words(self, line: DiagramLine) -> bool:
-        """Write the text of a line where the fewest other lines pass; return False without room."""
+        """Write the text of a line where few other lines are; return False without room for the text."""
         text = line.text
         if not text or line.family == "entity":
             return True
@@ -636,7 +642,7 @@ class _Diagram:
 
 
 def _pen(line: DiagramLine, scene: DrawnFrame) -> tuple[str, float, dict[str, Any]]:
-    """Return colour, width in points, and other attributes of a line."""
+    """Return the colour, the width in points and other attributes of a line in a diagram."""
     if line.family in {"ego", "matched"}:
         close = min((r for r in line.relations if r in RANK), key=RANK.__getitem__, default=None)
         colour, width = palette.CLOSENESS[close] if close else (palette.FAR_EDGE, 0.9)

@@ -1,4 +1,4 @@
-"""Relations shown in a picture, and their texts."""
+"""Relations that are drawn as lines in a picture of a frame, and their texts."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _ORDER: Final = (*PROXIMITY, *ALONG, *DIRECTIONS, *SIDES)
 
 @dataclass(frozen=True, slots=True)
 class DrawnLink:
-    """Edges between two nodes, drawn as one line.
+    """Edges between two nodes of a scene graph, drawn as one line.
 
     Attributes
     ----------
@@ -62,13 +62,13 @@ class DrawnLink:
 
     @property
     def closeness(self) -> str | None:
-        """Return the closest proximity relation of the two, or ``None``."""
+        """Return the closest proximity relation between the two nodes of a line, or ``None``."""
         close = [r for r in (*self.there, *self.back) if r in RANK]
         return min(close, key=RANK.__getitem__, default=None)
 
 
 def links_of(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> list[DrawnLink]:
-    """Return the links to draw: faint ones first, then the ego's, then those of matched nodes.
+    """Return the lines to draw between nodes: faint lines first, those of matched nodes last.
 
     ``ego``: the ego's proximity to all except scenery (its other relations, if the graph has no
     proximity), signals that control the ego's lane, and every edge among matched nodes. ``all``:
@@ -105,7 +105,7 @@ def _quiet_family(a: object, b: object) -> Family:
 
 
 def ego_lane(graph: SceneGraph) -> int | None:
-    """Return the ego's primary lane, or ``None``."""
+    """Return the node of the ego's primary lane, or ``None``."""
     lanes = [
         (not attributes.get("is_primary", False), dst)
         for src, relation, dst, attributes in graph.edges
@@ -117,7 +117,7 @@ def ego_lane(graph: SceneGraph) -> int | None:
 
 
 def seen_from_ego(graph: SceneGraph) -> dict[int, tuple[str, ...]]:
-    """Return each entity's relations to the ego, most informative first."""
+    """Return the relations of each entity to the ego, with the most informative relation first."""
     if graph.ego is None:
         return {}
     return {
@@ -128,14 +128,14 @@ def seen_from_ego(graph: SceneGraph) -> dict[int, tuple[str, ...]]:
 
 
 def sentences(link: DrawnLink, names: Mapping[int, str]) -> list[str]:
-    """Return a link's relations as text, with the names of its nodes: ``p near, inDFrontOf v``."""
+    """Return the relations between two nodes as texts with node names, such as ``p near, inDFrontOf v``."""
     a, b = (clean(names.get(node) or node, 16) for node in (link.a, link.b))
     there = [f"{b} {', '.join(link.there)} {a}"] if link.there else []
     return there + ([f"{a} {', '.join(link.back)} {b}"] if link.back else [])
 
 
 def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Map each pair of nodes ``(a, b)`` to its sorted relations in both directions.
+    """Return the sorted relations of each pair of nodes ``(a, b)``, in both directions.
 
     The ego is ``a``. The most informative relations are first.
     """
@@ -146,7 +146,7 @@ def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tu
 
 
 def _pairs(graph: SceneGraph) -> dict[tuple[int, int], tuple[list[str], list[str]]]:
-    """Map each pair of nodes ``(a, b)`` to its relations from b to a, and from a to b."""
+    """Return the relations of each pair of nodes ``(a, b)``: from b to a, and from a to b."""
     pairs: dict[tuple[int, int], tuple[list[str], list[str]]] = {}
     for src, relation, dst, _ in graph.edges:
         if src == dst or src not in graph.nodes or dst not in graph.nodes:

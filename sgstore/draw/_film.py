@@ -1,4 +1,4 @@
-"""Reusable page in pixels, for consecutive pictures.
+"""Page that is drawn again for each picture of an animation, as pixels.
 
 matplotlib makes an object for everything that is drawn; these objects take most of the time. This
 page sends shapes and texts directly to the renderer. The legend is drawn once, and drawn texts are
@@ -42,7 +42,7 @@ _AS_THEY_ARE = np.empty((0, 3, 3))
 
 
 class FilmPage(Page):
-    """Page for consecutive pictures; call :meth:`clear` before each."""
+    """Page for the pictures of an animation; the caller clears it before each picture."""
 
     def __init__(self, width: float, height: float, dpi: float) -> None:
         self._windows: dict[Rect, Axes] = {}
@@ -57,7 +57,7 @@ class FilmPage(Page):
         self._texts = TextSprites(dpi)
 
     def clear(self) -> None:
-        """Remove all content of the page."""
+        """Remove all content of the page before the next picture."""
         for axes in self._shown:
             for image in (*axes.images,):
                 image.remove()
@@ -65,7 +65,7 @@ class FilmPage(Page):
         self._scales = {}
 
     def pixels(self) -> Pixels:
-        """Return the rendered page, (height, width, 3) uint8."""
+        """Return the page as an array of pixels, (height, width, 3) uint8."""
         self._renderer.clear()
         self._figure.patch.draw(self._renderer)
         for axes, drawn in self._shown.items():
@@ -85,7 +85,7 @@ class FilmPage(Page):
         return pixels
 
     def add(self, axes: Axes, artist: Artist) -> None:
-        """Draw a matplotlib artist on the sheet or in a window, in its own units."""
+        """Draw a matplotlib object on the page or in a window of it, in the units of that window."""
         artist.set_figure(self._figure)
         artist.axes = axes
         if not artist.is_transform_set():
@@ -94,7 +94,7 @@ class FilmPage(Page):
         self._draw(axes, artist.zorder, partial(artist.draw, self._renderer))
 
     def once(self, key: Hashable, box: Rect, paint: Callable[[], None]) -> None:
-        """Paint in a reserved box; the result is cached by key."""
+        """Draw content in a free rectangle of the page. The pixels are cached by key for later pictures."""
         if key in self._blocks:
             pixels, left, below = self._blocks[key]
             pen = self._renderer.new_gc()
@@ -113,7 +113,7 @@ class FilmPage(Page):
         )
 
     def write(self, axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
-        """Write on a sheet or in a window, in its own units."""
+        """Write a text on the page or in a window of it, in the units of that window."""
         style = TEXT | look
         style.pop("gid", None)
         text = printable(text)
@@ -133,7 +133,7 @@ class FilmPage(Page):
     def fill(
         self, axes: Axes, outline: Outline, z: float, look: dict[str, Any], gid: str | None = None
     ) -> None:
-        """Fill an outline; ``look`` has the attributes of a matplotlib patch."""
+        """Fill an outline; ``look`` contains attributes of a matplotlib patch."""
         del gid
         alpha = look.get("alpha")
         face = to_rgba(look["facecolor"], alpha)
@@ -153,7 +153,7 @@ class FilmPage(Page):
     def fill_all(
         self, axes: Axes, outlines: Sequence[Outline], z: float, look: dict[str, Any]
     ) -> None:
-        """Draw outlines in one look, with the attributes of a matplotlib patch."""
+        """Fill several outlines in the same style; ``look`` contains attributes of a matplotlib patch."""
         alpha = look.get("alpha")
         face, edge = to_rgba(look["facecolor"], alpha), to_rgba(look["edgecolor"], alpha)
         width, scale = look["linewidth"], self.scale(axes)
@@ -171,7 +171,7 @@ class FilmPage(Page):
         self._draw(axes, z, partial(self._renderer.draw_path_collection, pen, *shapes))
 
     def scale(self, axes: Axes) -> Affine2D:
-        """Return the transform from the units of the sheet or a window to pixels."""
+        """Return the transform from the units of the page, or of a window on it, to pixels."""
         if axes not in self._scales:
             self._scales[axes] = cast("Affine2D", axes.transData.frozen())
         return self._scales[axes]
@@ -187,7 +187,7 @@ class FilmPage(Page):
         capstyle: str | None = None,
         joinstyle: str | None = None,
     ) -> Any:
-        """Return the renderer state for a look, clipped to a window."""
+        """Return the matplotlib graphics context for a line style, clipped to a window of the page."""
         key = (axes, edge, width, alpha, linestyle, capstyle, joinstyle)
         if key not in self._pens:
             made = self._pens[key] = self._renderer.new_gc()
@@ -203,7 +203,7 @@ class FilmPage(Page):
         return self._pens[key]
 
     def _has_room(self, outline: Outline, scale: Affine2D) -> bool:
-        """True if an outline is smaller than the page; matplotlib draws these as markers."""
+        """True if an outline is smaller than the page, so that matplotlib can draw it as a marker."""
         extents, page = outline.get_extents(scale), self._figure.bbox
         return extents.width < page.width and extents.height < page.height
 
@@ -219,7 +219,7 @@ class FilmPage(Page):
 
 
 class TextSprites:
-    """Cache of drawn texts, with one reused sheet."""
+    """Cache of texts as pixels, for repeated drawing."""
 
     def __init__(self, dpi: float) -> None:
         self._dpi = dpi
@@ -227,7 +227,7 @@ class TextSprites:
         self._renderer: Any = RendererAgg(1, 1, dpi)
 
     def drawn(self, text: str, width: float, style: dict[str, Any]) -> Sprite:
-        """Return a drawn text with its background; ``width`` in pixels, ``style`` of a matplotlib text."""
+        """Return a text with its background as pixels. ``width`` is its width in pixels."""
         around = 3 * style["fontsize"] * self._dpi / 72
         x, y = math.ceil(width + around), math.ceil(around)
         if 2 * x > self._renderer.width or 2 * y > self._renderer.height:
@@ -250,7 +250,10 @@ class TextSprites:
 
 
 def _dashes(linestyle: Any, width: float) -> tuple[float, list[float] | None]:
-    """Return start, dashes and gaps of a dashed line; pixels. ``None`` means solid."""
+    """Return the offset of a dashed line, and the lengths of its dashes and gaps in pixels.
+
+    ``None`` means a solid line.
+    """
     if linestyle is None or isinstance(linestyle, str):
         return 0.0, None
     start, dashes = linestyle

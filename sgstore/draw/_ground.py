@@ -1,4 +1,4 @@
-"""Ground of a frame: lanes, markings, crosswalks, scenery; rings, scale and compass."""
+"""Drawing of the ground of a frame: lanes, markings, crosswalks, scenery, distance rings, scale, compass."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _SHAPES: Final[WeakKeyDictionary[RoadMap, dict[int, tuple[Any, Outline | None]]]
 
 @dataclass(frozen=True, slots=True)
 class GroundView:
-    """Part of a map in a view.
+    """Part of a road map that is visible in a picture.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class GroundView:
 
     @classmethod
     def of(cls, road_map: RoadMap, view: MapWindow) -> GroundView:
-        """Return the parts of a map in a view, including its corners."""
+        """Return the part of a road map that is visible in a window."""
         reach = view.radius * math.sqrt(2)
         _, near = road_map.near(np.array([view.x]), np.array([view.y]), reach)
         rows = sorted(set((-1 - near).tolist()))
@@ -72,7 +72,7 @@ class GroundView:
         return self.road_map.nodes
 
     def of_kind(self, *kinds: str) -> list[int]:
-        """Return rows in view of these kinds with an outline."""
+        """Return the indices of visible map nodes of the given kinds that have an outline."""
         return [
             r
             for r in self.rows
@@ -80,7 +80,7 @@ class GroundView:
         ]
 
     def storeys(self) -> dict[int, int]:
-        """Map rows of lanes in view to storeys, counted from the lowest."""
+        """Return the storey of each visible lane, by node index, from 0 for the lowest."""
         rows = self.of_kind("lane")
         z = self.nodes.z[rows]
         low, high = np.nanmin(z, initial=np.inf), np.nanmax(z, initial=-np.inf)
@@ -89,7 +89,9 @@ class GroundView:
         return dict(zip(rows, levels.tolist(), strict=True))
 
     def cover(self, places: Floats, z: Floats) -> Floats:
-        """Return how far the highest lane is above places (N, 2) at heights z; m. -inf without a lane.
+        """Return the height in metres of the highest lane relative to each of some points (N, 2).
+
+        The value is -inf where there is no lane.
 
         The height of a lane is that of its nearest cross section.
         """
@@ -112,7 +114,7 @@ class GroundView:
         return found
 
     def outline(self, row: int) -> Outline | None:
-        """Return a node's outline in picture axes, or ``None`` without an area."""
+        """Return the outline of a map node in picture coordinates. ``None`` means a node without an area."""
         known = _SHAPES.setdefault(self.road_map, {})
         shape = self.outlines[row]
         if row not in known or known[row][0] is not shape:
@@ -127,16 +129,16 @@ class GroundView:
         )
 
     def open_lines(self, rows: Iterable[int]) -> list[Floats]:
-        """Return the open lines of several nodes, such as barriers; picture axes."""
+        """Return the open lines of several map nodes, such as barriers, in picture coordinates."""
         rings = [ring for row in rows for ring in rings_of(self.outlines[row])]
         return [self.view.place(ring) for ring in rings if not _is_closed(ring)]
 
     def outlines_of(self, rows: Iterable[int]) -> list[Outline]:
-        """Return the outlines of several nodes in picture axes."""
+        """Return the outlines of several map nodes in picture coordinates."""
         return [o for row in rows if (o := self.outline(row)) is not None]
 
     def parts(self, node: int) -> list[int]:
-        """Return the map rows whose outlines make up a node: itself, or its lanes."""
+        """Return the indices of the map nodes with the outlines of a node: itself, or the lanes of a road."""
         row = -1 - node
         if not 0 <= row < len(self.outlines):
             return []
@@ -151,7 +153,7 @@ class GroundView:
         return [row] if self.outlines[row] is not None else []
 
     def sides(self, row: int) -> tuple[Floats, Floats] | None:
-        """Return left and right border of a lane in its direction of travel, each (N, 2) in picture axes.
+        """Return the left and right border of a lane in its direction of travel, each (N, 2).
 
         ``None`` for other nodes.
         """
@@ -164,7 +166,7 @@ class GroundView:
         return self.view.place(left), self.view.place(right)
 
     def middles(self, node: int) -> Floats:
-        """Return points (N, 2) along the middle of a map part in view; picture axes."""
+        """Return visible points (N, 2) along the middle of a map part, in picture coordinates."""
         points: list[Floats] = []
         for row in self.parts(node):
             sides = self.sides(row)
@@ -178,7 +180,7 @@ class GroundView:
         return np.concatenate(points) if points else np.empty((0, 2))
 
     def spot(self, node: int) -> tuple[float, float] | None:
-        """Return a point on a map part, well inside the view, for its name; picture axes.
+        """Return a visible point on a map part where its name can stand; ``None`` without such a point.
 
         On a lane it is on the middle line, if possible at least 8 m from the middle of the picture.
         """
@@ -188,13 +190,13 @@ class GroundView:
         return _point(points, np.where(away >= 8.0, away, 1e6 - away))
 
     def nearest(self, node: int, to: tuple[float, float]) -> tuple[float, float] | None:
-        """Return the point along the middle of a map part nearest to a place; picture axes."""
+        """Return the point on the middle line of a map part that is nearest to a place."""
         points = self.middles(node)
         return _point(points, np.hypot(*(points - to).T))
 
 
 def paint_ground(stage: Stage, ground: GroundView, *, arrows: bool = True) -> None:
-    """Paint lanes by type, borders, direction arrows, crosswalks and the scenery of the map."""
+    """Draw the lanes by type, borders, direction arrows, crosswalks and scenery of a road map."""
     nodes = ground.nodes
     storeys = ground.storeys()
     for level in range(max(storeys.values(), default=-1) + 1):
@@ -237,7 +239,7 @@ def _paint_lanes(
 
 
 def tint(stage: Stage, ground: GroundView, node: int, colour: str, alpha: float) -> None:
-    """Paint a transparent colour over a map part; its id in an SVG is that of the node."""
+    """Draw a transparent colour over a map part. In an SVG file, the shape has the id of the node."""
     parts = ground.parts(node)
     outlines, gid = ground.outlines_of(parts), f"node-{node}"
     if outlines:
@@ -250,7 +252,7 @@ def tint(stage: Stage, ground: GroundView, node: int, colour: str, alpha: float)
 
 
 def rings_of(geometry: Any) -> list[Floats]:
-    """Return rings and lines of a shapely geometry, each (N, 2) float64; empty for points."""
+    """Return all rings and lines of a shapely geometry, each (N, 2) float64; empty for points."""
     if geometry is None or geometry.is_empty:
         return []
     match geometry.geom_type:
@@ -271,7 +273,7 @@ def _is_closed(ring: Floats) -> bool:
 
 
 def _chevrons(line: Floats) -> list[Floats]:
-    """Return evenly spaced arrow heads along a line; empty for a short line."""
+    """Return evenly spaced arrow heads along a line, as lines; empty for a short line."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate(((0.0,), np.cumsum(steps)))
     count = round(along[-1] / ARROW_SPACING)
@@ -291,7 +293,7 @@ def _chevron(place: Floats, angle: float) -> Floats:
 
 
 def _stripes(ground: GroundView, row: int) -> list[Outline]:
-    """Return zebra stripes across the longer axis of a crosswalk, the direction of walking."""
+    """Return the outlines of the zebra stripes of a crosswalk."""
     rings = rings_of(ground.outlines[row].minimum_rotated_rectangle)
     if not rings or len(rings[0]) != 5:
         return ground.outlines_of([row])
@@ -309,7 +311,7 @@ def _stripes(ground: GroundView, row: int) -> list[Outline]:
 
 
 def _point(points: Floats, cost: Floats) -> tuple[float, float] | None:
-    """Return the point with the least cost."""
+    """Return the point with the lowest cost; ``None`` without points."""
     if not len(points):
         return None
     x, y = points[cost.argmin()].tolist()
@@ -317,7 +319,7 @@ def _point(points: Floats, cost: Floats) -> tuple[float, float] | None:
 
 
 def _dense(line: Floats) -> Floats:
-    """Add points to a line every few metres, so that some points of a long lane are in view."""
+    """Return a line with additional points every few metres, so that a long lane has visible points."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate(((0.0,), np.cumsum(steps)))
     at = np.linspace(0.0, along[-1], int(np.clip(along[-1] / 2.0, 2, 1000)))
@@ -329,7 +331,7 @@ _SMALL: Final = {"fontsize": 6.5, "ha": "center"}
 
 
 def paint_rings(stage: Stage) -> list[Rect]:
-    """Paint faint distance circles around the middle; return the space of their labels."""
+    """Draw faint distance circles around the middle of the picture; return the rectangles of their labels."""
     taken: list[Rect] = []
     for metres in (10, 25, 50, 100, 200):
         if metres > stage.view.radius * 1.05:
@@ -352,7 +354,7 @@ def paint_rings(stage: Stage) -> list[Rect]:
 
 
 def paint_scale(stage: Stage) -> Rect:
-    """Paint a scale bar of a round length in the lower left corner; return its space."""
+    """Draw a scale bar of a round length in the lower left corner; return its rectangle."""
     half_x, half_y = stage.half
     metres = max(m for m in _LENGTHS if m <= max(1.0, min(half_x, half_y) / 2.2))
     margin, tick = 12 * stage.metre, 3 * stage.metre
@@ -364,7 +366,7 @@ def paint_scale(stage: Stage) -> Rect:
 
 
 def paint_compass(stage: Stage) -> Rect:
-    """Paint a north arrow in the upper right corner; return its space."""
+    """Draw a north arrow in the upper right corner; return its rectangle."""
     reach = min(11 * stage.metre, 0.05 * min(stage.half))
     middle = np.array(stage.half) - 1.8 * reach
     angle = stage.view.angle(math.pi / 2)

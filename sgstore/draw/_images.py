@@ -25,7 +25,7 @@ _PICTURES: Final = ("jpeg", "png", "webp", "tiff", "bmp")
 
 
 def camera_image(store: Store, frame: int | str, channel: str) -> Image:
-    """Return the picture in the camera message of a frame.
+    """Return the recorded camera picture of a frame as a Pillow image.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def camera_image(store: Store, frame: int | str, channel: str) -> Image:
 
 
 def _opened(data: bytes, channel: str) -> Image:
-    """Open an untrusted picture of a recording, with permitted formats and a limited size."""
+    """Return an untrusted picture of a recording as a Pillow image, with permitted formats and sizes."""
     from PIL import Image
 
     try:
@@ -65,7 +65,7 @@ def _opened(data: bytes, channel: str) -> Image:
 
 
 def frame_image(store: Store, frame: int | str, matches: Bindings | None, **look: Any) -> Image:
-    """Return a frame from above; parameters and errors as in :func:`sgstore.draw.draw_stored`."""
+    """Return a picture of a frame seen from above, as a Pillow image."""
     check_installed()
     from PIL import Image
 
@@ -82,7 +82,7 @@ THUMBNAIL: Final = 180
 
 
 def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
-    """Return a thumbnail of a frame as JPEG: the camera picture, or else the view from above.
+    """Return a thumbnail of a frame as JPEG: its camera picture, or the view from above.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
 
 
 def graph_picture(graph: SceneGraph, road_map: RoadMap | None = None, **look: Any) -> bytes:
-    """Return a graph from above as PNG; ``**look`` as in :func:`sgstore.draw.draw_frame`.
+    """Return a picture of a scene graph as PNG, seen from above or as a diagram.
 
     Raises
     ------

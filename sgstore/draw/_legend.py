@@ -1,4 +1,4 @@
-"""Legend: one entry for each sign in a picture."""
+"""Legend of a picture: one entry for each symbol or colour that occurs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Sign = Literal[
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Entry of the legend: a sign with its meaning.
+    """Entry of a legend: a symbol or colour with its meaning.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Entry:
 
 
 def entries_of(scene: DrawnFrame, half: tuple[float, float]) -> list[Entry]:
-    """Return entries for a frame, in a window of ``half`` its width and height; m."""
+    """Return the legend entries for a frame, in a window with half width and half height ``half`` in metres."""
     bodies = [b for b in scene.bodies.values() if abs(b.x) <= half[0] and abs(b.y) <= half[1]]
     kinds = {b.kind for b in bodies if not b.is_ego}
     entries = [Entry("box", "ego", palette.EGO)] if any(b.is_ego for b in bodies) else []
@@ -80,7 +80,7 @@ def entries_of(scene: DrawnFrame, half: tuple[float, float]) -> list[Entry]:
 
 
 def ground_entries(ground: GroundView) -> list[Entry]:
-    """Return entries for lane types, crosswalks and scenery in view."""
+    """Return the legend entries for the visible lane types, crosswalks and scenery."""
     by_tint: dict[str, list[str]] = {}
     types = {ground.nodes.lane_type[row] for row in ground.of_kind("lane")}
     for lane_type in sorted(types, key=lambda t: (t not in palette.TRAVELLED, t)):
@@ -93,7 +93,7 @@ def ground_entries(ground: GroundView) -> list[Entry]:
 
 
 def paint_swatch(page: Page, entry: Entry, at: tuple[float, float]) -> None:
-    """Draw an entry's sign at a point of the sheet; points."""
+    """Draw the symbol of a legend entry at a point of the page."""
     for artist in _swatch(entry, *at):
         page.add(page.sheet, artist)
 

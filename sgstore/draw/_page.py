@@ -1,4 +1,4 @@
-"""Page: drawing primitives, drawing order, and PNG and SVG output."""
+"""Page of a picture: drawing of shapes and texts by matplotlib, drawing order, PNG and SVG files."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ FURTHEST: Final = 24.0
 
 
 def indexed(picture: Image.Image) -> Image.Image:
-    """Convert an RGB picture to an indexed one, or return it if 256 colours are not enough."""
+    """Return an RGB picture with a palette of 256 colours, or unchanged if it has more colours."""
     counted = picture.getcolors(MOST_COLOURS)
     if counted is None:
         return picture
@@ -92,7 +92,7 @@ def indexed(picture: Image.Image) -> Image.Image:
 
 
 def with_palette(places: Pixels, colours: Colours) -> Image.Image:
-    """Return an indexed picture with this palette."""
+    """Return a picture with a palette, from palette indices and colours."""
     made = Image.fromarray(places)
     made.putpalette(colours.astype(np.uint8).tobytes())
     return made
@@ -101,7 +101,7 @@ def with_palette(places: Pixels, colours: Colours) -> Image.Image:
 def grown(
     palette: Colours, colours: Colours, most: int = PLACES, enough: float = 0.0
 ) -> tuple[Colours, NDArray[np.intp], float]:
-    """Add colours to a palette, each time the one furthest from all of its colours.
+    """Return a palette with added colours, each time the colour that differs most from the palette.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def grown(
 
 
 def packed(colours: NDArray[np.generic]) -> NDArray[np.int32]:
-    """Pack each colour (red, green, blue) into one integer."""
+    """Return each colour (red, green, blue) as one integer."""
     red, green, blue = (colours[..., axis].astype(np.int32) for axis in range(3))
     return 65536 * red + 256 * green + blue
 
@@ -178,7 +178,7 @@ _ONE_AT_A_TIME: Final = threading.RLock()
 
 @contextmanager
 def own_style() -> Generator[None]:
-    """Use the fixed style of this package, then restore the user's configuration."""
+    """Context manager with the fixed matplotlib style of this package instead of the user's style."""
     # matplotlib has one configuration per process: two pictures at once would mix them.
     with _ONE_AT_A_TIME, mpl.rc_context():
         dict.update(mpl.rcParams, _style())  # the values are already validated
@@ -187,7 +187,7 @@ def own_style() -> Generator[None]:
 
 @cache
 def _style() -> dict[Any, Any]:
-    """Return the matplotlib settings of this package's pictures, validated."""
+    """Return the matplotlib settings for the pictures of this package."""
     style: dict[Any, Any] = {k: v for k, v in mpl.rcParamsDefault.items() if k.startswith(_STYLE)}
     # At this size unhinted letters look better and are faster.
     style |= {"svg.fonttype": "none", "svg.hashsalt": "sgstore", "text.hinting": "none"}
@@ -197,7 +197,7 @@ def _style() -> dict[Any, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Window of the map on a page.
+    """Window on a page that shows part of a road map.
 
     Attributes
     ----------
@@ -219,11 +219,11 @@ class Stage:
 
     @property
     def metre(self) -> float:
-        """Return the metres per point, for sizes in points."""
+        """Return the number of metres per point (1/72 inch) of the page."""
         return 1.0 / self.points
 
     def rect(self, half_x: float, half_y: float, middle: tuple[float, float]) -> Rect:
-        """Convert a rectangle of the window from metres to points from the window's middle."""
+        """Return a rectangle of the map window in points from the middle of the window."""
         (x, y), scale = middle, self.points
         return (
             (x - half_x) * scale,
@@ -233,13 +233,13 @@ class Stage:
         )
 
     def shows(self, x: float, y: float) -> bool:
-        """True for a point in the window."""
+        """True if a point is inside the map window."""
         return abs(x) <= self.half[0] and abs(y) <= self.half[1]
 
     def fill(
         self, outline: Outline, colour: str, *, z: float, gid: str | None = None, **look: Any
     ) -> None:
-        """Fill an outline; ``look`` is for the patch."""
+        """Fill an outline in the map window; ``look`` contains attributes of a matplotlib patch."""
         look = {"facecolor": colour, "linewidth": 0.0, **look}
         self.page.fill(self.axes, outline, z, look, gid)
 
@@ -252,7 +252,7 @@ class Stage:
         edge: float = 0.4,
         alpha: float = 1.0,
     ) -> None:
-        """Fill many outlines with one colour, and a hairline of this colour to close seams."""
+        """Fill many outlines in the map window with one colour, without visible seams."""
         if outlines:
             look = {"facecolor": colour, "edgecolor": colour, "linewidth": edge, "alpha": alpha}
             self.page.fill_all(self.axes, list(outlines), z, look)
@@ -260,18 +260,18 @@ class Stage:
     def lines(
         self, lines: Sequence[Floats], colour: str, *, z: float, width: float, **look: Any
     ) -> None:
-        """Draw many lines (N, 2) in picture axes in one look."""
+        """Draw many lines (N, 2) in the map window in the same style."""
         if lines:
             look |= {"facecolor": "none", "edgecolor": colour, "linewidth": width}
             self.page.fill_all(self.axes, [Outline(line) for line in lines], z, look)
 
     def text(self, x: float, y: float, text: str, **look: Any) -> None:
-        """Write in the window; see :meth:`Page.text`."""
+        """Write a text in the map window, in the units of the window."""
         self.page.write(self.axes, x, y, text, **{"clip_on": True, **look})
 
 
 class Page:
-    """Sheet of paper.
+    """Page for drawing, with shapes, texts and windows; saved as PNG or SVG.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ class Page:
         self.sheet.set_ylim(0, height)
 
     def stage(self, box: Rect, view: MapWindow) -> Stage:
-        """Return a window on the page; ``view.radius`` is half its shorter side.
+        """Return a window on the page that shows part of a road map.
 
         Parameters
         ----------
@@ -313,13 +313,13 @@ class Page:
         return stage
 
     def add(self, axes: Axes, artist: Artist) -> None:
-        """Draw a matplotlib artist on the sheet or in a window, in its own units."""
+        """Draw a matplotlib object on the page or in a window of it, in the units of that window."""
         axes.add_artist(artist)
 
     def fill(
         self, axes: Axes, outline: Outline, z: float, look: dict[str, Any], gid: str | None = None
     ) -> None:
-        """Fill an outline; ``look`` has the attributes of a matplotlib patch."""
+        """Fill an outline; ``look`` contains attributes of a matplotlib patch."""
         patch = PathPatch(outline, zorder=z, **look)
         patch.set_gid(gid)
         self.add(axes, patch)
@@ -327,13 +327,13 @@ class Page:
     def fill_all(
         self, axes: Axes, outlines: Sequence[Outline], z: float, look: dict[str, Any]
     ) -> None:
-        """Draw outlines in one look, with the attributes of a matplotlib patch."""
+        """Fill several outlines in the same style; ``look`` contains attributes of a matplotlib patch."""
         each = {f"{name}s": [look[name]] for name in ("facecolor", "edgecolor", "linewidth")}
         rest = {name: value for name, value in look.items() if f"{name}s" not in each}
         self.add(axes, PathCollection(outlines, zorder=z, **each, **rest))
 
     def once(self, key: Hashable, box: Rect, paint: Callable[[], None]) -> None:
-        """Paint in a reserved box; content with the same key is the same.
+        """Draw content in a free rectangle of the page. Content with the same key is equal in all pictures.
 
         A reusable page paints it only once.
         """
@@ -341,24 +341,24 @@ class Page:
         paint()
 
     def text(self, x: float, y: float, text: str, **look: Any) -> None:
-        """Write on the sheet.
+        """Write a text on the page, at a point in points (1/72 inch).
 
         Markup in the text is not interpreted.
         """
         self.write(self.sheet, x, y, text, **look)
 
     def write(self, axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
-        """Write on a sheet or in a window, in its own units."""
+        """Write a text on the page or in a window of it, in the units of that window."""
         gid = look.pop("gid", None)
         axes.text(x, y, printable(text), parse_math=False, **(TEXT | look)).set_gid(gid)
 
     def text_size(self, text: str, size: float, weight: str = "normal") -> tuple[float, float]:
-        """Return width and height of a text; points."""
+        """Return the width and height of a text on the page, in points (1/72 inch)."""
         width, height = _text_size(printable(text), size, weight, self._dpi)
         return width * 72 / self._dpi, height * 72 / self._dpi
 
     def plot(self, left: float, bottom: float, right: float, top: float) -> Axes:
-        """Return the axes of a chart on the page; the box in points, without axis labels."""
+        """Return the axes of a chart in a rectangle of the page, given in points without axis labels."""
         box = (left, bottom, right - left, top - bottom)
         axes = self._figure.add_axes(self._share(*box))
         axes.spines[["top", "right"]].set_visible(False)
@@ -369,7 +369,7 @@ class Page:
         return axes
 
     def legend(self, handles: list[Any], at: tuple[float, float], loc: str, **look: Any) -> None:
-        """Paint a legend for artists on the sheet; its corner ``loc`` is at ``at``."""
+        """Draw a legend for matplotlib objects on the page; its corner ``loc`` is at the point ``at``."""
         style: dict[str, Any] = {
             "ncols": 3,
             "labelcolor": INK,
@@ -383,7 +383,7 @@ class Page:
     def picture(
         self, picture: bytes, left: float, top: float, width: float, height: float
     ) -> float:
-        """Paint a camera picture within a width and height; return its height in points.
+        """Draw a camera picture on the page, within a width and height; return the used height in points.
 
         Raises
         ------
@@ -399,7 +399,7 @@ class Page:
         return height
 
     def save(self, to: str | Path) -> None:
-        """Write the page as PNG or SVG, by the file ending; an existing file is replaced.
+        """Write the page to a PNG or SVG file, by the file ending. An existing file is replaced.
 
         Raises
         ------
@@ -415,7 +415,7 @@ class Page:
         return written.getvalue()
 
     def pixels(self) -> NDArray[np.uint8]:
-        """Return the rendered page, (height, width, 3) uint8."""
+        """Return the page as an array of pixels, (height, width, 3) uint8."""
         self._canvas.draw()
         return np.ascontiguousarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
 
@@ -439,7 +439,7 @@ class Page:
 
 @cache
 def _ruler(dpi: float) -> RendererAgg:
-    """Return a renderer that only measures texts."""
+    """Return a matplotlib renderer that is used only to measure texts."""
     return RendererAgg(1, 1, dpi)
 
 
@@ -452,7 +452,7 @@ def _text_size(text: str, size: float, weight: str, dpi: float) -> tuple[float, 
 
 
 def check_format(to: str | Path) -> str:
-    """Return ``png`` or ``svg``, by the file ending."""
+    """Return the picture format ``png`` or ``svg`` for a file name, or raise an error."""
     to = Path(to)
     if to.suffix.lower() not in FORMATS:
         raise ExportError(
@@ -462,7 +462,7 @@ def check_format(to: str | Path) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace characters that the font lacks by ``□``."""
+    """Return a text with ``□`` in place of characters that the font lacks."""
     known = _characters()
     return "".join(c if ord(c) in known else "□" for c in clean(text, 200))
 

@@ -1,4 +1,4 @@
-"""Colours and captions of kinds, lane types, lights and relations.
+"""Colours of kinds, lane types, lights and relations in pictures, with their captions.
 
 The colour families are those of the paper's figures: roads blue-grey, entities magenta, the ego
 orange. Hue is never the only difference: kinds also differ in lightness, shape and caption, traffic
@@ -136,10 +136,10 @@ CLOSENESS: Final[Mapping[str, tuple[str, float]]] = dict(
 
 
 def lane_tint(lane_type: str) -> str:
-    """Return the tint of a lane type; an unknown type has the tint of ``none``."""
+    """Return the colour of a lane type; an unknown type has the colour of ``none``."""
     return LANE_TINTS.get(lane_type, LANE_TINTS["none"])
 
 
 def entity_tint(kind: str, *, ego: bool = False) -> str:
-    """Return the colour of an entity; the ego has its own colour."""
+    """Return the colour of an entity by its kind; the ego has its own colour."""
     return EGO if ego else ENTITY_TINTS.get(kind, ENTITY_TINTS["unknown"])

@@ -1,4 +1,4 @@
-"""Side panel of a picture: legend, matches, and surroundings of the ego."""
+"""Side panel of a picture: camera picture, matches, surroundings of the ego, and legend."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _LEFT_OUT: Final = "… and {} more"
 
 @dataclass(slots=True)
 class Panel:
-    """Column of the page that is filled from its top; points.
+    """Column next to a picture that is filled with text from its top.
 
     Attributes
     ----------
@@ -54,11 +54,11 @@ class Panel:
     y: float
 
     def room(self) -> float:
-        """Return the height of the free part."""
+        """Return the height of the free part of the panel."""
         return self.y - self.bottom
 
     def head(self, text: str) -> None:
-        """Write a small heading with a rule under it."""
+        """Write a small heading with a line below it into the panel."""
         self.y -= HEAD - 3
         self.page.text(self.left, self.y + 4, text, fontsize=7.5, weight="bold")
         rule = Line2D((self.left, self.right), (self.y, self.y), color=palette.RULE, linewidth=0.7)
@@ -66,7 +66,7 @@ class Panel:
         self.y -= 3
 
     def row(self, *cells: tuple[float, str], **look: Any) -> None:
-        """Write a line of cells, each at its distance from the left border, cut at the next one."""
+        """Write a row of texts into the panel, each at its distance from the left; long texts are shortened."""
         self.y -= ROW
         ends = [x for x, _ in cells[1:]] + [self.right - self.left + 4]
         style = {"fontsize": _SMALL, **look}
@@ -74,7 +74,7 @@ class Panel:
             self.page.text(self.left + x, self.y + 2, self._cut(text, end - x - 4), **style)
 
     def _cut(self, text: str, width: float) -> str:
-        """Shorten a text to a width, because names of traces can be long."""
+        """Return a text shortened to a width in points, because names of traces can be long."""
         if self.page.text_size(text, _SMALL)[0] <= width:
             return text
         while len(text) > 1 and self.page.text_size(text + "…", _SMALL)[0] > width:
@@ -83,13 +83,13 @@ class Panel:
 
 
 def paint_picture(panel: Panel, picture: bytes) -> None:
-    """Paint the camera picture over the panel's width, at most three fifths of it high."""
+    """Draw a camera picture in the width of the panel, at most three fifths of the panel high."""
     width = panel.right - panel.left
     panel.y -= panel.page.picture(picture, panel.left, panel.y, width, 0.6 * width)
 
 
 def paint_matches(panel: Panel, scene: DrawnFrame) -> None:
-    """Write the bindings of variables, and the relations among matched nodes."""
+    """Write the matched nodes with their variables, and the relations between them, into the panel."""
     panel.head("Matched" if any(scene.matched.values()) else "Highlighted")
     for node in list(scene.matched)[:8]:
         known = node in scene.graph.nodes
@@ -105,7 +105,7 @@ def paint_matches(panel: Panel, scene: DrawnFrame) -> None:
 
 
 def paint_surroundings(panel: Panel, scene: DrawnFrame, bottom: float) -> None:
-    """Write the ego's neighbours, nearest first, down to ``bottom``."""
+    """Write the neighbours of the ego into the panel, nearest first, as far as there is room."""
     graph = scene.graph
     if graph.ego is None or graph.ego not in graph.nodes:
         return
@@ -140,12 +140,12 @@ def paint_surroundings(panel: Panel, scene: DrawnFrame, bottom: float) -> None:
 
 
 def legend_height(entries: Sequence[Entry]) -> float:
-    """Return the height of a legend with these entries; points."""
+    """Return the height of a legend in the side panel, in points."""
     return HEAD + ROW * _legend_rows(entries)
 
 
 def paint_legend(panel: Panel, entries: Sequence[Entry]) -> None:
-    """Draw the legend: short entries in two columns, long ones below."""
+    """Draw a legend into the side panel: short entries in two columns, long entries below."""
     panel.head("What is what")
     top, half = panel.y, (panel.right - panel.left) / 2
     short = [e for e in entries if not e.is_long]
@@ -164,12 +164,12 @@ _KEY_COLUMNS: Final = 9
 
 
 def key_height(entries: int) -> float:
-    """Return the height of a legend under a picture; points."""
+    """Return the height in points of a legend below a picture, for a number of entries."""
     return ROW * math.ceil(entries / _KEY_COLUMNS)
 
 
 def paint_key(page: Page, entries: Sequence[Entry], box: Rect) -> None:
-    """Paint a legend under a picture: entries in columns, without a heading."""
+    """Draw a legend below a picture: entries in columns, without a heading."""
     left, _, right, top = box
     step, down = (right - left) / _KEY_COLUMNS, math.ceil(len(entries) / _KEY_COLUMNS)
     panel = Panel(page, left, right, 0.0, top)

@@ -1,4 +1,4 @@
-"""Pictures of frames and maps, as PNG or SVG by the file ending.
+"""Pictures of a single frame or of a road map, as PNG or SVG by the file ending.
 
 A frame is seen from above, with the ego in the middle and its heading up. The legend explains every
 sign in a picture, and only these, for readers who do not know this project. An existing file is
@@ -55,7 +55,7 @@ def draw_frame(  # noqa: PLR0913  one option for each thing that people ask of a
     north_up: bool = False,
     diagram: bool = False,
 ) -> None:
-    """Draw a frame from above.
+    """Draw a picture of a frame seen from above, and write it to a file.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def frame_page(
     entries: Sequence[Entry] | None = None,
     blank: Callable[[float, float], Page] | None = None,
 ) -> Page:
-    """Return a page with the view from above, and a panel of camera picture, matches, surroundings, legend.
+    """Return a page with a frame seen from above, and a side panel with matches, surroundings and legend.
 
     ``entries``: the legend, by default of the occurring signs; ``blank``: function that makes a
     page of a width and height.
@@ -130,7 +130,7 @@ def diagram_page(
     entries: Sequence[Entry] | None = None,
     blank: Callable[[float, float], Page] | None = None,
 ) -> Page:
-    """Return a page with the view from above, the node-link diagram and the legend; see :func:`frame_page`."""
+    """Return a page with a frame seen from above, the diagram of its scene graph, and the legend."""
     from sgstore.draw._diagram import diagram_entries, paint_diagram
     from sgstore.draw._legend import entries_of
     from sgstore.draw._page import Page
@@ -184,7 +184,7 @@ def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> 
 
 
 def title_of(graph: SceneGraph, start_ns: int | None = None) -> str:
-    """Return the trace, the frame number, and the frame's time.
+    """Return a title for a frame: its trace, number and time.
 
     The time is relative (``t``) if the start of the trace is known. An absolute date is shown as
     well.
@@ -217,7 +217,7 @@ def check_installed() -> None:
 
 @contextmanager
 def drawing(to: str | Path) -> Generator[None]:
-    """Set up the style for drawing a file; raise errors before the drawing starts.
+    """Context manager that sets the drawing style, and checks the file name and installed packages before.
 
     Raises
     ------
@@ -235,7 +235,7 @@ def drawing(to: str | Path) -> Generator[None]:
 
 
 def checked(radius: float | None) -> float | None:
-    """Validate a radius from the user; m.
+    """Return the radius of a view in metres, or raise an error for an invalid value.
 
     Raises
     ------
@@ -248,7 +248,7 @@ def checked(radius: float | None) -> float | None:
 
 
 def matched_nodes(highlight: Mapping[str, int] | Sequence[int]) -> dict[int, str]:
-    """Map node ids to their variables."""
+    """Return the variable names of matched nodes, by node id."""
     if not isinstance(highlight, Mapping):
         return dict.fromkeys(map(int, highlight), "")
     matched: dict[int, str] = {}

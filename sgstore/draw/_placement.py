@@ -1,4 +1,4 @@
-"""Placement of texts near their objects, without overlaps."""
+"""Placement of texts near their objects in a picture, without overlaps."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _CLEAR: Final = 4.0
 
 
 class Placer:
-    """Free and taken space in a window.
+    """Free and occupied space of a picture, for placing texts.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Placer:
         self._things: list[Rect] = []
 
     def stand(self, x: float, y: float, reach: tuple[float, float]) -> None:
-        """Register an object with a possible name, so that other names keep a distance."""
+        """Register an object that can have a name, so that names of other objects keep a distance."""
         self._things.append(_around(x, y, reach))
 
     def block(self, rect: Rect) -> None:
@@ -53,7 +53,7 @@ class Placer:
     def beside(
         self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """Reserve the nearest free place for a text at an object; return its middle.
+        """Reserve the nearest free place for a text at an object; return the middle of the place.
 
         Parameters
         ----------
@@ -74,7 +74,9 @@ class Placer:
     def named(
         self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
     ) -> tuple[tuple[float, float], bool] | None:
-        """Reserve a place for a name; the flag is True if no other object is as near.
+        """Reserve a place for the name of an object; return its middle and a flag.
+
+        The flag is true if no other object is as near to the name.
 
         Places with a clear owner have priority.
         """
@@ -94,7 +96,7 @@ class Placer:
     def along(
         self, a: tuple[float, float], b: tuple[float, float], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """Reserve a place for a text on the line from ``a`` to ``b``; return its middle."""
+        """Reserve a place for a text on the line from ``a`` to ``b``; return the middle of the place."""
         spots = [
             (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]))
             for t in (0.55, 0.65, 0.45, 0.75, 0.35)
@@ -104,7 +106,7 @@ class Placer:
     def first_free(
         self, spots: list[tuple[float, float]], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """Reserve the first free place for a text of this size, or return None."""
+        """Reserve the first free place for a text of a given size; return its middle, or ``None``."""
         middles = np.array(spots)
         half = np.array(size) / 2
         low, high = middles - half, middles + half
@@ -124,7 +126,7 @@ class Placer:
 def _spots(
     x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
 ) -> list[tuple[float, float]]:
-    """Return middles of texts around an object, nearest first."""
+    """Return possible places (middles) of a text around an object, nearest first."""
     half_w, half_h = size[0] / 2, size[1] / 2
     return [
         (
@@ -141,7 +143,7 @@ def _around(x: float, y: float, reach: tuple[float, float]) -> Rect:
 
 
 def _gaps(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return distances (n, m) of rectangles (n, 4) and (m, 4); 0 for overlaps."""
+    """Return the distances (n, m) between rectangles (n, 4) and (m, 4); 0 for overlapping ones."""
     apart = np.maximum(one[:, None, :2] - other[:, 2:], other[:, :2] - one[:, None, 2:])
     return np.hypot(*np.moveaxis(np.maximum(apart, 0.0), -1, 0))
 

@@ -1,4 +1,4 @@
-"""Drawing of one frame in a window: content and captions.
+"""Drawing of a frame seen from above: its visible content, and the names in the picture.
 
 The texts in a window are names of nodes, and relations on the lines between them.
 """
@@ -49,7 +49,7 @@ _CLEAR: Final = 15.0
 
 
 def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect]) -> int:
-    """Write names of matched nodes, the ego's name, relations on lines, then other names.
+    """Write names of nodes and relations into a picture, important ones first; return the omitted number.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def _write(stage: Stage, spot: tuple[float, float], text: str, **look: Any) -> N
 
 
 def _slip(alpha: float) -> dict[str, Any]:
-    """Return the style of a paper background, which makes a text readable on any ground."""
+    """Return the style of a text background, which keeps the text readable on any colour."""
     return {
         "boxstyle": "round,pad=0.15",
         "facecolor": palette.PAPER,
@@ -164,7 +164,7 @@ def _tag() -> dict[str, Any]:
 def _extent(
     stage: Stage, scene: DrawnFrame, body: Body
 ) -> tuple[float, float, tuple[float, float]]:
-    """Return the middle of a body on the page, and its extent with its mark; points."""
+    """Return the middle of an entity's symbol in a picture, and half its width and height, in points."""
     half_x, half_y = half_extents(stage, body)
     pen = _PEN * (body.node in scene.matched)
     return body.x * stage.points, body.y * stage.points, (half_x + pen, half_y + pen)
@@ -175,7 +175,7 @@ def _is_named(body: Body) -> bool:
 
 
 def _room(stage: Stage, body: Body) -> list[Rect]:
-    """Return the area of a body and its arrow, as small squares."""
+    """Return the area of an entity's symbol and arrow as small squares, to keep texts away."""
     half_x, half_y = half_extents(stage, body)
     taken = [stage.rect(half_x * stage.metre, half_y * stage.metre, (body.x, body.y))]
     way = velocity_arrow(body)
@@ -201,7 +201,7 @@ _QUIET: Final[dict[Family, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrame:
-    """Content of a frame, prepared for drawing.
+    """Content of a frame that a picture shows: entities, relations, ground and matched nodes.
 
     Attributes
     ----------
@@ -234,7 +234,7 @@ class DrawnFrame:
         view: MapWindow,
         relations: Relations,
     ) -> DrawnFrame:
-        """Select the shown content of a frame in a view."""
+        """Return the content of a frame that is visible in a window."""
         bodies, lost = bodies_of(graph, view)
         ground = None if road_map is None else GroundView.of(road_map, view)
         bodies = _with_storeys(graph, bodies, ground)
@@ -242,7 +242,7 @@ class DrawnFrame:
         return cls(graph, matched, view, {b.node: b for b in bodies}, lost, links, ground)
 
     def place(self, node: int) -> Point | None:
-        """Return the place of a node in the picture, or ``None`` without a position."""
+        """Return the place of a node in the picture; ``None`` means an unknown position."""
         if node in self.bodies:
             return self.bodies[node].x, self.bodies[node].y
         place = place_of(self.graph.nodes.get(node, {}))
@@ -252,12 +252,12 @@ class DrawnFrame:
         return x, y
 
     def anchor(self, node: int) -> Point:
-        """Return the anchor of a node's name; for a lane, a near and visible point."""
+        """Return the point for the name of a node; for a lane, a near visible point."""
         spot = self.ground.spot(node) if self.ground is not None and node < 0 else None
         return spot or self.place(node) or (0.0, 0.0)
 
     def ends(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Return both ends of a link, or ``None`` if one of its nodes has no place.
+        """Return both ends of a line between two nodes; ``None`` if a node has no place.
 
         Between an entity and a lane it is the shortest line. Between matched map parts it is away
         from entities, to avoid confusion with their lines.
@@ -273,7 +273,7 @@ class DrawnFrame:
         return None if a is None or b is None else (a, b)
 
     def _beside_one_another(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Return the ends of a link between two map parts, away from entities, or ``None``."""
+        """Return both ends of a line between two map parts, away from entities, or ``None``."""
         ground = self.ground
         if ground is None or link.a in self.bodies or link.b in self.bodies:
             return None
@@ -290,7 +290,7 @@ class DrawnFrame:
         return None if other is None or math.dist((x, y), other) < 0.5 else ((x, y), other)
 
     def name(self, node: int) -> str:
-        """Return the name of a node, with its variable if it is matched: ``p = person 12``."""
+        """Return the name of a node, with the variable of a matched node, such as ``p = person 12``."""
         text = caption(node, self.graph.nodes.get(node, {}))
         if node in self.bodies and self.bodies[node].below:
             text += f", {self.bodies[node].below:.0f} m below"
@@ -298,29 +298,29 @@ class DrawnFrame:
         return f"{variable} = {text}" if variable else text
 
     def near_first(self) -> list[Body]:
-        """Return the bodies, nearest to the middle first."""
+        """Return the entities sorted by distance from the middle of the picture."""
         return sorted(self.bodies.values(), key=lambda b: (math.hypot(b.x, b.y), b.node))
 
     def named_first(self) -> list[int]:
-        """Return the nodes that are always named: matched ones, and the ego."""
+        """Return the nodes whose names are always written: matched nodes, and the ego."""
         ego = self.graph.ego
         also = [ego] if ego in self.bodies and ego not in self.matched else []
         return [node for node in self.matched if self.is_shown(node)] + also
 
     def is_shown(self, node: int) -> bool:
-        """True for a node with a place in the picture."""
+        """True if a node has a visible place in the picture."""
         place = (
             self.ground.spot(node) if self.has_outline(node) and self.ground else self.place(node)
         )
         return place is not None and max(map(abs, place)) <= self.view.radius
 
     def has_outline(self, node: int) -> bool:
-        """True for a map part with an outline in view."""
+        """True if a node is a map part with a visible outline."""
         return node < 0 and self.ground is not None and bool(self.ground.parts(node))
 
 
 def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | None) -> list[Body]:
-    """Set the depth of bodies that are below a drawn road.
+    """Return entities with their depth in metres below a road that is drawn above them.
 
     Without a map the reference is the ego: a body a storey deeper than the ego, beyond a slope.
     """
@@ -379,7 +379,7 @@ def _paint_link(stage: Stage, scene: DrawnFrame, link: DrawnLink) -> None:
 
 
 def _pen(scene: DrawnFrame, link: DrawnLink) -> tuple[str, float, dict[str, Any]]:
-    """Return colour, width in points, and other attributes of a line."""
+    """Return the colour, the width in points and other attributes of a line between two nodes."""
     if link.family in _QUIET:
         return _QUIET[link.family], 0.5, {"alpha": 0.45}
     if "controlsTrafficOf" in link.there + link.back:
@@ -393,7 +393,7 @@ def _pen(scene: DrawnFrame, link: DrawnLink) -> tuple[str, float, dict[str, Any]
 
 
 def _paint_halo(stage: Stage, scene: DrawnFrame, node: int) -> None:
-    """Paint a yellow mark around a node; nodes with an outline on the ground are tinted instead."""
+    """Draw a yellow mark around a matched node. Map parts with an outline are coloured instead."""
     place = scene.place(node)
     if place is None or (node not in scene.bodies and scene.has_outline(node)):
         return

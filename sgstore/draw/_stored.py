@@ -1,4 +1,4 @@
-"""Pictures and animations of frames of a store.
+"""Pictures and animations of the frames of a store.
 
 A clip becomes an animation: the pictures of its frames, with one scale and one legend.
 """
@@ -66,7 +66,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     diagram: bool = False,
     start_ns: int | None = None,
 ) -> Iterator[Shot]:
-    """Draw frames of a clip into an animation; yield each after it is drawn.
+    """Draw the frames of a clip into an animation file; yield each frame after it is drawn.
 
     Parameters
     ----------
@@ -122,13 +122,13 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
 
 
 def scale_of(samples: Iterable[Shot]) -> float | None:
-    """Return the radius of a view that fits all of these frames, or ``None`` without frames."""
+    """Return the radius of a view in metres that fits all given frames; ``None`` without frames."""
     radii = (view_of(graph, None, matched_nodes(marked)).radius for graph, marked, _ in samples)
     return max(radii, default=None)
 
 
 def _legend(scenes: Iterable[DrawnFrame]) -> list[Entry]:
-    """Return the distinct legend entries of all scenes, in order of first occurrence."""
+    """Return the distinct legend entries of several frames, in order of first occurrence."""
     found: dict[Entry, None] = {}
     for scene in scenes:
         half = scene.view.radius
@@ -155,10 +155,10 @@ _PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 
 
 class Bindings(Protocol):
-    """Bindings of a query in a frame: :class:`sgstore.matches.Matches` or precomputed bindings."""
+    """Object with the bindings of a query in a frame, to mark matches in a picture."""
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Return node ids by variable name, for each match."""
+        """Return the node ids by variable name, for each match in a frame."""
         ...
 
 
@@ -175,7 +175,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     diagram: bool = False,
     names: Names = "number",
 ) -> bool:
-    """Draw a frame of a store from above.
+    """Draw a picture of a stored frame seen from above; return True if a match is marked in it.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     fps: float = FPS,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Draw a clip of a store as an animation at the original speed.
+    """Draw a clip of a store as an animation at its original speed; return the number of pictures.
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
 
 
 def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
-    """Return the frames to draw: the first, and each that follows at least one period later."""
+    """Return the frames of a clip to draw, at most ``fps`` per second."""
     first, last = (store.file.frame(end) for end in frames)
     if last.seq < first.seq:
         raise ExportError(f"the clip from {' to '.join(frames)} ends before it begins")
@@ -327,7 +327,7 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
 
 
 def map_of(store: Store, trace: str) -> RoadMap | None:
-    """Return the road map of a trace of a store, or ``None``."""
+    """Return the road map of a trace of a store; ``None`` without a map."""
     return map_in(store.file, trace)
 
 
@@ -339,7 +339,7 @@ def map_in(file: StoreFile, trace: str) -> RoadMap | None:
 def _picture(
     store: Store, frame: FrameRef, camera: str | None, usual: str | None = None
 ) -> bytes | None:
-    """Return the camera picture nearest to the frame, as JPEG or PNG, or ``None``.
+    """Return the recorded camera picture nearest to a frame, as JPEG or PNG data, or ``None``.
 
     ``usual``: the known default camera.
     """
@@ -361,7 +361,7 @@ def _picture(
 
 
 def camera_of(store: Store, trace: str) -> str:
-    """Return the first channel with pictures, or an empty text."""
+    """Return the name of the first recorded channel with camera pictures; empty without such a channel."""
     return camera_in(store.file, trace)
 
 

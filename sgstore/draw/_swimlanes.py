@@ -1,4 +1,4 @@
-"""Timelines of matches and violations: one lane per entity, as terminal text or as a picture."""
+"""Timelines of matches and violations, one lane per entity, as text for a terminal or as a picture."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LaneSpan = tuple[float, float, bool]
 
 @dataclass(slots=True)
 class Lane:
-    """Line of a timeline: a pattern or a check, and its entities.
+    """Lane of a timeline: the time spans of a pattern or a check, for some entities.
 
     Attributes
     ----------
@@ -53,13 +53,13 @@ class Lane:
 
     @property
     def label(self) -> str:
-        """Return the label of the lane."""
+        """Return the label of the lane: the pattern or check, and its entities."""
         return " · ".join(part for part in (self.name, self.who) if part)
 
 
 @dataclass(slots=True)
 class Timeline:
-    """Lanes of a trace.
+    """Timeline of a trace, with lanes for matches and violations.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Timeline:
 
     @property
     def hit(self) -> bool:
-        """True if there is a match or a violation."""
+        """True if the timeline contains a match or a violation."""
         return any(lane.spans for lane in self.lanes)
 
 
@@ -84,7 +84,7 @@ def timelines(
     asked: Mapping[str, tuple[str, Mapping[str, Any]]],
     traces: str | Collection[str] = (),
 ) -> list[Timeline]:
-    """Return the timelines of the traces of a store.
+    """Return a timeline of matches and violations for each trace of a store.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def timelines(
 def parts_timeline(
     store: Store, text: str, frame: int | str, values: Mapping[str, Any]
 ) -> Timeline:
-    """Return the truth lanes of a match: each part of a pattern over a trace, then the whole pattern.
+    """Return a timeline of one match: the times in which each part of the pattern is true.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _spans(intervals: Iterable[Interval], *, violation: bool) -> list[LaneSpan]:
 
 
 def lines_of(timeline: Timeline, letters: int = LETTERS, longest: float = 0.0) -> list[str]:
-    """Return a timeline as lines of text; each letter is an equal part of the longest trace.
+    """Return a timeline as lines of text, in which each letter is an equal part of time.
 
     ``█``: true, or violated, for most of the part; ``▌``: for some of it; ``·``: for none of it.
 
@@ -243,7 +243,7 @@ def _letters(lane: Lane, seconds: float, letters: int) -> str:
 
 
 def _merged(spans: Sequence[LaneSpan]) -> list[tuple[float, float]]:
-    """Merge overlapping spans."""
+    """Return time spans with overlapping ones merged."""
     found: list[tuple[float, float]] = []
     for start, end, _ in sorted(spans, key=lambda one: one[0]):
         if found and start <= found[-1][1]:
@@ -254,7 +254,7 @@ def _merged(spans: Sequence[LaneSpan]) -> list[tuple[float, float]]:
 
 
 def _told(lane: Lane) -> str:
-    """Return the number of spans, and their total time, as text."""
+    """Return the number of time spans of a lane, and their total length, as text."""
     if not lane.spans:
         return lane.verdict
     seconds = sum(end - start for start, end in _merged(lane.spans))
@@ -287,7 +287,7 @@ _REASON: Final = 100
 
 
 def draw_timelines(timelines: list[Timeline], to: Path) -> None:
-    """Draw the timelines of traces below each other, on one scale, with verdicts.
+    """Draw the timelines of several traces below each other as a picture, with one time scale.
 
     Parameters
     ----------
@@ -327,7 +327,7 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
 
 
 def _key(page: Page, kinds: set[bool], more: int) -> None:
-    """Paint the legend of colours above all lanes, with the number of lanes not shown."""
+    """Draw the legend of a timeline picture above the lanes, with the number of omitted lanes."""
     from matplotlib.patches import Patch
 
     known = ((False, ROAD_EDGE, "found"), (True, EGO, "violated"))
@@ -338,7 +338,7 @@ def _key(page: Page, kinds: set[bool], more: int) -> None:
 
 
 def _draw(page: Page, timeline: Timeline, lanes: int, top: float, longest: float) -> None:
-    """Draw the lanes of a trace below ``top``; the longest trace takes the full width."""
+    """Draw the lanes of one trace below a height of the page. The longest trace has the full width."""
     from matplotlib.ticker import MaxNLocator
 
     from sgstore.draw._page import printable

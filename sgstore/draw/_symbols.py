@@ -1,4 +1,4 @@
-"""Symbols of entities: boxes with a windscreen, people as dots, traffic lights as lamps."""
+"""Symbols of entities in pictures: vehicles as boxes with a windscreen, people as dots, traffic lights."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SIGN: Final = 4.0
 
 
 def paint_body(stage: Stage, body: Body) -> None:
-    """Draw an entity; its group in an SVG has the id ``node-17``."""
+    """Draw the symbol of an entity. In an SVG file, its group has the id ``node-17``."""
     colour = palette.entity_tint(body.kind, ego=body.is_ego)
     edge: dict[str, Any] = {
         "edgecolor": palette.PAPER,
@@ -67,7 +67,7 @@ def paint_body(stage: Stage, body: Body) -> None:
 
 
 def halo(stage: Stage, body: Body | None, place: tuple[float, float]) -> tuple[Floats, float]:
-    """Return the outline of the mark around a matched node, and its pen width in points.
+    """Return the outline of the mark around a matched node, and the line width in points.
 
     Parameters
     ----------
@@ -85,14 +85,17 @@ def halo(stage: Stage, body: Body | None, place: tuple[float, float]) -> tuple[F
 
 
 def velocity_arrow(body: Body) -> Floats | None:
-    """Return the vector from a body's centre to its arrow tip, (2,); m. ``None`` without an arrow."""
+    """Return the vector from an entity's centre to the tip of its velocity arrow, (2,) in metres.
+
+    ``None`` means an entity without an arrow.
+    """
     way = np.array((body.vx, body.vy)) * ARROW_SECONDS
     # Very slow and implausibly fast bodies have no arrow.
     return way if 0.5 <= float(np.hypot(*way)) <= 150.0 else None
 
 
 def half_extents(stage: Stage, body: Body) -> tuple[float, float]:
-    """Return half the width and height of a symbol on the page; points."""
+    """Return half the width and half the height of an entity's symbol on the page, in points."""
     if body.kind in SIGNALS:
         return LAMP[0] / 2, LAMP[1] / 2
     corners = outline(body, SMALLEST * stage.metre) - (body.x, body.y)
@@ -103,7 +106,7 @@ def half_extents(stage: Stage, body: Body) -> tuple[float, float]:
 def lamps(
     x: float, y: float, light: str, metre: float, gid: str | None
 ) -> list[Circle | FancyBboxPatch]:
-    """Return the shapes of a traffic light, always upright.
+    """Return the shapes of a traffic light symbol, which is always upright.
 
     ``metre``: units of the window per point of the page.
     """
@@ -166,7 +169,7 @@ def _paint_velocity(stage: Stage, body: Body, colour: str) -> None:
 
 
 def _windscreen(stage: Stage, body: Body) -> Outline:
-    """Return a wedge in the front of the box that points ahead."""
+    """Return the outline of a windscreen: a wedge at the front of a vehicle's box that shows its heading."""
     corners = outline(body, SMALLEST * stage.metre)
     front, rear = corners[:2].mean(axis=0), corners[2:4].mean(axis=0)
     aside = (corners[0] - corners[1]) * 0.34

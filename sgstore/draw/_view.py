@@ -1,4 +1,4 @@
-"""Geometry of a frame seen from above: places, boxes and links in picture axes.
+"""Geometry of a frame seen from above: map coordinates → picture coordinates, and boxes of entities.
 
 Picture axes are metres from the middle of the picture, x to the right and y up. The ego is in the
 middle with its heading up, unless north is up. The functions are pure and need no drawing package.
@@ -37,7 +37,7 @@ TEXT_LENGTH: Final = 48
 
 @dataclass(frozen=True, slots=True)
 class MapWindow:
-    """Square window on the map.
+    """Square part of the road map that a picture shows: centre, rotation and radius.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class MapWindow:
     radius: float
 
     def place(self, points: Floats) -> Floats:
-        """Convert points of the map (N, 2) to picture coordinates (N, 2).
+        """Convert map coordinates (N, 2) to picture coordinates (N, 2).
 
         >>> MapWindow(10.0, 0.0, 0.0, 50.0).place(np.array([[13.0, 1.0]]))  # 3 m ahead, 1 m to the left
         array([[-1.,  3.]])
@@ -66,13 +66,13 @@ class MapWindow:
         return np.column_stack((away @ right, away @ forward))
 
     def angle(self, heading: float) -> float:
-        """Convert a map heading to an angle in the picture, counter-clockwise from its right; rad."""
+        """Convert a map heading to an angle in the picture, in radians counter-clockwise from the right."""
         return heading - self.up + math.pi / 2
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """Drawn entity in picture axes, metres and radians; NaN for unknown values.
+    """Entity to draw: position, size, heading and speed in picture coordinates. NaN means unknown.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Body:
 
 
 def clean(text: object, length: int = TEXT_LENGTH) -> str:
-    r"""Make a text from a trace printable: one line, printable characters, limited length.
+    r"""Return a text of a recording as one line of printable characters with a limited length.
 
     >>> clean("a\nb\x00c")
     'a·b·c'
@@ -117,7 +117,7 @@ def clean(text: object, length: int = TEXT_LENGTH) -> str:
 
 
 def counted(number: int, thing: str) -> str:
-    """Return a number of things, in words.
+    """Return a count with its noun, such as ``2 frames``.
 
     >>> counted(1, "lane"), counted(2000, "lane"), counted(2, "vegetation")
     ('1 lane', '2,000 lanes', '2 vegetation')
@@ -133,7 +133,7 @@ Names = Literal["number", "ident", "type"]
 
 
 def called(graph: SceneGraph, names: Names) -> SceneGraph:
-    """Replace the labels of entities by ids or types, where they are known."""
+    """Return a scene graph whose entities are named by their ids or types, where these are known."""
     if names == "number":
         return graph
     key = {"ident": "ident", "type": "type_name"}[names]
@@ -147,12 +147,12 @@ def called(graph: SceneGraph, names: Names) -> SceneGraph:
 
 
 def _lifetime(about: Mapping[str, Any], names: Names) -> str:
-    """Return the suffix that distinguishes entities with a reused id: ``#2``."""
+    """Return a suffix such as ``#2`` that distinguishes entities with the same recorded id."""
     return f"#{about['lifetime']}" if names == "ident" and about.get("lifetime", 1) > 1 else ""
 
 
 def caption(node: int, attributes: Mapping[str, Any]) -> str:
-    """Return the caption of a node: its label, ``car 17``, ``lane 12/0/-1``, ``ego (car 0)``."""
+    """Return the caption of a node, such as ``car 17``, ``lane 12/0/-1`` or ``ego (car 0)``."""
     told = clean(attributes.get(CALLED, ""), 32)
     if told:
         return f"ego ({told})" if attributes.get("is_ego") and told != "ego" else told
@@ -166,7 +166,7 @@ def caption(node: int, attributes: Mapping[str, Any]) -> str:
 
 
 def number(attributes: Mapping[str, Any], name: str) -> float:
-    """Return a number of a node; NaN if it is missing, infinite or not a number."""
+    """Return a numeric attribute of a node; NaN if it is missing or infinite."""
     value = attributes.get(name)
     if not isinstance(value, Real) or not math.isfinite(value):
         return math.nan
@@ -174,7 +174,7 @@ def number(attributes: Mapping[str, Any], name: str) -> float:
 
 
 def place_of(attributes: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Return the map coordinates of a node, or ``None``."""
+    """Return the map coordinates (x, y) of a node; ``None`` if they are unknown."""
     x, y = number(attributes, "x"), number(attributes, "y")
     return None if math.isnan(x + y) else (x, y)
 
@@ -186,7 +186,7 @@ def view_of(
     *,
     north_up: bool = False,
 ) -> MapWindow:
-    """Return the view of a frame: the ego in the middle, heading up.
+    """Return the visible part of the map for a frame: the ego is in the middle and faces up.
 
     Without an ego or its position, the middle is that of the entities (else of the map parts) and
     north is up. Without a radius it is the smallest one that shows the entities, within
@@ -212,7 +212,7 @@ def view_of(
 
 
 def bodies_of(graph: SceneGraph, view: MapWindow) -> tuple[list[Body], int]:
-    """Return the drawable entities, and the number of entities without a position.
+    """Return the entities to draw, and the number of entities without a position.
 
     Scenery of the map is part of the ground, but its signals are entities.
     """
@@ -231,7 +231,7 @@ def bodies_of(graph: SceneGraph, view: MapWindow) -> tuple[list[Body], int]:
 
 
 def outline(body: Body, smallest: float) -> Floats:
-    """Return the corners (5, 2) of a body's box from its front left, closed; picture axes, m.
+    """Return the closed outline (5, 2) of an entity's box in picture coordinates, from the front left.
 
     Parameters
     ----------
@@ -248,14 +248,17 @@ def outline(body: Body, smallest: float) -> Floats:
 
 
 def turned(points: Floats, body: Body) -> Floats:
-    """Convert points in a body's own axes (forward, left) to picture coordinates (N, 2)."""
+    """Convert points in the axes of an entity (forward, left) to picture coordinates (N, 2)."""
     angle = _or(body.angle, math.pi / 2)
     cos, sin = math.cos(angle), math.sin(angle)
     return points @ np.array(((cos, sin), (-sin, cos))) + (body.x, body.y)
 
 
 def distance(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
-    """Return the distance of two nodes' centres, in space if both heights are known; m, or NaN."""
+    """Return the distance between the centres of two nodes in metres, in 3D if both heights are known.
+
+    NaN means an unknown position.
+    """
     dz = number(a, "z") - number(b, "z")
     return math.hypot(
         number(a, "x") - number(b, "x"), number(a, "y") - number(b, "y"), _or(dz, 0.0)

@@ -1,6 +1,6 @@
-"""Text format of locks (lists of test cases): JSON with one entry per line. Equal content gives equal bytes.
+"""Text format of locks (lists of test cases): JSON with one trace or case per line.
 
-JSON with one trace or case per line. Equal content gives equal bytes.
+Equal content gives equal bytes.
 
 The text has no path and no time of day. Therefore it is the same on every machine for the same
 selection of the same recordings, and two locks can be compared line by line.
