@@ -37,6 +37,21 @@ def test_every_kind_of_extension_has_a_recipe() -> None:
 
 
 @pytest.mark.parametrize("title", RECIPES)
+def test_a_recipe_has_at_most_25_lines_of_code(title: str) -> None:
+    found = [(language, block) for _, language, block in BLOCK.findall(RECIPES[title])]
+    lines = [
+        line
+        for language, block in found
+        for line in block.splitlines()
+        if (language == "python" or (language == "diff" and line[0] == "+"))
+        and line.strip(" +")
+        and not line.strip(" +").startswith('"""')
+    ]
+
+    assert len(lines) <= 25
+
+
+@pytest.mark.parametrize("title", RECIPES)
 def test_a_recipe_passes_its_own_tests(title: str, tmp_path: Path) -> None:
     tree = copied(tmp_path / "tree")
     commands, written = applied(RECIPES[title], tree)
