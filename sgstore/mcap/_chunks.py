@@ -277,7 +277,7 @@ class Messages:
         return self.chunk_offset
 
     def data(self, row: int) -> memoryview:
-        """Return the bytes of one message."""
+        """Return the bytes of one message of the group."""
         return self.read(int(self.offset[row]) + MESSAGE_HEAD.itemsize, int(self.length[row]))
 
     def span(self, start: int, stop: int) -> Self:

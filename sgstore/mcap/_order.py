@@ -487,7 +487,7 @@ def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> 
 
 
 def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
-    """Return key values that divide the messages of an index into parts small enough to sort.
+    """Return limits (such as times) that divide the messages of an index into parts small enough to sort.
 
     A value with many messages becomes a separate part. The last part begins at the greatest value.
     """

@@ -106,7 +106,7 @@ class _Clock:
         )
 
     def kept(self, time_ns: Ints) -> Bools:
-        """Return a mask of the frames that the time span and frame rate select."""
+        """Return a mask of the frames to keep, by time span and frame rate."""
         part = self._part
         self._zero = int(time_ns[0]) if self._zero is None else self._zero
         since = (time_ns - self._zero) / 1e9

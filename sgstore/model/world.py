@@ -321,7 +321,7 @@ class Lives(Generic[AnyEntity]):
     def follow(
         self, kind: int, here: Sight, enter: Callable[[], AnyEntity], *, sure_kind: bool = True
     ) -> AnyEntity:
-        """Return the object that uses the id in an observation. It may be a new object.
+        """Return the object that an observation with a shared id belongs to. It may be a new object.
 
         Parameters
         ----------

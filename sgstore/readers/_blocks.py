@@ -274,7 +274,7 @@ class EntityTable:
             self.report.events.append(event)
 
     def take_events(self) -> tuple[Event, ...]:
-        """Remove and return the events added since the last call."""
+        """Remove and return the events (such as collisions) added since the last call."""
         events, self._events = self._events, []
         if self._turns:
             events = [

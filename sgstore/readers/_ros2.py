@@ -372,25 +372,25 @@ def decode(kind: Struct, data: Data) -> dict[str, Any]:
 
 
 def number(record: dict[str, Any], path: str) -> float:
-    """Return the number at a path of a record, such as ``pose.position.x``; NaN if it is missing."""
+    """Return the number at a field path of a decoded message, such as ``pose.position.x``; NaN if missing."""
     value = _at(record, path)
     return float(value) if isinstance(value, (int, float)) else float("nan")
 
 
 def text(record: dict[str, Any], path: str) -> str:
-    """Return the text at a path of a record; empty if it is missing."""
+    """Return the text at a field path of a decoded message; empty if it is missing."""
     value = _at(record, path)
     return value if isinstance(value, str) else ""
 
 
 def records(record: dict[str, Any], path: str) -> list[dict[str, Any]]:
-    """Return the list of nested records at a path of a record; empty if it is missing."""
+    """Return the list of nested records at a field path of a decoded message; empty if it is missing."""
     value = _at(record, path)
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
 def ident_of(record: dict[str, Any], path: str) -> int | None:
-    """Return the id at a path of a record. ``None`` means that it is missing or too large."""
+    """Return the id number at a field path of a decoded message. ``None`` means missing or too large."""
     value = number(record, path)
     return int(value) if abs(value) < MAX_IDENT else None
 

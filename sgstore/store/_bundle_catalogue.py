@@ -191,7 +191,7 @@ def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
 
 
 def parquet_rows(path: Path, columns: Iterable[str]) -> list[tuple[Any, ...]]:
-    """Return some columns of an sgstore Parquet file as rows. Missing columns of :data:`LATER` are NULL.
+    """Return some columns of an sgstore Parquet file as rows. Columns that older files lack are NULL.
 
     Raises
     ------

@@ -106,7 +106,7 @@ class TraceClasses:
         return self._columns([*zip(*of_frames, strict=True)], trace_id, seq)
 
     def _named(self, seen: GraphColumns) -> list[tuple[str, ...]]:
-        """Return the class names of each frame, as one tuple with a class per abstraction."""
+        """Return the class names of some frames: one tuple per abstraction, with one name per frame."""
         # Crowded frames are processed one abstraction at a time, to limit memory.
         together = len(self._of) if len(seen.frame) < _FEW_EDGES else 1
         named: list[str] = []
@@ -319,7 +319,7 @@ class Abstracted:
             return imported_names(connection)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """Yield label counts of nodes and edges for given frames in an abstraction, in groups of frames.
+        """Yield the counts of node and edge labels in the graphs of given frames, in groups of frames.
 
         Parameters
         ----------

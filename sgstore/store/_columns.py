@@ -209,7 +209,7 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
 
 
 def parted(columns: Columns) -> tuple[Columns, Columns]:
-    """Split rows into single rows and rows that repeat in consecutive frames; return two tables.
+    """Split rows into rows that differ from frame to frame, and runs of equal rows; return two tables.
 
     Parameters
     ----------

@@ -250,7 +250,7 @@ class MessagePlaces:
 
     @staticmethod
     def of(file: StoreFile, frame_id: Ints) -> MessagePlaces:
-        """Return the file positions of the messages of some frames, one row per frame and message."""
+        """Return where the messages of some frames are in the recording, one row per frame and message."""
         found = file.arrays(_MESSAGES, {"frames": frame_id.tolist()})
         frame, channel, *numbers = found.values()
         return MessagePlaces(

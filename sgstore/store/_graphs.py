@@ -340,7 +340,7 @@ def _own_attributes(
     frame_id: NDArray[np.int64],
     of_edges: dict[tuple[int, int, int, int], dict[str, Any]],
 ) -> dict[int, list[tuple[int, str, Any]]]:
-    """Return user-defined node attributes by frame. Edge attributes are added to ``of_edges``."""
+    """Return user-defined node attributes by frame, and add edge attributes to a given dict."""
     of_nodes: dict[int, list[tuple[int, str, Any]]] = {}
     for frame, node, relation, dst, name, text in run(connection, _OWN, by_frame).values:
         value = json.loads(text)
@@ -408,7 +408,7 @@ class _Traces:
         return cls(found["trace_id"].astype(np.int64), origin, found["map_id"].astype(np.int64))
 
     def rows(self, frame_id: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the index of the trace of each frame, in the table of traces."""
+        """Return, for each frame, the row of its trace in the table of traces."""
         return np.searchsorted(self.trace_id, trace_of(frame_id)).astype(np.int64)
 
 

@@ -224,7 +224,7 @@ class OpenFile:
             self.close()
 
     def refresh(self, settings: tuple[object, ...], folder: Path | None) -> None:
-        """Close an unused DuckDB instance if the store file or its settings have changed."""
+        """Close the idle database of a store file if the file or the settings have changed."""
         if self.instance is None or self.readers:
             return
         other = self.settings != settings or folder not in {None, self.folder}

@@ -122,7 +122,7 @@ class FrameTimes:
 def _messages_of(
     messages: Callable[[], Iterable[Columns]], numbers: list[int]
 ) -> Iterator[Columns]:
-    """Yield the messages of some channels in groups that fit into memory."""
+    """Yield the recorded messages of some channels, in groups that fit into memory."""
     waiting: list[Columns] = []
     for some in messages():
         rows = np.flatnonzero(np.isin(some["channel"], numbers))
@@ -191,7 +191,9 @@ def _none(count: int) -> Ints:
 
 
 def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
-    """Choose between two messages for each frame: the later or the earlier by log time.
+    """Choose between two messages for each frame: the later or the earlier one by log time.
+
+    At equal times, the message with the later file position is chosen.
 
     At equal times, the message with the later file position is chosen.
     """

@@ -199,7 +199,7 @@ def insert(
     table: str,
     given: Mapping[str, object] | None = None,
 ) -> None:
-    """Insert the prepared rows of a table into the store. Some columns get values from the store."""
+    """Insert the rows of a new trace into a store table. The store assigns the values of some columns."""
     given = given or {}
     # The arrays are reused, because a transaction keeps all arrays until its end.
     staged = _buffers(tables, table)
@@ -356,7 +356,7 @@ STEP: Final = 64
 
 @contextmanager
 def writing(access: Access) -> Generator[DuckDBPyConnection]:
-    """Context manager of one transaction on a store. Yield a connection with the store as ``store``."""
+    """Context manager of one transaction. It yields a database connection with the store as ``store``."""
     with scratch(spill_folder()) as connection, access.writing(connection):
         yield connection
 

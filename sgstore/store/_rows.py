@@ -63,7 +63,7 @@ class Tabular:
         return None
 
     def arrow(self) -> Any:
-        """Return all rows as a ``pyarrow.Table``.
+        """Return all rows of the result as a ``pyarrow.Table``.
 
         Raises
         ------
@@ -90,7 +90,7 @@ class Tabular:
         return arrow.table(list(arrays), names=list(names))
 
     def df(self) -> Any:
-        """Return all rows as a ``pandas.DataFrame``.
+        """Return all rows of the result as a ``pandas.DataFrame``.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class Tabular:
         return pandas.DataFrame.from_records(list(self), columns=list(names))
 
     def polars(self) -> Any:
-        """Return all rows as a ``polars.DataFrame``.
+        """Return all rows of the result as a ``polars.DataFrame``.
 
         Raises
         ------
@@ -129,7 +129,7 @@ class Tabular:
         return polars.DataFrame([polars.Series(name, of, strict=False) for name, of in columns])
 
     def _by_values(self) -> Any:
-        """Return an Arrow table with types inferred from Python values. ``None`` means impossible."""
+        """Return the result as an Arrow table with types from its Python values; ``None`` if impossible."""
         with suppress(MissingExtraError):
             package("pyarrow")
             table = self._table()
@@ -137,7 +137,7 @@ class Tabular:
         return None
 
     def parquet(self, path: str | Path) -> int:
-        """Stream all rows to a Parquet file, and return their number.
+        """Write all rows of the result to a Parquet file as a stream, and return their number.
 
         Raises
         ------
@@ -153,7 +153,7 @@ class Tabular:
         return ParquetTable.write_rows(names, self, Path(path), types)
 
     def csv(self, path: str | Path) -> int:
-        """Stream all rows to a CSV file, and return their number.
+        """Write all rows of the result to a CSV file as a stream, and return their number.
 
         Raises
         ------
@@ -226,7 +226,7 @@ class Rows(Tabular):
 
     @property
     def values(self) -> list[tuple[Any, ...]]:
-        """Rows as tuples. Enumeration values are ``str``; NULL is ``None``.
+        """Rows of the result as tuples. Enumeration values are ``str``; NULL is ``None``.
 
         Examples
         --------
@@ -300,7 +300,7 @@ class LaterRows(Rows):
 
     @property
     def values(self) -> list[tuple[Any, ...]]:
-        """Rows as tuples. Enumeration values are ``str``; NULL is ``None``."""
+        """Rows of the result as tuples. Enumeration values are ``str``; NULL is ``None``."""
         if not self._whole:
             self._values, self._whole = self._ask().values, True
         return self._values
@@ -309,7 +309,7 @@ class LaterRows(Rows):
         return None if self._whole else self._ask_table()
 
     def parquet(self, path: str | Path) -> int:
-        """Stream all rows to a Parquet file, and return their number.
+        """Write all rows of the result to a Parquet file as a stream, and return their number.
 
         Raises
         ------

@@ -77,7 +77,7 @@ _RUNS: Final = {
 
 
 class StagedRows(NamedTuple):
-    """Rows of whole tables in the file format of :class:`Staging`, for use in several traces.
+    """Table rows that several new traces share (such as the rows of a road map), as bytes.
 
     ``words``: enumeration → values that ``schema.sql`` lacks.
     """
@@ -131,7 +131,7 @@ class Staging:
             self._own.remove()
 
     def insert(self, table: str, columns: Columns) -> None:
-        """Append rows to a table. Missing values are non-finite, :data:`MISSING`, or empty."""
+        """Append rows to a table of the new trace. Missing values are non-finite, :data:`MISSING`, or empty."""
         rows = len(next(iter(columns.values())))
         if not rows:
             return

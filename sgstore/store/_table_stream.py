@@ -146,7 +146,7 @@ class TableFile:
         return list(self._pieces)
 
     def read(self, piece: Piece, first: int = 0, end: int | None = None) -> Columns:
-        """Return all columns for a range of rows in a row group of the file.
+        """Return all columns for a range of rows in a row group (block of rows) of the file.
 
         Raises
         ------
@@ -158,7 +158,7 @@ class TableFile:
     def column(
         self, piece: Piece, name: str, first: int = 0, end: int | None = None
     ) -> NDArray[Any]:
-        """Return one column for a range of rows in a row group of the file."""
+        """Return one column for a range of rows in a row group (block of rows) of the file."""
         about, end = piece.columns[name], piece.rows if end is None else end
         if about["type"] not in _PLAIN:
             raise self._wrong("is none of ours")

@@ -232,7 +232,7 @@ def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
 
 
 def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints]:
-    """Return (frame, lane strand, role) for the lanes of each frame."""
+    """Return the role of each lane relative to the ego of the frame: (frame, lane strand, role)."""
     frame, src, strand = inside
     ego = np.where(seen.ego_lane < 0, strands.of[-1 - seen.ego_lane], 0)
     present = np.flatnonzero(seen.kind == KIND_CODE["lane"])

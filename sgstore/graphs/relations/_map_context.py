@@ -263,6 +263,6 @@ def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
 
 
 def _looked_up(table: Table, wanted: Rows) -> Table:
-    """Return table rows for selected objects, with new row numbers."""
+    """Return the table rows (map parts below objects) that belong to selected objects."""
     owner, index = joined(table[0], wanted)
     return (owner, *(column[index] for column in table[1:]))

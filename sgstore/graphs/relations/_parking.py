@@ -71,12 +71,12 @@ class Parking:
 
     @property
     def parked(self) -> Codes:
-        """Return the parked state of each object in graphs: 1 parked, 0 not, -1 unknown or no vehicle."""
+        """Parked state of each object in graphs: 1 parked, 0 not, -1 unknown or no vehicle."""
         return self._parked(0)
 
     @property
     def world_parked(self) -> Codes:
-        """Return the parked state of each object, from states inside and outside the graphs."""
+        """Parked state of each object, from its states inside and outside the graphs."""
         return self._parked(1)
 
     def _parked(self, row: int) -> Codes:

@@ -148,12 +148,12 @@ class Bodies:
 
     @property
     def boxes(self) -> Floats:
-        """Footprints of the objects: ``x, y, heading, length, width``, (N, 5)."""
+        """Footprints (ground rectangles) of the objects: ``x, y, heading, length, width``, (N, 5)."""
         return np.stack([self.x, self.y, self.heading, self.length, self.width], axis=1)
 
 
 class BodyPairs:
-    """Ordered pairs (a, b) of objects that can have relations; the second half mirrors the first; K pairs.
+    """Ordered pairs (a, b) of objects that can have relations. The second half has the same pairs as (b, a).
 
     Parameters
     ----------
@@ -173,12 +173,12 @@ class BodyPairs:
 
     @cached_property
     def a(self) -> Rows:
-        """Row of the first object of each pair in :class:`Bodies`, (K,)."""
+        """Row of the first object of each pair in the table of objects, (K,)."""
         return np.concatenate(self._halves)
 
     @cached_property
     def b(self) -> Rows:
-        """Row of the second object of each pair in :class:`Bodies`, (K,)."""
+        """Row of the second object of each pair in the table of objects, (K,)."""
         return np.concatenate(self._halves[::-1])
 
     @cached_property
@@ -248,7 +248,7 @@ class BodyPairs:
 
     @cached_property
     def of_bodies(self) -> Bools:
-        """Mask (K / 2,) of the pairs of solid objects on the same level; empty means all."""
+        """Mask (K / 2,) of the pairs of solid objects on the same storey. An empty mask means all pairs."""
         of = self._bodies
         plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
         levels = of.low_and_high
@@ -411,7 +411,7 @@ class Standing:
     off_road: NDArray[np.intp]
 
     def take(self, place: NDArray[np.intp]) -> Standing:
-        """Return the map parts below selected objects, with new row numbers."""
+        """Return the map parts below selected objects. The objects get new row numbers."""
         hits, (rows, nodes) = self.hits, self.parts
         kept, there = place[hits.row] >= 0, place[rows] >= 0
         hits = taken(hits, kept)
@@ -671,7 +671,7 @@ def _relation_codes(relation: str | Codes, count: int) -> Codes:
 
 
 def kinds_mask(names: tuple[str, ...]) -> Bools:
-    """Return a lookup array: kind code → True for the named kinds."""
+    """Return a boolean array, indexed by kind code: True for the named kinds."""
     table = np.zeros(MOST_KINDS, np.bool_)
     table[[KIND_CODE[name] for name in names]] = True
     return table

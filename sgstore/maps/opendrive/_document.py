@@ -167,7 +167,9 @@ class Document:
         return self.tables[kind]
 
     def numbers(self, kind: str, name: str, default: float | None = None) -> Floats:
-        """Return an attribute of all elements as finite numbers. An invalid number is a defect of its road.
+        """Return an attribute of all elements of a kind as numbers.
+
+        Invalid numbers mark their road as defective.
 
         A missing number without default, or one that is not finite or too large, is a defect of its
         road, and the value is 0. Outside roads, the value is the default.
@@ -187,7 +189,10 @@ class Document:
         return values
 
     def integers(self, kind: str, name: str, default: int | None = None) -> Ints:
-        """Return an attribute of all elements as integers. An invalid number is a defect of its road."""
+        """Return an attribute of all elements of a kind as integers.
+
+        Invalid numbers mark their road as defective.
+        """
         values = self.numbers(kind, name, default)
         broken = (values != np.floor(values)) | (np.abs(values) > 1e9)
         self.accuse(kind, broken, f"attribute {name!r} is no whole number")
@@ -195,7 +200,7 @@ class Document:
         return values.astype(np.int64)
 
     def rough_numbers(self, kind: str, name: str, default: float = 0.0) -> Floats:
-        """Return an attribute of all elements as numbers: NaN if invalid, a default value if missing."""
+        """Return an attribute of all elements of a kind as numbers: NaN if invalid, a default if missing."""
         values = _floats(self.tables[kind].texts(name, repr(default)))
         values[~(np.abs(values) <= MAX_MAGNITUDE)] = np.nan
         return values

@@ -83,7 +83,7 @@ def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) ->
 
 
 def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_Stretch]]:
-    """Return a function: two neighbouring lanes → intervals of their common border with its road mark."""
+    """Return a function that finds the road marks on the common border of two neighbouring lanes."""
     kind = "road/laneSection/lane/roadMark"
     table = document[kind]
     offsets = document.rough_numbers(kind, "sOffset").tolist()

@@ -271,7 +271,7 @@ def _shifted(coefficients: Floats, by: Floats) -> Floats:
 def _along_road(
     document: Document, kind: str, lanes: LaneTable, intervals: _LaneIntervals
 ) -> Floats:
-    """Return the cubic of a road record (elevation, offset, …) on each interval of the road, (n, 4)."""
+    """Return the cubic polynomial of a road property (such as elevation) on each road interval, (n, 4)."""
     middle = (intervals.start + intervals.end) / 2
     at = document.numbers(kind, "s")
     record = last_before(document[kind].road, at, lanes.sections.road[intervals.section], middle)

@@ -218,7 +218,7 @@ def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
 
 
 def junction_types(document: Document) -> dict[str, str]:
-    """Return the type of each OpenDRIVE junction: junction id → type; by default ``default``."""
+    """Return the type of each OpenDRIVE junction, such as ``virtual``: junction id → type."""
     table = document["junction"]
     pairs = zip(table.texts("id"), table.texts("type", "default"), strict=True)
     return {name: kind.strip() or "default" for name, kind in pairs}

@@ -236,7 +236,7 @@ class _Repeat:
         return int(min(np.floor(self.length / step + 1e-9), MOST_POINTS)) + 1
 
     def shares(self, n: int) -> Floats:
-        """Return the relative positions 0 … 1 (n,) of n copies along a repetition."""
+        """Return the relative positions 0 … 1 (n,) of the n copies of a repeated object."""
         if self.distance > 0 and self.length > 0:
             return np.arange(n, dtype=np.float64) * (self.distance / self.length)
         return np.linspace(0.0, 1.0, n)

@@ -16,7 +16,7 @@ def starts_of(counts: Ints) -> Ints:
 
 
 def ragged(counts: Ints) -> tuple[Ints, Ints]:
-    """Return, for each row of consecutive groups, the group index and the row's index in the group.
+    """Number the rows of consecutive groups: return each row's group, and its index in the group.
 
     >>> ragged(np.array([2, 0, 3]))
     (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))

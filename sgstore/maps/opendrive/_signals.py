@@ -362,7 +362,7 @@ def _stops(lanes: frozenset[int], place: tuple[int, float]) -> Stops:
 
 
 def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
-    """Return, for each signal, the lanes and positions of all references to it."""
+    """Return the lanes and positions that OpenDRIVE signal references name: signal id → lanes and positions."""
     kind = "road/signalReference"
     table = document[kind]
     s = document.rough_numbers(kind, "s")

@@ -206,7 +206,7 @@ def along_line(line: Floats, places: Floats) -> Floats:
 
 
 def _cuts(run: Floats, more: Sequence[Floats]) -> Floats:
-    """Return the lengths along a line where cross sections are placed."""
+    """Return the lengths along a lane's centre line at which cross sections are placed."""
     inner = np.concatenate([run[1:-1], *more])
     own = np.arange(len(inner)) < len(run) - 2
     inside = (inner > APART) & (inner < run[-1] - APART)

@@ -459,7 +459,7 @@ class _Pairs:
         return np.where(usable, ahead / np.where(usable, both, 1.0), self.beside()[0])
 
     def _ahead(self, right: int, left: int) -> tuple[Floats, Floats]:
-        """Return the distance of a footprint's centre from an end of the lane piece, and the width there."""
+        """Return the distance of a footprint's centre from one end of a lane piece, and the width there."""
         across_x, across_y = self.x[left] - self.x[right], self.y[left] - self.y[right]
         width = np.hypot(across_x, across_y)
         ahead = self.y[right] * across_x - self.x[right] * across_y

@@ -58,7 +58,7 @@ class MapPlaces:
         return len(self.part)
 
     def rows(self) -> Iterator[tuple[int, str, int, float, float]]:
-        """Yield map part (node id, kind), lane node id, start and end of each lane interval."""
+        """Yield each lane interval as (map node id, kind, lane node id, start, end)."""
         ids = ((-1 - self.part).tolist(), self.what, (-2 - self.lane).tolist())
         return zip(*ids, self.start.tolist(), self.end.tolist(), strict=True)
 

@@ -91,7 +91,7 @@ class Ribbons:
         return column[before] + share * (column[before + 1] - column[before])
 
     def height(self, lane: Ints, along: Floats) -> Floats:
-        """Return heights at given positions along lanes; m."""
+        """Return the road heights at given positions along lanes; m."""
         return self.between(lane, along, self.z)
 
     def at(self, lane: Ints, along: Floats) -> LanePoints:

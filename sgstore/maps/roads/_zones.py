@@ -171,7 +171,7 @@ def _related(count: int, pairs: tuple[Ints, Ints], traffic: Sequence[bool]) -> l
 
 
 def _groups(beside: Sequence[Sequence[int]]) -> list[int]:
-    """Return, for each lane, the index of the first lane in its group of neighbours."""
+    """Return the group number of each lane. Neighbouring lanes are in one group."""
     group = [-1] * len(beside)
     for first in range(len(beside)):
         queue = [first] if group[first] < 0 else []

@@ -69,7 +69,7 @@ class Encounter:
 
     @cached_property
     def together(self) -> tuple[Ints, Ints]:
-        """Row numbers of a and of b in the frames that have both objects."""
+        """Row numbers of objects a and b in the frames that contain both."""
         _, rows_a, rows_b = np.intersect1d(
             self.a.times, self.b.times, assume_unique=True, return_indices=True
         )

@@ -47,11 +47,11 @@ class RecordedMeasure:
 
     @property
     def meaning(self) -> str:
-        """Return the description and unit of the measure in one line."""
+        """Description and unit of the criticality measure in one line."""
         return f"{self.doc}; {self.unit}; of what was recorded: the same in each frame of a trace"
 
     def value(self, encounter: Encounter) -> float:
-        """Return the measure for two tracks; NaN means unknown or undefined."""
+        """Return the criticality measure for the tracks of two objects; NaN means unknown or undefined."""
         of = getattr(import_module("sgstore.model.criticality"), self.name)
         found = np.atleast_1d(of(encounter))
         if self.least:

@@ -46,7 +46,7 @@ class PairFunction:
 
     @property
     def meaning(self) -> str:
-        """Return the description of the measure in one line."""
+        """Description of the measure in one line."""
         return f"{self.doc}; {self.unit}" + (f"; {self.note}" if self.note else "")
 
 

@@ -57,7 +57,7 @@ def expression_of(name: str, without: Marks) -> str:
 
 @cache
 def parts_of(name: str, without: Marks = frozenset()) -> tuple[str, ...]:
-    """Return the names (measures, parts and columns) in the SQL expression of a measure."""
+    """Return the names of the inputs in a measure's SQL expression: columns and other measures."""
     return tuple(sorted({*NAME.findall(expression_of(name, without))}))
 
 

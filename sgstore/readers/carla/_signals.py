@@ -154,7 +154,9 @@ class _Near(NamedTuple):
 
 
 def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
-    """Assign traffic lights to map signals by position: row of the light → row of the signal.
+    """Assign traffic lights to map signals by position: row of the light → row of its signal.
+
+    The columns are ``x, y, z, heading``.
 
     The columns are ``x, y, z, heading``.
     """
@@ -515,7 +517,7 @@ _STATES: Final = ("red", "yellow", "green", "off", "unknown")
 
 
 def light_state(number: int) -> str:
-    """Return the name of a traffic light state from its number in CARLA."""
+    """Return the name of a traffic light state (such as ``red``) for CARLA's state number."""
     return _STATES[number] if 0 <= number < len(_STATES) else "unknown"
 
 

@@ -111,7 +111,7 @@ class EntityMapping:
             return math.nan
 
     def shown(self, box: Box) -> str:
-        """Return the state text of a traffic light from its mapped field; empty if it is missing."""
+        """Return the state of a traffic light, as a text from its mapped field; empty if missing."""
         return _text(self.light_state, box)
 
 

@@ -184,7 +184,7 @@ def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> 
 
 
 def _cut(content: Iterator[tuple[int, bytes]], offset: int, length: int) -> bytes:
-    """Return ``length`` bytes from ``offset`` on of a content given in pieces."""
+    """Return ``length`` bytes from ``offset`` on, from file content that arrives in pieces."""
     found = bytearray()
     position = 0
     for _, piece in content:
@@ -472,7 +472,7 @@ def _beginning(data: bytes) -> bytes:
 
 
 def _likeness(name: str, data: bytes) -> int:
-    """Return a score for an OSI message type: the number of plausible objects in the data; -1 if invalid.
+    """Return a score for a guessed OSI message type: the number of plausible objects; -1 if invalid.
 
     A ground truth decoded as a sensor view, or the other way round, is malformed or empty.
     """

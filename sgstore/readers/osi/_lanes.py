@@ -273,7 +273,7 @@ class OsiLanes:
         return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
 
     def _rows(self, lines: Sequence[LaneLine], plain: Sequence[PlainLane]) -> dict[int, list[int]]:
-        """Return the lane numbers in the road map for each OSI lane id."""
+        """Return the lanes of the road map made from each OSI lane: OSI lane id → row numbers."""
         row_of = {lane.name: row for row, lane in enumerate(plain)}
         rows: dict[int, list[int]] = {}
         for line in lines:
@@ -523,7 +523,9 @@ def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
 
 
 def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -> Floats:
-    """Return points (n, 3) of a line at given positions s along it.
+    """Return the points (n, 3) of a polyline at given lengths s along it.
+
+    ``side`` selects the value at a jump of the line.
 
     ``side`` selects the value at a jump of the line.
     """

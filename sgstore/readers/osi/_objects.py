@@ -399,7 +399,7 @@ def _whole(content: Bytes, start: int, stop: int) -> NDArray[np.uint64]:
 
 
 def code_of(thing: Any) -> int:
-    """Return a number that combines type and vehicle type of an OSI moving object."""
+    """Return a code number for an OSI moving object, from its type and vehicle type."""
     vehicle = getattr(getattr(thing, "vehicle_classification", None), "type", 0)
     told = (part if 0 <= part < TYPES else TYPES - 1 for part in (thing.type, vehicle))
     return next(told) * TYPES + next(told)
