@@ -1,4 +1,4 @@
-"""Exporters of clips and their graphs: one file per format, listed in :data:`EXPORTERS`.
+"""Exporters: clips and their scene graphs as files of other tools, one module per format.
 
 Each export is first written to a temporary folder, then moved completely or not at all, with a
 manifest. A format is a function from an :class:`Export` and a folder to the written files. Other

@@ -1,4 +1,4 @@
-"""Clips of an export, and their frames with labels."""
+"""Clips of an export from a store, with the frames of each clip."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ORDER BY frame_id
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """Description of an export: store, clips and options.
+    """Export from a store: the clips, the labels of their frames, and the options.
 
     Attributes
     ----------
@@ -82,11 +82,11 @@ class Export:
     progress: Callable[[int, int], None] | None = None
 
     def trace(self, name: str) -> StoredTrace:
-        """Return a trace of the store."""
+        """Return the trace of the store with a name."""
         return self.store.file.trace(name)
 
     def frames(self) -> Iterator[ClipFrames]:
-        """Yield the frames of each clip; a frame in several clips occurs several times.
+        """Yield the frames of each clip. A frame in several clips occurs several times.
 
         Raises
         ------
@@ -102,13 +102,13 @@ class Export:
             yield frames
 
     def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
-        """Yield the frames of the clips in windows of ``size``, and report the progress."""
+        """Yield the frames of all clips in groups of ``size`` frames, and report the progress."""
         for frames in self.frames():
             yield from frames.windows(size)
             self.tell(frames.number, len(self.clips))
 
     def fresh_windows(self) -> Iterator[ClipFrames]:
-        """Yield windows of frames, each frame only with its first clip."""
+        """Yield groups of frames in which a frame of several clips occurs only once, with its first clip."""
         for frames in self.windows():
             time = frames.log_time_ns
             slack = tolerance_ns(self.trace(frames.clip.trace).period_ns)
@@ -121,24 +121,24 @@ class Export:
                 yield frames.take(np.flatnonzero(~known))
 
     def tell(self, done: int, of: int) -> None:
-        """Report the progress."""
+        """Report the progress of the export to the caller."""
         if self.progress is not None:
             self.progress(done, of)
 
     def named_graphs(
         self, frames: ClipFrames, abstraction: str
     ) -> Iterator[tuple[dict[str, str], list[tuple[str, str, str]]]]:
-        """Yield nodes and edges of the graphs of frames by names, under an abstraction."""
+        """Yield the labelled graph of each frame in an abstraction: nodes by name, and edges as names."""
         found, _, graphs = self.store.file.abstracted.frames(abstraction, **frames.bounds)
         for row in np.searchsorted(found, frames.seq).tolist():
             yield graphs.named(row)
 
     def label_columns(self, frame_id: Ints) -> dict[str, list[Any]]:
-        """Return the labels of frames, by name."""
+        """Return the labels of some frames as columns, by label name."""
         return {} if self.labels is None else self.labels.of(frame_id)
 
     def label_cells(self, frame_id: Ints) -> Iterator[list[Any]]:
-        """Yield the labels of each frame as CSV cells."""
+        """Yield the labels of each frame as a list of CSV cells."""
         columns = self.label_columns(frame_id).values()
         for values in zip(*columns, strict=True) if columns else [()] * len(frame_id):
             yield [
@@ -146,7 +146,7 @@ class Export:
             ]
 
     def about(self) -> dict[str, Any]:
-        """Return the values of the manifest: clips, labels, and their sources."""
+        """Return the content of the manifest file: clips, labels, and their sources."""
         traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
         return {
             "clips": [
@@ -166,7 +166,7 @@ class Export:
 
 @dataclass(frozen=True, slots=True)
 class ClipFrames:
-    """Frames of a clip, ordered by number; shape (n,).
+    """Frames of a clip as columns (n,), ordered by frame number.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class ClipFrames:
 
     @classmethod
     def of(cls, export: Export, number: int, clip: Clip) -> ClipFrames:
-        """Return the frames of a clip's trace with log times in the clip."""
+        """Return the frames of a trace whose log times are within a clip."""
         trace = export.trace(clip.trace)
         trace_id, reach = trace.trace_id, clip.widened(tolerance_ns(trace.period_ns))
         found = export.store.file.arrays(
@@ -214,16 +214,16 @@ class ClipFrames:
         return len(self.frame_id)
 
     def take(self, rows: slice | Ints) -> ClipFrames:
-        """Return these frames, in their order."""
+        """Return the frames at some indices."""
         columns = ("frame_id", "seq", "time_ns", "log_time_ns", "t")
         return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
     def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
-        """Yield the frames in windows of ``size``."""
+        """Yield the frames of the clip in groups of ``size`` frames."""
         for start in range(0, len(self), size):
             yield self.take(slice(start, start + size))
 
     @property
     def bounds(self) -> dict[str, int]:
-        """Return the first and the last ``frame_id``, as values of ``$first`` and ``$last``."""
+        """Return the ids of the first and last frame as values of the SQL parameters ``$first``, ``$last``."""
         return {"first": int(self.frame_id[0]), "last": int(self.frame_id[-1])}

@@ -1,4 +1,4 @@
-"""Shared parts of the exporters: sources and names of clips, and atomic output folders.
+"""Shared parts of the exporters: file names, descriptions of written files, atomic output folders.
 
 An export is complete or absent. Its files are written to a temporary folder next to their place.
 When all are finished, they are moved there one after another, the manifest last: a folder without a
@@ -42,7 +42,7 @@ _LONGEST_NAME: Final = 80
 
 @dataclass(frozen=True, slots=True)
 class ChannelCount:
-    """Messages of a channel in a clip; ``id``, ``topic`` and ``schema`` are those of the source."""
+    """Number of messages of a channel in an exported clip, with the id, topic and schema of the source."""
 
     id: int
     topic: str
@@ -52,7 +52,7 @@ class ChannelCount:
 
 @dataclass(frozen=True, slots=True)
 class WrittenClip:
-    """Description of a written clip.
+    """Description of a written clip: file, trace, times, channels and lost messages.
 
     Attributes
     ----------
@@ -86,13 +86,13 @@ class WrittenClip:
     provenance: dict[str, str]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the clip as plain values for a manifest."""
+        """Return the description of a written clip as plain values for the manifest file."""
         values = asdict(self)
         values["file"] = self.file.name
         return values
 
     def as_row(self) -> dict[str, Any]:
-        """Return a row for the table of the command line."""
+        """Return the description of a written clip as a table row for the command line."""
         return {
             "clip": str(self.file),
             "trace": self.trace,
@@ -104,7 +104,7 @@ class WrittenClip:
 
 @dataclass(frozen=True, slots=True)
 class WrittenFile:
-    """Description of a written file or folder.
+    """Description of a written file or folder: content, count, hash and lost data.
 
     Attributes
     ----------
@@ -128,33 +128,33 @@ class WrittenFile:
 
     @classmethod
     def of(cls, file: Path, holds: str, count: int, losses: Sequence[Loss] = ()) -> WrittenFile:
-        """Describe an existing file or folder, with its hash."""
+        """Return the description of an existing file or folder, with its hash."""
         digest = digest_of(file) if file.is_file() else ""
         return cls(file, digest, holds, count, tuple(losses))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the file as plain values for a manifest."""
+        """Return the description of a written file as plain values for the manifest file."""
         return asdict(self) | {"file": self.file.name}
 
     def as_row(self) -> dict[str, Any]:
-        """Return a row for the table of the command line."""
+        """Return the description of a written file as a table row for the command line."""
         return {"file": str(self.file), "holds": self.holds, "count": self.count}
 
 
 def provenance_of(told: dict[str, str]) -> dict[str, str]:
-    """Return the origin of an export: the caller's values, the hash of its query, the tool version."""
+    """Return the origin of an export: values of the caller, the hash of its query, and the version."""
     query = told.get("query", "")
     digest = {"query_sha256": hashlib.sha256(query.encode()).hexdigest()} if query else {}
     return {**told, **digest, "tool": tool()}
 
 
 def tool() -> str:
-    """Return name and version of this package."""
+    """Return the name and version of this package as a text."""
     return f"sgstore {version('sgstore')}"
 
 
 def clip_name(trace: str, number: int, ending: str) -> str:
-    """Return a portable file name for a clip: ``swarm_Town04_003.mcap``.
+    """Return a file name for a clip, valid on all systems, such as ``swarm_Town04_003.mcap``.
 
     Invalid characters become ``_``; the number, unique in an export, prevents collisions.
     """
@@ -162,7 +162,7 @@ def clip_name(trace: str, number: int, ending: str) -> str:
 
 
 def safe_name(text: str, otherwise: str) -> str:
-    """Return a portable name of a file or folder, without separators, leading dots and reserved names.
+    """Return a file or folder name without separators, leading dots and reserved names.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def safe_name(text: str, otherwise: str) -> str:
 
 
 def check_folder(to: Path) -> None:
-    """Reject a folder that cannot take an export, before the search starts.
+    """Raise an error if an export cannot be written into a folder. This is checked before the search.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def check_folder(to: Path) -> None:
 
 @contextmanager
 def export_folder(to: Path) -> Generator[Path]:
-    """Yield a temporary folder for the files of an export; move them to ``to`` on success.
+    """Yield a temporary folder for the files of an export. On success, the files are moved to ``to``.
 
     Parameters
     ----------
@@ -236,13 +236,13 @@ def export_folder(to: Path) -> Generator[Path]:
 
 
 def _mark(thing: Path) -> list[int]:
-    """Return the identity of a file or folder, which a move preserves."""
+    """Return numbers that identify a file or folder, also after a move."""
     about = thing.lstat()
     return [about.st_dev, about.st_ino]
 
 
 def _undo(left: Path) -> None:
-    """Remove the partly moved files of a killed export."""
+    """Remove the files that a killed export has already moved to its target folder."""
     try:
         marks = json.loads((left / _MOVING).read_text(encoding="utf-8"))
     except (OSError, ValueError):  # the move had not begun
@@ -264,7 +264,7 @@ def _is_the(thing: Path, mark: list[int]) -> bool:
 
 
 def _is_kept_free(target: Path, thing: Path) -> bool:
-    """True for a placeholder whose file has not been moved yet."""
+    """True if a target file is still the empty placeholder of a file that has not been moved."""
     if target.is_symlink() or not (target.exists() and thing.exists()):
         return False
     return not any(target.iterdir()) if target.is_dir() else not target.stat().st_size
@@ -286,14 +286,14 @@ def _refuse_taken(to: Path, names: Sequence[str]) -> None:
 
 
 def write_manifest(folder: Path, form: str, content: Mapping[str, Any]) -> None:
-    """Write the manifest of an export; equal content gives equal bytes."""
+    """Write the manifest file of an export. Equal content gives equal bytes."""
     told = {"format": form, "tool": tool(), **content}
     text = json.dumps(told, indent=2, sort_keys=True, ensure_ascii=False)
     (folder / MANIFEST).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def _move(things: Sequence[Path], to: Path) -> None:
-    """Move files and folders to a folder, all or none, without overwriting."""
+    """Move files and folders into a folder, all or none, and overwrite nothing."""
     moved: list[Path] = []
     try:
         for thing in things:

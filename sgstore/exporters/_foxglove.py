@@ -1,4 +1,4 @@
-"""Conversion of sensor data and scene graphs to Foxglove messages.
+"""Conversion of sensor data and scene graphs to Foxglove messages (Protobuf).
 
 Foxglove, Lichtblick and the reader of this package display them. Pictures are PNG; other
 measurements than pictures and points are JSON. In a scene graph, entities are boxes with names, map
@@ -89,13 +89,13 @@ SCENE, TRANSFORMS = "SceneUpdate", "FrameTransforms"
 
 
 def schema(name: str) -> bytes:
-    """Return the descriptors of a message and its dependencies, as in MCAP files."""
+    """Return the Protobuf descriptors of a Foxglove message type as bytes, for an MCAP file."""
     return _descriptors(name).SerializeToString()
 
 
 @cache
 def _descriptors(name: str) -> descriptor_pb2.FileDescriptorSet:
-    """Return descriptors of a message, its nested messages, and Google's files for them."""
+    """Return the Protobuf descriptors of a Foxglove message type, and of all types that it uses."""
     kinds = {one: set(re.findall(r":(\w+)", fields)) for one, fields in _TYPES.items()}
     needed, found = set[str](), {name}
     while found:
@@ -119,7 +119,7 @@ def _descriptors(name: str) -> descriptor_pb2.FileDescriptorSet:
 
 
 def _add_message(message: descriptor_pb2.DescriptorProto) -> None:
-    """Add the fields and enumerations of a message, by its name."""
+    """Add the fields and enumerations of a Foxglove message type to its Protobuf descriptor."""
     google = dict.fromkeys(_GOOGLE, "google.protobuf")
     add_fields(message, _TYPES[message.name], _ENUMS, "foxglove", google)
     for name_of, words in _ENUMS.items():
@@ -132,7 +132,7 @@ def _add_message(message: descriptor_pb2.DescriptorProto) -> None:
 
 @cache
 def message_type(name: str) -> type[Any]:
-    """Return the class of a message."""
+    """Return the Python class of a Foxglove message type."""
     pool = descriptor_pool.DescriptorPool()
     for file in _descriptors(name).file:
         pool.Add(file)
@@ -140,14 +140,14 @@ def message_type(name: str) -> type[Any]:
 
 
 def image(pixels: NDArray[np.uint8], time_ns: int, frame_id: str) -> bytes:
-    """Convert a picture (height, width, 3) to ``foxglove.CompressedImage``."""
+    """Return a picture (height, width, 3) as a ``foxglove.CompressedImage`` message."""
     out = message_type(IMAGE)(format="png", frame_id=frame_id, data=png(pixels))
     stamp(out, time_ns)
     return out.SerializeToString()
 
 
 def calibration(width: int, height: int, fov: float, time_ns: int, frame_id: str) -> bytes:
-    """Return a pinhole camera without distortion, from its horizontal field of view in degrees."""
+    """Return a camera calibration message for a pinhole camera, from its field of view in degrees."""
     focal = width / (2 * math.tan(math.radians(fov) / 2))
     x, y = width / 2, height / 2
     out = message_type(CALIBRATION)(
@@ -161,7 +161,7 @@ def calibration(width: int, height: int, fov: float, time_ns: int, frame_id: str
 
 
 def cloud(points: NDArray[Any], time_ns: int, frame_id: str) -> bytes:
-    """Convert points (a structured array) to ``foxglove.PointCloud`` in the sensor's axes."""
+    """Return points (a structured array) as a ``foxglove.PointCloud`` message, in the axes of the sensor."""
     out = message_type(CLOUD)(frame_id=frame_id, data=points.tobytes())
     out.point_stride = points.dtype.itemsize
     out.pose.orientation.w = 1.0
@@ -172,13 +172,13 @@ def cloud(points: NDArray[Any], time_ns: int, frame_id: str) -> bytes:
 
 
 def values(told: dict[str, Any], time_ns: int) -> bytes:
-    """Return values by name as JSON with a timestamp."""
+    """Return named values as a JSON message with a timestamp."""
     about = {"timestamp": {"sec": time_ns // 10**9, "nsec": time_ns % 10**9}} | told
     return json.dumps(finite(about), allow_nan=False).encode()
 
 
 def stamp(message: Any, time_ns: int) -> None:
-    """Set the field ``timestamp`` of a message."""
+    """Set the field ``timestamp`` of a Foxglove message from a time in ns."""
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
 
 
@@ -231,7 +231,7 @@ TEXT: Final = 12.0
 
 
 def message(graph: SceneGraph, log_time_ns: int) -> bytes:
-    """Convert a scene graph to a message, without nodes that have no place and without their edges."""
+    """Return a scene graph as a Foxglove 3D scene message. Nodes without a position are left out."""
     update = message_type(SCENE)()
     gone = update.deletions.add(type=_ALL)
     stamp(gone, log_time_ns)
@@ -289,12 +289,12 @@ def _add_node(
 
 
 def is_solid(node: int, about: Mapping[str, Any]) -> bool:
-    """True if a node is an entity with a known box."""
+    """True if a node is an entity with a known size."""
     return node >= 0 and all(about.get(side) for side in ("length", "width", "height"))
 
 
 def colour_of(about: Mapping[str, Any]) -> Colour:
-    """Return the colour of a node, by its kind and light state."""
+    """Return the colour of a node in a 3D scene, by its kind and light state."""
     if about.get("is_ego"):
         return EGO_COLOUR
     return LIGHTS.get(about.get("light_state", ""), COLOURS.get(about["kind"], OTHERS))
@@ -302,7 +302,7 @@ def colour_of(about: Mapping[str, Any]) -> Colour:
 
 @dataclass(frozen=True, slots=True)
 class AxesTransform:
-    """Pose of axes relative to parent axes.
+    """Position and rotation of coordinate axes relative to their parent axes.
 
     Attributes
     ----------
@@ -321,7 +321,7 @@ class AxesTransform:
 
 
 def transforms(told: Iterable[AxesTransform], log_time_ns: int) -> bytes:
-    """Convert poses of axes at a time to ``foxglove.FrameTransforms``."""
+    """Return positions and rotations of axes at a time as a ``foxglove.FrameTransforms`` message."""
     out = message_type(TRANSFORMS)()
     for one in told:
         found = out.transforms.add(parent_frame_id=one.parent, child_frame_id=one.child)
@@ -332,7 +332,7 @@ def transforms(told: Iterable[AxesTransform], log_time_ns: int) -> bytes:
 
 
 def turn_of(about: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Return heading, pitch and roll of a node; rad. Unknown angles are 0."""
+    """Return heading, pitch and roll of a node in radians. Unknown angles are 0."""
     heading, pitch, roll = (
         math.radians(about.get(angle, 0.0)) for angle in ("heading", "pitch", "roll")
     )
@@ -340,7 +340,7 @@ def turn_of(about: Mapping[str, Any]) -> tuple[float, float, float]:
 
 
 def quaternion(yaw: float, pitch: float, roll: float) -> tuple[float, float, float, float]:
-    """Return the quaternion x, y, z, w of turns about z, the new y, and the new x; rad."""
+    """Return the quaternion (x, y, z, w) of the rotations yaw, pitch and roll, given in radians."""
     cy, cp, cr = (math.cos(angle / 2) for angle in (yaw, pitch, roll))
     sy, sp, sr = (math.sin(angle / 2) for angle in (yaw, pitch, roll))
     return (
@@ -356,7 +356,7 @@ def _turn(orientation: Any, turn: tuple[float, float, float, float]) -> None:
 
 
 def place_of(about: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    """Return the position of a node; m. ``None`` means unknown."""
+    """Return the position (x, y, z) of a node in metres. ``None`` means an unknown position."""
     if "x" not in about or "y" not in about:
         return None
     return about["x"], about["y"], about.get("z", 0.0)

@@ -1,4 +1,4 @@
-"""Export of sensor messages as files: pictures, point clouds, videos.
+"""Export format ``frames``: sensor messages as files (pictures, point clouds, videos), with tables.
 
 Each clip has a folder with one subfolder per sensor: ``CLIP/SENSOR/000123.jpg`` is the message of
 frame 123 (the first such frame: several frames can share a message). Picture files are copied; raw
@@ -64,7 +64,7 @@ Place = tuple[int, int]
 
 @dataclass(slots=True)
 class _FrameMessage:
-    """Reference to a recorded message of a frame."""
+    """Reference to a recorded sensor message that belongs to a frame."""
 
     frame_id: int
     seq: int
@@ -81,7 +81,7 @@ Found = dict[tuple[str, Place], File | None]
 
 @dataclass(slots=True)
 class _Film:
-    """File of a video, the place of its latest picture in the recording, and the picture count."""
+    """Video file under construction, with the number of its pictures and the place of the last one."""
 
     path: Path
     form: str
@@ -89,14 +89,14 @@ class _Film:
     count: int
 
     def as_file(self) -> File:
-        """Return the table columns of the latest picture."""
+        """Return the last picture of the video as values for the table of files."""
         name = f"{self.path.parent.name}/{self.path.name}"
         return name, "video", self.form, str(self.count - 1), ""
 
 
 @dataclass(slots=True)
 class _Count:
-    """Counts of the messages of a channel."""
+    """Numbers of written and lost messages of a channel."""
 
     schema: str
     holds: str = ""
@@ -107,7 +107,7 @@ class _Count:
 
 @dataclass(slots=True)
 class _Tables:
-    """Tables of an export, and counts."""
+    """Tables that an export writes with the sensor files, and counts of the messages."""
 
     files: Any
     frames: Any
@@ -119,7 +119,7 @@ class _Tables:
     frame_rows: int = 0
 
     def losses(self) -> list[Loss]:
-        """Return the losses of each channel: the first reason, and their number."""
+        """Return the lost messages of each channel: their number, and the first reason."""
         return [
             Loss(
                 f"{trace}, {topic!r}: {count} messages are not there; the first: {reason}", count, 0
@@ -129,7 +129,7 @@ class _Tables:
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write files and tables; pictures are checked with Pillow if it is installed."""
+    """Write the sensor messages of the clips as files, with tables. Pictures are checked if possible."""
     _check_channels(export)
     names = list(export.labels.texts) if export.labels is not None else []
     places: list[Path] = []
@@ -178,7 +178,7 @@ def _check_channels(export: Export) -> None:
 
 @contextmanager
 def _recording(export: Export, frames: ClipFrames) -> Generator[tuple[StoredTrace, Recording]]:
-    """Open the recording of a clip; reject a file that has changed since ingest."""
+    """Open the recording of a clip, or raise an error if the file has changed since ingest."""
     trace = export.trace(frames.clip.trace)
     with open_recording(trace.path) as recording:
         if (recording.size, recording.mtime_ns) != (trace.size, trace.mtime_ns):
@@ -213,7 +213,7 @@ def _write_channels(file: Path, tables: _Tables) -> None:
 
 @dataclass(slots=True)
 class _Writing:
-    """Writer of one clip into its folder."""
+    """Writer of the sensor messages of one clip into a folder."""
 
     export: Export
     trace: StoredTrace
@@ -228,7 +228,7 @@ class _Writing:
     _films: dict[str, _Film] = field(default_factory=dict[str, _Film])
 
     def write(self) -> None:
-        """Write the files of all frames, some frames at a time."""
+        """Write the files of all frames of the clip, in groups of frames."""
         before: Found = {}
         for start in range(0, len(self.frames), WINDOW):
             rows = list(self._rows(self.frames.take(slice(start, start + WINDOW))))
@@ -259,7 +259,10 @@ class _Writing:
         wanted: dict[tuple[str, Place], _FrameMessage],
         found: Found,
     ) -> None:
-        """Write the messages at these places to files; ``None`` means neither picture nor cloud."""
+        """Write the messages at the given places of the recording to files.
+
+        ``None`` means that a message is neither a picture nor a point cloud.
+        """
         chunks = {place[0] for _, place in wanted}
         if not chunks:
             return
@@ -290,7 +293,7 @@ class _Writing:
         found: Found,
         ends: dict[str, Place],
     ) -> None:
-        """Write a message if it is wanted, or if a video needs it for a later picture."""
+        """Write a message to a file if a frame needs it, or if a video needs it for a later picture."""
         channel = self.recording.channels.get(int(run.channel[at]))
         if channel is None:
             return
@@ -349,7 +352,7 @@ class _Writing:
         return f"{self.folder.name}/{name}", holds, form, "", digest
 
     def _begin(self, row: _FrameMessage, video: Sensed) -> File | None:
-        """Start a video file with the key frame before a picture, and all pictures between."""
+        """Start a video file with the last key frame before a picture, and all pictures up to it."""
         try:
             carried = self.export.store.file.carried(row.frame_id, row.channel)
         except (TraceError, StoreError) as error:
@@ -370,7 +373,7 @@ class _Writing:
         return film.as_file()
 
     def _tell(self, row: _FrameMessage, file: File | None) -> None:
-        """Write a row of the table of files."""
+        """Write a row into the table of files."""
         count = self._count(row)
         count.frames += 1
         if file is None:
@@ -401,7 +404,7 @@ class _Writing:
         self.tables.lost[key] = first, count + 1
 
     def _name(self, topic: str) -> str:
-        """Return a unique, portable folder name for a sensor."""
+        """Return a unique folder name for a sensor, valid on all systems."""
         if topic not in self._names:
             name, number = safe_name(topic, "sensor"), 1
             taken = {other.lower() for other in self._names.values()}
@@ -412,7 +415,7 @@ class _Writing:
 
 
 def _test_picture(path: Path, data: bytes) -> None:
-    """Open a written picture with Pillow, if it is installed.
+    """Raise an error if a written picture cannot be opened. Without Pillow, nothing is tested.
 
     Raises
     ------

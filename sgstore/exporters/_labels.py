@@ -1,4 +1,4 @@
-"""Clips of a store for an export, and labels of their frames by queries.
+"""Labels of exported frames: values of queries or expressions.
 
 A label from a query is a named value for each frame.
 
@@ -43,7 +43,7 @@ TAKEN: Final = frozenset(
 
 
 def parse_labels(pairs: Iterable[str]) -> dict[str, str]:
-    """Parse texts ``NAME=TEXT`` into names and texts.
+    """Return label expressions by name, from texts ``NAME=TEXT``.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def parse_labels(pairs: Iterable[str]) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """Labels of frames.
+    """Labels of exported frames: a value per frame and label name.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class Labels:
         frame_id: Ints,
         **parameters: object,
     ) -> Labels:
-        """Evaluate labels for some frames of a store.
+        """Return the labels of some frames, computed by queries on the store.
 
         Parameters
         ----------
@@ -118,7 +118,7 @@ class Labels:
         return cls(texts, wanted, values)
 
     def of(self, frame_id: Ints) -> dict[str, list[Any]]:
-        """Return the labels of these frames by name; all must have been evaluated."""
+        """Return the labels of some frames as columns by name. They must be computed before."""
         rows = np.searchsorted(self.frame_id, frame_id)
         return {name: values[rows].tolist() for name, values in self.values.items()}
 
@@ -154,7 +154,7 @@ def _over_matches(
     matches: AnyMatches,
     wanted: Ints,
 ) -> np.ndarray[Any, np.dtype[np.object_]]:
-    """Return the value of each match in its frames; unknown in the others."""
+    """Return a label column: the value of a match in all its frames. Other frames have no value."""
     values = np.full(len(wanted), None, object)
     taken = np.zeros(len(wanted), np.bool_)
     traces = _trace_ids(store)
@@ -174,7 +174,7 @@ def _over_matches(
 def _answers(
     store: Store | Collection, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
-    """Yield rows of frames and values of an expression: frames with an ego, then the others."""
+    """Yield indices of frames with the values of an expression there: frames with an ego, then others."""
     value = f"{text}) AS label"
     try:
         matches = store.find(_OF_EGO + value, **parameters)
@@ -199,7 +199,7 @@ _OF_ANYTHING: Final = f"MATCH (anything) {_RETURNED}"
 
 
 def _of_expression(error: QueryError, text: str) -> QueryError:
-    """Convert an error of the internal query to one that points into the user's expression."""
+    """Return an error of the internal query as an error that points into the user's expression."""
     if error.span is None:
         return QueryError(error.reason, text=text, hint=error.hint)
     before, end = len(_OF_EGO), len(text)
@@ -211,7 +211,7 @@ def _of_expression(error: QueryError, text: str) -> QueryError:
 def _columns(
     matches: AnyMatches, wanted: Ints
 ) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
-    """Return rows of the wanted frames, and their values."""
+    """Return the indices of the wanted frames that match a query, and the values of the matches."""
     found = matches.numpy()
     of, row = _rows(wanted, found["frame_of_label"].astype(np.int64))
     values = found["label"].astype(object)
@@ -220,7 +220,7 @@ def _columns(
 
 
 def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
-    """Return the positions of wanted frames in ``frame_id``, and their rows in ``wanted``."""
+    """Return the positions of the wanted frames in an array of frame ids, and their wanted indices."""
     row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
     of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
     return of, row[of]

@@ -1,4 +1,4 @@
-"""Clips as MCAP files: the recorded messages of an interval, and their context.
+"""Export format ``mcap``: the recorded messages of each clip, with the messages needed for its context.
 
 A clip has the schemas, channels, metadata and attachments of its source, and its messages with
 their bytes, times and sequence numbers; ids of schemas and channels are renumbered. Messages that
@@ -67,7 +67,7 @@ _DAMAGED: Final = "an attachment has another checksum than it says"
 
 
 def write(export: Export, folder: Path) -> list[WrittenClip]:
-    """Cut the clips of an export from their recordings, recording by recording.
+    """Write each clip of an export as an MCAP file, cut from its recording.
 
     With ``with_graph`` or labels, every clip has additional channels: see
     :mod:`sgstore.exporters._mcap_graphs`. With graphs there is also a viewer layout.
@@ -104,7 +104,7 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
 
 @contextmanager
 def _near(path: Path) -> Generator[None]:
-    """Use a local copy of a remote recording in the ``with`` block, because it is read several times."""
+    """Context manager with a local copy of a remote recording, because it is read several times."""
     with working_folder("recording") as held, near(path, held):
         yield
 
@@ -148,7 +148,7 @@ def _survey(recording: RecordingFile, trace: StoredTrace, context: MessageRefs) 
 def _context_of(
     refs: MessageRefs, reach: Clip
 ) -> tuple[dict[int, list[int]], set[tuple[int, int]]]:
-    """Find the context messages of a clip outside its interval.
+    """Return the messages outside a clip that its frames need, such as the road map.
 
     Context from before the start is included. If the context of a channel begins only after the
     end, as for a map that is recorded last, its first message is included, unless the clip has
@@ -175,7 +175,7 @@ def _context_of(
 
 
 class _Cutting:
-    """Writer of one clip into a file.
+    """Writer of one clip as an MCAP file.
 
     The official writer numbers schemas and channels from 1 in order of registration. ``_numbers``
     maps the numbers of the source to them.
@@ -209,7 +209,7 @@ class _Cutting:
         self._carried = 0
 
     def write(self, file: Path, number: int) -> WrittenClip:
-        """Write the clip, verify it, and return its description; ``number`` counts from 1."""
+        """Write the clip to a file, verify the file, and return its description."""
         clip, source, recording = self._clip, self._source, self._recording
         losses = [
             loss
@@ -254,13 +254,13 @@ class _Cutting:
         )
 
     def _own_channels(self) -> Iterator[tuple[int, str, str]]:
-        """Yield number, topic and schema of each channel of the source."""
+        """Yield the number, topic and schema name of each channel of the recording."""
         for number, channel in self._kept.items():
             schema = self._recording.schemas.get(channel.schema_id)
             yield number, channel.topic, schema.name if schema else ""
 
     def _write_head(self, reach: Clip) -> list[Loss]:
-        """Write definitions, metadata and attachments of the source, and the clip record.
+        """Write the schemas, channels, metadata and attachments of the recording; return lost parts.
 
         ``reach`` is the interval with a time tolerance at its ends, as readers of the clip need it.
         """
@@ -292,7 +292,7 @@ class _Cutting:
         return losses
 
     def _define(self, record: Schema | Channel) -> None:
-        """Register a schema, or a channel with a registered schema."""
+        """Write the definition of a schema or a channel into the MCAP file."""
         if isinstance(record, Schema):
             number = self._writer.register_schema(record.name, record.encoding, record.data)
             self._schemas[record.id] = number
@@ -304,7 +304,7 @@ class _Cutting:
         self._counts[record.id] = 0
 
     def _write_attachment(self, pieces: Iterable[memoryview]) -> str:
-        """Write an attachment of the source from the pieces of its record.
+        """Copy an attachment of the recording, given in pieces; return its defect, or an empty text.
 
         Returns
         -------
@@ -331,7 +331,7 @@ class _Cutting:
         return _DAMAGED if damaged else ""
 
     def _write_messages(self, reach: Clip, number: int) -> None:
-        """Write the messages of the clip and the added messages, merged by log time."""
+        """Write the recorded messages of the clip, and the added messages, in order of log time."""
         added = () if self._added is None else self._added.messages(number)
         every = heapq.merge(self._messages(reach), added, key=lambda message: message[2])
         for channel, sequence, log_time, publish_time, data in every:
@@ -340,7 +340,7 @@ class _Cutting:
             self._counts[channel] += 1
 
     def _messages(self, reach: Clip) -> Iterator[ClipMessage]:
-        """Yield the messages of the clip in order of time; count the context messages.
+        """Yield the recorded messages of the clip in order of time; context messages are also counted.
 
         A source without log times keeps the order of its file: while its clock runs backwards, log
         times stay constant.
@@ -373,7 +373,7 @@ class _Cutting:
 
 
 def _among(run: Messages, places: dict[int, list[int]]) -> NDArray[np.bool_]:
-    """Return a mask of the messages at these places: offsets by chunk."""
+    """Return a mask of the messages that are at given places of a recording (offsets by chunk)."""
     chunks, found = run.chunks, np.zeros(len(run), np.bool_)
     for chunk in np.unique(chunks).tolist():
         found |= (chunks == chunk) & np.isin(run.offset, places.get(chunk, ()))
@@ -381,7 +381,7 @@ def _among(run: Messages, places: dict[int, list[int]]) -> NDArray[np.bool_]:
 
 
 def _validate(file: Path, expected: Counter[int]) -> None:
-    """Read a clip with the official reader, in order and by its indexes.
+    """Read a written clip with the official MCAP reader, or raise an error for a wrong message count.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Additional channels of exported clips: scene graphs, frame labels; and a viewer layout.
+"""Channels that an MCAP export adds to clips: scene graphs, frame labels, transforms; and a viewer layout.
 
 Channels, each with one message a frame, at the frame's log time:
 
@@ -107,12 +107,12 @@ ClipMessage = tuple[int, int, int, int, bytes | memoryview]
 
 
 def is_added(channel: Channel) -> bool:
-    """True for a channel that an export has added to the recording."""
+    """True if an earlier export has added a channel to the recording."""
     return all(channel.metadata.get(key) == value for key, value in DERIVED.items())
 
 
 class Added:
-    """Additional channels of exported clips.
+    """Channels with scene graphs and labels that an export adds to MCAP clips.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class Added:
     def definitions(
         self, schemas: Mapping[int, Schema], channels: Mapping[int, Channel]
     ) -> Iterator[Schema | Channel]:
-        """Yield schemas and channels for the next clip of a recording, with free numbers.
+        """Yield the schemas and channels to add to a clip, with numbers that the recording does not use.
 
         Raises
         ------
@@ -158,11 +158,11 @@ class Added:
             yield Channel(channel + i, topic, encoding, dict(DERIVED), schema + i)
 
     def channels(self) -> list[tuple[int, str, str]]:
-        """Return number, topic and schema of each channel, as last defined."""
+        """Return the number, topic and schema name of each added channel."""
         return [(i, topic, name) for i, (topic, name, *_) in enumerate(self._kinds, self._first)]
 
     def messages(self, number: int) -> Iterator[ClipMessage]:
-        """Yield the messages of the frames of a clip, by its number, in order of log time."""
+        """Yield the messages to add for the frames of a clip, in order of log time."""
         frames = ClipFrames.of(self._export, number, self._export.clips[number - 1])
         order = frames.log_time_ns.argsort(kind="stable")
         sequence = 0

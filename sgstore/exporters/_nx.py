@@ -1,4 +1,4 @@
-"""Export for networkx: node-link JSON, one graph per line, and optionally GraphML, one file per frame.
+"""Export formats for networkx: node-link JSON with one graph per line, and GraphML files.
 
 Each clip has a file ``CLIP.jsonl`` for ``networkx.node_link_graph(json.loads(line),
 edges="edges")``; with ``graphml`` also a folder ``CLIP`` with ``000123.graphml``, one per frame, by
@@ -37,14 +37,14 @@ if TYPE_CHECKING:
 
 
 def graphs_of(export: Export, frames: ClipFrames) -> Iterator[SceneGraph]:
-    """Yield the scene graphs of frames of a clip, edges ordered by source, relation and destination."""
+    """Yield the scene graph of each frame of a clip, with sorted edges."""
     for graph in export.store.file.graphs(frames.frame_id):
         edges = sorted(graph.edges, key=lambda edge: (edge[0], RELATION_CODE[edge[1]], edge[2]))
         yield replace(graph, edges=edges)
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write the graphs of all frames, and read each again with networkx."""
+    """Write the scene graphs of all frames, and verify each by reading it with networkx."""
     abstraction = export.abstraction
     if abstraction and not _is_derived(export):
         abstraction = abstraction_named(abstraction).name
@@ -67,7 +67,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _is_derived(export: Export) -> bool:
-    """True if the abstraction is a derived set of relations, and not shadowed by an abstraction."""
+    """True if a name means a derived set of relations, not an abstraction of graphs."""
     derived = {normalize_name(one.name) for one in export.store.file.deriving.sets()}
     name = normalize_name(export.abstraction)
     return name in derived and name not in abstractions()
@@ -104,7 +104,7 @@ def _of_window(export: Export, frames: ClipFrames, abstraction: str) -> Iterator
 
 
 def _line(graph: Graph) -> str:
-    """Return a graph as a line of node-link JSON, verified by reading it back."""
+    """Return a graph as one line of node-link JSON, verified by reading the line again."""
     for _, about in graph.nodes(data=True):
         _drop_unknown(about)
     for *_, about in graph.edges(data=True):
@@ -124,7 +124,7 @@ def _drop_unknown(about: dict[str, Any]) -> None:
 
 
 def _write_graphml(graph: Graph, file: Path) -> None:
-    """Write a graph as GraphML, and verify nodes, edges and relations by reading it back."""
+    """Write a graph as a GraphML file, and verify its nodes and edges by reading the file again."""
     drawn: Graph = nx.MultiDiGraph(**_drawable(graph.graph))
     for node, about in graph.nodes(data=True):
         drawn.add_node(node, **_drawable(about))
@@ -141,7 +141,7 @@ def _write_graphml(graph: Graph, file: Path) -> None:
 
 
 def _drawable(about: dict[str, Any]) -> dict[str, Any]:
-    """Convert attributes for GraphML: numbers, truth values, and texts for all others."""
+    """Return attributes for GraphML: numbers and truth values stay, other values become texts."""
     return {
         name: value if isinstance(value, (bool, int, float)) else _readable(str(value))
         for name, value in about.items()

@@ -1,4 +1,4 @@
-"""Clips as ASAM OpenLABEL 1.0.0: objects, their frames and boxes, and relations among them.
+"""Export format ASAM OpenLABEL 1.0.0: objects with their frames and boxes, and relations between them.
 
 An object is an entity, named by the simulator's id. Boxes are in the frames; boxes of static
 entities are at the object. Frames have the numbers of the trace. A relation between two entities is
@@ -66,7 +66,7 @@ _SECTIONS: Final = {"action": "actions", "event": "events", "context": "contexts
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write a file for each clip, and read it again."""
+    """Write an OpenLABEL file for each clip, and verify it by reading it again."""
     written: list[WrittenFile] = []
     for frames in export.frames():
         file = folder / clip_name(frames.clip.trace, frames.number, ".openlabel.json")
@@ -80,25 +80,25 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 class _Spans:
-    """Set of frames as intervals, added in the order of time."""
+    """Set of frames, stored as intervals of consecutive frames."""
 
     def __init__(self) -> None:
         self.spans: list[list[int]] = []
 
     def add(self, place: int) -> None:
-        """Add a frame by its place in the clip."""
+        """Add a frame, given as its index in the clip. Frames must be added in order."""
         if self.spans and self.spans[-1][1] >= place - 1:
             self.spans[-1][1] = place
         else:
             self.spans.append([place, place])
 
     def told(self, numbers: list[int]) -> list[dict[str, int]]:
-        """Return the intervals in frame numbers."""
+        """Return the intervals of frames as first and last frame numbers."""
         return [{"frame_start": numbers[a], "frame_end": numbers[b]} for a, b in self.spans]
 
 
 class _Labelling:
-    """Writer of one clip into a file.
+    """Writer of one clip as an OpenLABEL file.
 
     Parameters
     ----------
@@ -125,14 +125,14 @@ class _Labelling:
         self._numbers = self._numbered()
 
     def _known(self) -> list[dict[str, Any]]:
-        """Return the constant attributes of the entities of the trace."""
+        """Return the attributes of the trace's entities that never change, such as size."""
         rows = self._export.store.file.rows(_OBJECTS, {"trace": self._trace.trace_id})
         found = [dict(zip(rows.columns, row, strict=True)) for row in rows]
         self._kinds = {entity["node_id"]: entity["kind"] for entity in found}
         return found
 
     def _numbered(self) -> list[int]:
-        """Return the numbers of the frames."""
+        """Return the numbers of the frames in the OpenLABEL file."""
         numbers: list[int] = self._frames.seq.tolist()
         if not self._again or not numbers:
             return numbers
@@ -141,7 +141,7 @@ class _Labelling:
         return [int(one) for one in told] if all(one.isdecimal() for one in told) else numbers
 
     def write(self, stream: TextIO) -> None:
-        """Write the frames in reading order, then the objects and relations."""
+        """Write the frames of the clip in order, then the objects and relations."""
         stream.write('{"openlabel": {\n"metadata": ')
         stream.write(_json(self._metadata()))
         axes = {AXES: {"type": "scene_cs", "parent": "", "children": []}}
@@ -180,7 +180,7 @@ class _Labelling:
         return told | trace.report.get("metadata", {}) if self._again else told
 
     def _window(self, frames: ClipFrames) -> Iterable[tuple[int, dict[str, Any]]]:
-        """Yield frame numbers with their content."""
+        """Yield the number of each frame, with its objects and relations as OpenLABEL data."""
         place = {int(one): i for i, one in enumerate(self._frames.frame_id.tolist())}
         ids: list[int] = frames.frame_id.tolist()
         own = self._own(frames)
@@ -217,7 +217,7 @@ class _Labelling:
             yield number, {"frame_properties": properties, **within[frame_id]}
 
     def _own(self, frames: ClipFrames) -> dict[tuple[int, int], dict[str, Any]]:
-        """Return attributes without a column, by frame and node; register keys of elements."""
+        """Return the imported attributes without a column in the store, by frame and node."""
         found: dict[tuple[int, int], dict[str, Any]] = {}
         if not self._trace.report.get("imported"):
             return found
@@ -230,7 +230,7 @@ class _Labelling:
         return found
 
     def _elements(self) -> dict[str, dict[str, Any]]:
-        """Return objects and other elements, if any."""
+        """Return all objects and other elements (actions, events, contexts) of the clip as OpenLABEL data."""
         found: dict[str, dict[str, Any]] = {"objects": {}}
         for entity in self._entities:
             node, kind = entity["node_id"], entity["kind"]
@@ -294,7 +294,10 @@ class _Labelling:
 
 
 def _data(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Return box, speed and light state; only the position without a known box."""
+    """Return the box, speed and light state of an entity as OpenLABEL data.
+
+    Without a known box, the position is returned.
+    """
     place = [state["x"], state["y"], state["z"]]
     if None in place[:2]:
         return {}
@@ -321,7 +324,7 @@ def _data(state: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _typed(attributes: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Convert the user's attributes to element data, typed by their values."""
+    """Return attributes as OpenLABEL element data, with a type for each value."""
     found: dict[str, list[dict[str, Any]]] = {}
     for name, value in attributes.items():
         form, told = "text", value
@@ -338,7 +341,7 @@ def _typed(attributes: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def _quaternion(heading: float, pitch: float, roll: float) -> list[float]:
-    """Return the quaternion x, y, z, w of turns about z, y, x (rad), with w >= 0."""
+    """Return the quaternion (x, y, z, w) of heading, pitch and roll in radians, with w >= 0."""
     (sy, cy), (sp, cp), (sr, cr) = (
         (float(np.sin(a / 2)), float(np.cos(a / 2))) for a in (heading, pitch, roll)
     )
@@ -364,7 +367,7 @@ def _json(value: Any) -> str:
 
 
 def _test(file: Path, clip: _Labelling) -> None:
-    """Read a file again, and compare its frames and objects with the written ones."""
+    """Raise an error if a written OpenLABEL file does not contain the same frames and objects."""
     try:
         told = json.loads(file.read_text(encoding="utf-8"))["openlabel"]
         wrong = {*told["objects"]} != clip.objects() or not told["frames"]

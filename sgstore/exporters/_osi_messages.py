@@ -1,4 +1,4 @@
-"""Frames as messages of ASAM OSI: an ``osi3.SensorView`` with the ground truth."""
+"""Conversion of frames to ASAM OSI messages: ``osi3.SensorView`` with the ground truth."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ _INDICATORS: Final = ("OFF", "LEFT", "RIGHT", "WARNING")
 
 @cache
 def types() -> tuple[type[Any], type[Any], bytes, bytes]:
-    """Return the classes of a sensor view and a road map, and their descriptors for MCAP."""
+    """Return the OSI message classes of a sensor view and a road map, and their descriptors for MCAP."""
     view_schema = descriptors()
     file = descriptor_pb2.FileDescriptorProto(
         name="osi3/osi_mapasamopendrive.proto", package="osi3", syntax="proto2"
@@ -120,13 +120,13 @@ def types() -> tuple[type[Any], type[Any], bytes, bytes]:
 
 
 def map_message(text: str, name: str) -> bytes:
-    """Return the message with a road map."""
+    """Return an OSI message with the text of a road map, as bytes."""
     message = types()[1](map_reference=name, open_drive_xml_content=text)
     return message.SerializeToString()
 
 
 class OsiFrames:
-    """Converter of frames of one run to serialised ``osi3.SensorView``."""
+    """Converter of the frames of one run to ``osi3.SensorView`` messages."""
 
     def __init__(self) -> None:
         self._numbers: dict[str, int] = {}
@@ -135,7 +135,7 @@ class OsiFrames:
         self._standing: set[str] = set()
 
     def message(self, frame: Frame) -> bytes:
-        """Return the message of the next frame."""
+        """Return the next frame as an OSI message, in bytes."""
         out = types()[0]()
         ground = out.global_ground_truth
         for part in (out, ground):
@@ -165,7 +165,7 @@ class OsiFrames:
                 self._write_standing(ground.stationary_object.add(), entity, kind)
 
     def _number(self, ident: str) -> int:
-        """Return the number of an entity: its id if it is numeric."""
+        """Return the OSI number of an entity: its recorded id if that is a number, else a new number."""
         number = self._numbers.get(ident)
         if number is None:
             plain = ident.isascii() and ident.isdecimal() and str(int(ident)) == ident
@@ -178,7 +178,7 @@ class OsiFrames:
         return self._given
 
     def _name(self, thing: Any, entity: Entity) -> None:
-        """Write an entity's number, its own id if it is not numeric, and its map reference."""
+        """Write the number of an entity into an OSI object, with its recorded id and its map reference."""
         number = self._number(entity.ident)
         thing.id.value = number
         if str(number) != entity.ident:
@@ -219,7 +219,7 @@ class OsiFrames:
         about.type = _number_of(about, "type", _SIGN_TYPES.get(kind, "TYPE_OTHER"))
 
     def _write_light(self, ground: Any, entity: Entity) -> None:
-        """Write three bulbs, one above another, that fill the box of the light."""
+        """Write a traffic light as three OSI bulbs, one above another, that fill its box."""
         numbers = self._bulbs.get(entity.ident)
         if numbers is None:
             numbers = (self._number(entity.ident), self._fresh(), self._fresh())
@@ -264,7 +264,7 @@ def _write_base(base: Any, values: dict[str, float]) -> None:
 
 
 def _write_vector(out: Any, names: dict[str, str], values: dict[str, float]) -> None:
-    """Write the known numbers of a vector; an unknown first number omits the vector.
+    """Write the known components of a vector into an OSI message; nothing if the first one is unknown.
 
     In OSI a missing number of a vector is 0, and a missing vector is unknown.
     """
@@ -295,7 +295,7 @@ def _write_lamps(out: Any, mask: int) -> None:
 
 
 def _mode(state: str, bulb: str) -> str:
-    """Return the mode of a bulb for a light state."""
+    """Return the OSI mode of one bulb of a traffic light, for the state of the light."""
     if state == "flashing":
         return "MODE_FLASHING" if bulb == "yellow" else "MODE_OFF"
     if state == "unknown":

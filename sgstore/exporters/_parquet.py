@@ -1,4 +1,4 @@
-"""Tables of the clips as Parquet: ``clips``, ``frames``, ``nodes``, ``entities``, ``edges``, ``payloads``.
+"""Export format Parquet: tables of the clips and their frames, nodes, entities, edges and messages.
 
 The first column is the number of the clip, then the columns of the public views; a frame in two
 clips occurs twice. ``frames`` have their labels, ``edges`` the attributes of lanes and gaps. Rows
@@ -82,7 +82,7 @@ _CLIPS: Final = {
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write the tables, and read them again."""
+    """Write the tables of all clips as Parquet files, and verify them by reading them again."""
     about = export.about()["clips"]
     with ParquetTable(folder / "clips.parquet", _CLIPS.items()) as clips:
         columns = {name: [clip.get(name) for clip in about] for name in _CLIPS}
@@ -101,14 +101,14 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 class _Present:
-    """Entities and trace of each clip, by the clip's number."""
+    """Entities that occur in each clip, and the trace of each clip, by clip number."""
 
     def __init__(self) -> None:
         self.nodes: defaultdict[int, set[int]] = defaultdict(set)
         self.trace: dict[int, int] = {}
 
     def see(self, name: str, clip: int, columns: Mapping[str, Any]) -> None:
-        """Register the rows of a table."""
+        """Add the entities in the rows of a table to those of a clip."""
         if name == "frames" and len(columns["trace_id"]):
             self.trace.setdefault(clip, int(columns["trace_id"][0]))
         elif name == "nodes":
@@ -149,7 +149,7 @@ def _of_clip(
     found: Mapping[str, np.ndarray[Any, Any]],
     labels: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return the rows of a table in the clip, with its number and the labels."""
+    """Return the rows of a table that belong to a clip, with the clip number and the labels."""
     frame_id = np.asarray(found["frame_id"]).astype(np.int64)
     rows = np.isin(frame_id, frames.frame_id)
     columns: dict[str, Any] = {name: values[rows] for name, values in found.items()}
@@ -165,7 +165,7 @@ def _types(file: StoreFile, sql: str, bounds: Mapping[str, int] = _NOWHERE) -> d
 
 
 def _label_types(export: Export) -> dict[str, str]:
-    """Return the types of label columns: the narrowest that holds all values."""
+    """Return the database type of each label: the narrowest type for all its values."""
     if export.labels is None:
         return {}
     return {name: _type_of(values.tolist()) for name, values in export.labels.values.items()}
@@ -181,7 +181,7 @@ def _type_of(values: Sequence[Any]) -> str:
 
 
 def _tested(file: Path, name: str, count: int) -> WrittenFile:
-    """Verify a table by reading it again, with pyarrow if it is installed."""
+    """Return the description of a written Parquet table, after reading it again."""
     try:
         arrow: Any = import_module("pyarrow.parquet")
     except ImportError:
@@ -204,7 +204,7 @@ _VIEWS: Final = "SELECT view_name, comment FROM duckdb_views() WHERE schema_name
 
 
 def _described(file: StoreFile, fields: Mapping[str, Mapping[str, str]]) -> bytes:
-    """Return names, types and units of all columns, by table, with table descriptions, as JSON."""
+    """Return names, types and units of all columns of all tables, as JSON."""
     about = {str(name): str(comment or "") for name, comment in file.rows(_VIEWS, {})}
     told = {
         table: {
@@ -230,7 +230,7 @@ def _unit(table: str, column: str) -> dict[str, str]:
 
 
 def _card(export: Export, counts: Mapping[str, int]) -> str:
-    """Return the card of a data set, with the head for the Hugging Face hub."""
+    """Return the data set card (README text) of an export, with the header of the Hugging Face hub."""
     about = export.about()
     head = ["---", "tags:", "- autonomous-driving", "- scene-graph", "configs:"]
     for name in counts:
@@ -250,7 +250,7 @@ def _code(text: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a text as an indented literal block."""
+    """Return a text as an indented literal block for Markdown."""
     return "\n".join(f"    {line}" for line in text.splitlines())
 
 

@@ -1,4 +1,4 @@
-"""Graphs for machine learning, as columns for PyTorch Geometric (:mod:`sgstore.exporters.graph_data`).
+"""Export format for PyTorch Geometric: graphs as arrays, read by :mod:`sgstore.exporters.graph_data`.
 
 A folder ``graphs`` of ``.npy`` files, which are memory-mapped (no pickle), and ``graphs.json`` with
 the meaning of the numbers. Graph i has the rows ``node_ptr[i]`` to ``node_ptr[i + 1]`` of the node
@@ -75,7 +75,7 @@ _KINDS: Final = {
 
 
 class _TensorColumns:
-    """All columns as growing ``.npy`` files, with their row counts.
+    """Columns of exported graphs as growing ``.npy`` files, with their numbers of rows.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class _TensorColumns:
             stream.close()
 
     def _write_head(self, name: str) -> None:
-        """Write the length of a column: 0 at first, the final number at the end."""
+        """Write the header of a column file with the number of rows: first 0, at the end the final number."""
         dtype, width = self._kinds[name]
         shape = (self._rows[name], width) if width else (self._rows[name],)
         # Numpy reserves room for the largest number, so that the length of the header is constant.
@@ -121,7 +121,7 @@ class _TensorColumns:
         self._streams[name].write(np.ascontiguousarray(values, self._kinds[name][0]).tobytes())
 
     def add(self, frames: ClipFrames, columns: Mapping[str, NDArray[Any]]) -> None:
-        """Append graphs."""
+        """Append the columns of some graphs to the files."""
         count = len(frames)
         if len(self.clips) < frames.number:
             start = self.clips[-1][1] if self.clips else 0
@@ -141,7 +141,7 @@ class _TensorColumns:
 
 
 def _kind_of(values: list[Any]) -> tuple[str, list[str]]:
-    """Return the kind of a label (``bool``, ``number`` or ``text``), and the words of a text label."""
+    """Return the type of a label (``bool``, ``number`` or ``text``), and the words of a text label."""
     known = [value for value in values if value is not None]
     if all(isinstance(value, bool) for value in known):
         return "bool", []
@@ -151,14 +151,14 @@ def _kind_of(values: list[Any]) -> tuple[str, list[str]]:
 
 
 def _numbers(values: list[Any], words: list[str]) -> NDArray[np.float64]:
-    """Convert values of a label to numbers; NaN means unknown."""
+    """Return the values of a label as numbers (for texts, word indices). NaN means unknown."""
     place = {word: i for i, word in enumerate(words)}
     told = [place[str(v)] if words and v is not None else v for v in values]
     return np.array([np.nan if value is None else float(value) for value in told])
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write the graphs of all frames, and read them again."""
+    """Write the graphs of all frames as arrays, and verify the files by reading them again."""
     abstraction = abstraction_named(export.abstraction or BY_ITSELF).name
     told = {} if export.labels is None else export.labels.values
     labels = {name: _kind_of(of.tolist()) for name, of in told.items()}
@@ -195,7 +195,7 @@ WHERE trace_id = $trace AND (ident IS NOT NULL OR type_name IS NOT NULL) ORDER B
 
 
 def _write_entities(export: Export, folder: Path) -> int:
-    """Write the simulator's names of the entities, one per line; return their number."""
+    """Write the recorded ids and types of the entities, one entity per line; return their number."""
     written = 0
     with (folder / ENTITIES).open("x", encoding="utf-8", newline="\n") as stream:
         for trace in dict.fromkeys(clip.trace for clip in export.clips):
@@ -232,7 +232,7 @@ def _about(export: Export, abstraction: str, columns: _TensorColumns) -> dict[st
 def _columns_of(
     export: Export, frames: ClipFrames, abstraction: str, columns: _TensorColumns
 ) -> dict[str, NDArray[Any]]:
-    """Return the columns of the graphs of frames; ``nodes`` and ``edges`` are counts per graph."""
+    """Return the graphs of some frames as columns. ``nodes`` and ``edges`` are counts per graph."""
     found, seen, labelled = export.store.file.abstracted.frames(abstraction, **frames.bounds)
     wanted = np.full(len(found), -1)
     wanted[np.searchsorted(found, frames.seq)] = np.arange(len(frames))
@@ -265,7 +265,7 @@ def _columns_of(
 
 
 def _edges(labelled: Labelled) -> tuple[NDArray[Any], ...]:
-    """Return edges with one label each: frame, source, label, destination."""
+    """Return the edges of labelled graphs as four arrays: frame, source, label, destination."""
     bundles = labelled.bundles[::-1]  # a negative label counts from the end
     several = [(i,) for i in range(len(labelled.labels))] + [tuple(of) for of in bundles]
     many = np.array([len(of) for of in several] or [0])
@@ -280,7 +280,7 @@ def _edges(labelled: Labelled) -> tuple[NDArray[Any], ...]:
 
 
 def _row(labelled: Labelled, frame: NDArray[Any], node: NDArray[Any]) -> NDArray[np.int64]:
-    """Return rows of nodes in frames; nodes must ascend."""
+    """Return the array index of each given node in its frame. Nodes must ascend."""
     low = int(labelled.node.min(initial=0))
     span = int(labelled.node.max(initial=0)) - low + 1
     keys = labelled.node_frame * span + (labelled.node - low)
@@ -290,7 +290,7 @@ def _row(labelled: Labelled, frame: NDArray[Any], node: NDArray[Any]) -> NDArray
 def _codes(
     known: list[str], labels: NDArray[np.object_], meaning: Mapping[str, str]
 ) -> NDArray[np.int64]:
-    """Return numbers of labels; new labels are appended to ``known``."""
+    """Return a number for each label. New labels are appended to the list of known labels."""
     texts, inverse = np.unique(labels.astype(str), return_inverse=True)
     place = {name: i for i, name in enumerate(known)}
     codes: list[int] = []
@@ -304,7 +304,7 @@ def _codes(
 
 
 def _features(seen: GraphColumns, frame: NDArray[Any], node: NDArray[Any]) -> NDArray[np.float64]:
-    """Return positions of nodes relative to the ego of their frame; see :data:`FEATURES`."""
+    """Return numeric features of nodes relative to the ego of their frame; see :data:`FEATURES`."""
     row = seen.row_of(frame, node)
     ego = np.full(seen.frames, -1)
     own = np.flatnonzero(seen.is_ego)
@@ -322,7 +322,7 @@ def _features(seen: GraphColumns, frame: NDArray[Any], node: NDArray[Any]) -> ND
 
 
 def _sorted(file: Path, names: list[str]) -> list[str]:
-    """Sort names alphabetically, and renumber them in a file piece by piece."""
+    """Return names sorted alphabetically, after changing their numbers in a file accordingly."""
     order = sorted(range(len(names)), key=names.__getitem__)
     place = np.zeros(len(names) + 1, np.int16)
     place[order] = np.arange(len(names))
@@ -334,7 +334,7 @@ def _sorted(file: Path, names: list[str]) -> list[str]:
 
 
 def _test(folder: Path, columns: _TensorColumns) -> None:
-    """Read all columns again.
+    """Raise an error if the written column files of the graphs cannot be read again.
 
     Raises
     ------

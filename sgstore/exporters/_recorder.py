@@ -1,4 +1,4 @@
-"""Recorder of a live run into one MCAP file: frames as OSI, the road map, and sensor readings.
+"""Recorder of a live simulator run as one MCAP file: frames as OSI, the road map, and sensor data.
 
 Log times are simulation times; they join sensors and frames to the nanosecond. The file has a
 temporary name until it is finished; memory does not grow with its length.
@@ -41,7 +41,7 @@ _JSON_SCHEMA: Final = b'{"type": "object", "properties": {"timestamp": {"type": 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """Content of a written recording.
+    """Description of a finished recording: file, numbers of frames and messages, and times.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Written:
 
 
 class Recorder:
-    """Recorder of a live run; a context manager.
+    """Recorder of a live simulator run into an MCAP file; a context manager.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class Recorder:
         self.close()
 
     def frame(self, frame: Frame) -> None:
-        """Write a frame.
+        """Write a frame of the live run to the recording.
 
         Raises
         ------
@@ -146,7 +146,7 @@ class Recorder:
         self._frames += 1
 
     def reading(self, reading: SensorReading) -> None:
-        """Write a sensor reading.
+        """Write a sensor reading of the live run to the recording.
 
         Raises
         ------
@@ -170,7 +170,7 @@ class Recorder:
             self._write(topic, schema, time_ns, foxglove.values(data, time_ns), "json")
 
     def close(self) -> None:
-        """Finish the file and rename it to its final name."""
+        """Finish the recording, and rename the file to its final name."""
         if self._stream.closed:
             return
         try:

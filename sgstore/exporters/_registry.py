@@ -1,4 +1,4 @@
-"""Registry of exporters: built-in formats, and those of other packages.
+"""Registry of export formats: built-in formats, and formats of other packages.
 
 A format is a function from an :class:`Export` and a folder to the written files. This module loads
 no formats, and is fast to load: the help of the command line lists formats and their options.
@@ -36,7 +36,7 @@ The exporter chooses file names but does not write the manifest. It may raise
 
 @dataclass(frozen=True, slots=True)
 class Exporter:
-    """Export format.
+    """Export format: its name, the function that writes the files, and the supported options.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Exporter:
 
 
 def _of(module: str, *options: str) -> Exporter:
-    """Return a built-in format, whose module is loaded on first use."""
+    """Return a built-in export format. Its module is imported on first use."""
 
     def write(export: Export, folder: Path) -> Sequence[WrittenClip | WrittenFile]:
         found: Any = import_module(f"sgstore.exporters._{module}")
@@ -79,7 +79,7 @@ EXPORTERS: Final = (
 
 
 def exporters() -> dict[str, Exporter]:
-    """Return all formats by name: built-in, and of other packages.
+    """Return all export formats by name: built-in ones, and those of other packages.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def exporters() -> dict[str, Exporter]:
 
 
 def exporter_named(name: str) -> Exporter:
-    """Return the exporter with this name.
+    """Return the export format with a name, or raise an error for an unknown name.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Clips for Rerun: one file each, with scene, graph, cameras and point clouds over time.
+"""Export format of the Rerun viewer: one file per clip, with scene, graph, cameras and point clouds.
 
 Paths in the recording:
 
@@ -52,7 +52,7 @@ _KINDS_OF_PICTURES: Final = frozenset({"jpeg", "png", "webp", "bmp"})
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write a recording for each clip, and read it again with Rerun's reader."""
+    """Write a Rerun file for each clip, and verify it with Rerun's own reader."""
     try:
         rerun: Any = import_module("rerun")
         reader: Any = import_module("rerun.chunk").RrdReader
@@ -72,7 +72,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _test(file: Path, paths: set[str], reader: Any) -> None:
-    """Read the written file: every path must exist."""
+    """Raise an error if a written Rerun file lacks one of its entity paths."""
     try:
         found = {str(chunk.entity_path) for chunk in reader(str(file)).stream().to_chunks()}
     except Exception as error:  # any error of Rerun
@@ -83,7 +83,7 @@ def _test(file: Path, paths: set[str], reader: Any) -> None:
 
 
 class RerunClip:
-    """Writer of one clip into a file.
+    """Writer of one clip as a Rerun file.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class RerunClip:
         self._mounts = {one.child for one in export.mounts if one.parent == EGO}
 
     def write(self, file: Path) -> None:
-        """Write the clip into a file."""
+        """Write the clip to a Rerun file."""
         clip = self._frames.clip
         ident = f"{clip.trace} {clip.start_ns} {clip.end_ns}"
         self._out = self._rerun.RecordingStream(APPLICATION, recording_id=ident)
@@ -127,7 +127,7 @@ class RerunClip:
             self._out.disconnect()
 
     def _view(self) -> Any:
-        """Return the initial layout of the viewer: the scene, with the camera and the graph next to it."""
+        """Return the initial layout of the Rerun viewer: the scene, the camera and the graph side by side."""
         views: Any = import_module("rerun.blueprint")
         return views.Blueprint(
             views.Horizontal(
@@ -152,7 +152,7 @@ class RerunClip:
             self._out.set_time("frame", sequence=frame)
 
     def _path(self, *parts: str) -> str:
-        """Return a path from arbitrary names."""
+        """Return a Rerun entity path whose parts are arbitrary names."""
         return str(self._rerun.new_entity_path(list(parts))).lstrip("/")
 
     def _write_map(self) -> None:
@@ -196,7 +196,7 @@ class RerunClip:
         self._write_graph(graph, places)
 
     def _clear_edges(self, graph: SceneGraph) -> None:
-        """Clear relations that have no more edges."""
+        """Clear the lines of relations that have no edges in this frame."""
         now = {self._path("world", "edges", relation) for _, relation, _, _ in graph.edges}
         for path in sorted(path for path in self.paths - now if path.startswith("world/edges/")):
             self._out.log(path, self._rerun.Clear(recursive=False))
@@ -213,7 +213,7 @@ class RerunClip:
             self._log(path, self._rerun.Transform3D(translation=one.place, quaternion=turn))
 
     def _write_graph(self, graph: SceneGraph, places: dict[int, Any]) -> None:
-        """Write nodes at their positions around the ego, ahead is up."""
+        """Write the nodes and edges of a scene graph as a diagram: the ego in the middle, ahead is up."""
         rerun = self._rerun
         known = [node for node in graph.nodes if places[node]]
         about = {} if graph.ego is None else graph.nodes.get(graph.ego, {})
@@ -277,7 +277,7 @@ _SPREAD: Final = 8.0
 
 
 def _axes_of(record: Mapping[str, Any]) -> str:
-    """Return the axes of a message: ``frame_id``, for ROS from its header."""
+    """Return the name of the coordinate axes of a sensor message (``frame_id``)."""
     header = record.get("header")
     held = header if isinstance(header, Mapping) else record
     return str(held.get("frame_id", ""))
@@ -292,7 +292,7 @@ def _rgba(colour: drawn.Colour) -> list[int]:
 
 
 def _lines(graph: SceneGraph, places: dict[int, Any]) -> dict[str, list[Any]]:
-    """Return the line ends of the edges of each relation."""
+    """Return the lines between connected nodes, by relation, as pairs of positions."""
     found: dict[str, list[Any]] = {}
     for src, relation, dst, _ in graph.edges:
         if places.get(src) and places.get(dst):

@@ -1,4 +1,4 @@
-"""Graphs as rows (node, edge, node), with the header for S3C's scripts.
+"""Export format S3C: edges as CSV rows (node, edge, node), with the header that S3C's scripts expect.
 
 The header is ``ds, sg, n_img, t_id, node1, edge, node2``. ``ds`` is the trace, ``sg`` the frame as
 ``trace#seq``, ``n_img`` is 1 (every frame counts once), ``t_id`` counts the rows of a graph. Graphs
@@ -33,7 +33,7 @@ BY_ITSELF: Final = "RSV"
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write the rows, and read them again."""
+    """Write the edges of all graphs as CSV rows, and verify the file by reading it again."""
     abstraction = abstraction_named(export.abstraction or BY_ITSELF).name
     rows = alone = 0
     with (folder / GRAPHS).open("x", encoding="utf-8", newline="") as stream:

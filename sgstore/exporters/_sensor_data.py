@@ -1,4 +1,4 @@
-"""Sensor messages decoded to pictures, point clouds and video packets."""
+"""Decoders of sensor messages: pictures, point clouds and video packets."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ _OPENCV: Final = re.compile(r"(8|16|32|64)([usf])c(\d)")
 
 
 class Sensed(NamedTuple):
-    """Content of a sensor message.
+    """Decoded content of a sensor message: a picture, a point cloud or a video packet.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ Record = Mapping[str, Any]
 
 
 def sensor_of(channel: Channel, schema: Schema | None) -> Callable[[bytes], Sensed | None]:
-    """Return a function from messages of a channel to their content; it returns ``None`` for other data.
+    """Return a function that decodes the messages of a channel. It returns ``None`` for other data.
 
     It raises ``TraceError`` for an inconsistent picture or cloud.
     """
@@ -97,7 +97,7 @@ def sensor_of(channel: Channel, schema: Schema | None) -> Callable[[bytes], Sens
 
 
 def cloud_of(file: StoreFile, frame: int | str, channel: str) -> NDArray[Any]:
-    """Return the points in a channel's message of a frame.
+    """Return the point cloud of a channel for a frame, as a structured array.
 
     Returns
     -------
@@ -223,7 +223,7 @@ def _points(data: bytes, record: Record) -> NDArray[Any]:
 
 
 def _field(told: Any, order: str, *, ros: bool) -> tuple[str, Any, int]:
-    """Return name, type and offset of a field of point cloud points."""
+    """Return the name, data type and byte offset of a field of a point cloud."""
     number = told["datatype"] if ros else told["type"]
     if isinstance(number, str):
         number = _FOXGLOVE_WORDS.index(number)
@@ -238,7 +238,7 @@ def _field(told: Any, order: str, *, ros: bool) -> tuple[str, Any, int]:
 
 
 def cloud_file(points: NDArray[Any], form: str) -> bytes:
-    """Return points as the content of a file.
+    """Return a point cloud as the bytes of a file, in a given format.
 
     Parameters
     ----------
@@ -259,7 +259,7 @@ def cloud_file(points: NDArray[Any], form: str) -> bytes:
 
 
 def _pcd(points: NDArray[Any]) -> bytes:
-    """Return points in the format PCD 0.7 (Point Cloud Library, "The PCD file format")."""
+    """Return a point cloud as the bytes of a PCD file (version 0.7)."""
     names = points.dtype.names or ()
     kinds = [points.dtype[name] for name in names]
     letters = {"f": "F", "i": "I", "u": "U"}

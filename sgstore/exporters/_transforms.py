@@ -1,4 +1,4 @@
-"""Transforms of clips: poses of the ego and its sensors in the axes of the scene graphs.
+"""Positions and rotations of the ego and its sensors in the map axes, for each frame of a clip.
 
 A viewer can draw sensor data only with the pose of its axes. Each frame of a clip with graphs
 contains these poses, as ``foxglove.FrameTransforms``:
@@ -48,7 +48,7 @@ TOLD: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Constant pose of a sensor relative to the ego, or of any axes relative to others.
+    """Constant position and rotation of a sensor relative to the ego, or of any axes relative to others.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Mount:
 
 
 def parse_mounts(texts: Iterable[str]) -> tuple[Mount, ...]:
-    """Parse mounts from texts ``[PARENT:]CHILD=X,Y,Z[,YAW[,PITCH,ROLL]]``; m and degrees.
+    """Return sensor mounts from texts ``[PARENT:]CHILD=X,Y,Z[,YAW[,PITCH,ROLL]]``, in m and degrees.
 
     Raises
     ------
@@ -98,14 +98,14 @@ def parse_mounts(texts: Iterable[str]) -> tuple[Mount, ...]:
 
 
 def _ends(axes: str, mounts: Mapping[str, Mount]) -> str:
-    """Return the root axes of some axes."""
+    """Return the outermost parent of coordinate axes."""
     while axes in mounts:
         axes = mounts[axes].parent
     return axes
 
 
 def _numbers(text: str) -> list[float]:
-    """Parse finite numbers between commas; return an empty list if one is invalid."""
+    """Return the numbers of a comma-separated text; an empty list if a number is invalid or infinite."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -114,7 +114,7 @@ def _numbers(text: str) -> list[float]:
 
 
 class FrameTransforms:
-    """Transforms in each frame of the clips of one recording.
+    """Positions and rotations of the ego and its sensors in each frame of a recording.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class FrameTransforms:
             self._fixed.append(AxesTransform(AXES, GLOBAL, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
 
     def of(self, graph: SceneGraph) -> Iterator[AxesTransform]:
-        """Yield the transforms of a frame; without an ego, only the constant ones."""
+        """Yield the positions and rotations for a frame; without an ego, only the constant ones."""
         about = graph.nodes.get(graph.ego) if graph.ego is not None else None
         if about is not None and "x" in about and "y" in about:
             yield _of_ego(about, self.ego)
@@ -157,7 +157,7 @@ def _of_ego(about: dict[str, Any], name: str) -> AxesTransform:
 
 
 def matrix(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
-    """Return the rotation matrix of turns about z, the new y, and the new x; rad.
+    """Return the rotation matrix (3, 3) of yaw, pitch and roll in radians.
 
     Its columns are the turned x, y and z.
     """

@@ -1,4 +1,4 @@
-"""Layout for Foxglove and Lichtblick: the content of a clip with graphs, in panels."""
+"""Layout file for the viewers Foxglove and Lichtblick: panels for the channels of an exported clip."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CLOUDS: Final = ("PointCloud", "PointCloud2", "LaserScan")
 
 
 def layout(channels: Sequence[ChannelCount], ego: str) -> str:
-    """Return the viewer layout as JSON; equal channels give equal text.
+    """Return a viewer layout for the channels of a clip, as JSON. Equal channels give equal text.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def layout(channels: Sequence[ChannelCount], ego: str) -> str:
 
 
 def _topics(channels: Sequence[ChannelCount], endings: tuple[str, ...]) -> list[str]:
-    """Return topics of non-empty channels, by the last word of their schema."""
+    """Return the topics of channels with messages, selected by the last word of their schema name."""
     found = [
         one.topic
         for one in channels
@@ -110,7 +110,7 @@ def _above(clouds: Sequence[str], ego: str) -> dict[str, Any]:
 
 
 def _camera(image: str, calibrations: Sequence[str]) -> dict[str, Any]:
-    """Return the camera panel, with a calibration topic in the same namespace."""
+    """Return the viewer panel of a camera, with a calibration topic of the same namespace."""
     place = image.rpartition("/")[0]
     beside = [topic for topic in calibrations if topic.rpartition("/")[0] == place]
     mode = {"imageTopic": image} | ({"calibrationTopic": beside[0]} if beside else {})

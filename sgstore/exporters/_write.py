@@ -1,4 +1,4 @@
-"""Export from a store: clips around frames, labels, and atomic writing with a manifest."""
+"""Export of clips from a store: the files and a manifest are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ OPTIONS: Final = {
 def around_frames(
     store: Store, frames: Iterable[int | str], before: float, after: float
 ) -> list[Clip]:
-    """Return clips around frames; overlapping clips are merged.
+    """Return clips around given frames. Overlapping clips are merged.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def labelled(export: Export, texts: Mapping[str, str], **parameters: object) -> 
 def write_export(
     export: Export, to: str | Path, form: str = "mcap"
 ) -> list[WrittenClip | WrittenFile]:
-    """Write clips of a store, completely or not at all.
+    """Write the clips of an export into a folder, completely or not at all.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def write_export(
 
 
 def _written(exporter: Exporter, export: Export, folder: Path) -> list[WrittenClip | WrittenFile]:
-    """Run an exporter; errors in it are reported with the name of the format."""
+    """Run an exporter; its errors are raised with the name of the format."""
     try:
         written: list[Any] = list(exporter.write(export, folder))
         odd = [one for one in written if not isinstance(one, WrittenClip | WrittenFile)]

@@ -1,4 +1,4 @@
-"""Clips as scenarios in OpenSCENARIO XML 1.2 for simulators, with the road map.
+"""Export format OpenSCENARIO XML 1.2: each clip as a scenario for simulators, with the road map.
 
 Each clip has a file ``CLIP.xosc``; its map, if the trace has one, is ``MAP.xodr`` in the same
 folder.
@@ -86,7 +86,7 @@ WHERE frame_id >= $first AND frame_id <= $last AND node_id = $node AND light_sta
 
 @dataclass(slots=True)
 class EntityTrack:
-    """States of an entity; shape (n,).
+    """States of an entity over the frames of a clip, as columns (n,).
 
     Attributes
     ----------
@@ -104,13 +104,13 @@ class EntityTrack:
     speed: Numbers
 
     def stretches(self) -> Iterator[tuple[int, int]]:
-        """Yield first and last index of each stretch without a gap."""
+        """Yield the first and last index of each run of frames without a gap."""
         ends = np.flatnonzero(np.diff(self.row) > 1).tolist()
         yield from zip([0, *(end + 1 for end in ends)], [*ends, len(self.row) - 1], strict=True)
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write a scenario for each clip, and the referenced maps."""
+    """Write an OpenSCENARIO file for each clip, and the road maps that the files use."""
     maps: dict[str, Path | None] = {}
     written: list[WrittenFile] = []
     for frames in export.frames():
@@ -129,7 +129,10 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _write_map(export: Export, folder: Path, trace: str) -> Path | None:
-    """Write the road map of a trace next to its scenarios; equal texts are shared."""
+    """Write the road map of a trace to a file, and return its path.
+
+    Equal maps share a file. ``None`` means a trace without a map.
+    """
     told = export.store.file.road_map_text(trace)
     if told is None:
         return None
@@ -149,7 +152,7 @@ def _write_map(export: Export, folder: Path, trace: str) -> Path | None:
 
 
 class Scenario:
-    """Writer of one clip into a file.
+    """Writer of one clip as an OpenSCENARIO file.
 
     Parameters
     ----------
@@ -194,7 +197,7 @@ class Scenario:
                 )
 
     def losses(self) -> list[Loss]:
-        """Return the parts of the clip that the scenario does not have."""
+        """Return the parts of the clip that are left out or assumed in the scenario, with reasons."""
         told: list[Loss] = []
         if self._unsized:
             reason = f"the size of {_some(self._unsized)} is not known: a usual one is written"
@@ -207,7 +210,7 @@ class Scenario:
         return told
 
     def write(self, file: Path) -> None:
-        """Write the scenario into a file."""
+        """Write the clip to an OpenSCENARIO file."""
         with file.open("x", encoding="utf-8", newline="\n") as stream:
             xml = XmlWriter(stream)
             with xml.element("OpenSCENARIO"):
@@ -283,7 +286,7 @@ class Scenario:
         track: EntityTrack,
         ends: tuple[int, int],
     ) -> None:
-        """Write the appearance, movement and disappearance of an entity."""
+        """Write the appearance, the trajectory and the disappearance of an entity as scenario events."""
         low, high = ends
         times, poses = self._seconds[track.row[low : high + 1]], track.pose[low : high + 1]
         start = float(times[0])
@@ -312,7 +315,10 @@ class Scenario:
                 xml.leaf("DeleteEntityAction")
 
     def _write_lights(self, xml: XmlWriter, *, alone: bool) -> None:
-        """Write light changes; without moving entities, a placeholder fills the act."""
+        """Write the changes of traffic lights as scenario events.
+
+        Without moving entities, a placeholder is added, because an act must not be empty.
+        """
         for node, ref in self._lights:
             changes = [(row, state) for row, state in self._light(node) if row > 0]
             if not changes:
@@ -328,7 +334,7 @@ class Scenario:
                 pass
 
     def _track(self, actor: ScenarioEntity, *, first: bool = False) -> EntityTrack:
-        """Return the states of an entity in the clip, or only in its first frame."""
+        """Return the states of an entity over the clip, or only in its first frame."""
         bounds = self._frames.bounds
         if first:
             bounds["last"] = bounds["first"]
@@ -342,7 +348,7 @@ class Scenario:
         return EntityTrack(row, _origins(pose, actor.centre), speed)
 
     def _light(self, node: int) -> Iterator[tuple[int, str]]:
-        """Yield rows of the frames where a light changes, and its new state."""
+        """Yield the changes of a traffic light: the frame index and the new state."""
         before = ""
         for frame_id, state in self._store.rows(_LIGHT, {**self._frames.bounds, "node": node}):
             if state != before:
@@ -356,7 +362,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _unwrapped(heading: Numbers) -> Numbers:
-    """Remove full-turn jumps from headings; unknown headings stay."""
+    """Return headings without jumps by full turns. Unknown headings stay unknown."""
     known = np.isfinite(heading)
     out = heading.copy()
     out[known] = np.unwrap(heading[known])
@@ -364,7 +370,7 @@ def _unwrapped(heading: Numbers) -> Numbers:
 
 
 def _origins(pose: Numbers, centre: tuple[float, float, float]) -> Numbers:
-    """Convert poses of box centres to poses of vehicle origins."""
+    """Return the poses of vehicle origins, computed from the poses of box centres."""
     (ch, cp, cr), (sh, sp, sr) = (
         [of(np.nan_to_num(pose[:, axis])) for axis in (3, 4, 5)] for of in (np.cos, np.sin)
     )

@@ -1,4 +1,4 @@
-"""Elements of OpenSCENARIO XML."""
+"""Elements of OpenSCENARIO XML files: entities, conditions, positions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _MASS: Final = {"person": 75.0, "animal": 20.0}
 
 @dataclass(frozen=True, slots=True)
 class ScenarioEntity:
-    """Entity of a clip.
+    """Entity of an exported scenario: its node, name, type and box.
 
     Attributes
     ----------
@@ -72,13 +72,13 @@ class ScenarioEntity:
 
     @property
     def centre(self) -> tuple[float, float, float]:
-        """Return the middle of the box in the axes of the entity; m."""
+        """Return the centre of the entity's box in the axes of the entity, in metres."""
         ahead = REAR_AXLE * self.size[0] if self.kind in VEHICLES else 0.0
         return ahead, 0.0, self.size[2] / 2
 
 
 class XmlWriter:
-    """Writer of XML elements in sequence."""
+    """Writer of an XML file, element by element."""
 
     def __init__(self, stream: Any) -> None:
         self._out = XMLGenerator(stream, "utf-8", short_empty_elements=True)
@@ -87,7 +87,7 @@ class XmlWriter:
 
     @contextmanager
     def element(self, tag: str, /, **attributes: str) -> Generator[None]:
-        """Write an element around the content of the ``with`` block."""
+        """Context manager that writes the start and the end of an XML element around its content."""
         self._begin(tag, attributes)
         self._out.ignorableWhitespace("\n")
         self._depth += 1
@@ -98,7 +98,7 @@ class XmlWriter:
         self._out.ignorableWhitespace("\n")
 
     def leaf(self, tag: str, /, **attributes: str) -> None:
-        """Write an empty element."""
+        """Write an XML element without content."""
         self._begin(tag, attributes)
         self._out.endElement(tag)
         self._out.ignorableWhitespace("\n")
@@ -109,12 +109,12 @@ class XmlWriter:
         self._out.startElement(tag, AttributesImpl(told))
 
     def finish(self) -> None:
-        """End the document."""
+        """Write the end of the XML document."""
         self._out.endDocument()
 
 
 def _readable(text: str) -> str:
-    """Replace characters that XML cannot hold, and ``$``, which marks scenario parameters."""
+    """Return a text without characters that XML forbids, and without ``$`` (scenario parameters)."""
     return "".join(c if c.isprintable() and c != "$" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
@@ -215,7 +215,7 @@ def write_signal(xml: XmlWriter, ref: str, state: str) -> None:
 
 
 def write_when(xml: XmlWriter, time: float, name: str) -> None:
-    """Write a condition that holds from a time on."""
+    """Write a scenario condition that is true from a simulation time on."""
     with (
         xml.element("ConditionGroup"),
         xml.element("Condition", name=name, delay="0", conditionEdge="none"),
@@ -243,7 +243,7 @@ def event(xml: XmlWriter, name: str, time: float) -> Generator[None]:
 
 
 def test(file: Path, vertices: int) -> None:
-    """Read the written file again, one element at a time."""
+    """Raise an error if a written scenario file cannot be read or has a wrong number of vertices."""
     found = 0
     try:
         for _, element in ET.iterparse(file):  # noqa: S314  it is ours

@@ -1,4 +1,4 @@
-"""Reader of graphs from ``sgstore export --format pyg``, for machine learning.
+"""Reader of exported graphs (``sgstore export --format pyg``) for machine learning.
 
 ::
 
@@ -44,7 +44,7 @@ _MOST: Final = 64 << 20
 
 
 class GraphData:
-    """Graphs as memory-mapped arrays.
+    """Exported graphs as memory-mapped arrays.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class GraphData:
         return len(self.columns["frame_id"])
 
     def arrays(self, number: int) -> dict[str, NDArray[Any]]:
-        """Return one graph as arrays.
+        """Return the arrays of one exported graph, by name.
 
         Returns
         -------
@@ -125,7 +125,7 @@ class GraphData:
         return found
 
     def identities(self, number: int) -> list[tuple[str, str]]:
-        """Return the simulator's id and type name of each node of a graph.
+        """Return the recorded id and type name of each node of an exported graph.
 
         Returns
         -------
@@ -147,7 +147,7 @@ class GraphData:
 
     @cached_property
     def _entities(self) -> dict[str, dict[int, tuple[str, str]]]:
-        """Return the simulator's id and type name of each entity, by trace and node."""
+        """Return the recorded id and type name of each entity, by trace and node."""
         found: dict[str, dict[int, tuple[str, str]]] = {}
         file = self.folder / ENTITIES
         try:
@@ -161,19 +161,19 @@ class GraphData:
         return found
 
     def sequences(self) -> Iterator[range]:
-        """Yield the graphs of each clip, in order of time."""
+        """Yield the range of graph numbers of each clip, in order of time."""
         for clip in self.about["clips"]:
             yield range(*clip["graphs"])
 
     def by_trace(self) -> dict[str, list[int]]:
-        """Return the graphs of each trace, for a split into training and test data."""
+        """Return the graph numbers of each trace, for a split into training and test data."""
         found: dict[str, list[int]] = {}
         for clip in self.about["clips"]:
             found.setdefault(clip["trace"], []).extend(range(*clip["graphs"]))
         return found
 
     def check(self) -> None:
-        """Check the consistency of the columns.
+        """Raise an error if the exported columns of the graphs contradict each other.
 
         Raises
         ------
@@ -214,7 +214,7 @@ class GraphData:
 
 
 class GraphDataset:
-    """Data set of graphs for ``torch_geometric.loader.DataLoader``.
+    """Data set of exported graphs for ``torch_geometric.loader.DataLoader``.
 
     Parameters
     ----------
@@ -315,7 +315,7 @@ class GraphDataset:
     def _hetero_data(
         self, graph: dict[str, NDArray[Any]], kind: NDArray[Any], relation: NDArray[Any]
     ) -> Any:
-        """Return data with all types and triples, empty ones too, so that graphs can be batched."""
+        """Return a graph as ``HeteroData`` with all node types and triples, also empty ones, for batching."""
         made = self._data.HeteroData()
         tensor = self._torch.from_numpy
         own = np.zeros(len(kind), np.int64)
@@ -336,7 +336,7 @@ class GraphDataset:
         return made
 
     def triples(self) -> list[tuple[str, str, str]]:
-        """Return all triples (type, relation, type) in the data, in order."""
+        """Return all triples (node type, relation, node type) that occur in the graphs."""
         return self._triples
 
     @cached_property
@@ -360,7 +360,7 @@ class GraphDataset:
 
 
 def _renumbered(own: list[str], wanted: list[str], folder: str | Path) -> NDArray[np.int64]:
-    """Map numbers of names in one list to numbers in another list."""
+    """Return for each name of one list its index in another list."""
     place = {name: i for i, name in enumerate(wanted)}
     missing = [name for name in own if name not in place]
     if missing:
