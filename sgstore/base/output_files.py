@@ -81,7 +81,7 @@ class Stream(io.RawIOBase):
         self.lost = False
 
     def writable(self) -> bool:
-        """Return True: the stream is writable."""
+        """Return True: the output stream is writable."""
         return True
 
     def seekable(self) -> bool:
@@ -97,11 +97,11 @@ class Stream(io.RawIOBase):
         return os.lseek(self._descriptor, offset, whence)
 
     def fileno(self) -> int:
-        """Return the file descriptor of the stream."""
+        """Return the file descriptor of the output stream."""
         return self._descriptor
 
     def isatty(self) -> bool:
-        """Return True if the stream is a terminal."""
+        """Return True if the output stream is a terminal."""
         return os.isatty(self._descriptor)
 
     def write(self, data: Any, /) -> int:

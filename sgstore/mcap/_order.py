@@ -515,7 +515,7 @@ def _raise_publish_times(blocks: Sequence[_IndexBlock]) -> None:
 
 
 def _sorted(blocks: Sequence[_IndexBlock]) -> Numbers:
-    """Return the numbers of the messages of some blocks, in order of time."""
+    """Return the message numbers of some parts of a sort index, in order of time."""
     entries = np.concatenate([block.entries for block in blocks])
     log, channel = entries["log"], entries["channel"]
     order = np.lexsort((channel, published(log, entries["publish"], channel), log))

@@ -1,4 +1,4 @@
-"""Read-ahead: file summary, reusable buffers, and decompression in threads.
+"""Reading of MCAP chunks in advance: file summary, memory buffers, and decompression in threads.
 
 Buffers are reused after their last view is gone. Fresh memory for every chunk would be slower: the system must
 map and clear each page, and recently used memory is in the processor cache.
@@ -248,7 +248,7 @@ class Spool:
         self._size += total
 
     def has(self, path: Path, chunk_offset: int) -> bool:
-        """Return True if the messages of a chunk are in the cache."""
+        """Return True if the messages of a chunk are in the cache of messages."""
         return (path, chunk_offset) in self._places
 
     def get(self, path: Path, chunk_offset: int, anew: Callable[[], Read]) -> Messages | None:
@@ -289,7 +289,7 @@ class Spool:
         )
 
     def close(self) -> None:
-        """Clear the cache and delete its file."""
+        """Clear the cache of messages, and delete its file."""
         self._places.clear()
         self._size = 0
         if self._file is not None:
@@ -342,7 +342,7 @@ Found = dict[int, "tuple[ChunkHead, Records | TraceError]"]
 
 
 def chunks_in(file: BufferedReader) -> Iterator[int]:
-    """Yield the byte offsets of the chunks of a file without a usable summary.
+    """Yield the byte offsets of the chunks of an MCAP file that has no usable summary section.
 
     The search stops after more than :data:`BETWEEN` other records in a row.
     """

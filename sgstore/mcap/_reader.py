@@ -421,7 +421,7 @@ class McapFile:
             yield from self._flush(walk)
 
     def _flush(self, walk: _FileWalk) -> Iterator[Messages]:
-        """Yield the messages collected outside chunks."""
+        """Yield the messages outside chunks that were collected so far."""
         if not walk.run:
             return
         offsets = np.frombuffer(walk.run, np.int64)

@@ -454,7 +454,7 @@ class MessageDecoder(Generic[Raw]):
         return self._window[0] <= log_time_ns <= self._window[1]
 
     def lose(self, reason: str, run: Messages, row: int) -> None:
-        """Count an unreadable message."""
+        """Count an unreadable message of the recording, under the reason of the loss."""
         self._unreadable.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
 
     def _warn_of_egos(self, words: str) -> None:

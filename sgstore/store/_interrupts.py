@@ -74,7 +74,7 @@ def interrupt(connection: DuckDBPyConnection) -> None:
 
 
 class _Task(Generic[T]):
-    """Database call that another thread runs."""
+    """Database call that another thread runs, with its result or error."""
 
     def __init__(self, step: Callable[[], T]) -> None:
         self.ended = threading.Event()

@@ -301,7 +301,7 @@ files: Final[dict[Path, OpenFile]] = {}
 
 
 def give_back(patience_s: float = 0.0) -> None:
-    """Close all store files without readers."""
+    """Close all open store files of this process that have no readers."""
     for file in tuple(_watch.kept):
         if file.changed.acquire(timeout=patience_s):
             try:

@@ -82,7 +82,7 @@ _SURPRISES: Final = (
 
 
 def without_faults(connection: DuckDBPyConnection) -> None:
-    """Disable features that are faulty in some DuckDB versions.
+    """Disable DuckDB features that are faulty in some versions of DuckDB.
 
     * From 1.5.1 on its optimizer *common_subplan* merges two branches of a union that read
       different columns of the same joins. Rows are wrong, without an error (duckdb/duckdb#25819; 2.0, too).

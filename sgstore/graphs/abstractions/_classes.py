@@ -413,7 +413,7 @@ class _Block:
         return [blake2b(row.astype("<u8").tobytes(), digest_size=16).digest() for row in sums]
 
     def taken(self, rows: list[int]) -> _Block:
-        """Return selected graphs of the block, in ascending order."""
+        """Return selected labelled graphs of the block, in ascending order."""
         if len(rows) == self.graphs:
             return self
         number = np.full(self.graphs, -1)
@@ -469,7 +469,7 @@ def _mixed(words: Words) -> Words:
 
 
 def _sums(owner: Ints, values: Words, count: int) -> Words:
-    """Return sums of hash words per graph or node, modulo 2⁶⁴."""
+    """Return sums of hash words (modulo 2⁶⁴) for each graph or node."""
     total = np.zeros(count, np.uint64)
     if len(owner):
         starts = np.flatnonzero(np.append(True, owner[1:] != owner[:-1]))

@@ -64,7 +64,7 @@ class Hitches:
         self._said: dict[str, int] = {}
 
     def learn(self, entities: Entities) -> None:
-        """Record new objects of the trace, in order of node id."""
+        """Record the new objects of a block of frames: possible carriers and loads."""
         count = len(entities)
         self._kind = np.append(self._kind, entities.kind)
         self._seen = np.append(self._seen, np.zeros(count, np.bool_))

@@ -35,7 +35,7 @@ class Parking:
         self._place: Floats = np.zeros((0, 2))
 
     def learn(self, entities: Entities) -> None:
-        """Record new vehicles of the trace, in order of node id."""
+        """Record the new objects of a block of frames, to detect parked vehicles later."""
         no: Bools = np.zeros(len(entities), np.bool_)
         self._vehicle = np.append(self._vehicle, IS_VEHICLE[entities.kind])
         self._static = np.append(self._static, entities.static)

@@ -209,7 +209,7 @@ class BodyPairs:
         return bearings(of.x[b] - of.x[a], of.y[b] - of.y[a], of.heading[a])
 
     def some(self, rows: Rows) -> tuple[Rows, Rows]:
-        """Return the rows of both objects for selected pairs."""
+        """Return the rows of both objects of selected pairs."""
         first, second = (half[rows % max(self._half, 1)] for half in self._halves)
         mirrored = rows >= self._half
         return np.where(mirrored, second, first), np.where(mirrored, first, second)
@@ -298,7 +298,7 @@ def turns(bodies: Bodies) -> tuple[Floats, Floats]:
 
 
 def even_parts(count: int) -> Iterator[slice]:
-    """Yield consecutive slices of :data:`EVEN_PART` rows."""
+    """Yield slices that split ``count`` rows into parts of :data:`EVEN_PART` rows."""
     for start in range(0, count, EVEN_PART):
         yield slice(start, min(start + EVEN_PART, count))
 
@@ -474,7 +474,7 @@ class EdgeRoom:
         self._used = 0
 
     def rest(self, count: int) -> Columns:
-        """Return arrays with room for ``count`` edges."""
+        """Return preallocated arrays with room for ``count`` edges."""
         if self._used + count > len(self._columns[0]):
             return _columns_of(count)
         frame, relation, src, dst = self._columns
@@ -603,7 +603,7 @@ class Relation:
     legend: str = ""
 
     def asked(self, config: Config) -> bool:
-        """Return True if the settings request the relation."""
+        """Return True if the settings request this relation (edge type) in the graphs."""
         return self.settings(config) and (not self.of_pairs or relates_pairs(config))
 
 
@@ -684,7 +684,7 @@ IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
 
 
 def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Expand index ranges: return the range number and the index for each element.
+    """Expand index ranges (start, count): return the range number and the index of each element.
 
     Returns
     -------

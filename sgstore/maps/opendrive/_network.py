@@ -63,7 +63,7 @@ class Network:
 
     @classmethod
     def of(cls, document: Document, lanes: LaneTable) -> Network:
-        """Build the look-ups of an OpenDRIVE map's lanes."""
+        """Build look-ups of an OpenDRIVE map's lanes by road, lane section and lane id."""
         roads: dict[str, int] = {}
         warnings: list[str] = []
         for row, name in enumerate(document.road_ids):

@@ -102,7 +102,7 @@ class Objects:
     shapes: list[Any]
 
     def take(self, rows: Ints) -> Objects:
-        """Return the objects of the given rows, in this order."""
+        """Return the map objects of the given rows, in this order."""
         return Objects(self.nodes.take(rows), [self.shapes[row] for row in rows.tolist()])
 
 

@@ -166,7 +166,7 @@ class _Grid:
         self.keys, self.begin = key[begin], np.append(begin, len(key))
 
     def cells(self, places: Floats) -> Ints:
-        """Return the grid cells (2, N) of positions (2, N), int64."""
+        """Return the grid cell (two integers) of each position; (2, N)."""
         return np.floor((places - self.origin) / self.cell).astype(np.int64)
 
     def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
@@ -408,7 +408,7 @@ class _Pairs:
         return cls(row, quad, shapes.a[row], shapes.b[row], quads.turn[quad], along, across)
 
     def take(self, rows: Ints) -> _Pairs:
-        """Return the pairs with the given indices."""
+        """Return the pairs of footprint and lane piece with the given indices."""
         return _Pairs(
             self.row[rows],
             self.quad[rows],

@@ -97,7 +97,7 @@ def _counts(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
 
 @compiled
 def _doubled(found: Ints, inside: Bools, numbers: Floats) -> tuple[Ints, Bools, Floats]:
-    """Copy result arrays into arrays of twice the size."""
+    """Return copies of the result arrays with twice the size."""
     return (
         np.concatenate((found, np.empty_like(found))),
         np.concatenate((inside, np.empty_like(inside))),

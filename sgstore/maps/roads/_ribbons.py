@@ -222,7 +222,7 @@ def _is_smooth(first: Floats, last: Floats) -> Bools:
 
 
 def wrapped(angle: Floats) -> Floats:
-    """Wrap angles to (-π, π]."""
+    """Wrap angles into (-π, π]; rad."""
     return np.pi - (np.pi - angle) % (2 * np.pi)
 
 

@@ -176,7 +176,7 @@ def _place(centre: Floats, border: Floats) -> tuple[float, float, bool]:
 
 
 def _looks(line: Floats) -> Floats:
-    """Return positions (n, 2) at equal distances along a line."""
+    """Return sample positions (n, 2) at equal distances along a line."""
     run = run_of(line)
     at = run[-1] * np.linspace(0.0, 1.0, _BORDER_LOOKS)
     return np.column_stack([np.interp(at, run, column) for column in line[:, :2].T])

@@ -168,7 +168,7 @@ class TrafficScenario:
     states: int = 0
 
     def lose(self, what: str) -> None:
-        """Record an unreadable part of the scenario."""
+        """Record an unreadable part of the scenario, for the report."""
         if len(self.lost) < MAX_LOST:
             self.lost.append(what)
         else:

@@ -346,7 +346,9 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
     def _take_scene(
         self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int, *, goes_on: bool
     ) -> None:
-        """Update the current scene objects from a scene message.
+        """Add, change and delete the current scene objects, as a scene message describes.
+
+        With ``goes_on``, the message adds to a message of another channel.
 
         With ``goes_on``, the message adds to a message of another channel.
         """

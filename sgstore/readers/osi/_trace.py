@@ -115,7 +115,7 @@ def classes_of(conditions: Any) -> str:
 
 
 def numbers_of(conditions: Any) -> list[str]:
-    """Return time of day and temperature as texts, if known."""
+    """Return time of day and temperature of an OSI message as texts, if known."""
     told: list[str] = []
     if conditions.HasField("time_of_day"):
         minutes, seconds = divmod(conditions.time_of_day.seconds_since_midnight % 86_400, 60)

@@ -78,7 +78,7 @@ def opened(path: Path) -> BufferedIOBase:
 
 
 class _Unpacked(gzip.GzipFile):
-    """Gzip file that also closes the compressed file below."""
+    """Gzip file that also closes the underlying compressed file."""
 
     def __init__(self, file: BufferedIOBase) -> None:
         super().__init__(fileobj=file, mode="rb")
