@@ -1,4 +1,4 @@
-"""Collections of stores: the same queries over several stores and machines.
+"""Collections: many store files (bundles) in a folder or object store, with the query interface of a store.
 
 A collection is a folder, or a prefix in an object store. It has *bundles*, which are immutable
 stores of some hundreds of traces, and a *catalogue* of their contents. ``_storage`` reads and writes

@@ -1,4 +1,4 @@
-"""Cache of bundles on this machine: fetched once, and verified once against the catalogue.
+"""Local cache of the bundles (store files) of a collection: each is fetched and verified once.
 
 The name of a bundle is the SHA-256 of its file. A bundle in a local folder is used in place. A
 verified bundle is remembered by the file's inode, size and time, so that it is not hashed for each
@@ -25,7 +25,7 @@ CACHE: Final = "SGSTORE_CACHE"
 
 
 def cache_folder() -> Path:
-    """Create and return the folder for fetched bundles and for verification marks.
+    """Return the folder for fetched bundles (store files of a collection), and create it if missing.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def cache_folder() -> Path:
 
 
 def bundle_path(place: Place, sha: str, *, again: bool = False) -> Path:
-    """Return the local file of a bundle after verification.
+    """Return the path of a bundle (store file of a collection) on this machine, after verification.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def _stamp(path: Path) -> list[int]:
 
 
 def _seen(folder: Path, sha: str, path: Path) -> bool:
-    """True if a file has been verified and has not changed since."""
+    """True if a bundle file has been verified and has not changed since."""
     try:
         return json.loads((folder / "seen" / sha).read_text()) == _stamp(path)
     except FileNotFoundError:

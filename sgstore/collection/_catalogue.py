@@ -1,4 +1,4 @@
-"""Catalogue of a collection: complete snapshots of its contents.
+"""Catalogue of a collection: snapshots that list all its bundles, traces and their contents.
 
 A snapshot has a number, a folder of Parquet files, and a JSON file. The JSON file is written last,
 and only if its number is free: a snapshot is complete or absent, and of two simultaneous commits
@@ -57,7 +57,7 @@ _SNAPSHOTS: Final = "catalogue"
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """Fixed settings of a collection.
+    """Settings of a collection that never change after its creation.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class About:
 
 
 def about(place: Place) -> About:
-    """Return the settings of a collection.
+    """Return the settings of a collection, or raise an error for a place without a collection.
 
     Raises
     ------
@@ -102,13 +102,13 @@ def about(place: Place) -> About:
 
 
 def _damage(error: Exception) -> str:
-    """Return the defect of a JSON file as text."""
+    """Return the defect of a damaged JSON file as text."""
     why = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
     return f"damaged or cut off ({why}); put it back from a copy"
 
 
 def create(place: Place, wanted: About) -> About:
-    """Create the collection if it is missing, and return its settings."""
+    """Return the settings of a collection, and create a missing collection."""
     told = {
         "format": FORMAT,
         "schema_version": wanted.schema_version,
@@ -121,7 +121,7 @@ def create(place: Place, wanted: About) -> About:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """State of a collection.
+    """Snapshot of a collection: its bundles (store files) and traces at the time of a commit.
 
     Attributes
     ----------
@@ -136,30 +136,30 @@ class Snapshot:
 
     @cached_property
     def bundles(self) -> tuple[dict[str, Any], ...]:
-        """Return the rows of table ``bundle``, in commit order."""
+        """Return the catalogue rows of all bundles (store files), in the order of their commits."""
         names = [*CATALOGUE["bundle"]]
         return tuple(dict(zip(names, row, strict=True)) for row in self.facts["bundle"])
 
     @cached_property
     def traces(self) -> tuple[dict[str, Any], ...]:
-        """Return the rows of table ``trace``, by name in natural order."""
+        """Return the catalogue rows of all traces, sorted by name (``run2`` before ``run10``)."""
         names = [*CATALOGUE["trace"]]
         found = (dict(zip(names, row, strict=True)) for row in self.facts["trace"])
         return tuple(sorted(found, key=lambda row: natural(row["name"])))
 
     def scope(self, *, world: bool, traces: Iterable[int] | None = None) -> dict[str, Any]:
-        """Return the omissions by settings in some or all traces; see :func:`sgstore.model.scope.scope_of`."""
+        """Return the data that settings excluded from all or some traces of a collection, as JSON values."""
         chosen = None if traces is None else frozenset(traces)
         told = (row["scope"] for row in self.traces if chosen is None or row["trace_id"] in chosen)
         return scope_of(({"scope": json.loads(one)} for one in told if one), world=world)
 
     @cached_property
     def homes(self) -> dict[int, str]:
-        """Map each trace to its bundle."""
+        """Return the bundle (store file) of each trace, by trace id."""
         return {row["trace_id"]: row["bundle"] for row in self.traces}
 
     def of(self, table: str, bundle: str) -> list[tuple[Any, ...]]:
-        """Return the rows of a table for one bundle."""
+        """Return the catalogue rows of one table for one bundle."""
         return self._by_bundle(table).get(bundle, [])
 
     def _by_bundle(self, table: str) -> dict[str, list[tuple[Any, ...]]]:
@@ -176,7 +176,7 @@ class Snapshot:
 
     @cached_property
     def words(self) -> dict[str, tuple[str, ...]]:
-        """Map each enumeration to its additional values in the bundles, in a fixed order."""
+        """Return the values that users added to each enumeration in any bundle, in a fixed order."""
         found: dict[str, dict[str, None]] = {enum: {} for enum in NAMES}
         for _, what, word, _, _ in sorted(
             self.facts["word"], key=lambda row: (row[1], row[4], row[2])
@@ -187,7 +187,7 @@ class Snapshot:
 
     @cached_property
     def own(self) -> dict[str, dict[str, Type]]:
-        """Map ``own`` and ``own_edges`` to custom attributes, with their types over all bundles."""
+        """Return the custom attributes of nodes and of edges in all bundles, with their types."""
         found: dict[str, dict[str, set[Type]]] = {"own": {}, "own_edges": {}}
         for _, what, word, kind, _ in self.facts["word"]:
             if what in found:
@@ -199,16 +199,19 @@ class Snapshot:
 
     @cached_property
     def classed(self) -> tuple[str, ...]:
-        """Return the abstractions with known classes of frames in some bundle."""
+        """Return the abstractions whose frame classes are stored in at least one bundle."""
         return tuple(sorted({row[2] for row in self.facts["word"] if row[1] == "classed"}))
 
     @cached_property
     def catalog(self) -> Catalog:
-        """Return the contents of all bundles together, for the compiler."""
+        """Return the contents of all bundles as one catalog for compiling queries."""
         return self.catalog_of([bundle["bundle"] for bundle in self.bundles])
 
     def catalog_of(self, bundles: Sequence[str]) -> Catalog:
-        """Return the contents of some bundles together, with the names of all bundles."""
+        """Return the contents of some bundles as one catalog for compiling queries.
+
+        Names of attributes and enumeration values are those of all bundles.
+        """
         chosen = frozenset(bundles)
         found = zip(self._homes, self._facts, strict=True)
         sets = subset_catalogs()
@@ -224,7 +227,10 @@ class Snapshot:
         )
 
     def contents(self, bundles: Sequence[str], name: str = "") -> Catalog:
-        """Return triples and kinds of some bundles, in a derived set or as ingested, without traces."""
+        """Return a catalog with the kinds and the (kind, relation, kind) triples of some bundles.
+
+        The relations are those of a derived set, or of the ingest.
+        """
         edges, map_edges, beyond = Counter[Any](), Counter[Any](), Counter[Any]()
         tables = {True: edges, False: map_edges, None: beyond}
         kinds: dict[str, set[str]] = {home: set() for home in ("moving", "fixed", "mapped")}
@@ -247,7 +253,9 @@ class Snapshot:
     def triples(
         self, name: str, matters: Callable[[Triple], bool], *, world: bool
     ) -> dict[str, frozenset[Triple]]:
-        """Map each bundle to its relevant triples, in a derived set or as ingested.
+        """Return the relevant (kind, relation, kind) triples of each bundle, by bundle.
+
+        The relations are those of a derived set, or of the ingest.
 
         ``world``: includes triples outside the graphs.
         """
@@ -269,7 +277,7 @@ class Snapshot:
 
     @cached_property
     def kinds(self) -> dict[str, tuple[frozenset[str], ...]]:
-        """Map each bundle to its kinds that move, that are fixed, and those of the map."""
+        """Return the kinds of moving entities, of static entities and of map parts in each bundle."""
         homes = {home: place for place, home in enumerate(("moving", "fixed", "mapped"))}
         found = {one["bundle"]: (set[str](), set[str](), set[str]()) for one in self.bundles}
         for bundle, home, kind in self.facts["kind"]:
@@ -304,14 +312,14 @@ class Snapshot:
 
     @cached_property
     def sets(self) -> dict[str, list[tuple[Any, ...]]]:
-        """Map each derived set to its rows of table ``set``."""
+        """Return the catalogue rows of each derived set of relations, by name."""
         found: dict[str, list[tuple[Any, ...]]] = {}
         for row in self.facts["set"]:
             found.setdefault(row[1], []).append(row)
         return found
 
     def _derived(self, name: str, bundles: frozenset[str], whole: Catalog) -> Catalog:
-        """Return the catalogue of a derived set, for the traces that have it."""
+        """Return a catalog with the relations of a derived set, for the traces that have this set."""
         held = self.contents([*bundles], name)
         own = {row[2]: row for row in self.sets[name] if row[0] in bundles}
         traces = tuple(
@@ -339,7 +347,7 @@ class Snapshot:
         )
 
     def relations_of(self, name: str) -> frozenset[str] | None:
-        """Return the relations of a derived set by its settings, over all bundles; ``None`` means unknown."""
+        """Return the relations in the settings of a derived set, over all bundles; ``None`` means unknown."""
         rows = self.sets[name]
         numbers = {row[2] for row in rows}
         if any("abstraction" in json.loads(row[4]) for row in rows):
@@ -356,7 +364,7 @@ def _name(number: int) -> str:
 
 
 def numbers(place: Place) -> list[int]:
-    """Return the numbers of all snapshots."""
+    """Return the numbers of all snapshots of a collection."""
     found: list[int] = []
     for name, _, _ in place.names(_SNAPSHOTS):
         head, _, tail = name.removeprefix(f"{_SNAPSHOTS}/").partition(".")
@@ -379,7 +387,7 @@ def latest(place: Place) -> Snapshot:
 
 
 def read(place: Place, number: int) -> Snapshot:
-    """Return a snapshot by its number.
+    """Return the snapshot of a collection with a number.
 
     Raises
     ------
@@ -415,7 +423,7 @@ def read(place: Place, number: int) -> Snapshot:
 
 
 def write(place: Place, number: int, facts: Facts) -> bool:
-    """Commit a snapshot; return False if its number is already taken.
+    """Write a snapshot of a collection under a new number; return False if the number is taken.
 
     The files of a late snapshot are removed.
     """
@@ -445,7 +453,7 @@ def write(place: Place, number: int, facts: Facts) -> bool:
 
 
 def joined(facts: Iterable[Facts]) -> Facts:
-    """Concatenate the rows of several catalogues; equal settings become one row."""
+    """Return the rows of several catalogues as one catalogue; equal settings become one row."""
     found: Facts = {table: [] for table in CATALOGUE}
     for one in facts:
         for table, rows in one.items():
@@ -455,7 +463,7 @@ def joined(facts: Iterable[Facts]) -> Facts:
 
 
 def without(facts: Facts, bundles: Iterable[str]) -> Facts:
-    """Return the rows of a catalogue without those of some bundles."""
+    """Return the rows of a catalogue without those of the given bundles."""
     gone = frozenset(bundles)
     kept = {
         table: rows if table == "config" else [row for row in rows if row[0] not in gone]
@@ -467,7 +475,7 @@ def without(facts: Facts, bundles: Iterable[str]) -> Facts:
 
 
 def files(place: Place, known: Iterable[int]) -> set[str]:
-    """Return the names of the files of some snapshots."""
+    """Return the names of the files that store the given snapshots of a collection."""
     found: set[str] = set()
     for number in known:
         told = json.loads(place.read(f"{_name(number)}.json"))
@@ -477,5 +485,5 @@ def files(place: Place, known: Iterable[int]) -> set[str]:
 
 
 def _answers_of(text: str) -> tuple[str, ...]:
-    """Return the relations that a trace in a catalogue can answer."""
+    """Return the relations for which a trace has data, from the text in a catalogue."""
     return tuple(map(str, json.loads(text)))

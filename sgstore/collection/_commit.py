@@ -1,4 +1,4 @@
-"""Commit of landed segments: they become bundles of a collection."""
+"""Commit to a collection: ingested segments (one trace each) become bundles (store files of many traces)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class _Landed:
-    """Landed segment before its commit."""
+    """Ingested segment (file of one trace) in a collection that is not committed yet."""
 
     segment: str
     trace_id: int
@@ -46,7 +46,7 @@ class _Landed:
 
 
 def commit(url: str | Path) -> Commit:
-    """Make bundles of all landed, uncommitted segments, and commit a snapshot with them.
+    """Create bundles (store files) from all ingested segments, and a snapshot that contains them.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def commit(url: str | Path) -> Commit:
 
 
 def _waiting(place: Place, before: Snapshot, folder: Path) -> list[_Landed]:
-    """Return the landed segments outside bundles, ordered by the digests of their recordings."""
+    """Return the ingested segments that are in no bundle yet, ordered by the digest of the recording."""
     known = {row["segment"] for row in before.traces}
     sizes: dict[str, int] = {}
     complete: set[str] = set()
@@ -122,7 +122,7 @@ def _fetched(place: Place, segment: str, folder: Path, files: Iterable[str] = FI
 
 
 def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_Landed]:
-    """Return the acceptable segments; record the others with a reason."""
+    """Return the segments that can be committed; rejected segments are recorded with a reason."""
     there = {row["trace_id"]: row for row in before.traces}
     by_id: dict[int, list[_Landed]] = {}
     for one in waiting:
@@ -154,12 +154,12 @@ def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_L
 
 
 def _read_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return how a trace of the collection was read, as in :class:`_Landed`."""
+    """Return the settings, map digest, frame count and start time with which a trace was read."""
     return row["config"], row["map_digest"] or "", row["frames"], row["start_ns"]
 
 
 def _names(waiting: Sequence[_Landed], before: Snapshot, done: Commit) -> dict[int, str]:
-    """Return the name of each trace, in the order of digests, independent of the landing order."""
+    """Return a unique name for each new trace. Names do not depend on the order of arrival."""
     taken = {row["name"] for row in before.traces}
     names: dict[int, str] = {}
     for one in waiting:
@@ -176,7 +176,7 @@ def _bundled(
     names: Mapping[int, str],
     maps: Mapping[str, str],
 ) -> Facts:
-    """Make a bundle of segments, through a temporary store."""
+    """Create a bundle (store file) from some segments, upload it, and return its catalogue rows."""
     path = folder / "published.sgstore"
     file = StoreFile.create(path)
     for one in waiting:

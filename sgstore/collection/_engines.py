@@ -1,4 +1,4 @@
-"""Engines that run the tasks of a query through one interface, ``map``.
+"""Engines that run the parts of a query in parallel: local processes, Ray or Spark.
 
 ``local:N`` uses N processes of this machine, ``local`` or ``local:1`` the current process. ``ray``
 and ``ray://HOST:PORT`` use Ray, ``spark``, ``spark:MASTER`` and ``spark://HOST:PORT`` use Spark.
@@ -46,7 +46,7 @@ Outcome = dict[str, Any]
 
 
 class Engine(Protocol):
-    """Runner of tasks.
+    """Interface of an engine that runs tasks in parallel: local processes, Ray or Spark.
 
     Attributes
     ----------
@@ -57,7 +57,9 @@ class Engine(Protocol):
     shares_files: bool
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
-        """Yield the result of each task on arrival; ``{"bundle": …, "error": …}`` for a failed one.
+        """Run a function on all tasks in parallel, and yield each result on arrival.
+
+        A failed task gives ``{"bundle": …, "error": …}``.
 
         :func:`refusal` adds details for :func:`fault_of_question`.
         """
@@ -65,7 +67,7 @@ class Engine(Protocol):
 
 
 def engine_named(name: str) -> Engine:
-    """Return an engine by its name, such as ``local:4``, ``ray://HOST:PORT`` or ``spark:MASTER``.
+    """Return the engine for a name such as ``local:4``, ``ray://HOST:PORT`` or ``spark:MASTER``.
 
     Raises
     ------
@@ -95,13 +97,16 @@ _OF_QUESTIONS: Final = (QueryError, SqlError, AbstractionError, ConfigError)
 
 
 def refusal(task: Task, error: SgstoreError) -> Outcome:
-    """Return the result of a task with a permanent error, which needs no retry."""
+    """Return the result of a task that failed with an error that a retry would repeat."""
     outcome = {"bundle": task["bundle"], "error": str(error)}
     return outcome | ({"wrong": plain_error(error)} if isinstance(error, _OF_QUESTIONS) else {})
 
 
 def fault_of_question(outcome: Outcome) -> SgstoreError | None:
-    """Return the error if the query caused it; ``None`` for errors of a bundle, or success."""
+    """Return the error of a failed task if the query caused it.
+
+    ``None`` means success, or an error of the bundle.
+    """
     return error_of(outcome["wrong"]) if "wrong" in outcome else None
 
 
@@ -117,7 +122,7 @@ class _Here:
 
 
 class _Processes:
-    """Local processes; an idle process takes the next task, and a dead process is replaced."""
+    """Engine of local worker processes. An idle process gets the next task, and a dead one is replaced."""
 
     shares_files = True
 
@@ -162,7 +167,7 @@ class _Processes:
 
 
 class _Process:
-    """Process that runs tasks one after the other."""
+    """Local worker process that runs tasks one after another."""
 
     def __init__(self, name: str, events: SimpleQueue[tuple[_Process, str | None]]) -> None:
         separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
@@ -184,7 +189,7 @@ class _Process:
         self._events.put((self, None))
 
     def begin(self, task: tuple[int, Task]) -> None:
-        """Send a task; if the process is dead, the end of its stdout reports it."""
+        """Send a task to the worker process. A dead process is detected later, by the end of its output."""
         self.task = task
         with suppress(OSError):
             assert self._process.stdin is not None  # noqa: S101 - it was asked for
@@ -192,7 +197,7 @@ class _Process:
             self._process.stdin.flush()
 
     def end(self) -> int:
-        """Kill the process if it still runs; return its exit code."""
+        """Kill the worker process if it still runs, and return its exit code."""
         self._process.kill()
         code = self._process.wait()
         self._listener.join()
@@ -204,7 +209,7 @@ class _Process:
 
 
 class _Ray:
-    """Tasks of Ray, which repeats lost tasks itself."""
+    """Engine that runs tasks by Ray, which repeats lost tasks itself."""
 
     shares_files = False
 
@@ -233,7 +238,7 @@ class _Ray:
 
 
 class _Spark:
-    """Tasks of Spark, one partition each; Spark repeats lost tasks itself.
+    """Engine that runs tasks by Spark, one partition each. Spark repeats lost tasks itself.
 
     If a complete job fails, the faulty task is unknown: its tasks then run one by one.
     """
@@ -277,7 +282,7 @@ class _Spark:
 
 
 def _session(sql: Any, master: str) -> Any:
-    """Return a Spark session on a master, or on all local cores, with retries of lost tasks."""
+    """Return a Spark session on a master, or on all local cores, which repeats lost tasks."""
     build = sql.SparkSession.builder.appName("sgstore").master(master or f"local[*,{RETRIES + 1}]")
     build = build.config("spark.task.maxFailures", RETRIES + 1).config("spark.ui.enabled", "false")
     build = build.config("spark.ui.showConsoleProgress", "false")
@@ -296,7 +301,7 @@ _RAISED: Final = re.compile(r'^[ \t]+File ".*\n(?:[ \t].*\n)*(\S.*)', re.MULTILI
 
 
 def _cause(error: BaseException) -> str:
-    """Return the cause of an error in one line: the remote error, else the first line."""
+    """Return the cause of a Ray or Spark error in one line."""
     text = re.sub(r"\x1b\[[\d;]*m", "", str(error)).strip()  # Ray writes in colours
     lines = _RAISED.findall(text)[-1:] or text.splitlines() or [type(error).__name__]
     return lines[0].strip()[:300]
@@ -315,7 +320,7 @@ def _done(name: str, task: Task) -> Outcome:
 
 
 def main(name: str, stdin: TextIO, answers: TextIO) -> None:
-    """Run tasks from JSON lines until the end of the input."""
+    """Run tasks from JSON lines in a worker process until the input ends."""
     for line in stdin:
         answers.write(f"{json.dumps(_done(name, json.loads(line)))}\n")
         answers.flush()

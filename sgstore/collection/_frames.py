@@ -1,4 +1,4 @@
-"""Frames of a collection, with the interface of a store's frames.
+"""Frames of a collection (many stores), with the same interface as the frames of one store.
 
 Coverage, selections and locks use them.
 """
@@ -39,7 +39,7 @@ _ALL: Final = f"FROM {PARTS} ORDER BY ALL"
 
 
 class Bundles(Protocol):
-    """Methods of a collection that frames need; see :class:`sgstore.collection.Collection`."""
+    """Methods of a collection that the classes for its frames use."""
 
     snapshot: Snapshot
 
@@ -54,7 +54,7 @@ class Bundles(Protocol):
 
 
 class CollectionFrames:
-    """Frames of a collection, with the interface of :class:`StoreFile` and its :class:`Abstracted`.
+    """Frames of all bundles of a collection, with the interface of a single store file.
 
     Parameters
     ----------
@@ -70,15 +70,17 @@ class CollectionFrames:
 
     @property
     def abstracted(self) -> Self:
-        """Return itself: the interface for abstractions."""
+        """Return this object, which also has the methods for graph abstractions."""
         return self
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Do nothing: the snapshot of a collection does not change."""
+        """Return an empty context manager, because the snapshot of a collection never changes."""
         return nullcontext()
 
     def arrays(self, sql: str, parameters: Parameters = ()) -> dict[str, NDArray[np.generic]]:
-        """Return all columns of a statement whose rows belong to one trace each, ordered by value.
+        """Run an SQL statement on all bundles, and return its columns as arrays, ordered by value.
+
+        Each row must belong to one trace.
 
         Parameters
         ----------
@@ -91,7 +93,7 @@ class CollectionFrames:
             return PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
 
     def rows(self, sql: str, parameters: Parameters = ()) -> Rows:
-        """Return all rows of such a statement; see :meth:`arrays`."""
+        """Run an SQL statement on all bundles, and return its rows. Each row must belong to one trace."""
         with self._told(sql, parameters) as parts:
             values = [*_rows(parts, self._words)]
             return Rows(parts[0].columns, parts[0].types, values)
@@ -107,7 +109,7 @@ class CollectionFrames:
             yield parts
 
     def by_bundle(self, frame_id: Ints) -> list[tuple[str, tuple[Ints, Ints]]]:
-        """Return the bundles of some frames, each with the indices and ids of its frames."""
+        """Return the bundles that contain the given frames, each with the indices and ids of its frames."""
         traces, number = np.unique(trace_of(frame_id), return_inverse=True)
         homes = [self._homes[trace] for trace in traces.tolist()]
         of = {bundle: place for place, bundle in enumerate(dict.fromkeys(homes))}
@@ -116,22 +118,22 @@ class CollectionFrames:
         return [(name, (some, frame_id[some])) for name, some in rows]
 
     def coded(self, name: str) -> CodedClasses:
-        """Return the class of each frame as a number; computed in bundles without stored classes."""
+        """Return the class number of each frame in an abstraction. Classes that are not stored are computed."""
         with self._parts({"kind": "coded", "abstraction": name}) as parts:
             return PartFile.merged_classes(parts)
 
     def times(self) -> tuple[Ints, Ints]:
-        """Return the ids of all frames, ascending, and their simulation times; ns."""
+        """Return the ids of all frames, ascending, and their simulation times in ns."""
         frame_id, time_ns = self.arrays(_TIMES).values()
         return np.asarray(frame_id, np.int64), np.asarray(time_ns, np.int64)
 
     def imported_names(self) -> dict[str, int]:
-        """Map names of graphs in imported files to the ids of their frames."""
+        """Return the frame ids of imported graphs, by the name of the graph in its file."""
         found = sorted(self.rows(_IMPORTS).values, key=lambda row: row[1])
         return dict(found)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """Yield features of the graphs of frames in an abstraction, bundle by bundle.
+        """Yield the features of frames (label counts of their graphs) in an abstraction, bundle by bundle.
 
         Parameters and results as in :meth:`sgstore.store._classes.Abstracted.features`.
         """
@@ -149,7 +151,7 @@ class CollectionFrames:
             yield homes[result["bundle"]][0], Triples(names, *columns)
 
     def margins(self, question: dict[str, Any]) -> Iterator[tuple[Ints, Floats]]:
-        """Yield the margins of a check, as :meth:`sgstore.temporal.CheckRun.margins`."""
+        """Yield frame ids with the robustness margins of a check, bundle by bundle."""
         with self._parts({"kind": "margins"} | question) as parts:
             found = PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
         yield (
@@ -161,7 +163,10 @@ class CollectionFrames:
     def _parts(
         self, question: dict[str, Any], each: Mapping[str, dict[str, Any]] = MappingProxyType({})
     ) -> Generator[list[PartFile]]:
-        """Return the results of all bundles, or of the bundles with an entry in ``each``."""
+        """Context manager with the result files of all bundles for a query.
+
+        If ``each`` has entries, only their bundles run it.
+        """
         with working_folder("parts") as folder:
             found: list[PartFile] = []
             for bundles in ([*each] or self._bundles, [worker.EMPTY]):  # all bundles may be missing

@@ -1,4 +1,4 @@
-"""Ingest into a collection: recordings land as sealed segments, and a commit makes bundles of them.
+"""Ingest into a collection: each recording becomes segment files, from which a later commit makes bundles.
 
 Landing needs no lock and no order: the name of a segment is its content hash, so that a repeated
 landing writes the same. The digests of the recordings distribute them: each of N shards takes its
@@ -49,7 +49,7 @@ def land(  # noqa: PLR0913  as many options as there are ways to read
     until: float | None = None,
     rate: float | None = None,
 ) -> list[TraceOutcome]:
-    """Read recordings, and land their segments in a collection, which is created if missing.
+    """Ingest recordings as segment files into a collection; a missing collection is created.
 
     Recordings that have landed with the same settings are not read again.
 
@@ -107,7 +107,7 @@ class _Landing:
     maps: set[str] = field(default_factory=set[str])
 
     def landed(self, paths: list[Path], share: int, of: int, jobs: int) -> list[TraceOutcome]:
-        """Read a share of some recordings, and land their segments."""
+        """Ingest one share (``share`` of ``of``) of the recordings, and write their segment files."""
         Maps(self.job.road_map, self.job.config.signs)  # an unreadable map stops the run early
         found: dict[int, list[TraceOutcome]] = {}
         wanted: dict[int, tuple[Path, str]] = {}
@@ -147,7 +147,7 @@ class _Landing:
             yield reader.read(path, self.folder / str(number))
 
     def _key(self, digest: str) -> str:
-        """Return the key of a landed recording: its digest and the settings."""
+        """Return a key for an ingested recording: a hash of its digest, the settings and the map."""
         job = self.job
         road_map = ""
         if job.road_map is not None and job.road_map.is_file():
@@ -158,7 +158,10 @@ class _Landing:
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
     def _told(self, key: str, path: Path) -> list[TraceOutcome] | None:
-        """Return the results of a recording that has landed before, or ``None``."""
+        """Return the earlier results for a recording that was ingested before with the same settings.
+
+        ``None`` means that it was not.
+        """
         name = f"landed/{key[:2]}/{key}.json"
         if not any(one == name for one, _, _ in self.place.names(f"landed/{key[:2]}")):
             return None
@@ -186,7 +189,7 @@ class _Landing:
         return [outcome for outcome, _ in views]
 
     def _put(self, sealed: Path) -> str:
-        """Put a segment, and its map if missing, into the collection; return the segment's name."""
+        """Upload a segment file and its road map to the collection, and return the name of the segment."""
         with working_folder("segment") as folder:
             parts = [folder / name for name in ("segment", "map")]
             for part in parts:
@@ -205,7 +208,7 @@ class _Landing:
 
 
 def _mark(path: Path) -> str:
-    """Return the digest of a recording, which identifies it before it is read.
+    """Return the digest of a recording file, which identifies the recording before it is read.
 
     A remote recording is identified by its URL, size and time: hashing would make every shard fetch
     it.

@@ -1,4 +1,4 @@
-"""Maintenance of a collection: verification, and removal of unused files."""
+"""Maintenance of a collection: verification of its files, and removal of unused files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class CollectionFaults:
-    """Faults of a collection.
+    """Result of a verification: faults of a collection, and the numbers of verified bundles and traces.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ def verify(url: str | Path) -> CollectionFaults:
 
 
 def _differing(snapshot: Snapshot, sha: str, facts: Facts) -> list[tuple[str, str, str]]:
-    """Return the tables of the catalogue that disagree with a bundle."""
+    """Return the catalogue tables whose rows for a bundle differ from the content of the bundle."""
     faults: list[tuple[str, str, str]] = []
     for table in CATALOGUE:
         if table == "config":
@@ -89,7 +89,7 @@ def _differing(snapshot: Snapshot, sha: str, facts: Facts) -> list[tuple[str, st
 
 @dataclass(slots=True)
 class Garbage:
-    """Unreferenced files.
+    """Files of a collection that no snapshot uses, with their total size.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class Garbage:
 def gc(
     url: str | Path, *, keep: int = 1, older_s: float = GRACE_S, dry_run: bool = False
 ) -> Garbage:
-    """Remove old snapshots, and files that no snapshot references.
+    """Remove old snapshots of a collection, and files that no snapshot uses.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def _segment_of(name: str) -> str:
 
 
 def _last(name: str) -> bool:
-    """True for a file that is removed after others: a snapshot goes before its tables."""
+    """True if a file must be removed after other files: tables of a snapshot go after the snapshot."""
     return not name.endswith(".json")
 
 

@@ -1,4 +1,4 @@
-"""The function that opens a store, or with an engine a collection of stores."""
+"""Function ``open`` for a store or, with an engine, a collection of stores."""
 
 from __future__ import annotations
 

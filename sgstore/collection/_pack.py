@@ -1,4 +1,4 @@
-"""Bundles of a collection: creation from stores, unpacking to one store, maintenance.
+"""Conversion of a store to bundles (store files) of a collection, and of a collection to one store.
 
 Committed traces and road maps keep their names. New traces are named in the order of the digests of
 their recordings, so that names depend only on the committed contents.
@@ -37,7 +37,7 @@ TRACE: Final = {name: place for place, name in enumerate(CATALOGUE["trace"])}
 
 @dataclass(slots=True)
 class Commit:
-    """Changes of a commit.
+    """Result of a commit to a collection: number of the snapshot, added and renamed traces, rejections.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ def pack(
     bundle_traces: int | None = None,
     on_bundle: Callable[[int, int], None] | None = None,
 ) -> Commit:
-    """Add the traces of a store to a collection, which is created if missing.
+    """Copy the traces of a store to a collection. A missing collection is created.
 
     Existing traces and the store do not change.
 
@@ -109,7 +109,7 @@ def _sized(traces: int) -> About:
 
 @dataclass(slots=True)
 class _Source:
-    """Store whose traces are added to a collection."""
+    """Store whose traces are copied to a collection."""
 
     path: Path
     about: About
@@ -117,7 +117,10 @@ class _Source:
     on_bundle: Callable[[int, int], None] | None = None
 
     def committed(self, place: Place) -> Commit | None:
-        """Commit the new traces to the last snapshot; ``None`` means that another commit was first."""
+        """Add the new traces to the collection, and return the result.
+
+        ``None`` means that another process committed first.
+        """
         before = catalogue.latest(place)
         done = Commit(before.number)
         names = self._named(before, done, place)
@@ -139,7 +142,7 @@ class _Source:
         return done if catalogue.write(place, done.number, whole) else None
 
     def _named(self, before: Snapshot, done: Commit, place: Place) -> dict[int, str]:
-        """Return the new traces with their names.
+        """Return the traces of the store that the collection lacks, with unique names.
 
         Raises
         ------
@@ -173,13 +176,13 @@ class _Source:
         return names
 
     def _groups(self, names: Mapping[int, str]) -> list[dict[int, str]]:
-        """Return the traces of each bundle."""
+        """Return the new traces divided into groups, one group for each bundle."""
         each = max(self.path.stat().st_size // max(len(BundleSource(self.path).names()), 1), 1)
         return groups(names, max(min(self.limit, self.about.bundle_bytes // each), 1))
 
 
 def groups(names: Mapping[int, str], most: int) -> list[dict[int, str]]:
-    """Divide traces into groups of limited size, neighbours by name.
+    """Return traces in groups of at most ``most``, divided in the order of their names.
 
     The groups have almost equal sizes: 1,001 traces are not split into 1,000 and 1. Few bundles
     have the first traces by name.
@@ -198,7 +201,7 @@ def put_bundle(
     maps: Mapping[str, str],
     segments: Mapping[int, str] | None = None,
 ) -> Facts:
-    """Make a bundle of traces of a store and add it to a collection; return its catalogue rows.
+    """Create a bundle (store file) with some traces, upload it, and return its catalogue rows.
 
     Parameters
     ----------
@@ -226,7 +229,7 @@ def put_bundle(
 
 
 def map_names(before: Snapshot, found: Mapping[str, str]) -> dict[str, str]:
-    """Return the name of each road map by digest; known maps keep their names."""
+    """Return a name for each road map, by digest. Maps that the collection knows keep their names."""
     names = {row["map_digest"]: row["map"] for row in before.traces if row["map_digest"]}
     taken = set(names.values())
     for digest, name in sorted(found.items()):
@@ -237,7 +240,7 @@ def map_names(before: Snapshot, found: Mapping[str, str]) -> dict[str, str]:
 
 
 def unpack(url: str | Path, store: str | Path) -> list[str]:
-    """Copy all traces of a collection into one new store; return their names.
+    """Copy all traces of a collection into one new store, and return their names.
 
     Raises
     ------
@@ -270,7 +273,7 @@ def unpack(url: str | Path, store: str | Path) -> list[str]:
 
 
 def refuse_others(place: Place, snapshot: Snapshot) -> None:
-    """Reject a collection with bundles of another schema version.
+    """Raise an error if a collection has bundles of another schema version.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Queries over a collection: run on the relevant bundles, with merged results.
+"""Queries over a collection: each runs on the relevant bundles (store files), and the results are merged.
 
 A query is compiled once, against the contents of all bundles. This finds its errors and the
 irrelevant bundles. The rows of each bundle are written to Parquet files in a temporary folder, and
@@ -82,7 +82,7 @@ _ALL: Final = f"FROM {PARTS}"
 
 
 class PartialAnswerError(StoreError):
-    """Some bundles did not answer.
+    """Error for a query that some bundles of a collection did not answer.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class PartialAnswerError(StoreError):
 
 
 class Collection:
-    """Collection of stores, with the query interface of a store.
+    """Collection of many stores, with the query interface of one store.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ class Collection:
         """
 
     def joined(self, tables: Mapping[str, object]) -> Collection:
-        """Return the same collection with other user tables: see the parameter ``tables``.
+        """Return the same collection with other user tables for its queries.
 
         Examples
         --------
@@ -184,17 +184,17 @@ class Collection:
 
     @cached_property
     def engine(self) -> Engine:
-        """Return the engine for the bundles, started with the first query."""
+        """Return the engine that runs queries in parallel. It is started by the first query."""
         return engine_named(self._engine_name)
 
     @cached_property
     def catalog(self) -> Catalog:
-        """Return the contents of all bundles together, with the user tables."""
+        """Return the contents of all bundles, and the user tables, as a catalog for compiling queries."""
         found = self.snapshot.catalog
         return found if self._tables is None else replace(found, tables=self._table_facts())
 
     def _table_facts(self) -> dict[str, TableFacts]:
-        """Return facts about user tables for the compiler: the match of their rows with the frames."""
+        """Return for each user table how its rows match the frames of the collection."""
         told: dict[str, dict[str, Any]] = {}
         for result in self.ask({"kind": "tables"}, self.bundles() or [worker.EMPTY]):
             for name, one in result["tables"].items():
@@ -207,11 +207,11 @@ class Collection:
 
     @cached_property
     def file(self) -> CollectionFrames:
-        """Return its frames, with the interface of a store's file."""
+        """Return the frames of the collection, with the interface of a store file."""
         return CollectionFrames(self, lambda: self.catalog)
 
     def bundles(self) -> list[str]:
-        """Return all bundles, the largest first."""
+        """Return the names of all bundles (store files), the largest first."""
         ordered = sorted(self.snapshot.bundles, key=lambda one: (-one["bytes"], one["bundle"]))
         return [one["bundle"] for one in ordered]
 
@@ -282,7 +282,7 @@ class Collection:
         return PartedChecks(self, text, parameters, about)
 
     def sql(self, text: str, *, each: bool = False) -> PartedRows:
-        """Run a statement in every bundle; return its rows after a column ``bundle``.
+        """Run an SQL statement on every bundle, and return the rows with an additional column ``bundle``.
 
         Parameters
         ----------
@@ -352,7 +352,7 @@ class Collection:
         return self._at_home(frame, Store.pattern, {"frame": frame, "ignore": [*ignore]})
 
     def _at_home(self, frame: str, step: Callable[..., Any], values: dict[str, Any]) -> Any:
-        """Run a function on the bundle of a frame; errors are those of a single store."""
+        """Run a function on the bundle that contains a frame. Errors are the same as for a single store."""
         home = self._home_of(frame)
         try:
             for _, value in self.each(step, {home: values}):
@@ -362,7 +362,7 @@ class Collection:
         raise StoreError(self.missing[home])
 
     def _home_of(self, frame: str) -> str:
-        """Return the bundle of a frame's trace; names as in :meth:`sgstore.Store.graph`.
+        """Return the bundle that contains a frame, given by its name or id.
 
         Raises
         ------
@@ -380,7 +380,7 @@ class Collection:
     def each(
         self, step: Callable[..., Any], asked: Mapping[str, Mapping[str, Any]]
     ) -> Iterator[tuple[str, Any]]:
-        """Run a function on some bundles; yield bundle and result on arrival.
+        """Run a function on some bundles in parallel, and yield each bundle with its result on arrival.
 
         Parameters
         ----------
@@ -411,7 +411,9 @@ class Collection:
         bundles: Sequence[str],
         each: Mapping[str, dict[str, Any]] = MappingProxyType({}),
     ) -> Iterator[dict[str, Any]]:
-        """Yield the result of each bundle on arrival; ``each`` has the parameters of single bundles.
+        """Send a query to some bundles, and yield their results on arrival.
+
+        ``each`` has the parameters of single bundles.
 
         Missing bundles are not tried again.
 
@@ -444,7 +446,7 @@ class Collection:
             self._judge(failed, len(tasks))
 
     def _judge(self, failed: Mapping[str, str], asked: int) -> None:
-        """Reject a result without some bundles, or record them if ``partial`` is on.
+        """Raise an error if bundles failed to answer a query. With ``partial``, they are only recorded.
 
         Earlier results may include bundles that answered then; such bundles cannot be left out now.
         """
@@ -487,13 +489,16 @@ class Collection:
         return {"text": "", "parameters": {}, "limit": None} | asked | about
 
     def _sent(self, path: Path) -> str:
-        """Return a table for a task: its path, or its bytes if files are not shared."""
+        """Return a user table for a task: its path, or its bytes for a machine without the same files."""
         if self.engine.shares_files:
             return str(path)
         return "base64:" + base64.b64encode(path.read_bytes()).decode()
 
     def classes(self, questions: Iterable[ClassQuestion], folder: str | Path) -> dict[str, Path]:
-        """Write the table of classes of all bundles for these abstractions; empty without any."""
+        """Write a file with the frame classes of all bundles, and return its path by table name.
+
+        Without abstractions, nothing is written.
+        """
         rows: list[tuple[str, str, str, int]] = []
         asked = False
         for one in questions:
@@ -519,7 +524,7 @@ class Collection:
         return {CLASSES_GIVEN: path}
 
     def _counted(self, abstraction: str) -> list[tuple[str, str, str, int]]:
-        """Return the number of frames of each class of an abstraction in all bundles, from the catalogue."""
+        """Return the number of frames of each class in all bundles together, from the catalogue."""
         counts: dict[str, int] = {}
         for _, of, name, frames, _ in self.snapshot.facts["class_count"]:
             if of == abstraction:
@@ -527,7 +532,7 @@ class Collection:
         return [("", abstraction, name, frames) for name, frames in counts.items()]
 
     def may_answer(self, compiled: Compiled) -> list[str]:
-        """Return the bundles in which a query may have a match, the largest first."""
+        """Return the bundles that can contain a match of a query, the largest first."""
         chosen, left = traces_of(compiled.query, compiled.catalog)
         every = {t.trace_id for t in compiled.catalog.traces}
         asked = (every if chosen is None else chosen) - left
@@ -539,7 +544,7 @@ class Collection:
     def _held(
         self, catalog: Catalog, pruning: Pruning
     ) -> Callable[[str], tuple[frozenset[Triple], Sequence[frozenset[str]]]]:
-        """Return a function from a bundle to its relevant triples, and its kinds, under an abstraction."""
+        """Return a function that gives the relevant triples and the kinds of a bundle, for an abstraction."""
         snapshot, name, world = self.snapshot, catalog.name, catalog.world
         if name and name not in snapshot.sets:
 
@@ -562,7 +567,7 @@ def _similar(values: dict[str, Any]) -> SimilarFrames:
 
 
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
-    """Return the facts about a user table, from the match of its rows with the frames."""
+    """Return facts about a user table for compiling queries: how its rows match the frames."""
     refused = None
     if not told["joins"]:
         refused = "no rows that belong to frames"
@@ -573,7 +578,7 @@ def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
 
 
 class PartedMatches(Tabular):
-    """Matches of a query in a collection, with the interface of :class:`sgstore.matches.Matches`.
+    """Matches of a query in all bundles of a collection, with the interface of matches in one store.
 
     Each method runs the query again.
 
@@ -603,7 +608,7 @@ class PartedMatches(Tabular):
         return f"<PartedMatches of {' '.join(self._text.split())[:80]!r}>"
 
     def limit(self, most: int) -> Self:
-        """Return the same matches with at most ``most`` rows, as with ``LIMIT``.
+        """Return the same matches, limited to at most ``most`` rows.
 
         Raises
         ------
@@ -619,28 +624,28 @@ class PartedMatches(Tabular):
 
     @property
     def of_all(self) -> bool:
-        """True if the query uses the classes of frames of all bundles."""
+        """True if the query needs the frame classes of all bundles."""
         return bool(class_questions(self._ready.bound))
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Map traces that cannot answer to the reason, as known from the catalogue and earlier runs."""
+        """Return the traces that cannot answer the query, each with the reason."""
         found = {**self._ready.reasons, **self._reasons}
         return {name: found[name] for name in sorted(found, key=natural)}
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Return the traces that cannot answer, because a required value is unknown."""
+        """Return the names of the traces that cannot answer the query because a required value is unknown."""
         return tuple(self.reasons)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return no notes: a collection does not search for likely mistakes."""
+        """Return an empty tuple: a collection does not search queries for likely mistakes."""
         return ()
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the omissions by settings in the queried traces; see :func:`sgstore.model.scope.scope_of`."""
+        """Return the data that settings excluded from the queried traces, as JSON values."""
         chosen = (trace.trace_id for trace in self._ready.chosen)
         return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
 
@@ -654,17 +659,17 @@ class PartedMatches(Tabular):
         yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
     def rows(self) -> list[Any]:
-        """Return all rows at once."""
+        """Return all rows of the matches as a list."""
         return list(self)
 
     def numpy(self) -> dict[str, Any]:
-        """Return all columns as arrays, masked for NULL."""
+        """Return all columns of the matches as arrays; NULL values are masked."""
         with self._tables("rows", (0, 0)) as tables:
             text, values = parted(self._ready).statement(self._ready.catalog)
             return PartFile.merged_arrays(tables, self.snapshot.words, text, values)
 
     def count(self) -> int:
-        """Return the number of distinct frames."""
+        """Return the number of distinct frames with a match."""
         if self._ready.limited_to_frames is not None:
             return len({row[0] for row in self._frames()})
         with working_folder("classes") as folder:
@@ -678,7 +683,10 @@ class PartedMatches(Tabular):
             return total
 
     def frames(self) -> Iterator[FrameRef]:
-        """Yield the distinct frames, ordered by trace name and number, or in the order of limited rows."""
+        """Yield the distinct frames with a match, ordered by trace name and frame number.
+
+        With ``LIMIT``, they have the order of the rows.
+        """
         for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
             yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
 
@@ -717,12 +725,12 @@ class PartedMatches(Tabular):
 
     @property
     def _slack(self) -> dict[str, int]:
-        """Return the time tolerance of each trace, by name; ns."""
+        """Return the time tolerance of each trace in ns, by trace name."""
         traces = self._ready.catalog.traces
         return {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
 
     def explain(self) -> str:
-        """Explain the query, stage by stage, and the merge of the results."""
+        """Return an explanation of the query: its SQL stages, and the merge of the bundles' results."""
         asked = parted(self._ready)
         bundles = self._whole.may_answer(self._ready)
         text, _ = asked.statement(self._ready.catalog)
@@ -731,7 +739,7 @@ class PartedMatches(Tabular):
         return f"{self._ready.stages()}\n\n{told}"
 
     def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-        """Return columns and rows in a readable form."""
+        """Return the columns and rows of the matches in a readable form, with names of entities."""
         return for_people(self.columns, self, graphs=self.graphs)
 
     def _described(self) -> tuple[tuple[str, ...], None]:
@@ -753,7 +761,7 @@ class PartedMatches(Tabular):
         }
 
     def _answered(self, form: str, offsets: tuple[int, int] = (0, 0)) -> Iterator[tuple[Any, ...]]:
-        """Yield the merged rows of the matches in one of their forms."""
+        """Run the query, and yield the merged rows of all bundles in one form (rows, frames, intervals, …)."""
         asked = parted(self._ready, form, *offsets)
         with self._tables(form, offsets) as tables:
             text, values = asked.statement(self._ready.catalog)
@@ -763,7 +771,7 @@ class PartedMatches(Tabular):
                     yield from batch.values
 
     def written_apart(self, to: Path) -> PartFile:
-        """Write the rows as a part of a union, with columns that distinguish nodes of several traces."""
+        """Write the rows of one part of a ``UNION`` to a file, with columns that distinguish equal node ids."""
         asked = parted(self._ready, "apart")
         with self._tables("apart", (0, 0)) as tables:
             statement = asked.statement(self._ready.catalog)
@@ -772,7 +780,7 @@ class PartedMatches(Tabular):
 
     @contextmanager
     def _tables(self, form: str, offsets: tuple[int, int]) -> Generator[dict[str, list[PartFile]]]:
-        """Run the query on the bundles; yield their results by table of the merging statement."""
+        """Run the query on the bundles, and yield their result files by table name for the merge."""
         with working_folder("parts") as folder:
             question = self._question(form, folder, offsets)
             tables: dict[str, list[PartFile]] = {}
@@ -789,18 +797,18 @@ class PartedMatches(Tabular):
 
 
 class PartedUnion(UnionMatches):
-    """Matches of ``UNION`` or ``UNION ALL`` in a collection."""
+    """Matches of a ``UNION`` query in all bundles of a collection."""
 
     _parts: Sequence[Any]  # PartedMatches
 
     @property
     def of_all(self) -> bool:
-        """True if the query uses the classes of frames of all bundles."""
+        """True if the query needs the frame classes of all bundles."""
         return any(part.of_all for part in self._parts)
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the omissions by settings in the traces of all parts."""
+        """Return the data that settings excluded from the traces of all parts, as JSON values."""
         parts = [part._ready for part in self._parts]  # noqa: SLF001
         chosen = {trace.trace_id for one in parts for trace in one.chosen}
         snapshot = self._parts[0].snapshot
@@ -816,7 +824,7 @@ class PartedUnion(UnionMatches):
                 yield from map(row._make, batch.values)
 
     def numpy(self) -> dict[str, Any]:
-        """Return all columns as arrays, masked for NULL."""
+        """Return all columns of the matches as arrays; NULL values are masked."""
         if self.graphs:
             raise QueryError("a table has values, and SUBGRAPHS are graphs")
         with self._tables() as asked:
@@ -824,7 +832,7 @@ class PartedUnion(UnionMatches):
 
     @contextmanager
     def _tables(self) -> Generator[tuple[Any, Any, str, list[Any]]]:
-        """Yield the rows of the parts as tables, their enumeration values, and the joining statement."""
+        """Yield the rows of all parts of the union as tables, and the SQL statement that joins them."""
         tables, snapshot = dict[str, list[PartFile]](), self._parts[0].snapshot
         with working_folder("union") as folder:
             for number, part in enumerate(self._parts):
@@ -839,7 +847,7 @@ class PartedUnion(UnionMatches):
 
 
 class _NoFile:
-    """Substitute for the file of a store: a collection does not change during a query."""
+    """Placeholder for the file of a store; a collection has no single file."""
 
     @contextmanager
     def snapshot(self) -> Generator[None]:
@@ -847,7 +855,7 @@ class _NoFile:
 
 
 class PartedChecks:
-    """Checks of a text over a collection; iteration runs them and yields verdicts, check by check."""
+    """``CHECK`` statements over a collection. Iteration runs them and yields the verdicts."""
 
     def __init__(
         self,
@@ -867,16 +875,16 @@ class PartedChecks:
 
     @property
     def quantitative(self) -> bool:
-        """True if some check has a robustness."""
+        """True if at least one check has a robustness margin."""
         return any(one.check.robustness for one in self._checks)
 
     @property
     def lasting(self) -> bool:
-        """True if frames have margins; see :attr:`sgstore.temporal.CheckRun.lasting`."""
+        """True if the check has a robustness margin in each frame, not only one per trace."""
         return all(kept_throughout(one.check) is not None for one in self._checks)
 
     def margins(self) -> Iterator[tuple[Ints, Floats]]:
-        """Yield the margins of the only check; see :meth:`sgstore.temporal.CheckRun.margins`."""
+        """Yield frame ids with the robustness margins of the only check."""
         question = {"text": self._text, "parameters": self._parameters}
         return self._whole.file.margins(question)
 
@@ -889,17 +897,17 @@ class PartedChecks:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return no notes: a collection does not search for likely mistakes."""
+        """Return an empty tuple: a collection does not search checks for likely mistakes."""
         return ()
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the omissions by settings in the traces; see :func:`sgstore.model.scope.scope_of`."""
+        """Return the data that settings excluded from the checked traces, as JSON values."""
         world = any(one.check.world for one in self._checks)
         return self._whole.snapshot.scope(world=world)
 
     def explain(self) -> str:
-        """Explain the checks: formulas over atoms, and each atom."""
+        """Return an explanation of the checks: their formulas, and the query of each condition."""
         from sgstore.temporal import CheckRun
 
         with working_folder("empty") as folder:
@@ -935,7 +943,7 @@ def _verdicts(path: Path) -> Iterator[Verdict]:
 
 
 class PartedRows(Tabular):
-    """Rows of a statement in every bundle; iteration runs it."""
+    """Rows of an SQL statement in every bundle of a collection. Iteration runs the statement."""
 
     def __init__(self, whole: Collection, text: str) -> None:
         self._whole, self._text = whole, text
@@ -963,7 +971,7 @@ class PartedRows(Tabular):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the columns, found by running the statement."""
+        """Return the column names of an SQL statement, after running it."""
         if not self._columns:
             next(iter(self), None)
         return self._columns

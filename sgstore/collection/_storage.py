@@ -1,4 +1,4 @@
-"""Places of collections: a folder, or a prefix in an object store.
+"""Storage of a collection: a local folder, or a prefix in an object store such as S3.
 
 Files are written and removed, but never changed. A file appears complete or not at all. If two
 processes write the same name at once, one of them learns that it was late.
@@ -33,11 +33,11 @@ PIECE: Final = 1 << 20
 
 
 class MissingObjectError(StoreError):
-    """The place has no file with this name."""
+    """Error for a missing file of a collection."""
 
 
 class Place(Protocol):
-    """Folder of files with names such as ``bundles/….sgstore``.
+    """Interface of a collection's storage: files with names such as ``bundles/….sgstore``.
 
     Attributes
     ----------
@@ -52,32 +52,32 @@ class Place(Protocol):
         ...
 
     def write_new(self, name: str, data: bytes) -> bool:
-        """Write a new file; return False if the name exists."""
+        """Write a new file; return False if a file with this name exists."""
         ...
 
     def upload(self, path: Path, name: str) -> None:
-        """Write a file with the content of a local file."""
+        """Copy a local file to a name in the storage."""
         ...
 
     def fetch(self, name: str, to: Path) -> None:
-        """Copy a file to a local path."""
+        """Copy a file from the storage to a local path."""
         ...
 
     def names(self, folder: str) -> Iterator[tuple[str, int, float]]:
-        """Yield name, bytes and time (s since 1970) of the files in a folder and below it."""
+        """Yield the name, size in bytes and time (s since 1970) of all files below a folder."""
         ...
 
     def remove(self, name: str) -> None:
-        """Remove a file, if it exists."""
+        """Remove a file from the storage; a missing file is ignored."""
         ...
 
     def local(self, name: str) -> Path | None:
-        """Return the path of a local file; ``None`` means that it must be fetched."""
+        """Return the local path of a file in the storage; ``None`` means that it must be fetched."""
         ...
 
 
 def place_at(url: str | Path) -> Place:
-    """Return the place of a collection.
+    """Return the storage of a collection at a path or URL.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class _Folder:
 
     @contextmanager
     def _beside(self, name: str) -> Generator[tuple[Path, Path]]:
-        """Yield a temporary path, which is removed at the end, and the final path."""
+        """Yield a temporary path and the final path of a file; the temporary file is removed at the end."""
         path = self.root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
@@ -183,7 +183,7 @@ class _Folder:
 
 
 class _Remote:
-    """Place in an object store, with obstore, which retries requests."""
+    """Storage of a collection in an object store, by the package obstore, which retries requests."""
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")

@@ -1,4 +1,4 @@
-"""Worker: runs a part of a query on one bundle and writes its results to files.
+"""Worker process of a collection: runs part of a query on one bundle, and writes result files.
 
 A task and its result are plain values, so that any engine can transport them. A task depends only
 on its values and the bundle; it can be repeated anywhere with the same result.
@@ -44,7 +44,7 @@ EMPTY: Final = ""
 
 @dataclass(frozen=True, slots=True)
 class Whole:
-    """Facts about the whole collection that a part of a query needs.
+    """Facts about the whole collection that a worker needs to run a query on one bundle.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Whole:
     sets: dict[str, list[str] | None]
 
     def catalog(self, local: Catalog) -> Catalog:
-        """Return the catalogue of a part: its contents, with the names of the whole."""
+        """Return the catalog of one bundle for compiling queries, with the names of the whole collection."""
         sets = dict(local.sets)
         for name, relations in self.sets.items():
             if name in sets:
@@ -83,7 +83,7 @@ class Whole:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Build the facts from plain values."""
+        """Return facts about a collection from their JSON values."""
         return cls(**values)
 
 
@@ -95,10 +95,10 @@ def _with_relations(
 
 
 class PartMatches(TemporalMatches):
-    """Matches of a query in one bundle, in the forms that the merge needs."""
+    """Matches of a query in one bundle, in the forms that the merge of bundles needs."""
 
     def written(self, form: str, offsets: tuple[int, int], folder: Path) -> list[PartFile]:
-        """Write the rows of each partial query."""
+        """Write the rows of a query on one bundle to files, in one form, and return the files."""
         with self._compiled() as compiled:
             if form == "count":
                 return [self._written(compiled, Compiled.count(compiled), folder)]
@@ -113,7 +113,7 @@ class PartMatches(TemporalMatches):
 
 
 def answer(task: dict[str, Any]) -> dict[str, Any]:
-    """Run a task on one bundle.
+    """Run a task of a query on one bundle, and return the result as JSON values.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _known(file: StoreFile, told: str) -> Catalog:
-    """Return the cached catalogue of a bundle, which never changes."""
+    """Return the catalog of a bundle for compiling queries; it is cached, because bundles never change."""
     local = file.catalog()
     held = _catalogs.get((file.path, told))
     if held is None or held[0] is not local:
@@ -161,7 +161,7 @@ _catalogs: Final[dict[tuple[Path, str], tuple[Catalog, Catalog]]] = {}
 
 @contextmanager
 def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
-    """Yield the open bundle; user tables and user statements get their own connection."""
+    """Yield a bundle as an open store. User tables and user SQL get a separate connection."""
     if task["bundle"] == EMPTY:
         path = held / "empty.sgstore"
         StoreFile.create(path).close()
@@ -180,12 +180,12 @@ def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
 
 @lru_cache(maxsize=KEPT)
 def _kept(path: Path) -> StoreFile:
-    """Return an open bundle from the cache."""
+    """Return a bundle as an open store, from a cache."""
     return StoreFile.together(path)
 
 
 def _tables_of(task: dict[str, Any], held: Path) -> dict[str, Path]:
-    """Return the user tables of a task, by name, as files."""
+    """Return the files of the user tables for a task, by table name."""
     given: dict[str, Path] = {}
     for name, table in task.get("tables", {}).items():
         if table.startswith("base64:"):
@@ -238,7 +238,7 @@ _of_interval, _of_robustness = _getter(Interval), _getter(Robustness)
 
 
 def _values_of(verdict: Verdict) -> list[Any]:
-    """Return the values of a verdict without names, which would triple the size."""
+    """Return a verdict as a list of values. Field names would make it three times as long."""
     margin, witnesses = verdict.robustness, verdict.witnesses
     return [
         *(verdict.check, verdict.trace, verdict.verdict),
@@ -251,7 +251,7 @@ def _values_of(verdict: Verdict) -> list[Any]:
 
 
 def as_verdict(values: list[Any]) -> Verdict:
-    """Rebuild a verdict from its values."""
+    """Return the verdict for a list of values that a worker has sent."""
     import numpy as np
 
     check, trace, word, violations, witnesses, status, reason, margin, absent = values
@@ -274,7 +274,7 @@ def as_verdict(values: list[Any]) -> Verdict:
 def _classes(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the classes of the frames of some traces, or of a table of single frames."""
+    """Write the classes of the frames of one bundle to a file."""
     path = to / f"{secrets.token_hex(8)}.parquet"
     part = PartFile.of_classes(file, task["abstraction"], task["traces"], task["table"], path)
     return {"parts": [part.as_dict()], "reasons": {}}
@@ -283,7 +283,7 @@ def _classes(
 def _sql(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the rows of a user's statement on one bundle as JSON lines."""
+    """Write the rows of a user's SQL statement on one bundle to a file, as JSON lines."""
     path = to / f"{secrets.token_hex(8)}.ndjson"
 
     def find(text: str, **values: object) -> Matches:
@@ -311,7 +311,7 @@ def _coded(
 def _features(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write features of the graphs of frames in an abstraction; frames are numbered as in the task."""
+    """Write the features of frames (label counts of their graphs) of one bundle to a file."""
     import numpy as np
 
     def rows() -> Iterator[tuple[int, str, int]]:
@@ -331,7 +331,7 @@ def _features(
 def _margins(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the margin of each frame, or of its trace, for a check."""
+    """Write the robustness margins of a check for the frames or traces of one bundle to a file."""
     import numpy as np
 
     run = CheckRun(file, catalog, task["text"], task["parameters"])
@@ -364,7 +364,7 @@ def _step(
 def _tables(
     _task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
 ) -> dict[str, Any]:
-    """Return the match of user tables with the frames of one bundle."""
+    """Return how the rows of the user tables match the frames of one bundle."""
     joined, told = file.joined(), dict[str, Any]()
     for name, facts in file.catalog().tables.items():
         rows = joined.get(name)
@@ -379,12 +379,12 @@ def _tables(
 
 
 def example_in(store: Store, **asked: Any) -> dict[str, Any]:
-    """Return a frame of a bundle as an example for others."""
+    """Return a frame of a bundle as an example, to find similar frames in other bundles."""
     return asdict(Example.of(store.file, **asked))
 
 
 def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str, Any]]:
-    """Return the frames of a bundle that are most similar to an example."""
+    """Return the frames of one bundle that are most similar to an example frame."""
     return [asdict(one) for one in Example.find(store.file, Example(**example), **how)]
 
 
@@ -403,7 +403,7 @@ _KINDS: Final[dict[str, Any]] = {
 
 
 def _carry(found: dict[str, Any]) -> None:
-    """Embed the content of files into a result for another machine."""
+    """Replace file paths in a result by the content of the files, for another machine."""
     for part in found.get("parts", ()):
         if not part["path"]:
             continue
@@ -413,7 +413,7 @@ def _carry(found: dict[str, Any]) -> None:
 
 
 def brought(result: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Write the embedded files of a result to a local folder.
+    """Write the file contents in a result to a local folder, and return the result with their paths.
 
     Raises
     ------
