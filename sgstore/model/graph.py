@@ -671,7 +671,7 @@ class SceneGraph:
         return self.reach.between(*ends)
 
     def to_next(self, node: int, what: str) -> float | None:
-        """Return the distance along lanes to the next map part of a kind (such as crosswalk); m.
+        """Return the distance along lanes to the next map part of a kind (such as crosswalk); m; 0 on the part.
 
         ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
         means none within 200 m.

@@ -651,7 +651,7 @@ FIRST_STEPS: Final = 64
 
 
 class LifetimeTracker:
-    """Assigns node ids to the objects of frames. An id that returns as another object gets a new node id.
+    """Assignment of node ids to objects. An id that returns as another object gets a new node id.
 
     Node ids depend on lifetimes, by the rule of :class:`~sgstore.model.world.Lives`. Most ids have the same
     entity in all frames. They are compared as arrays; only the rows of possibly different entities are

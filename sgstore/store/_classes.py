@@ -138,7 +138,7 @@ class TraceClasses:
 
 
 class IngestedClasses:
-    """Computes the frame classes and the lane roles of one trace during ingest."""
+    """Frame classes and lane roles of one trace, computed during ingest."""
 
     def __init__(self, road_map: RoadMap | None) -> None:
         self._grounds = None if road_map is None else MapColumns.of(road_map)

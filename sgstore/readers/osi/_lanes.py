@@ -172,7 +172,7 @@ def _paths(fields: dict[str, Any]) -> Iterator[str]:
 
 
 class OsiLanes:
-    """Collects the lanes and lane boundaries from OSI messages.
+    """Collector of the lanes and lane boundaries in OSI messages.
 
     Parameters
     ----------
