@@ -23,6 +23,8 @@ TITLES = {
     "selection": "Small parts of a million frames that keep every class",
     "criticality": "Measures of criticality, a million pairs each",
     "explorer": "The explorer: in a browser, and by request",
+    "library": "The library: patterns and checks over a million frames",
+    "verbs": "Verbs at 1,007 traces, each a new process",
     "startup": "Start of the command line, beside bare imports",
     "prioritize": "Orders of simulator runs by risk, beside their outcomes",
 }

@@ -35,9 +35,14 @@ PATTERN = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 5"
 
 def seconds(*arguments: str) -> float:
     """Return the processor time of a new Python process."""
-    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": ""}  # keep compiled files, as an installed package does
+    environment = {
+        **os.environ,
+        "PYTHONDONTWRITEBYTECODE": "",
+    }  # keep compiled files, as an installed package does
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL, env=environment)
+    subprocess.run(
+        [sys.executable, *arguments], check=True, stdout=subprocess.DEVNULL, env=environment
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
