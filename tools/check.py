@@ -52,7 +52,7 @@ TESTS = {
     "numba_loops": "compiled",
     "opendrive": "opendrive_*",
     "pair_numbers": "pair_numbers ttc criticality lane_dist lane_places lane_courses roundabouts",
-    "processes": "ingest_many sandbox",
+    "processes": "processes ingest_many sandbox",
     "plugins": "plugins relations abstractions flavours",
     "query": "query api datasets",
     "quoting": "user_tables",

@@ -9,17 +9,13 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 import sys
-import threading
-from collections import deque
-from contextlib import suppress
+from collections import Counter, deque
 from functools import partial
 from importlib import import_module
-from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, Final, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from sgstore.base.processes import command
+from sgstore.base.processes import WorkerPool, requests, send_reply
 from sgstore.errors import (
     AbstractionError,
     ConfigError,
@@ -131,81 +127,23 @@ class _Processes:
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
         name = f"{function.__module__}:{function.__qualname__}"
-        waiting = deque(enumerate(tasks))
-        tries = [0] * len(tasks)
-        events: SimpleQueue[tuple[_Process, str | None]] = SimpleQueue()
-        workers: set[_Process] = set()
-        left = len(tasks)
-        try:
+        waiting, tries, left = deque(range(len(tasks))), Counter[int](), len(tasks)
+        with WorkerPool(self._count, "sgstore.collection._engines", name) as pool:
             while left:
-                while waiting and len(workers) < self._count:
-                    workers.add(_Process(name, events))
-                for worker in workers:
-                    if worker.task is None and waiting:
-                        worker.begin(waiting.popleft())
-                worker, line = events.get()
-                held, worker.task = worker.task, None
-                if line is not None:
-                    left -= 1
-                    yield json.loads(line)
-                    continue
-                workers.discard(worker)
-                code = worker.end()
-                if held is None:
-                    continue
-                tries[held[0]] += 1
-                if tries[held[0]] <= RETRIES:
-                    waiting.appendleft(held)
-                else:
-                    left -= 1
-                    how = f"signal {-code}" if code < 0 else f"code {code}"
-                    reason = f"the process that asked it ended with {how}, {tries[held[0]]} times"
-                    yield {"bundle": held[1]["bundle"], "error": reason}
-        finally:
-            for worker in workers:
-                worker.end()
-
-
-class _Process:
-    """Local worker process that runs tasks one after another."""
-
-    def __init__(self, name: str, events: SimpleQueue[tuple[_Process, str | None]]) -> None:
-        separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
-        self.task: tuple[int, Task] | None = None
-        self._events = events
-        self._process = subprocess.Popen(  # noqa: S603  a module of ours
-            [*command("sgstore.collection._engines"), name],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            encoding="utf-8",
-            **separate,
-        )
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
-
-    def _listen(self) -> None:
-        for line in self._process.stdout or ():
-            self._events.put((self, line))
-        self._events.put((self, None))
-
-    def begin(self, task: tuple[int, Task]) -> None:
-        """Send a task to the worker process. A dead process is detected later, by the end of its output."""
-        self.task = task
-        with suppress(OSError):
-            assert self._process.stdin is not None  # noqa: S101 - it was asked for
-            self._process.stdin.write(f"{json.dumps(task[1])}\n")
-            self._process.stdin.flush()
-
-    def end(self) -> int:
-        """Kill the worker process if it still runs, and return its exit code."""
-        self._process.kill()
-        code = self._process.wait()
-        self._listener.join()
-        for pipe in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):
-                if pipe is not None:
-                    pipe.close()
-        return code
+                while waiting and pool.has_room:
+                    index = waiting.popleft()
+                    pool.put(index, tasks[index])
+                index, outcome = pool.get()
+                if isinstance(outcome, int):
+                    tries[index] += 1
+                    if tries[index] <= RETRIES:
+                        waiting.appendleft(index)
+                        continue
+                    how = f"signal {-outcome}" if outcome < 0 else f"code {outcome}"
+                    reason = f"the process that asked it ended with {how}, {tries[index]} times"
+                    outcome = {"bundle": tasks[index]["bundle"], "error": reason}
+                left -= 1
+                yield outcome
 
 
 class _Ray:
@@ -319,14 +257,6 @@ def _done(name: str, task: Task) -> Outcome:
         return refusal(task, error)
 
 
-def main(name: str, stdin: TextIO, answers: TextIO) -> None:
-    """Run tasks from JSON lines in a worker process until the input ends."""
-    for line in stdin:
-        answers.write(f"{json.dumps(_done(name, json.loads(line)))}\n")
-        answers.flush()
-
-
 if __name__ == "__main__":
-    out = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    sys.stdout = sys.stderr  # printed text must not mix with the results
-    main(sys.argv[1], sys.stdin, out)
+    for request in requests():
+        send_reply(_done(sys.argv[1], request))
