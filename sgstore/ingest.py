@@ -5,22 +5,16 @@ Resolution of names, folders, patterns and URLs to recordings.
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import shutil
-import subprocess
-import threading
-from collections import deque
-from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import ExitStack, closing
+from dataclasses import replace
 from glob import glob, has_magic
 from pathlib import Path
-from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from sgstore.base.logs import logger
-from sgstore.base.processes import command
+from sgstore.base.processes import WorkerPool
 from sgstore.errors import SgstoreError, StoreError, TraceError, failure, url_named
 from sgstore.maps.map_files import Maps
 from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of, remote_names
@@ -34,11 +28,10 @@ from sgstore.store import Folder, PresentError, Sealed, StoreFile
 _log = logger("ingest")
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 
     from sgstore.mcap import BagPart
 
-    Event = tuple["_Worker", dict[str, Any] | None]
     Views = list[tuple[TraceOutcome, Path | None]]
 
 __all__ = ["ingest", "recordings"]
@@ -157,38 +150,14 @@ _WAITING: Final = 64
 """Recordings per process that may be read before the first of them is published."""
 
 
-@dataclass(eq=False)
-class _Worker:
-    """Reader process with the numbers of the recordings assigned to it."""
-
-    process: subprocess.Popen[str]
-    tasks: deque[int] = field(default_factory=deque[int])
-    listener: threading.Thread | None = None
-
-    def tell(self, values: dict[str, Any]) -> None:
-        stdin = self.process.stdin
-        if stdin is not None:
-            try:
-                stdin.write(f"{json.dumps(values)}\n")
-                stdin.flush()
-            except OSError:  # The process has died; the end of its stdout reports it.
-                return
-
-    def end(self) -> int:
-        """Kill the process if it still runs, and return its exit code."""
-        self.process.kill()
-        code = self.process.wait()
-        if self.listener is not None:
-            self.listener.join()
-        for pipe in (self.process.stdin, self.process.stdout):
-            with suppress(OSError):  # The process has exited; unflushed data can be dropped.
-                if pipe is not None:
-                    pipe.close()
-        return code
-
-
-class Workers:
-    """Pool of processes that read recordings.
+def read_in_processes(
+    job: Job,
+    count: int,
+    on_block: Callable[[int, int, int, int], None],
+    paths: Sequence[Path],
+    folder: Path,
+) -> Generator[Views]:
+    """Yield the outcomes of the recordings, in order. The processes end with the generator.
 
     Parameters
     ----------
@@ -198,97 +167,40 @@ class Workers:
     on_block : function
         Called after each block with the number of the recording, its frames done, its bytes done (approximate)
         and its size.
-
-    Notes
-    -----
-    Use it as a context manager. The processes end with the context, and also if this process dies.
+    paths : sequence of Path
+    folder : Path
+        Folder of the segments, one subfolder per recording.
     """
-
-    def __init__(
-        self, job: Job, count: int, on_block: Callable[[int, int, int, int], None]
-    ) -> None:
-        self._job = job
-        self._count = count
-        self._on_block = on_block
-        self._workers: list[_Worker] = []
-        self._events: SimpleQueue[Event] = SimpleQueue()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        for worker in self._workers:
-            worker.process.kill()
-        for worker in self._workers:
-            worker.end()
-
-    def read(self, paths: list[Path], folder: Path) -> Iterator[Views]:
-        """Yield the outcomes of the recordings, in order. Segments are built in subfolders of ``folder``."""
-        waiting, done, given = deque(range(len(paths))), dict[int, "Views"](), 0
-        while given < len(paths):
-            self._hire(min(self._count, len(waiting) + len(self._workers)))
-            self._assign(waiting, paths, folder, given + _WAITING * self._count)
-            worker, event = self._events.get()
-            if event is None:
-                self._replace(worker, waiting, paths, done)
-            elif "done" in event:
-                worker.tasks.remove(event["index"])
-                done[event["index"]] = [
+    done, next_read, next_out = dict[int, "Views"](), 0, 0
+    worker = "sgstore.pipeline.recording_ingest"
+    with WorkerPool(count, worker, first=job.as_dict(), ahead=_AHEAD) as pool:
+        while next_out < len(paths):
+            end = min(next_out + _WAITING * count, len(paths))
+            while next_read < end and pool.has_room:
+                task = {"path": str(paths[next_read]), "folder": str(folder / str(next_read))}
+                pool.put(next_read, task)
+                next_read += 1
+            if next_out in done:
+                yield done.pop(next_out)
+                next_out += 1
+                continue
+            index, reply = pool.get()
+            if isinstance(reply, int):
+                done[index] = [(_lost(paths[index], reply), None)]
+            elif "done" in reply:
+                done[index] = [
                     (TraceOutcome.from_dict(outcome), Path(sealed) if sealed else None)
-                    for outcome, sealed in event["done"]
+                    for outcome, sealed in reply["done"]
                 ]
-                self._assign(waiting, paths, folder, given + _WAITING * self._count)
             else:
-                self._on_block(event["index"], event["frames"], event["bytes"], event["size"])
-            while given in done:
-                yield done.pop(given)
-                given += 1
+                on_block(index, reply["frames"], reply["bytes"], reply["size"])
 
-    def _hire(self, count: int) -> None:
-        while len(self._workers) < count:
-            separate: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
-            process = subprocess.Popen(  # noqa: S603  a module of ours
-                command("sgstore.pipeline.recording_ingest"),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                encoding="utf-8",
-                **separate,  # The parent process handles Ctrl-C.
-            )
-            worker = _Worker(process)
-            self._workers.append(worker)
-            worker.listener = threading.Thread(target=self._listen, args=(worker,), daemon=True)
-            worker.listener.start()
-            worker.tell(self._job.as_dict())
 
-    def _listen(self, worker: _Worker) -> None:
-        for line in worker.process.stdout or ():
-            self._events.put((worker, json.loads(line)))
-        self._events.put((worker, None))
-
-    def _assign(self, waiting: deque[int], paths: list[Path], folder: Path, end: int) -> None:
-        """Assign the next recordings to the processes with the fewest assigned recordings."""
-        while waiting and waiting[0] < end:
-            worker = min(self._workers, key=lambda one: len(one.tasks), default=None)
-            if worker is None or len(worker.tasks) >= _AHEAD:
-                return
-            index = waiting.popleft()
-            worker.tasks.append(index)
-            place = folder / str(index)
-            worker.tell({"index": index, "path": str(paths[index]), "folder": str(place)})
-
-    def _replace(
-        self, worker: _Worker, waiting: deque[int], paths: list[Path], done: dict[int, Views]
-    ) -> None:
-        """Remove a dead process. Its current recording fails; its other recordings return to the queue."""
-        self._workers.remove(worker)
-        code = worker.end()
-        if worker.tasks:
-            index = worker.tasks.popleft()
-            how = f"was killed by signal {-code}; is there too little memory?"
-            how = how if code < 0 else f"ended with code {code}; what it said of that is on stderr"
-            error = TraceError(f"the process that read it {how}", path=paths[index])
-            done[index] = [(TraceOutcome(paths[index], error=error), None)]
-        waiting.extendleft(reversed(worker.tasks))
+def _lost(path: Path, code: int) -> TraceOutcome:
+    """Return the outcome of a recording whose process died."""
+    how = f"was killed by signal {-code}; is there too little memory?"
+    how = how if code < 0 else f"ended with code {code}; what it said of that is on stderr"
+    return TraceOutcome(path, error=TraceError(f"the process that read it {how}", path=path))
 
 
 # The run: recordings are read, here or in other processes, and published in the given order.
@@ -380,7 +292,8 @@ def ingest(  # noqa: PLR0913  one option per way to read
         folder = Path() if dry_run else stack.enter_context(Folder(job.store)).path
         if min(jobs, len(paths)) > 1:
             Maps(job.road_map, config.signs)  # An unreadable map stops the run at once.
-            read = stack.enter_context(Workers(job, jobs, meter.see)).read(paths, folder)
+            read = read_in_processes(job, jobs, meter.see, paths, folder)
+            stack.enter_context(closing(read))
         else:
             read = _one_by_one(job, paths, folder, meter)
         for number, views in enumerate(read):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from contextlib import ExitStack
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -19,7 +19,7 @@ from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._storage import digest_of_file, place_at
 from sgstore.errors import SgstoreError, StoreError, TraceError, url_named
-from sgstore.ingest import BLOCK_FRAMES, Workers
+from sgstore.ingest import BLOCK_FRAMES, read_in_processes
 from sgstore.maps.map_files import Maps
 from sgstore.mcap import digest_of, mark_of
 from sgstore.model.config import Config
@@ -28,7 +28,7 @@ from sgstore.pipeline.recording_ingest import Job, SegmentReader, TraceOutcome
 from sgstore.store import split_segment
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Generator, Sequence
 
     from sgstore.collection._storage import Place
 
@@ -126,21 +126,20 @@ class _Landing:
                 wanted[place] = path, key
             else:
                 found[place] = told
-        with ExitStack() as stack:
-            read = self._read([path for path, _ in wanted.values()], jobs, stack)
+        with closing(self._read([path for path, _ in wanted.values()], jobs)) as read:
             for number, (place, (_, key)) in enumerate(wanted.items()):
                 found[place] = self._land(key, next(read))
                 shutil.rmtree(self.folder / str(number), ignore_errors=True)
         return [outcome for place in sorted(found) for outcome in found[place]]
 
     def _read(
-        self, paths: list[Path], jobs: int, stack: ExitStack
-    ) -> Iterator[list[tuple[TraceOutcome, Path | None]]]:
+        self, paths: list[Path], jobs: int
+    ) -> Generator[list[tuple[TraceOutcome, Path | None]]]:
         def see(*_told: int) -> None:
             """Ignore the progress."""
 
         if min(jobs, len(paths)) > 1:
-            yield from stack.enter_context(Workers(self.job, jobs, see)).read(paths, self.folder)
+            yield from read_in_processes(self.job, jobs, see, paths, self.folder)
             return
         reader = SegmentReader(self.job, see)
         for number, path in enumerate(paths):

@@ -2,17 +2,12 @@
 
 Types for the progress and the outcome of an ingest.
 
-``python -m sgstore.pipeline.recording_ingest`` is a worker process. It reads recordings for its parent process.
-Input (stdin) and output (stdout) have one JSON value per line. The first input is the job, each further one
-a recording. The outputs are progress and outcomes. The process ends at once when stdin ends.
+``python -m sgstore.pipeline.recording_ingest`` is a worker process (:mod:`sgstore.base.processes`). Its first
+request is the job, each further one a recording. Its replies are progress and outcomes.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import sys
-import threading
 import time
 import traceback
 from array import array
@@ -20,13 +15,13 @@ from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
 from sgstore import errors
 from sgstore.base.logs import logger
+from sgstore.base.processes import requests, send_reply
 from sgstore.errors import SgstoreError, TraceError, failure, place_named
 from sgstore.graphs.relations import Crowds, renamed
 from sgstore.maps.map_files import Maps, lost_lanes
@@ -580,33 +575,16 @@ def _reached(frames: FrameBlock, size: int) -> int:
 
 
 def main() -> None:
-    """Read recordings on request: requests on stdin, results on stdout, until stdin ends."""
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    sys.stdout = sys.stderr  # Printed text must not mix with the results.
-    told: SimpleQueue[dict[str, Any]] = SimpleQueue()
-    threading.Thread(target=_listen, args=(told,), daemon=True).start()
-
-    def answer(values: dict[str, Any]) -> None:
-        answers.write(f"{json.dumps(values)}\n")
-        answers.flush()
+    """Read recordings for the parent process. The first request is the job."""
+    asked = requests()
 
     def on_block(frames: int, reached: int, size: int) -> None:
-        answer({"index": index, "frames": frames, "bytes": reached, "size": size})
+        send_reply({"frames": frames, "bytes": reached, "size": size, "more": True})
 
-    index = -1
-    reading = SegmentReader(Job.from_dict(told.get()), on_block)
-    while True:
-        task = told.get()
-        index = task["index"]
+    reading = SegmentReader(Job.from_dict(next(asked)), on_block)
+    for task in asked:
         views = reading.read(Path(task["path"]), Path(task["folder"]))
-        done = [[outcome.as_dict(), sealed and str(sealed)] for outcome, sealed in views]
-        answer({"index": index, "done": done})
-
-
-def _listen(told: SimpleQueue[dict[str, Any]]) -> None:
-    for line in sys.stdin:
-        told.put(json.loads(line))
-    os._exit(0)
+        send_reply({"done": [[one.as_dict(), sealed and str(sealed)] for one, sealed in views]})
 
 
 if __name__ == "__main__":

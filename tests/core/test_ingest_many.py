@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import signal
+import subprocess
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,6 @@ from killing import content, made
 from opendrive_maps import a_map, a_road, line
 from recordings import Recorder, car, drive, person
 
-from sgstore import ingest as workers
 from sgstore import readers
 from sgstore.errors import MapError, StoreError, TraceError
 from sgstore.ingest import ingest, recordings
@@ -102,13 +102,13 @@ def test_a_process_that_dies_costs_the_recording_that_it_read(
 ) -> None:
     paths = [drive(tmp_path / f"d{i}.mcap", frames=200 + i) for i in range(5)]
     hired: list[Any] = []
-    real = workers.subprocess.Popen
+    real = subprocess.Popen
 
     def hire(*arguments: Any, **options: Any) -> Any:
         hired.append(real(*arguments, **options))
         return hired[-1]
 
-    monkeypatch.setattr(workers.subprocess, "Popen", hire)
+    monkeypatch.setattr(subprocess, "Popen", hire)
     victims: list[Path] = []
 
     def kill(progress: Progress) -> None:
@@ -130,7 +130,7 @@ def test_a_process_that_dies_costs_the_recording_that_it_read(
 def test_a_map_that_is_none_stops_before_a_process_is_begun(
     mixed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workers.subprocess, "Popen", None)
+    monkeypatch.setattr(subprocess, "Popen", None)
 
     with pytest.raises(MapError):
         ingest(tmp_path / "s.db", mixed, jobs=2, road_map=tmp_path / "none.xodr")
