@@ -6,7 +6,7 @@ query has a deadline, after which the process is killed (stopping a query in the
 long). Its result has a limited number of rows and bytes. The process lives on between queries,
 because its start takes a third of a second.
 
-Parent and child exchange JSON, one message per line. Other packages can run their own queries in
+The process is a worker of :mod:`sgstore.base.processes`. Other packages can run their own queries in
 such a process: the ``worker`` of a sandbox is a module that calls :func:`serve` with a function for
 its queries, and :meth:`Sandbox.ask` sends them.
 """
@@ -18,8 +18,6 @@ import json
 import os
 import queue
 import shutil
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -27,9 +25,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
-from sgstore.base.processes import command
+from sgstore.base.processes import WorkerProcess, requests, send_reply
 from sgstore.base.temporary_folders import new_place
 from sgstore.errors import (
     QueryError,
@@ -154,7 +152,8 @@ class Sandbox:
         self._tables = {name: str(Path(path).resolve()) for name, path in (tables or {}).items()}
         self._folder: Path | None = None
         self._turn = threading.Lock()
-        self._child: subprocess.Popen[bytes] | None = None
+        self._child: WorkerProcess | None = None
+        self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._stopped = False
         with self._turn:
             self._ready()
@@ -219,9 +218,9 @@ class Sandbox:
         SqlError
             The query exceeds the time or memory limit.
         """
-        line = _line(question, error)
+        _check_length(question, error)
         with self._turn:
-            return _granted(self._exchange(self._ready(), line, self._timeout_s))
+            return _granted(self._exchange(self._ready(), question, self._timeout_s))
 
     def replies(self, question: Mapping[str, object]) -> Iterator[dict[str, Any]]:
         """Yield the replies of the sandbox process to a query on arrival.
@@ -242,11 +241,11 @@ class Sandbox:
         SqlError
             The query exceeds the time or memory limit, or was stopped.
         """
-        line, finished = _line(question, QueryError), False
-        until = time.monotonic() + self._timeout_s
+        _check_length(question, QueryError)
+        finished, until = False, time.monotonic() + self._timeout_s
         with self._turn:
             try:
-                reply = self._exchange(self._ready(), line, self._timeout_s)
+                reply = self._exchange(self._ready(), question, self._timeout_s)
                 while reply.pop("more", False):
                     yield reply
                     assert self._child is not None  # noqa: S101 - it has just answered
@@ -273,18 +272,16 @@ class Sandbox:
     def is_ready(self) -> bool:
         """True if the sandbox process runs."""
         child = self._child
-        return child is not None and child.poll() is None
+        return child is not None and child.is_alive
 
-    def _ready(self) -> subprocess.Popen[bytes]:
+    def _ready(self) -> WorkerProcess:
         """Return the sandbox process; a stopped process is started again."""
-        if self._child is None or self._child.poll() is not None:
+        if self._child is None or not self._child.is_alive:
             self._kill()
             self._stopped = False
-            self._child = subprocess.Popen(  # noqa: S603  a module of ours
-                command(self._worker),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
+            self._lines = queue.SimpleQueue()
+            self._child = WorkerProcess(
+                self._worker, on_line=self._lines.put, longest=self._max_bytes + 1, quiet=True
             )
             self._folder = new_place("sandbox")
             self._folder.mkdir(mode=0o700)
@@ -298,7 +295,7 @@ class Sandbox:
             }
             wait = START_S + READ_S * len(self._tables)
             try:
-                reply = self._exchange(self._child, json.dumps(settings), wait)
+                reply = self._exchange(self._child, settings, wait)
             except SqlError as error:
                 raise SqlError(f"the process that answers did not start: {error}") from None
             if "error" in reply:
@@ -306,36 +303,34 @@ class Sandbox:
             _granted(reply)
         return self._child
 
-    def _exchange(self, child: subprocess.Popen[bytes], line: str | None, timeout_s: float) -> Any:
-        """Send a line (or none) to the sandbox process, and return its reply.
+    def _exchange(
+        self, child: WorkerProcess, question: Mapping[str, object] | None, timeout_s: float
+    ) -> Any:
+        """Send a question (or none) to the sandbox process, and return its reply.
 
         The process is killed after the timeout.
 
         The caller does not wait for its end, because a process with much memory exits slowly.
         """
-        replies: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        talk = threading.Thread(
-            target=_sent_and_read,
-            args=(child, None if line is None else line.encode(), replies, self._max_bytes),
-            daemon=True,
-        )
-        talk.start()
+        if question is not None:
+            # In a thread, because a stuck process does not read a long question.
+            threading.Thread(target=child.send, args=(question,), daemon=True).start()
         try:
-            reply = replies.get(timeout=max(timeout_s, 0))
+            line = self._lines.get(timeout=max(timeout_s, 0))
         except queue.Empty:
             self._abandon()
-            told = self._timeout_s if line is None else timeout_s  # later parts have less time left
+            told = self._timeout_s if question is None else timeout_s  # later parts have less time
             raise SqlError(f"stopped after {told:g} s") from None
         except BaseException:
             self._kill()
             raise
-        if reply.endswith(b"\n"):
-            return json.loads(reply)
+        if line.endswith(b"\n"):
+            return json.loads(line)
         stopped = self._stopped
         self._kill()
         if stopped:
             raise SqlError("stopped")
-        if len(reply) > self._max_bytes:
+        if len(line) > self._max_bytes:
             raise SqlError(f"stopped: the answer is longer than {self._max_bytes} bytes")
         raise SqlError("stopped: it took more memory than is allowed")
 
@@ -351,44 +346,20 @@ class Sandbox:
         child, folder = self._child, self._folder
         self._child = self._folder = None
         if child is not None:
-            child.kill()
             _bury(child, folder)
 
 
-def _bury(child: subprocess.Popen[bytes], folder: Path | None) -> None:
+def _bury(child: WorkerProcess, folder: Path | None) -> None:
     """Wait for the end of a sandbox process, and remove its folder."""
-    with child:  # closes the pipes, too
-        pass
+    child.end()
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _sent_and_read(
-    child: subprocess.Popen[bytes],
-    line: bytes | None,
-    replies: queue.SimpleQueue[bytes],
-    most: int,
-) -> None:
-    """Send a line to a sandbox process, and put its reply line into a queue.
-
-    The line is incomplete if the process ended or the reply is too long.
-    """
-    reply = b""
-    # A thread that kills the process may close its pipes during their use here.
-    with suppress(OSError, ValueError):
-        if child.stdin is not None and child.stdout is not None:
-            if line is not None:
-                child.stdin.write(line + b"\n")
-                child.stdin.flush()
-            reply = child.stdout.readline(most + 1)
-    replies.put(reply)
-
-
-def _line(question: Mapping[str, object], error: type[SgstoreError]) -> str:
-    line = json.dumps(question)
-    if len(line) > MAX_QUESTION:
-        raise error(f"the question has {len(line)} characters; {MAX_QUESTION} are allowed")
-    return line
+def _check_length(question: Mapping[str, object], error: type[SgstoreError]) -> None:
+    length = len(json.dumps(question))
+    if length > MAX_QUESTION:
+        raise error(f"the question has {length} characters; {MAX_QUESTION} are allowed")
 
 
 def _granted(reply: Any) -> dict[str, Any]:
@@ -584,21 +555,15 @@ class SandboxPool:
 
 
 def serve(answering: Answering) -> None:
-    """Answer queries from stdin in the sandbox process until the input ends, then exit the process.
+    """Answer the queries of the parent process until it ends this one.
 
     Parameters
     ----------
     answering : callable
         Function from a query to its reply (JSON values). Errors of sgstore are sent to the caller.
     """
-    with suppress(KeyboardInterrupt, BrokenPipeError):
-        _serve(answering)
-    os._exit(0)
-
-
-def _serve(answering: Answering) -> None:
-    lines, replies = sys.stdin.buffer, sys.stdout.buffer
-    settings = json.loads(lines.readline())
+    asked = requests()
+    settings = next(asked)
     tempfile.tempdir = settings["folder"]
     free = settings["may_write"]
     _limit(settings["memory"], files=None if free else _TABLE_BYTES)
@@ -612,25 +577,19 @@ def _serve(answering: Answering) -> None:
         os.chdir(path.parent)  # so that the database knows only the file name
         store = Store(path.name, memory=settings["memory"], tables=tables)
     except OSError as error:
-        _send(replies, _refusal(StoreError(f"{path}: {error.strerror}")))
+        send_reply(_refusal(StoreError(f"{path}: {error.strerror}")))
         return
     except SgstoreError as error:
-        _send(replies, _refusal(error))
+        send_reply(_refusal(error))
         return
-    _send(replies, {"columns": [], "rows": [], "truncated": False, "reasons": {}})
-    for line in lines:
-        question = json.loads(line)
+    send_reply({"columns": [], "rows": [], "truncated": False, "reasons": {}})
+    for question in asked:
         try:
-            reply = answering(store, question, settings["rows"])
-            for one in [reply] if isinstance(reply, dict) else reply:
-                _send(replies, one)
+            answer = answering(store, question, settings["rows"])
+            for one in [answer] if isinstance(answer, dict) else answer:
+                send_reply(one)
         except SgstoreError as error:
-            _send(replies, _refusal(error))
-
-
-def tell(reply: Mapping[str, Any]) -> None:
-    """Send a partial reply from the sandbox process to its parent process."""
-    _send(sys.stdout.buffer, {**reply, "more": True})
+            send_reply(_refusal(error))
 
 
 def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
@@ -672,11 +631,6 @@ def _spilled(error: SgstoreError) -> bool:
     """True if an error comes from temporary files of the database, which the sandbox forbids."""
     text = str(error)
     return os.strerror(errno.EFBIG) in text and "duckdb_temp" in text
-
-
-def _send(to: IO[bytes], reply: object) -> None:
-    to.write(json.dumps(reply).encode() + b"\n")
-    to.flush()
 
 
 def _limit(memory: int, *, files: int | None) -> None:

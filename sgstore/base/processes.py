@@ -224,11 +224,6 @@ def send_reply(values: Mapping[str, Any]) -> None:
         sys.__stdout__.buffer.flush()
 
 
-def command(module: str) -> list[str]:
-    """Return the command that runs a module in an isolated process with the packages of this process."""
-    return [sys.executable, "-I", "-c", _START, json.dumps(folders()), module]
-
-
 def folders() -> list[str]:
     """Return the folders of the Python packages that a child process needs.
 

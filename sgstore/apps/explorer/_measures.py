@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.apps.sandbox import tell
 from sgstore.base.json_text import finite
+from sgstore.base.processes import send_reply
 from sgstore.errors import StoreError
 from sgstore.exporters import Export, write_export
 from sgstore.model.frame_ids import frame_ids
@@ -105,7 +105,7 @@ def diff(store: Store, other: str, abstraction: str) -> dict[str, Any]:
 
 
 def _done(done: int, whole: int) -> None:
-    tell({"progress": [done, whole]})
+    send_reply({"progress": [done, whole], "more": True})
 
 
 def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], Any, float]]:
