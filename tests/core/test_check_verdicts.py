@@ -416,7 +416,7 @@ BOUNDED = tuple(
 )
 """Those whose operators are over at some time: others fail at the end."""
 
-EACH = 500 if LONG else 40
+EACH = 500 if LONG else 20
 """Scenes that a test looks at."""
 
 
