@@ -1,1 +1,1 @@
-"""The processing of one recording: segments, imports, derived relations, rebuilding, diagnosis."""
+"""Processing of one recording: ingest, import of graphs, derived relations, rebuild, diagnosis."""

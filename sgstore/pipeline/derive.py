@@ -1,4 +1,4 @@
-"""Derivation of other relations from the states in a store, without its recordings."""
+"""Derived sets of relations: computed from the states in a store, without its recordings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _NOT_RELATIONS: Final = ("ego", "egos", "payloads", "mapping", "rate")
 
 @dataclass(frozen=True, slots=True)
 class Derivation:
-    """Outcome of the derivation for one trace.
+    """Result of deriving relations for one trace.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ def derive(
     *,
     replace_old: bool = False,
 ) -> list[Derivation]:
-    """Derive another set of relations from the stored states, and store it under a name.
+    """Compute another set of relations from the stored states, and store it under a name.
 
     The set equals an ingest with these settings: the same edges, and the same range. The recordings are not
     read. Each trace is one transaction, so a stopped run can continue.
@@ -125,7 +125,7 @@ def derive(
 def keep_abstraction(
     store: str | Path, name: str, traces: Sequence[int | str] = ()
 ) -> list[Derivation]:
-    """Store the graphs of an abstraction under its name, for use in queries.
+    """Store the labelled graphs of an abstraction as a named set, so that queries can use them.
 
     This works for ``roadscene2vec`` and for a client's own function. The set contains nodes of the scene graph,
     and edges labelled with relations. Artificial nodes and other labels are only in ``graph(frame,
@@ -209,7 +209,7 @@ def _digest(config: Config) -> str:
 
 
 def _settings(trace: StoredTrace, wanted: Config) -> Config:
-    """Return the settings for the derivation of a trace, after a check against its stored states.
+    """Return the settings for deriving relations of a trace, or raise an error if its states do not suffice.
 
     Raises
     ------
@@ -256,7 +256,7 @@ def _kinds(config: Config) -> set[str]:
 
 
 def _shown(settings: RangeSettings) -> dict[str, Any]:
-    """Return the settings that determine the extent of a range."""
+    """Return the settings that define the area around the ego: radius, shape and height limits."""
     of_shape = {
         "radius": ("radius",),
         "rectangle": ("front", "rear", "side"),
@@ -269,7 +269,7 @@ def _shown(settings: RangeSettings) -> dict[str, Any]:
 
 
 def _covers(old: RangeSettings, new: RangeSettings) -> bool:
-    """True if the old range surely contains the new range."""
+    """True if the old area around the ego surely contains the new area, heights included."""
     if _shown(old) == _shown(new):
         return True
     for name in ("by", "static_by"):
@@ -282,7 +282,7 @@ def _covers(old: RangeSettings, new: RangeSettings) -> bool:
 
 
 def _reaches(old: RangeSettings, new: RangeSettings) -> bool:
-    """True if the area of the old range contains the area of the new range. Heights are ignored."""
+    """True if the old area around the ego contains the new area. Heights are ignored."""
     if old.shape == new.shape == "corridor":
         return new.length <= old.length and new.width <= old.width
     if old.shape == "polygon":

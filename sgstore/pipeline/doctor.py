@@ -1,4 +1,4 @@
-"""Check of recordings without a store: their contents and any damage."""
+"""Check of recordings without a store: their content and any damage."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sgstore.readers import on_map, open_recording, open_trace
 
 @dataclass(slots=True)
 class Examination:
-    """Contents and faults of a recording.
+    """Report on a recording: its content and its faults.
 
     Attributes
     ----------
@@ -79,14 +79,14 @@ class Examination:
     error: str = ""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all fields as plain values."""
+        """Return all fields of the report on a recording as plain values."""
         return asdict(self)
 
 
 def examine(
     path: str | Path, *, config: Config | None = None, road_map: str | Path | None = None
 ) -> Examination:
-    """Read a recording as :func:`sgstore.ingest.ingest` would, and return only the report.
+    """Read a recording as an ingest would, without a store, and return a report on its content and faults.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def examine(
 
 
 def _channels(found: Examination, report: TraceReport) -> Counter[int]:
-    """Fill in the channels of a recording. Return the number of readable messages by channel id."""
+    """Add the channels of a recording to the report; return the number of readable messages by channel id."""
     counts: Counter[int] = Counter()
     recording = open_recording(found.path)
     try:

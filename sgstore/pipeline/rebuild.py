@@ -1,4 +1,4 @@
-"""Rebuild of a store from its recordings.
+"""Rebuild of a store from its recordings, such as after a change of the database schema.
 
 A store is a cache of its traces. A rebuild is needed after a change of the table format or of the tables. The
 new store grows beside the old one in ``STORE.rebuild``. A stopped run continues there. The new store replaces
@@ -43,7 +43,7 @@ _SHOWN: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class Rebuilt:
-    """Rebuilt trace.
+    """Result of rebuilding one trace.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Rebuilt:
 
 @dataclass(frozen=True, slots=True)
 class _ReadingStep:
-    """Traces to read together: same settings, part and map."""
+    """Traces of a rebuild that are read together, because settings, time range and map are equal."""
 
     config: Config
     part: tuple[float | None, float | None]
@@ -80,7 +80,7 @@ def rebuild(
     jobs: int = 1,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> list[Rebuilt]:
-    """Rebuild a store from its recordings, with the same settings, parts, maps, egos and names.
+    """Rebuild a store from its recordings, with the same settings, time ranges, maps, egos and names.
 
     Derived sets and requested classes are rebuilt, too. The old store stays until the new one is complete. A
     stopped run continues at its last trace.
@@ -146,7 +146,7 @@ def rebuild(
 
 
 def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
-    """Return the contents of a store without the traces to drop."""
+    """Return the description of an old store without the traces to leave out."""
     names = [one.name for one in whole.traces]
     strange = [name for name in leave_out if name not in names]
     if strange:
@@ -161,7 +161,7 @@ def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
 
 @contextmanager
 def _alone(fresh: Path) -> Generator[None]:
-    """Context manager with a lock against a second rebuild of the same store."""
+    """Context manager with a lock file, so that only one process rebuilds a store."""
     lock = fresh.with_name(f"{fresh.name}-lock")
     try:
         held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
@@ -183,7 +183,7 @@ def _alone(fresh: Path) -> Generator[None]:
 def _found(
     path: Path, traces: Sequence[OldTrace], look_in: Sequence[str | Path]
 ) -> dict[int, Path]:
-    """Return the recording of each trace, by trace id.
+    """Return the path of the recording of each trace, by trace id, or raise an error for missing ones.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def _found(
 
 
 def _place(trace: OldTrace, candidates: dict[int, list[Path]]) -> Path | str:
-    """Return the path of a trace's recording, or the reason why it is unusable."""
+    """Return the path of the recording of a trace, or the reason why no usable file was found."""
     reason = "changed since it was ingested"
     try:
         mark = mark_of(trace.path)
@@ -229,7 +229,7 @@ def _place(trace: OldTrace, candidates: dict[int, list[Path]]) -> Path | str:
 
 
 def _by_size(folders: Sequence[str | Path]) -> dict[int, list[Path]]:
-    """Return the recordings in some folders, grouped by file size."""
+    """Return the files in some folders, by file size, to find recordings that were moved."""
     found: dict[int, list[Path]] = {}
     for path in recordings(folders) if folders else ():
         with suppress(OSError, TraceError):
@@ -240,7 +240,7 @@ def _by_size(folders: Sequence[str | Path]) -> dict[int, list[Path]]:
 
 
 def _resume(fresh: Path, old: Remains) -> None:
-    """Prepare the file of a stopped run: keep its valid traces, or delete an unusable file."""
+    """Prepare the new store file after an interrupted rebuild: keep valid traces, delete an invalid file."""
     if not fresh.exists():
         return
     try:
@@ -260,7 +260,7 @@ def _resume(fresh: Path, old: Remains) -> None:
 
 
 def _check_settings(path: Path, traces: Sequence[OldTrace]) -> None:
-    """Raise if this version does not support the settings of a trace."""
+    """Raise an error if this version does not support the settings of an old trace."""
     try:
         for one in traces:
             _settings(one)
@@ -275,7 +275,7 @@ def _settings(trace: OldTrace) -> Config:
 def _steps(
     traces: Sequence[OldTrace], places: dict[int, Path]
 ) -> Iterator[_ReadingStep | OldTrace]:
-    """Yield the steps in the order of the traces. Traces with equal settings are read together."""
+    """Yield the groups of traces to read together, and imported traces, in the order of the old store."""
     steps: list[_ReadingStep | OldTrace] = []
     alike = groupby(traces, key=lambda t: (t.digest, t.settings, t.since, t.until, t.map_id))
     for _, views in alike:
@@ -295,7 +295,7 @@ def _steps(
 
 
 def _as_egos(path: Path, views: Sequence[OldTrace]) -> Config:
-    """Return settings that give the recording the same egos as before."""
+    """Return settings with which a recording gets the same egos as in the old store."""
     config = _settings(views[0])
     if len(views) > 1:
         return replace(config, egos=tuple(one.ego for one in views))
@@ -311,7 +311,7 @@ def _read(
     jobs: int,
     on_progress: Callable[[Progress], None] | None,
 ) -> None:
-    """Read the recordings of a step into the new store. Traces already present stay."""
+    """Ingest the recordings of some traces into the new store. Traces that it already has stay."""
     with _map_file(maps.get(step.map_id) if step.map_id is not None else None) as road_map:
         outcomes = ingest(
             fresh,
@@ -335,7 +335,7 @@ def _stopped(fresh: Path, wrong: list[str]) -> str:
 
 @contextmanager
 def _map_file(road_map: OldMap | None) -> Generator[Path | None]:
-    """Yield a map of the old store as a temporary file, for recordings without their own map."""
+    """Yield the path of a temporary file with a map of the old store, for recordings without a map."""
     if road_map is None or not road_map.text.lstrip("\ufeff \t\r\n").startswith("<"):
         yield None
         return
@@ -347,7 +347,7 @@ def _map_file(road_map: OldMap | None) -> Generator[Path | None]:
 
 
 def _import(fresh: Path, trace: OldTrace, path: Path, maps: dict[int, OldMap]) -> None:
-    """Import the graphs of another tool again, with the same options."""
+    """Import a file of graphs of another tool into the new store, with the same options as before."""
     how: dict[str, Any] = {"relations": trace.answers, "period_s": trace.period_ns / 1e9 or 1.0}
     how |= trace.imported or {}
     form, words = how.pop("form"), how.pop("words", {})
@@ -369,7 +369,7 @@ def _import(fresh: Path, trace: OldTrace, path: Path, maps: dict[int, OldMap]) -
 
 
 def _complete(path: Path, fresh: Path, old: Remains) -> None:
-    """Rebuild the derived sets and requested classes, and check that all traces are present."""
+    """Rebuild the derived relations and frame classes of the old store, and check that no trace is missing."""
     file = StoreFile(fresh)
     there = {one.trace_id for one in file.traces()}
     missing = [f"{one.name}: {one.path}" for one in old.traces if one.trace_id not in there]

@@ -1,4 +1,4 @@
-"""Conversion of one recording into sealed segments, one per ego.
+"""Ingest of one recording: for each ego, the scene graphs are written to a segment (file of one trace).
 
 Types for the progress and the outcome of an ingest.
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress within one recording and within the whole ingest.
+    """Progress of an ingest: within the current recording, and in total.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Progress:
 
 @dataclass(slots=True, repr=False)
 class TraceOutcome:
-    """Outcome of the ingest of one recording for one ego.
+    """Result of the ingest of one recording for one ego: status, trace name, losses or error.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class TraceOutcome:
         return f"<TraceOutcome {self.name or self.path.name!r}: {self.status}, {about}>"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the outcome as JSON values; :meth:`from_dict` is the inverse."""
+        """Return the result of an ingest as JSON values; :meth:`from_dict` is the inverse."""
         told = {"class": type(self.error).__name__, "message": str(self.error)}
         return asdict(self) | {
             "path": place_named(self.path),
@@ -136,7 +136,7 @@ class TraceOutcome:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Return the outcome for JSON values. An error keeps its class and message."""
+        """Return the result of an ingest from its JSON values. An error keeps its class and message."""
         told = values["error"]
         error = getattr(errors, told["class"])(told["message"]) if told else None
         changed: dict[str, Any] = {
@@ -152,7 +152,7 @@ class TraceOutcome:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Settings for the reading of recordings.
+    """Settings for the ingest of recordings, which worker processes receive.
 
     Attributes
     ----------
@@ -180,7 +180,7 @@ class Job:
     block_frames: int = 120
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the job as JSON values; :meth:`from_dict` is the inverse."""
+        """Return the ingest settings as JSON values; :meth:`from_dict` is the inverse."""
         return {
             "store": str(self.store),
             "road_map": None if self.road_map is None else str(self.road_map),
@@ -193,7 +193,7 @@ class Job:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Return the job for JSON values."""
+        """Return ingest settings from their JSON values."""
         road_map = values["road_map"]
         changed: dict[str, Any] = {
             "store": Path(values["store"]),
@@ -212,7 +212,7 @@ SHOWN: Final = 20
 
 @dataclass(slots=True)
 class TraceTally:
-    """Counter of the frames and entities of a trace, with the frame times.
+    """Counts of frames and entities of a trace during an ingest, with the times of its frames.
 
     Attributes
     ----------
@@ -228,23 +228,23 @@ class TraceTally:
     times: array[int] = field(default_factory=lambda: array("q"))
 
     def see(self, frames: FrameBlock) -> None:
-        """Add the counts of the next frames."""
+        """Add a block of frames to the counts of the trace."""
         self.frames += len(frames)
         self.kinds.update(frames.entities.kind.tolist())
         self.times.frombytes(frames.time_ns.astype(np.int64).tobytes())
 
     @property
     def entities(self) -> dict[str, int]:
-        """Number of entities by kind, in the order of the vocabulary."""
+        """Number of entities of the trace by kind, in the order of the vocabulary."""
         return {KINDS[code]: self.kinds[code] for code in sorted(self.kinds)}
 
     @property
     def seconds(self) -> float:
-        """Time from the first to the last frame; s."""
+        """Time from the first to the last frame of the trace, in seconds."""
         return (self.times[-1] - self.times[0]) / 1e9 if self.times else 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the counts as JSON values.
+        """Return the counts of the trace as JSON values.
 
         Returns
         -------
@@ -284,7 +284,7 @@ _VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle
 
 @dataclass(slots=True)
 class _EgoView:
-    """View of a recording from one ego.
+    """State of the ingest of a recording for one of its egos: its segment and its result.
 
     Attributes
     ----------
@@ -310,7 +310,7 @@ class _EgoView:
 
 
 class SegmentReader:
-    """Reader of recordings, one after another, into segments.
+    """Reader that converts recordings to segments (files of one trace), one recording after another.
 
     Parameters
     ----------
@@ -332,7 +332,7 @@ class SegmentReader:
         self._on_map: OnMap | None = None
 
     def read(self, path: Path, folder: Path) -> list[tuple[TraceOutcome, Path | None]]:
-        """Read a recording and build its segments in subfolders of ``folder``.
+        """Read a recording, and write a segment (file of one trace) for each ego into ``folder``.
 
         ``folder`` is created if needed. The result has one entry per ego: the outcome, and the folder of the
         segment or ``None``.
@@ -386,7 +386,7 @@ class SegmentReader:
                     self._build(trace, group, road_map, config, folder / str(first))
 
     def _wanted(self, trace: MessageTrace, views: list[_EgoView]) -> Iterator[_EgoView]:
-        """Yield the requested views of a recording. The outcome of an unknown ego gets an error."""
+        """Yield the egos of a recording that the settings select. The result of an unknown ego is an error."""
         info, egos = trace.info, self._job.config.egos
         if not egos:
             views.append(_EgoView(TraceOutcome(info.path, ego=info.ego), info))
@@ -408,7 +408,7 @@ class SegmentReader:
                 yield view
 
     def _excluded(self, trace: MessageTrace) -> tuple[str, ...]:
-        """Return the ids of the entities to exclude. Each name may be a role, a vehicle name or an id."""
+        """Return the ids of the entities that the settings exclude by role, name or id."""
         found: list[str] = []
         for name in self._job.config.exclude_ids:
             with suppress(SgstoreError):
@@ -417,7 +417,7 @@ class SegmentReader:
         return tuple(dict.fromkeys(found))
 
     def _ident(self, trace: MessageTrace, name: str) -> str:
-        """Return the id of the ego for a name, as resolved by the reader of the recording."""
+        """Return the id of an ego in a recording, from its id, role or name."""
         info = trace.info
         try:
             found = trace.ego_named(name)
@@ -430,7 +430,7 @@ class SegmentReader:
             return again.info.ego
 
     def _vehicles(self, trace: MessageTrace) -> list[str]:
-        """Return the ids of all vehicles of a recording."""
+        """Return the ids of all vehicles of a recording, which can be egos."""
         found: list[str] = []
         for block in trace.blocks(self._job.block_frames):
             entities = self._meant(block).entities
@@ -441,7 +441,7 @@ class SegmentReader:
         return found
 
     def _is_new(self, store: StoreFile, view: _EgoView, road_map: RoadMap | None) -> bool:
-        """True if the store lacks the trace of this ego. Otherwise, set the status of the outcome."""
+        """True if the store has no trace of this recording and ego. Otherwise, the result gets its status."""
         job, outcome = self._job, view.outcome
         try:
             shown = map_of_graphs(road_map, job.config)
@@ -464,7 +464,7 @@ class SegmentReader:
         config: Config,
         folder: Path,
     ) -> None:
-        """Build the segments of several egos in one pass over the recording."""
+        """Write the segments of several egos in one pass over the recording."""
         job, size = self._job, self._job.block_frames
         generator = SceneGraphGenerator(road_map, config)
         tally = TraceTally()
@@ -549,12 +549,12 @@ class SegmentReader:
             outcome.status = "sealed"
 
     def _meant(self, block: FrameBlock) -> FrameBlock:
-        """Apply the configured type mapping to the entities of a block."""
+        """Return a block of frames after applying the configured mapping from type names to kinds."""
         return replace(block, entities=renamed(block.entities, self._job.config.types))
 
 
 def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
-    """Return the node id of the ego in each frame: (F,) int64, -1 if absent."""
+    """Return the node id of the ego in each frame, (F,) int64; -1 for a frame without the ego."""
     idents = enumerate(block.entities.ident, start=block.entities.first)
     one.nodes += [node for node, ident in idents if ident == one.info.ego]
     rows = np.isin(block.states.node, one.nodes)
@@ -565,7 +565,7 @@ def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
 
 
 def _reached(frames: FrameBlock, size: int) -> int:
-    """Return the approximate number of file bytes read up to this block."""
+    """Return the approximate number of bytes of the recording that have been read."""
     messages = frames.messages
     places = np.where(messages.chunk_offset < 0, messages.offset, messages.chunk_offset)
     return min(int(places.max(initial=0)), size)
@@ -575,7 +575,7 @@ def _reached(frames: FrameBlock, size: int) -> int:
 
 
 def main() -> None:
-    """Read recordings for the parent process. The first request is the job."""
+    """Ingest recordings in a worker process. The first request of the parent process is the job."""
     asked = requests()
 
     def on_block(frames: int, reached: int, size: int) -> None:

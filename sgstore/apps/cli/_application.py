@@ -166,8 +166,6 @@ def _ran(arguments: list[str]) -> int:
     """Run one command line of ``sgstore``, and return its exit code.
 
     A signal or deadline counts even if Python lost its exception.
-
-    An error is raised. A signal or deadline counts even if Python lost its exception.
     """
     try:
         code = int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)

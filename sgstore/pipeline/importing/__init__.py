@@ -1,4 +1,4 @@
-"""Import of scene graphs from other tools into a store.
+"""Import of scene graphs of other tools into a store.
 
 ``_formats`` and ``_openlabel`` read the files, with limits for untrusted input. ``_resolve`` maps labels and
 relations to the vocabulary. ``_run`` builds frames and stores them.

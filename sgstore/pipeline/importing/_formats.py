@@ -1,4 +1,4 @@
-"""Readers of graph files: node-link JSON, and tables of edges.
+"""Readers of graph files: node-link JSON, and tables of edges (CSV).
 
 Files are untrusted text, read line by line with limits. ``.xz``, ``.gz`` and ``.bz2`` are decompressed.
 """
@@ -50,7 +50,7 @@ _PACKED: Final = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
 
 
 def stem_of(path: Path) -> str:
-    """Return the file name without its format suffixes: ``graphs.csv.xz`` gives ``graphs``."""
+    """Return the file name without its format suffixes, such as ``graphs`` for ``graphs.csv.xz``."""
     name = path.name
     for ending in (*_PACKED, ".csv", ".json", ".ndjson", ".jsonl", ".openlabel"):
         if name.lower().endswith(ending) and len(name) > len(ending):
@@ -60,7 +60,7 @@ def stem_of(path: Path) -> str:
 
 @contextmanager
 def lines_of(path: Path) -> Generator[Iterator[str]]:
-    """Context manager with the lines of a file, including line ends.
+    """Context manager with the text lines of a file, which may be compressed.
 
     Raises
     ------
@@ -134,7 +134,7 @@ MAX_ROW: Final = 1 << 20
 
 
 def read_s3c(path: Path) -> Iterator[GivenGraph]:
-    """Yield the graphs of an S3C file, in file order.
+    """Yield the graphs of a CSV file in the format of S3C, in file order.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def _read(path: Path, header: tuple[str, ...]) -> Iterator[GivenGraph]:
 
 
 class _EdgeTable:
-    """Parser of a table of edges, row by row."""
+    """Parser of a CSV file of edges, which builds graphs row by row."""
 
     def __init__(self, path: Path, lines: Iterator[str]) -> None:
         self._path, self._lines = path, lines
@@ -176,7 +176,7 @@ class _EdgeTable:
         self._edge_place = ""
 
     def graphs(self, header: tuple[str, ...]) -> Iterator[GivenGraph]:
-        """Yield the graphs. If ``header`` is not empty, the file must have exactly this header."""
+        """Yield the graphs of the edge table. A given ``header`` must be the header of the file."""
         reader = csv.reader(self._bounded(), strict=True)
         try:
             self._read_header(next(reader, None), header)
@@ -185,7 +185,7 @@ class _EdgeTable:
             raise wrong(self._path, f"row {reader.line_num}", f"no CSV: {error}") from error
 
     def _bounded(self) -> Iterator[str]:
-        """Yield the lines for the CSV parser, with a limit on the characters of one row."""
+        """Yield the lines of the file for the CSV parser, or raise an error for a row that is too long."""
         for line in self._lines:
             self._line += 1
             self._taken += len(line)
@@ -249,12 +249,12 @@ class _EdgeTable:
         return f"row {self._number}, column {self._names[self._places[column]]}"
 
     def _text(self, column: str) -> str:
-        """Return the text in a column; empty if the column is missing."""
+        """Return the text of the current row in a column; empty if the column is missing."""
         place = self._places[column]
         return self._row[place].strip() if place >= 0 else ""
 
     def _opened(self, name: str) -> GivenGraph:
-        """Return a new graph for its first row."""
+        """Return a new graph that starts with the current row of the edge table."""
         if not name or len(name) > LONGEST:
             raise self._wrong(
                 "graph", f"expected the name of a graph, of 1 to {LONGEST} characters"
@@ -297,7 +297,7 @@ class _EdgeTable:
         graph.edges.append(GivenEdge(src, sys.intern(relation), dst, *place, NO_ATTRIBUTES))
 
     def _node(self, graph: GivenGraph, end: str) -> str:
-        """Add the node ``src`` or ``dst`` of the row, and return its name."""
+        """Add the source or destination node of the current row to a graph, and return its name."""
         name, label = self._text(end), self._text(f"{end}_kind")
         if not name or len(name) > LONGEST:
             raise self._wrong(end, f"expected the name of a node, of 1 to {LONGEST} characters")
@@ -352,7 +352,7 @@ def read_nodelink(path: Path) -> Iterator[GivenGraph]:
 
 
 def _documents(path: Path) -> Iterator[tuple[str, Any]]:
-    """Yield the JSON documents of a file, each with its place in the file."""
+    """Yield the JSON documents of a file, each with its place for messages, such as ``line 2``."""
     with lines_of(path) as lines:
         numbered = enumerate(lines, start=1)
         number, first = next((one for one in numbered if one[1].strip()), (0, ""))
@@ -377,7 +377,7 @@ def _documents(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, Any]]:
-    """Parse a file as one JSON text, and yield its graph or graphs."""
+    """Yield the graph or graphs of a file that is one JSON document."""
     parts = StringIO()
     values = 0
     for part in lines:
@@ -410,12 +410,12 @@ def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, A
 
 
 def _values(text: str) -> int:
-    """Return an upper bound of the number of values in a JSON text."""
+    """Return an upper bound for the number of values in a JSON text, before it is parsed."""
     return sum(map(text.count, "[{,"))
 
 
 def _parsed(text: str) -> Any:
-    """Parse a JSON document.
+    """Return the content of a JSON text, or raise an error for an invalid or too large text.
 
     Raises
     ------

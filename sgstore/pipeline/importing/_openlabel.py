@@ -1,4 +1,4 @@
-"""Reader of ASAM OpenLABEL 1.0 files: each frame becomes a graph.
+"""Reader of ASAM OpenLABEL 1.0 files (annotations of a recording): each frame becomes a graph.
 
 The nodes are objects, actions, events, contexts and tags. A file is one JSON document. An element is in the
 frames that list it, and in its ``frame_intervals``; without both, it is in all frames. Boxes are transformed
@@ -64,7 +64,9 @@ _UNITS: Final = ((4e9, 1e9), (4e12, 1e6), (4e15, 1e3), (4e18, 1.0))
 
 
 def read_openlabel(path: Path) -> Iterator[GivenGraph]:
-    """Yield the frames of a file as graphs, ordered by number. A file without frames is one graph.
+    """Yield the frames of an OpenLABEL file as graphs, ordered by frame number.
+
+    A file without frames is one graph.
 
     Raises
     ------
@@ -76,7 +78,7 @@ def read_openlabel(path: Path) -> Iterator[GivenGraph]:
 
 
 def metadata_of(path: Path) -> dict[str, Any]:
-    """Return the metadata of a file, unchanged."""
+    """Return the metadata of an OpenLABEL file, unchanged."""
     return _Labels(path).root.get("metadata") or {}
 
 
@@ -111,7 +113,7 @@ def _root(path: Path) -> dict[str, Any]:
 
 
 class _Labels:
-    """Parsed OpenLABEL file.
+    """Parsed OpenLABEL file: its elements, frames, relations and coordinate systems.
 
     Attributes
     ----------
@@ -151,7 +153,10 @@ class _Labels:
         return found
 
     def _numbered(self) -> list[int]:
-        """Return the frame numbers, ascending. Without frames: those of the intervals, or a single 0."""
+        """Return the frame numbers of an OpenLABEL file, ascending.
+
+        Without frames, they are the numbers in the intervals, or a single 0.
+        """
         if self._frames:
             if not all(key.isdecimal() and len(key) < 16 for key in self._frames):
                 raise self._wrong("frames", "expected numbers of frames as keys")
@@ -172,12 +177,12 @@ class _Labels:
         return found
 
     def _places(self, element: Mapping[str, Any], where: str) -> Iterator[int]:
-        """Yield the indices of the frames in the intervals of an element."""
+        """Yield the indices of the frames in which an element (object, action, …) occurs, by its intervals."""
         for first, last in self._intervals(element, where):
             yield from range(bisect_left(self._numbers, first), bisect_right(self._numbers, last))
 
     def _presence(self) -> list[dict[tuple[str, str], None]]:
-        """Return the elements in each frame. Elements listed by the frame come first."""
+        """Return the elements (objects, actions, …) that occur in each frame."""
         there: list[dict[tuple[str, str], None]] = [{} for _ in self._numbers]
         listed: set[tuple[str, str]] = set()
         for place, number in enumerate(self._numbers):
@@ -205,7 +210,7 @@ class _Labels:
         return frame
 
     def graphs(self) -> Iterator[GivenGraph]:
-        """Yield the graph of each frame."""
+        """Yield the graph of each frame of an OpenLABEL file."""
         edges = self._edges()
         for place, number in enumerate(self._numbers):
             frame, where = self._frame(number), f"frame {number}"
@@ -232,7 +237,7 @@ class _Labels:
             yield graph
 
     def _edges(self) -> list[list[tuple[str, str, str]]]:
-        """Return the relations in each frame, with the node names of both ends."""
+        """Return the relations in each frame, each with the names of its two nodes."""
         found: list[list[tuple[str, str, str]]] = [[] for _ in self._numbers]
         listed: dict[str, list[int]] = {}
         for place, number in enumerate(self._numbers):
@@ -297,7 +302,7 @@ class _Labels:
     def _data(
         self, data: Mapping[str, Any], usual: str, where: str, axes: _FrameAxes
     ) -> dict[str, Any]:
-        """Return the attributes in the data of an element, including its pose."""
+        """Return the node attributes in the data of an OpenLABEL element, with its pose in the root system."""
         found: dict[str, Any] = {}
         boxes: dict[str, tuple[Any, str]] = {}
         for form, row in self._rows(data, where):
@@ -318,7 +323,7 @@ class _Labels:
         return found
 
     def _rows(self, data: Any, where: str) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield the data of an element with their type, each before its nested attributes."""
+        """Yield each data value of an OpenLABEL element with its type; nested values follow their parent."""
         if not isinstance(data, dict):
             raise self._wrong(where, "expected an object of lists of data")
         for form, rows in data.items():
@@ -337,7 +342,7 @@ class _Labels:
         return [float(one) for one in value]
 
     def _time(self, about: Mapping[str, Any], where: str) -> int | None:
-        """Return the time of a frame; ns.
+        """Return the time of a frame in ns; ``None`` means that the file has none.
 
         The unit of a number (s, ms, µs or ns since 1970) follows from its size. Seconds may have
         another origin.
@@ -367,23 +372,23 @@ class _Labels:
 
 
 def _name(key: tuple[str, str]) -> str:
-    """Return the node name of an element, unique in the file."""
+    """Return the name of the graph node for an OpenLABEL element, unique in the file."""
     return key[1] if key[0] == "object" else f"{key[0]} {key[1]}"
 
 
 def _tail(told: Any) -> str:
-    """Return a type without the address of its ontology: ``http://…/ontology#Car`` gives ``Car``."""
+    """Return a type name without its ontology address, such as ``Car`` for ``http://…/ontology#Car``."""
     return str(told or "").rpartition("#")[2].rpartition("/")[2]
 
 
 class _Axes:
-    """Coordinate systems of a file."""
+    """Coordinate systems of an OpenLABEL file, each with its parent and its pose."""
 
     def __init__(self, systems: Mapping[str, Any]) -> None:
         self._systems = {name: of if isinstance(of, dict) else {} for name, of in systems.items()}
 
     def at(self, transforms: Mapping[str, Any]) -> _FrameAxes:
-        """Return the coordinate systems in one frame, with the transforms of this frame."""
+        """Return the coordinate systems for one frame, whose transforms can change their poses."""
         moved: dict[tuple[str, str], NDArray[np.float64]] = {}
         for told in transforms.values():
             if isinstance(told, dict):
@@ -394,7 +399,7 @@ class _Axes:
 
 
 class _FrameAxes:
-    """Coordinate systems in one frame. Converts poses into the root system.
+    """Coordinate systems of an OpenLABEL file in one frame, for converting poses into the root system.
 
     Attributes
     ----------
@@ -412,7 +417,7 @@ class _FrameAxes:
         self.missing: set[str] = set()
 
     def _outward(self, system: str) -> NDArray[np.float64] | None:
-        """Return the matrix from a coordinate system into the root system.
+        """Return the matrix (4, 4) that converts coordinates of a system into the root system.
 
         ``None`` means the root system itself.
         """
@@ -442,12 +447,12 @@ class _FrameAxes:
         return _matrix(self._systems[system].get("pose_wrt_parent"))
 
     def turned(self, vector: list[float], system: str) -> list[float]:
-        """Return a direction rotated into the root system."""
+        """Return a direction vector of a coordinate system, rotated into the root system."""
         matrix = self._outward(system)
         return vector if matrix is None else (matrix[:3, :3] @ vector).tolist()
 
     def pose(self, value: list[float], system: str) -> dict[str, float]:
-        """Return the node attributes for a cuboid or point; m, degrees."""
+        """Return position, angles and size of a cuboid or point as node attributes, in m and degrees."""
         matrix = self._outward(system)
         place = value[:3]
         if matrix is not None:
@@ -467,7 +472,7 @@ class _FrameAxes:
 
 
 def _turn(told: list[float]) -> NDArray[np.float64]:
-    """Return a rotation matrix for a quaternion (x, y, z, w) or three angles about x, y, z (z first); rad."""
+    """Return the rotation matrix for a quaternion (x, y, z, w), or for three angles in radians."""
     if len(told) == 3:
         return _in_sequence("ZYX", told[::-1])
     x, y, z, w = np.array(told) / (np.linalg.norm(told) or 1.0)
@@ -481,7 +486,7 @@ def _turn(told: list[float]) -> NDArray[np.float64]:
 
 
 def _in_sequence(sequence: str, angles: list[float]) -> NDArray[np.float64]:
-    """Return a rotation matrix for successive rotations, each about an already rotated axis; rad."""
+    """Return the rotation matrix for successive rotations in radians, each about an already rotated axis."""
     made = np.eye(3)
     for letter, angle in zip(sequence, angles, strict=True):
         axis = "XYZ".index(letter)
@@ -494,7 +499,7 @@ def _in_sequence(sequence: str, angles: list[float]) -> NDArray[np.float64]:
 
 
 def _matrix(told: Any) -> NDArray[np.float64] | None:
-    """Return the homogeneous (4, 4) matrix of transform data, or ``None`` if the data are invalid."""
+    """Return the (4, 4) matrix of an OpenLABEL transform; ``None`` means invalid data."""
     if not isinstance(told, dict):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Resolution of imported labels, relations and attributes.
+"""Conversion of the labels, relations and attributes of imported graphs to those of sgstore.
 
 Graphs before the resolution: names, labels and rows as in the file.
 """
@@ -61,7 +61,7 @@ NO_ATTRIBUTES: Final[Mapping[str, Any]] = MappingProxyType({})
 
 @dataclass(slots=True)
 class GivenNode:
-    """Node of a graph in a file.
+    """Node of an imported graph, with its label and attributes as in the file.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class GivenNode:
 
 @dataclass(slots=True)
 class GivenEdge:
-    """Edge of a graph in a file, between two node names.
+    """Edge of an imported graph between two named nodes, as in the file.
 
     To save memory, its place is stored as a number and a text that similar edges share.
     """
@@ -99,13 +99,13 @@ class GivenEdge:
 
     @property
     def where(self) -> str:
-        """Place in the file, as a text for messages."""
+        """Place of an edge in its file, as text for error messages."""
         return self.place.replace("{}", str(self.number), 1)
 
 
 @dataclass(slots=True)
 class GivenGraph:
-    """Graph of a file, which becomes a frame.
+    """Imported graph as in its file: name, time, nodes and edges. It becomes a frame.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class GivenGraph:
 
 
 def check_size(path: Path, where: str, graph: GivenGraph) -> None:
-    """Raise if a graph is too large.
+    """Raise an error if an imported graph has too many nodes, edges or characters of names.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def check_size(path: Path, where: str, graph: GivenGraph) -> None:
 
 
 def wrong(path: Path, where: str, reason: str) -> TraceError:
-    """Return the error for a place in a file."""
+    """Return an error for a place in an imported file, with the reason."""
     return TraceError(f"{where}: {reason}" if where else reason, path=path)
 
 
@@ -205,7 +205,7 @@ OWN: Final = "own"
 
 @dataclass(frozen=True, slots=True)
 class LabelMeaning:
-    """Resolved label of a node: its kind in the vocabulary, with details.
+    """Meaning of a node label in an imported file: a kind of sgstore, with details.
 
     Attributes
     ----------
@@ -224,13 +224,13 @@ class LabelMeaning:
 
     @property
     def is_part(self) -> bool:
-        """True if the node is a map part, not an entity."""
+        """True if a label means a part of the map, such as a lane, not an entity."""
         return self.kind in MAP_KINDS
 
 
 @dataclass(frozen=True)
 class Words:
-    """Mapping from the labels and relations of a file to the vocabulary.
+    """Mapping from the labels and relation names of imported files to kinds and relations of sgstore.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ class Words:
         return known or ""
 
     def meaning(self, name: str, label: str) -> LabelMeaning | None:
-        """Return the resolved label of a node. ``None`` means unknown."""
+        """Return the kind of sgstore that a node label of a file means. ``None`` means unknown."""
         for text in dict.fromkeys((label, name) if label else (name, _plain(name))):
             found = self._meant(text)
             if found is not None:
@@ -306,13 +306,13 @@ class Words:
         return _simulators(text)
 
     def relation(self, name: str) -> str | None:
-        """Return the relation in the vocabulary for a relation name of a file. ``None`` means unknown."""
+        """Return the relation of sgstore that a relation name of a file means. ``None`` means unknown."""
         given = {normalize_name(own): relation for own, relation in self.relations.items()}
         known = relation_named(given.get(normalize_name(name), name))
         return _own_relation(name) if known is None and self.unknown_as == OWN else known
 
     def why_not_kind(self, name: str, label: str) -> str:
-        """Return the error text for an unknown label, with the remedies."""
+        """Return the error text for an unknown node label in a file, with the remedies."""
         text = label or _plain(name)
         several = kinds_labelled(text)
         known = [*labels(), *_SHORT]
@@ -326,7 +326,7 @@ class Words:
         )
 
     def why_not_relation(self, name: str) -> str:
-        """Return the error text for an unknown relation, with the remedies."""
+        """Return the error text for an unknown relation name in a file, with the remedies."""
         like = suggestion(name, RELATIONS)
         hint = f" (did you mean {like!r}?)" if like else ""
         return (
@@ -335,7 +335,7 @@ class Words:
         )
 
     def as_dict(self) -> dict[str, object]:
-        """Return the mapping as JSON values, in a fixed order."""
+        """Return the mapping of labels and relation names as JSON values, in a fixed order."""
         return {
             "kinds": dict(sorted(self.kinds.items())),
             "relations": dict(sorted(self.relations.items())),
@@ -345,7 +345,7 @@ class Words:
 
 
 def _plain(name: str) -> str:
-    """Return a name without the number at its end."""
+    """Return a node name without the number at its end, such as ``car`` for ``car_12``."""
     numbered = _NUMBERED.fullmatch(name)
     return numbered[1] if numbered else name
 
@@ -354,7 +354,7 @@ _NO_NAME: Final = re.compile(r"[^A-Za-z0-9]+")
 
 
 def _own_kind(text: str) -> str:
-    """Register a label as a new kind and return it; empty if the label is not a valid name."""
+    """Register a node label as a new kind, and return the kind; empty if the label is not a valid name."""
     name = _NO_NAME.sub("_", text).strip("_").lower()
     known = kind_named(name)
     with suppress(ValueError):
@@ -363,7 +363,7 @@ def _own_kind(text: str) -> str:
 
 
 def _own_relation(text: str) -> str | None:
-    """Register a name as a new relation and return it, or ``None`` if the name is invalid."""
+    """Register a name as a new relation, and return the relation; ``None`` means an invalid name."""
     name = _NO_NAME.sub("_", text).strip("_")
     known = relation_named(name)
     with suppress(ValueError):
@@ -372,12 +372,15 @@ def _own_relation(text: str) -> str | None:
 
 
 def _kind(text: str) -> str:
-    """Return the kind that a word names; empty if the word is unknown or ambiguous."""
+    """Return the kind with a given name; empty if the name is unknown or ambiguous."""
     return kind_named(_SHORT.get(normalize_name(text), text)) or ""
 
 
 def _simulators(text: str) -> LabelMeaning | None:
-    """Return the meaning of a simulator's type name, or of its longest known prefix before a dot."""
+    """Return the meaning of a simulator's type name, such as ``vehicle.audi.tt``.
+
+    The longest known part before a dot counts. ``None`` means unknown.
+    """
     meanings = type_meanings()
     name = text.lower()
     while name:
@@ -443,7 +446,7 @@ Own = dict[str, Any]
 def state_of(
     path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int], *, any_state: bool
 ) -> tuple[dict[str, float], Own]:
-    """Return the state of an entity in a frame, and its attributes without a column.
+    """Return the state of an imported entity in a frame, and its attributes without a column in the store.
 
     The columns are those of :class:`sgstore.model.world.States`. With ``any_state``, traffic lights may have
     states outside the vocabulary.
@@ -477,7 +480,7 @@ def state_of(
 
 
 def _drop_implausible(found: dict[str, float], lost: dict[str, int]) -> None:
-    """Remove implausible sizes and velocities, and count them as losses."""
+    """Remove implausible sizes and velocities from the state of an entity, and count them as losses."""
     row = [found.get(name, math.nan) for name in POSE]
     if is_plausible(*row[6:9], *row[13:]):
         return
@@ -491,7 +494,7 @@ def _drop_implausible(found: dict[str, float], lost: dict[str, int]) -> None:
 
 
 def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[str, int]) -> None:
-    """Convert a speed into a velocity along the heading, if the velocity is missing."""
+    """Set a missing velocity of an entity from its speed and heading."""
     speed = attributes.get("speed")
     if speed is None or "vx" in found:
         return
@@ -503,7 +506,7 @@ def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[st
 
 
 def part_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[dict[str, Any], Own]:
-    """Return the attributes of a map part with a column, and those without.
+    """Return the attributes of an imported map part: those with a column in the store, and the others.
 
     The columns are those of :class:`sgstore.maps.roads.MapNodes`.
 
@@ -536,7 +539,7 @@ def part_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[dict
 def lane_state_of(
     path: Path, where: str, attributes: Mapping[str, Any]
 ) -> tuple[dict[str, float], Own]:
-    """Return the position of an entity in a lane, and the other attributes of the edge.
+    """Return the position of an entity in a lane from an edge's attributes, and the other attributes.
 
     ``primary`` is 1 or 0; it is absent if the file does not contain it.
     """
@@ -555,14 +558,17 @@ def lane_state_of(
 
 
 def gap_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[float, Own]:
-    """Return the gap of a ``leads`` or ``follows`` edge, and its other attributes. NaN means unknown."""
+    """Return the gap attribute of a ``leads`` or ``follows`` edge, and its other attributes.
+
+    NaN means an unknown gap.
+    """
     value = attributes.get("gap")
     gap = float("nan") if value is None else _number(path, where, "gap", value)
     return gap, {name: value for name, value in attributes.items() if name != "gap"}
 
 
 def columns_of(rows: list[dict[str, float]]) -> dict[str, NDArray[Any]]:
-    """Convert rows into columns. Missing values become NaN or the column's code for unknown."""
+    """Return rows of entity states as columns. Missing values become NaN or the code for unknown."""
     empty = {"lights": -1, "light_state": -1, "derived": 0}
     types = {"lights": np.int64, "light_state": np.int8, "derived": np.int64}
     names = {name for row in rows for name in row}
@@ -611,7 +617,7 @@ Part = tuple[str, str]
 
 @dataclass(slots=True)
 class Meant:
-    """Graph with resolved labels and relations.
+    """Imported graph whose labels and relations are converted to kinds and relations of sgstore.
 
     Attributes
     ----------
@@ -634,7 +640,7 @@ class Meant:
 
 
 class Understanding:
-    """Resolver that maps the labels and relations of a file's graphs to the vocabulary."""
+    """Converter of the graphs of a file to the kinds and relations of sgstore."""
 
     def __init__(self, path: Path, words: Words) -> None:
         self._path = path
@@ -643,7 +649,9 @@ class Understanding:
         self._relations = lru_cache(_REMEMBERED)(words.relation)
 
     def of(self, graph: GivenGraph) -> Meant:
-        """Resolve a graph. Unknown parts are dropped and counted, or raise an error.
+        """Return a graph with kinds and relations of sgstore.
+
+        Unknown labels are dropped and counted, or raise an error.
 
         Raises
         ------
@@ -701,7 +709,7 @@ class Understanding:
 
 @dataclass(slots=True)
 class FileMeaning:
-    """Results that all graphs of a file share.
+    """Result of the first reading of an imported file: its number of graphs, map parts, relations and ego.
 
     Attributes
     ----------
@@ -724,7 +732,7 @@ class FileMeaning:
 
 
 def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeaning:
-    """Check a whole file once, and raise its first error.
+    """Read all graphs of a file once, and return the data that the graphs share. Raise its first error.
 
     Raises
     ------
@@ -765,7 +773,7 @@ def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeanin
 
 
 def _check_names(path: Path, digests: array[int], places: array[int]) -> None:
-    """Raise if two graphs have the same name, compared by 8-byte hashes."""
+    """Raise an error if two graphs of a file have the same name, compared by 8-byte hashes."""
     names = np.frombuffer(digests, np.uint64)
     order = np.argsort(names, kind="stable")
     again = np.flatnonzero(names[order[1:]] == names[order[:-1]])

@@ -1,4 +1,4 @@
-"""Import run: graph files become traces of a store, in blocks as in an ingest.
+"""Import of graph files: each file becomes a trace, stored in blocks of frames as in an ingest.
 
 A file is read twice: once to resolve its labels, once to store its graphs.
 """
@@ -85,7 +85,7 @@ _BLOCK_SIZE: Final = 200_000
 
 @dataclass(slots=True)
 class Imported:
-    """Outcome of the import of one file.
+    """Result of the import of one graph file.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ def import_graphs(  # noqa: PLR0913  one option per way to read
     force: bool = False,
     on_frames: Callable[[Path, int], None] | None = None,
 ) -> list[Imported]:
-    """Import graph files into a store, which is created if it is missing.
+    """Import graph files into a store. A missing store is created.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def import_graphs(  # noqa: PLR0913  one option per way to read
 
 
 class _ImportRun:
-    """Run of :func:`import_graphs`, with its options."""
+    """Import of graph files with given options."""
 
     period_ns: int
     force: bool
@@ -179,7 +179,7 @@ class _ImportRun:
             self._store.settle()
 
     def outcome(self, path: Path) -> Imported:
-        """Import one file, and return the outcome."""
+        """Import one graph file, and return the result."""
         done = Imported(path)
         try:
             self._import(path, done)
@@ -274,7 +274,7 @@ class _ImportRun:
         return graph
 
     def _variant(self, found: FileMeaning) -> str:
-        """Return the identity of a map of named parts: the parts and the options of the import, as JSON."""
+        """Return a JSON text that identifies the map of an imported file: its parts and the import options."""
         about = {
             "of": self._form,
             "words": self._words.as_dict(),
@@ -286,7 +286,7 @@ class _ImportRun:
 
 
 def _blocks(graphs: Iterable[Meant]) -> Iterator[list[Meant]]:
-    """Yield the graphs in blocks. Large graphs make smaller blocks."""
+    """Yield graphs in blocks of limited total size."""
     some: list[Meant] = []
     size = 0
     for graph in graphs:
@@ -317,7 +317,7 @@ _LONGEST_VALUE: Final = 10_000
 
 
 def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) -> RoadMap:
-    """Return a road map of named lanes and roads, without geometry and without edges.
+    """Return a road map with the names of imported lanes and roads, without geometry and without edges.
 
     Parameters
     ----------
@@ -356,7 +356,7 @@ def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) 
 
 
 class Blocks:
-    """Builder of graph blocks, one after another. Entities keep their node ids.
+    """Converter of imported graphs to blocks of frames. Entities keep their node ids between blocks.
 
     Parameters
     ----------
@@ -389,7 +389,7 @@ class Blocks:
         self._seq = 0
 
     def block(self, graphs: Sequence[Meant]) -> GraphBlock:
-        """Return the next graphs as a block of frames. Losses are counted in ``lost`` of each graph."""
+        """Return the given imported graphs as a block of frames. Lost values are counted for each graph."""
         new: list[tuple[GivenNode, LabelMeaning]] = []
         self.own = []
         first = len(self._entities)
@@ -436,7 +436,7 @@ class Blocks:
     def _keep(
         self, lost: dict[str, int], at: tuple[int, int, int, int], own: Mapping[str, Any]
     ) -> None:
-        """Store custom attributes. Values that are too long or not JSON are counted as losses."""
+        """Store the custom attributes of an imported node or edge; invalid values are counted as losses."""
         for name, value in own.items():
             if value is None or name in _OF_EDGES:
                 continue
@@ -451,7 +451,7 @@ class Blocks:
                 lost[what] = lost.get(what, 0) + 1
 
     def _ids(self, meant: Meant, new: list[tuple[GivenNode, LabelMeaning]]) -> dict[str, int]:
-        """Return the node ids of a graph by name, and add its new entities to ``new``."""
+        """Return the node id of each node name of a graph, and add new entities to the list ``new``."""
         found = {name: self._parts[part] for name, part in meant.parts.items()}
         for name, (node, meaning) in meant.entities.items():
             key = (name, meaning.kind)
@@ -478,7 +478,7 @@ class Blocks:
         return States.of(node=np.array(nodes, np.int64), **columns_of(rows))
 
     def _scenery(self, first: int, new: Sequence[tuple[GivenNode, LabelMeaning]]) -> States:
-        """Return the states of new static entities."""
+        """Return the states of new static entities of an imported graph."""
         still = [(first + row, node) for row, (node, _) in enumerate(new) if node.static]
         rows = [
             state_of(self._path, node.where, node.attributes, {}, any_state=self._any_state)[0]
@@ -532,7 +532,7 @@ def _entities(first: int, new: Sequence[tuple[GivenNode, LabelMeaning]]) -> Enti
 
 
 def _lane_states(inside: Mapping[tuple[int, int, int], dict[str, float]]) -> LaneStates:
-    """Return the lane states of entities. A lane is primary if the file marks it or it is the only one."""
+    """Return the lanes of imported entities. A lane is primary if it is marked so, or is the only one."""
     frame, node, lane = _whole(list(inside), 3)
     rows = list(inside.values())
     known = {
@@ -550,5 +550,5 @@ def _lane_states(inside: Mapping[tuple[int, int, int], dict[str, float]]) -> Lan
 
 
 def _whole(rows: Sequence[tuple[int, ...]], width: int) -> list[Ints]:
-    """Return integer rows as columns."""
+    """Return rows of integers as columns, each an int64 array."""
     return list(np.array(rows, np.int64).reshape(-1, width).T.copy())
