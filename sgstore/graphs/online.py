@@ -832,7 +832,7 @@ class Stepper:
         return known
 
     def _follow(self, entity: Entity, time_ns: int) -> None:
-        """Record the position of an object. An id that returns after a gap is a new object."""
+        """Record the position of an object. An object that reuses the id of another one is a new object."""
         lives = self._moving[entity.ident]
         place = (_NAN,) * 3 if entity.whole[_LIGHT] >= 0 else entity.numbers[:3]
         here = Sight(place, time_ns, self._run)

@@ -320,7 +320,7 @@ class LaterRows(Rows):
 
 
 class Batches:
-    """Result of an SQL statement as a stream of batches. Each batch has some thousand rows.
+    """Result of an SQL statement as a stream; each batch of rows is a :class:`Rows` object.
 
     Attributes
     ----------

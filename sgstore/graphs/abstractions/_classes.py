@@ -46,7 +46,7 @@ _DEEPEST: Final = 150
 
 
 class TooSymmetricError(Exception):
-    """Error: the search for the canonical node order of a graph exceeds its work limit."""
+    """Error: the search for the canonical node order of a graph exceeds its limit."""
 
 
 @dataclass(slots=True)

@@ -54,7 +54,7 @@ _IS_TWO_WHEELER: Final = kinds_mask(tuple(SUPER_KINDS["two_wheeler"]))
 
 
 class Hitches:
-    """Record of the carriers in a trace: towing vehicles of trailers, and bicycles of riders."""
+    """Record of the carriers in a trace, such as towing vehicles of trailers, and bicycles of riders."""
 
     def __init__(self) -> None:
         self._kind: Codes = np.zeros(0, np.int8)

@@ -136,7 +136,7 @@ class Waypoints:
         )
 
     def of(self, hits: LaneHits, along: Floats, bodies: Bodies) -> tuple[Ints, Ints]:
-        """Return pairs of an object row and the node id of its nearest waypoint, sorted by object.
+        """Return pairs of an object row and the node id of a waypoint below the object, sorted by object.
 
         Parameters
         ----------
