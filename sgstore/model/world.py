@@ -117,8 +117,6 @@ def implausible(values: Floats) -> Bools:
 
     All readers and the online mode use this check.
 
-    All readers and the online mode use this check.
-
     Parameters
     ----------
     values : (n, 16) float64
@@ -525,8 +523,6 @@ class FrameBlock:
 
     Frame f has the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
 
-    Frame f has the rows ``offsets[f]:offsets[f + 1]`` of ``states``.
-
     Attributes
     ----------
     seq : (F,) int64
@@ -706,8 +702,6 @@ class TraceReport(Findings):
 
     The reader extends the report block by block.
 
-    The reader extends the report block by block.
-
     Attributes
     ----------
     frames, states : int
@@ -811,8 +805,6 @@ def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
     """Round the object states of frames to the precision of the store.
 
     Graphs are then equal before and after storage.
-
-    Graphs are then equal before and after storage.
     """
     return replace(
         frames,
@@ -823,8 +815,6 @@ def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
 
 def _as_kept(states: States, origin: Origin) -> States:
     """Convert object states to float32 relative to the coordinate origin, as in the store.
-
-    A second call, or storage, changes nothing.
 
     A second call, or storage, changes nothing.
 

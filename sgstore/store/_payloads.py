@@ -194,8 +194,6 @@ def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
     """Choose between two messages for each frame: the later or the earlier one by log time.
 
     At equal times, the message with the later file position is chosen.
-
-    At equal times, the message with the later file position is chosen.
     """
     further = np.zeros(one.shape[1], np.bool_)
     same = np.ones(one.shape[1], np.bool_)

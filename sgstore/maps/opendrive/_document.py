@@ -83,7 +83,7 @@ Record = tuple[str, int, int]
 
 
 class Spoiled(Exception):  # noqa: N818 (control flow inside the package; a road is spoiled, not the map)
-    """Error: roads or records of an OpenDRIVE map are unusable, each with the reason."""
+    """Error: roads or records (such as lane widths) of an OpenDRIVE map are unusable, with reasons."""
 
     def __init__(self, roads: dict[int, MapError], records: dict[Record, MapError]) -> None:
         self.roads = roads
@@ -221,12 +221,12 @@ class Document:
                 self.blame[road] = MapError(reason, road=self.road_ids[road], element=table.element)
 
     def settle(self) -> None:
-        """Raise an error if a road or record of the map has a defect so far."""
+        """Raise an error if a road or record (such as a lane width) of the map has a defect so far."""
         if self.blame or self.odd:
             raise Spoiled(self.blame, self.odd)
 
     def leave_out(self, records: Collection[Record]) -> None:
-        """Remove defective records (such as signals) from the tables."""
+        """Remove defective records (such as lane widths) from the tables."""
         for kind in {kind for kind, _, _ in records}:
             table = self.tables[kind]
             every = self._records(kind, np.arange(len(table)))
@@ -236,7 +236,7 @@ class Document:
             table.road = table.road[kept]
 
     def _records(self, kind: str, rows: Ints) -> list[Record]:
-        """Convert rows of a table to references (road, kind, number in the road).
+        """Convert table rows to references to records: kind, road, number in the road.
 
         The rows of a road are contiguous.
         """

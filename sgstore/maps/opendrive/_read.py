@@ -112,7 +112,7 @@ def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _without(odd: Mapping[Record, MapError], skip: Container[int]) -> list[str]:
-    """Return warnings about skipped records (such as signals) of roads: one line per road and kind."""
+    """Return warnings about skipped records (such as lane widths) of roads: one line per road and kind."""
     groups: dict[tuple[str, int], list[MapError]] = {}
     for (kind, road, _), error in odd.items():
         if road not in skip:

@@ -127,8 +127,6 @@ class RangeSettings:
         """Return the circle around the ego with known objects outside the graphs.
 
         ``None`` means no such objects.
-
-        ``None`` means no such objects.
         """
         return replace(self, shape="radius", radius=self.world) if self.world else None
 
@@ -480,8 +478,6 @@ def check_steps(
 
 def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
     """Raise an error for labels (such as ``Car``) that no kind of object has.
-
-    ``Ego`` is valid if ``ego`` is true.
 
     ``Ego`` is valid if ``ego`` is true.
     """

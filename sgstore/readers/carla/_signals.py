@@ -157,8 +157,6 @@ def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
     """Assign traffic lights to map signals by position: row of the light → row of its signal.
 
     The columns are ``x, y, z, heading``.
-
-    The columns are ``x, y, z, heading``.
     """
     found: dict[int, int] = {}
     best = _Rule(TURNS[0], FORWARD, 0.0)

@@ -349,8 +349,6 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
         """Add, change and delete the current scene objects, as a scene message describes.
 
         With ``goes_on``, the message adds to a message of another channel.
-
-        With ``goes_on``, the message adds to a message of another channel.
         """
         standing = self._standing.setdefault(channel, {})
         if self._mapping.scene.snapshot and not goes_on:

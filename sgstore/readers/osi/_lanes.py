@@ -526,8 +526,6 @@ def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -
     """Return the points (n, 3) of a polyline at given lengths s along it.
 
     ``side`` selects the value at a jump of the line.
-
-    ``side`` selects the value at a jump of the line.
     """
     at = np.searchsorted(s, cuts, side)
     at = np.minimum(at, len(s) - 1) if side == "left" else np.maximum(at - 1, 0)
