@@ -34,7 +34,7 @@ _DEFAULT: Final = re.compile(r"(\w+)\s*=")
 
 
 def load(ipython: Any) -> None:
-    """Register the cell magic and the pictures in an IPython session."""
+    """Register the cell magic ``%%sgql`` and the pictures of graphs in an IPython session."""
     ipython.register_magic_function(SgqlCell(ipython.user_ns), "cell", "sgql")
     pictures = ipython.display_formatter.formatters["image/png"]
     pictures.for_type_by_name("sgstore.model.graph", "SceneGraph", _picture)

@@ -1,4 +1,4 @@
-"""Matches of a query as one HTML file that plays without a server and without a network.
+"""Report: the matches of a query as one HTML file that works without a server and without a network.
 
 The file contains the page's modules as one script, and the data that they would request from a
 server: matches, truth lanes, states around each match, outlines of maps and optionally camera

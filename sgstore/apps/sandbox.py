@@ -1,4 +1,4 @@
-"""Sandbox: untrusted SQL and patterns, run in a separate process.
+"""Sandbox: a separate process that runs untrusted SQL and pattern queries on a store.
 
 The process can only read the store: the database is opened read-only without file access, and its
 settings are locked. The operating system forbids it to write files and limits its address space. A

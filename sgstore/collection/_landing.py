@@ -136,7 +136,7 @@ class _Landing:
         self, paths: list[Path], jobs: int
     ) -> Generator[list[tuple[TraceOutcome, Path | None]]]:
         def see(*_told: int) -> None:
-            """Ignore the progress."""
+            """Ignore the progress of reading."""
 
         if min(jobs, len(paths)) > 1:
             yield from read_in_processes(self.job, jobs, see, paths, self.folder)

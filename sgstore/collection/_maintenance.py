@@ -164,7 +164,7 @@ def _segment_of(name: str) -> str:
 
 
 def _last(name: str) -> bool:
-    """True if a file must be removed after other files: tables of a snapshot go after the snapshot."""
+    """True for a table file of a snapshot, which is removed after the snapshot itself."""
     return not name.endswith(".json")
 
 

@@ -161,7 +161,7 @@ class Collection:
         self.close()
 
     def close(self) -> None:
-        """Do nothing: files are closed after each query.
+        """Do nothing, because the files of a collection are closed after each query.
 
         Examples
         --------

@@ -149,7 +149,7 @@ class Gif(Animation):
         self._stream.write(b";")  # the trailer of a GIF
 
     def _drop(self) -> None:
-        """Do nothing: the output closes its stream itself."""
+        """Do nothing, because the output file closes its stream itself."""
 
     def _write(self, pixels: Pixels, delay: int) -> None:
         """Write a picture to the GIF file, with its display time in hundredths of a second."""

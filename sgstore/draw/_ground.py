@@ -68,7 +68,7 @@ class GroundView:
 
     @property
     def nodes(self) -> MapNodes:
-        """Return all nodes of the map."""
+        """Return all nodes of the road map."""
         return self.road_map.nodes
 
     def of_kind(self, *kinds: str) -> list[int]:
@@ -180,7 +180,7 @@ class GroundView:
         return np.concatenate(points) if points else np.empty((0, 2))
 
     def spot(self, node: int) -> tuple[float, float] | None:
-        """Return a visible point on a map part where its name can stand; ``None`` without such a point.
+        """Return a visible point of a map part for its name; ``None`` without such a point.
 
         On a lane it is on the middle line, if possible at least 8 m from the middle of the picture.
         """

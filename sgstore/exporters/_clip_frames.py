@@ -128,7 +128,7 @@ class Export:
     def named_graphs(
         self, frames: ClipFrames, abstraction: str
     ) -> Iterator[tuple[dict[str, str], list[tuple[str, str, str]]]]:
-        """Yield the labelled graph of each frame in an abstraction: nodes by name, and edges as names."""
+        """Yield the graph of each frame in an abstraction: labels by node name, and edges between names."""
         found, _, graphs = self.store.file.abstracted.frames(abstraction, **frames.bounds)
         for row in np.searchsorted(found, frames.seq).tolist():
             yield graphs.named(row)

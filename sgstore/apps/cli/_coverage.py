@@ -213,7 +213,7 @@ def growth_(
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """Compare the growth of the number of classes with that of a random order."""
+    """Compare the growth of the number of scene classes with frames in random order."""
     from sgstore.testsets.coverage import growth
 
     (frames,) = scenes.of(ask, a, slots=scenes.slots)
@@ -337,7 +337,7 @@ def spec_(
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """Measure how much of a specification is covered: the cells of a query, or declared slots."""
+    """Measure the coverage of a specification: value combinations of a query, or declared slots."""
     from sgstore.testsets.coverage import specification
 
     if (query is None) == (slots is None):

@@ -193,7 +193,7 @@ def prioritize(
     out: PrintedRows,
     bounds: QueryLimits,
 ) -> None:
-    """Order frames, clips or traces so that failures are found soon, with reasons.
+    """Order frames, clips or traces so that tests find failures soon, with reasons.
 
     The risk of a case is the sum of its ranks by measures of criticality of the
     ego and others that move. With --by learned it is the probability that it

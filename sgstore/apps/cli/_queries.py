@@ -90,7 +90,7 @@ def find(
     whole: CollectionOptions,
     ask: AskOptions,
 ) -> int:
-    """Find frames by a pattern of their scene graphs.
+    """Find frames whose scene graphs match a pattern.
 
     One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
     Without RETURN, a terminal shows stretches of frames in which a match lasts.

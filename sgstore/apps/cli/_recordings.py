@@ -152,7 +152,7 @@ def _with_scopes(
 def _landed(
     store: Path, paths: list[Path], shard: str | None, how: dict[str, Any], *, alone: bool
 ) -> list[TraceOutcome]:
-    """Ingest a share of recordings into the landing area of a collection, and return the results.
+    """Ingest a share of recordings as segment files into a collection, and return the results.
 
     ``alone`` is true if an option for single stores was given, which is an error.
     """

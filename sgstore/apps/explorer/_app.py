@@ -327,7 +327,7 @@ class Explorer:
 
 
 async def page_of(request: Request, script: str = "main.js") -> Response:
-    """Return the HTML page with its first script, and with the nonce of the content security policy."""
+    """Return the HTML page with its first script and the nonce of the content security policy."""
     text = (PAGE / "index.html").read_text(encoding="utf-8").replace(_SCRIPT, f"js/{script}")
     nonce = request.scope["state"]["nonce"]
     return Response(text.replace(_NONCE, nonce), media_type="text/html")

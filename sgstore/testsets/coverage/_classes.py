@@ -202,7 +202,7 @@ def _numbered(parts: Sequence[Ints]) -> tuple[Ints, Ints]:
 
 
 def _window_name(classes: Sequence[str]) -> str:
-    """Return a name for the class of a window: a hash of the classes of its frames, equal in every store."""
+    """Return a name for the class of a window of frames: a hash of the classes of these frames."""
     text = "\n".join(classes).encode()
     return blake2b(text, digest_size=16, person=b"sgstore window").hexdigest()
 

@@ -299,7 +299,7 @@ def novel_clips(a: Classed, than: Classed) -> ReportTable:
 
 
 def venn(a: Classed, b: Classed) -> ReportTable:
-    """Return a table with the number of classes in both of two selections, in one only, and in total.
+    """Return a table with the numbers of classes that two selections share, or only one selection has.
 
     Returns
     -------

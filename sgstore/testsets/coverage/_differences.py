@@ -77,7 +77,7 @@ def tree(
 
 
 def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tuple[int, int] | None:
-    """Return the best split of a decision tree: a feature, and the threshold of its count."""
+    """Return the best split of a decision tree: a feature, and the threshold for its number of occurrences."""
     good = np.where(ours, weight, 0.0)
     total, positive = float(weight.sum()), float(good.sum())
     if min(positive, total - positive) < 1e-9:

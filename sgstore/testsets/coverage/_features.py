@@ -316,7 +316,7 @@ def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
 
 
 def _together(found: ClassFeatures) -> Ints:
-    """Return the number of frames that have both features of a pair, for all pairs, (F, F)."""
+    """Return the number of frames with both features of a pair, for all pairs of features, (F, F)."""
     total = np.zeros((len(found.names), len(found.names)))
     kind = np.float32 if found.frames.sum() < 1 << 24 else np.float64  # exact for integers
     for first in range(0, len(found.codes), _ROWS):

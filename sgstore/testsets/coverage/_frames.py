@@ -1,4 +1,4 @@
-"""Queries for missing features and slot values, and result tables.
+"""Queries that find missing features or missing scene parameters (slots), and result tables.
 
 Missing features and slot values are returned as queries that users can run.
 """

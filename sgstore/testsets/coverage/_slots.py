@@ -186,11 +186,11 @@ class Slot:
 
     @property
     def domain(self) -> tuple[str, ...]:
-        """Return the names of all values of the slot, ``none`` first."""
+        """Return the names of all values of the slot (scene parameter), ``none`` first."""
         return (NONE, *self.values)
 
     def block(self, value: str) -> tuple[list[str], list[str]]:
-        """Return the patterns that a frame must match, and must not match, to have a value of the slot."""
+        """Return the patterns that a frame must match, and must not match, for a value of a slot."""
         blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
         return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
 
@@ -220,7 +220,7 @@ class Specification:
     def matrix(
         self, chosen: ChosenFrames
     ) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
-        """Return all pairs of slot values, the number of frames of each pair, and a mask of required pairs.
+        """Return pairs of values of scene parameters (slots), with their frames and a mask of required pairs.
 
         Returns
         -------
@@ -261,7 +261,7 @@ class Specification:
 
     @staticmethod
     def read(path: str | Path) -> list[Specification]:
-        """Return the slot specifications of a TOML file.
+        """Return the specifications of scene parameters (slots) in a TOML file.
 
         Parameters
         ----------
@@ -324,7 +324,7 @@ def _specification(path: Path, given: Any, name: str) -> Specification:
 
 
 def _tables(path: Path, given: Mapping[str, Any]) -> dict[str, Path]:
-    """Return the user table files named in a slot file, relative to the folder of that file."""
+    """Return the files of the user tables in a slot file, by table name, relative to its folder."""
     tables = given.get("tables", {})
     if not isinstance(tables, dict) or not all(isinstance(one, str) for one in tables.values()):
         raise ConfigError(
@@ -374,7 +374,7 @@ class _Held:
         return self._known[pattern]
 
     def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
-        """Return the frames that have each slot value, as bit masks by slot and value."""
+        """Return the frames with each value of each scene parameter (slot), as bit masks."""
         counts = self.of(specification.where)
         held: dict[tuple[str, str], Bits] = {}
         for slot in specification.slots:
@@ -387,7 +387,7 @@ class _Held:
         return held
 
     def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
-        """Return the frames that count, the distinct combinations of slot values, and their index per frame."""
+        """Return the counted frames, and for each the combination of its values of scene parameters (slots)."""
         rows = np.flatnonzero(self.of(specification.where))
         names, code = [""], np.zeros(len(rows), np.int64)
         for slot in specification.slots:
@@ -410,7 +410,7 @@ class _Held:
 
 
 def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints, list[str], Ints]:
-    """Return frames with classes that are defined by the values of declared slots.
+    """Return frames with a class for each combination of values of scene parameters (slots).
 
     Returns
     -------
@@ -433,7 +433,7 @@ def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints,
 def _combined(
     specification: Specification, k: int, held: _Held
 ) -> Iterator[tuple[tuple[Slot, ...], tuple[str, ...], int]]:
-    """Yield each possible combination of values of k slots, with its number of frames.
+    """Yield each possible combination of values of k scene parameters (slots), with its number of frames.
 
     Raises
     ------
@@ -464,7 +464,7 @@ def _combined(
 def slot_coverage(
     chosen: ChosenFrames, specifications: Sequence[Specification], k: int = 0
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Return tables of the occurring and the missing combinations of slot values.
+    """Return tables of the occurring and the missing value combinations of scene parameters (slots).
 
     Parameters
     ----------

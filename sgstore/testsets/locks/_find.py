@@ -136,7 +136,7 @@ def by_bundle(
 
 
 def store_beside(path: str | Path, lock: Lock) -> Path:
-    """Return the only store near a lock file (its folder, the working folder) with all traces of the lock.
+    """Return the only store with all traces of a lock file, from its folder or the working folder.
 
     Raises
     ------

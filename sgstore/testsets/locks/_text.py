@@ -142,7 +142,7 @@ class Lock:
         return tuple(sorted(self.cases, key=lambda case: places.get(case.id, len(places))))
 
     def write(self, path: str | Path) -> None:
-        """Write the lock to a file.
+        """Write the lock to a text file.
 
         Raises
         ------
@@ -164,7 +164,7 @@ class Lock:
 
 
 def read_lock(path: str | Path) -> Lock:
-    """Read a lock from a file.
+    """Return the lock in a text file.
 
     Raises
     ------

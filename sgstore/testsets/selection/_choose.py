@@ -231,7 +231,7 @@ class SelectionSpec:
 
     @property
     def wished(self) -> UnitsWished:
-        """Return the definition of the selection units (frames, clips or traces) for the bundle processes."""
+        """Return the definition of the selection units (frames, clips or traces) as plain values."""
         least = self.abstraction, self.objective, self.seed
         return UnitsWished(self.unit.value, self.clip_s, self.stride_s, *least)
 
@@ -352,7 +352,7 @@ def holdings_of(spec: SelectionSpec, units: Units) -> Holdings:
 
 
 def _every(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    """Select all frames, clips or traces, or random ones until the budget is used up."""
+    """Select all frames, clips or traces; with a budget, random ones until it is used up."""
     picked = np.arange(len(units))
     if spec.budget is not None:
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
@@ -501,7 +501,7 @@ def _stratified(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 def _allotted(
     order: Ints, stratum: Ints, tracker: BudgetTracker, shares: Floats, rank: Ints
 ) -> Ints:
-    """Select clips of each stratum up to its share of the budget, then random clips for the rest."""
+    """Select clips of each group (stratum) up to its share of the budget, then random clips for the rest."""
     within_share: list[Ints] = []
     used = np.zeros(len(shares))
     for number, share in enumerate(shares.tolist()):
@@ -539,7 +539,10 @@ def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
-    """Return the stratum of each clip (the most frequent value of its frames), and all values."""
+    """Return the group (stratum) of each clip, which is the most frequent value of its frames.
+
+    Also return the names of all groups.
+    """
     from sgstore.exporters import Labels
 
     asked = np.flatnonzero(units.asked)

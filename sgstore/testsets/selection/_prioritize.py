@@ -1,4 +1,4 @@
-"""Order of test cases: by risk, by diversity, by both, or learned from outcomes.
+"""Order of test cases: by risk, by diversity, by both, or by failure probabilities learned from results.
 
 The *risk* of a case comes from measures of criticality between the ego and other moving entities:
 the worst value in its frames. A measure of the later recording (``pet``) belongs to a complete

@@ -99,7 +99,7 @@ class SetFamily:
         return np.repeat(np.arange(len(self)), np.diff(self.starts))
 
     def elements(self, one: int) -> Ints:
-        """Return the elements of a set."""
+        """Return the elements of one set of the family."""
         return self.members[self.starts[one] : self.starts[one + 1]]
 
     def by_element(self) -> tuple[Ints, Ints]:

@@ -372,7 +372,7 @@ class Holdings:
         return replace(found, weight=self.weight)
 
     def over(self, units: Units) -> Holdings:
-        """Return the scene classes or combinations in each of other clips of the same frames.
+        """Return the scene classes or combinations that other clips of the same frames contain.
 
         Raises
         ------
