@@ -35,7 +35,7 @@ def recorded(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
         yield store
 
 
-def test_there_are_fifty_six_questions_and_nine_more() -> None:
+def test_there_are_65_questions() -> None:
     assert [entry.number for entry in ENTRIES] == [*range(1, 66)]
     assert all(entry.question.endswith("?") for entry in ENTRIES)
 
