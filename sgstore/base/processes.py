@@ -1,4 +1,4 @@
-"""Worker processes, which run a module of this package and answer requests.
+"""Worker processes: child Python processes that run a module of sgstore and answer JSON requests.
 
 A worker is an isolated Python process with the packages of this process. Requests and replies are JSON
 objects, one per line, on its stdin and stdout. All replies to a request except the last have ``more``. The
@@ -41,7 +41,7 @@ _START: Final = (
 
 
 class WorkerProcess:
-    """Process that runs a module, which iterates over :func:`requests`.
+    """Child Python process that runs a module of sgstore and answers its requests.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def _listen(lines: IO[bytes], longest: int, on_line: Callable[[bytes], object]) 
 
 
 class WorkerPool:
-    """Equal workers that share requests. A context manager, which ends the workers.
+    """Pool of equal worker processes that share requests. It is a context manager that ends the workers.
 
     A dead worker is replaced. Requests that it has not begun go to the other workers.
 
@@ -159,12 +159,12 @@ class WorkerPool:
 
     @property
     def has_room(self) -> bool:
-        """True if a worker can take another request."""
+        """True if a worker process can take another request."""
         least = min(map(len, self._given.values()), default=0)
         return len(self._workers) < self._count or least < self._ahead
 
     def put(self, key: int, request: Mapping[str, Any]) -> None:
-        """Send a request to the worker with the fewest requests; its replies come with its key."""
+        """Send a request to the worker process with the fewest requests. Replies come with the given key."""
         number = min(self._given, key=lambda one: len(self._given[one]), default=0)
         if len(self._workers) < self._count and self._given.get(number, True):
             number = self._start()
@@ -172,7 +172,7 @@ class WorkerPool:
         self._workers[number].send(request)
 
     def get(self) -> tuple[int, dict[str, Any] | int]:
-        """Return the next reply with the key of its request; the exit code if the worker died of it."""
+        """Return the next reply of any worker, with the key of its request; an exit code if the worker died."""
         while True:
             number, line = self._lines.get()
             given = self._given[number]
@@ -200,7 +200,10 @@ class WorkerPool:
 
 
 def requests() -> Iterator[dict[str, Any]]:
-    """Yield the requests to this worker process. It exits at once when its parent process ends it or dies."""
+    """Yield the requests that the parent process sends to this worker process.
+
+    The worker exits at once when its parent process ends it or dies.
+    """
     sys.stdout = sys.stderr  # printed text must not mix with the replies
     lines: SimpleQueue[bytes] = SimpleQueue()
     threading.Thread(target=_read, args=(lines,), daemon=True).start()
@@ -217,7 +220,10 @@ def _read(lines: SimpleQueue[bytes]) -> None:
 
 
 def send_reply(values: Mapping[str, Any]) -> None:
-    """Send a reply from this worker process; with ``more``, others follow."""
+    """Send a reply from this worker process to its parent process.
+
+    With ``more`` in the reply, other replies follow.
+    """
     assert sys.__stdout__ is not None  # noqa: S101 - a pipe to the parent process
     with suppress(BrokenPipeError):  # the parent process is dead, and this process about to exit
         sys.__stdout__.buffer.write(json.dumps(values).encode() + b"\n")
