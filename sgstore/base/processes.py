@@ -41,7 +41,9 @@ _START: Final = (
 
 
 class WorkerProcess:
-    """Child Python process that runs a module of sgstore and answers its requests.
+    """Child Python process that runs a module of sgstore and answers requests.
+
+    The module iterates over :func:`requests`.
 
     Parameters
     ----------
