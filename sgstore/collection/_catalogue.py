@@ -159,7 +159,7 @@ class Snapshot:
         return {row["trace_id"]: row["bundle"] for row in self.traces}
 
     def of(self, table: str, bundle: str) -> list[tuple[Any, ...]]:
-        """Return the catalogue rows of one table for one bundle."""
+        """Return the catalogue rows of one table for one bundle (store file)."""
         return self._by_bundle(table).get(bundle, [])
 
     def _by_bundle(self, table: str) -> dict[str, list[tuple[Any, ...]]]:
@@ -176,7 +176,7 @@ class Snapshot:
 
     @cached_property
     def words(self) -> dict[str, tuple[str, ...]]:
-        """Return the values that users added to each enumeration in any bundle, in a fixed order."""
+        """Return the values that users added to each enumeration in any store of the collection."""
         found: dict[str, dict[str, None]] = {enum: {} for enum in NAMES}
         for _, what, word, _, _ in sorted(
             self.facts["word"], key=lambda row: (row[1], row[4], row[2])
@@ -187,7 +187,7 @@ class Snapshot:
 
     @cached_property
     def own(self) -> dict[str, dict[str, Type]]:
-        """Return the custom attributes of nodes and of edges in all bundles, with their types."""
+        """Return the custom attributes of nodes and of edges in all bundles (store files), with their types."""
         found: dict[str, dict[str, set[Type]]] = {"own": {}, "own_edges": {}}
         for _, what, word, kind, _ in self.facts["word"]:
             if what in found:
@@ -199,16 +199,16 @@ class Snapshot:
 
     @cached_property
     def classed(self) -> tuple[str, ...]:
-        """Return the abstractions whose frame classes are stored in at least one bundle."""
+        """Return the abstractions whose frame classes are stored in at least one bundle (store file)."""
         return tuple(sorted({row[2] for row in self.facts["word"] if row[1] == "classed"}))
 
     @cached_property
     def catalog(self) -> Catalog:
-        """Return the contents of all bundles as one catalog for compiling queries."""
+        """Return the contents of all bundles (store files) as one catalog for compiling queries."""
         return self.catalog_of([bundle["bundle"] for bundle in self.bundles])
 
     def catalog_of(self, bundles: Sequence[str]) -> Catalog:
-        """Return the contents of some bundles as one catalog for compiling queries.
+        """Return the contents of some bundles (store files) as one catalog for compiling queries.
 
         Names of attributes and enumeration values are those of all bundles.
         """
@@ -227,7 +227,7 @@ class Snapshot:
         )
 
     def contents(self, bundles: Sequence[str], name: str = "") -> Catalog:
-        """Return a catalog with the kinds and the (kind, relation, kind) triples of some bundles.
+        """Return a catalog of some bundles (store files): kinds, and triples (kind, relation, kind).
 
         The relations are those of a derived set, or of the ingest.
         """
@@ -253,7 +253,7 @@ class Snapshot:
     def triples(
         self, name: str, matters: Callable[[Triple], bool], *, world: bool
     ) -> dict[str, frozenset[Triple]]:
-        """Return the relevant (kind, relation, kind) triples of each bundle, by bundle.
+        """Return the relevant (kind, relation, kind) triples of each bundle (store file), by bundle.
 
         The relations are those of a derived set, or of the ingest.
 
@@ -277,7 +277,7 @@ class Snapshot:
 
     @cached_property
     def kinds(self) -> dict[str, tuple[frozenset[str], ...]]:
-        """Return the kinds of moving entities, of static entities and of map parts in each bundle."""
+        """Return the kinds of moving entities, static entities and map parts in each bundle (store file)."""
         homes = {home: place for place, home in enumerate(("moving", "fixed", "mapped"))}
         found = {one["bundle"]: (set[str](), set[str](), set[str]()) for one in self.bundles}
         for bundle, home, kind in self.facts["kind"]:
@@ -347,7 +347,10 @@ class Snapshot:
         )
 
     def relations_of(self, name: str) -> frozenset[str] | None:
-        """Return the relations in the settings of a derived set, over all bundles; ``None`` means unknown."""
+        """Return the relations in the settings of a derived set, over all stores of the collection.
+
+        ``None`` means unknown.
+        """
         rows = self.sets[name]
         numbers = {row[2] for row in rows}
         if any("abstraction" in json.loads(row[4]) for row in rows):
@@ -463,7 +466,7 @@ def joined(facts: Iterable[Facts]) -> Facts:
 
 
 def without(facts: Facts, bundles: Iterable[str]) -> Facts:
-    """Return the rows of a catalogue without those of the given bundles."""
+    """Return the rows of a catalogue without those of the given bundles (store files)."""
     gone = frozenset(bundles)
     kept = {
         table: rows if table == "config" else [row for row in rows if row[0] not in gone]

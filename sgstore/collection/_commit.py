@@ -79,7 +79,7 @@ def commit(url: str | Path) -> Commit:
 
 
 def _waiting(place: Place, before: Snapshot, folder: Path) -> list[_Landed]:
-    """Return the ingested segments that are in no bundle yet, ordered by the digest of the recording."""
+    """Return the ingested segments that no bundle (store file) contains yet, ordered by recording digest."""
     known = {row["segment"] for row in before.traces}
     sizes: dict[str, int] = {}
     complete: set[str] = set()

@@ -78,9 +78,9 @@ class CollectionFrames:
         return nullcontext()
 
     def arrays(self, sql: str, parameters: Parameters = ()) -> dict[str, NDArray[np.generic]]:
-        """Run an SQL statement on all bundles, and return its columns as arrays, ordered by value.
+        """Run an SQL statement on all stores of the collection, and return its columns as arrays.
 
-        Each row must belong to one trace.
+        Each row must belong to one trace. The rows are ordered by value.
 
         Parameters
         ----------
@@ -93,7 +93,7 @@ class CollectionFrames:
             return PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
 
     def rows(self, sql: str, parameters: Parameters = ()) -> Rows:
-        """Run an SQL statement on all bundles, and return its rows. Each row must belong to one trace."""
+        """Run an SQL statement on all stores of the collection, and return its rows."""
         with self._told(sql, parameters) as parts:
             values = [*_rows(parts, self._words)]
             return Rows(parts[0].columns, parts[0].types, values)
@@ -109,7 +109,7 @@ class CollectionFrames:
             yield parts
 
     def by_bundle(self, frame_id: Ints) -> list[tuple[str, tuple[Ints, Ints]]]:
-        """Return the bundles that contain the given frames, each with the indices and ids of its frames."""
+        """Return the stores that contain the given frames, each with the indices and ids of its frames."""
         traces, number = np.unique(trace_of(frame_id), return_inverse=True)
         homes = [self._homes[trace] for trace in traces.tolist()]
         of = {bundle: place for place, bundle in enumerate(dict.fromkeys(homes))}
@@ -133,7 +133,7 @@ class CollectionFrames:
         return dict(found)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """Yield the features of frames (label counts of their graphs) in an abstraction, bundle by bundle.
+        """Yield the features of frames (label counts of their graphs) in an abstraction, store by store.
 
         Parameters and results as in :meth:`sgstore.store._classes.Abstracted.features`.
         """
@@ -151,7 +151,7 @@ class CollectionFrames:
             yield homes[result["bundle"]][0], Triples(names, *columns)
 
     def margins(self, question: dict[str, Any]) -> Iterator[tuple[Ints, Floats]]:
-        """Yield frame ids with the robustness margins of a check, bundle by bundle."""
+        """Yield frame ids with the robustness margins of a check, one bundle (store file) after another."""
         with self._parts({"kind": "margins"} | question) as parts:
             found = PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
         yield (
@@ -163,7 +163,7 @@ class CollectionFrames:
     def _parts(
         self, question: dict[str, Any], each: Mapping[str, dict[str, Any]] = MappingProxyType({})
     ) -> Generator[list[PartFile]]:
-        """Context manager with the result files of all bundles for a query.
+        """Context manager with the result files of all bundles (store files) for a query.
 
         If ``each`` has entries, only their bundles run it.
         """

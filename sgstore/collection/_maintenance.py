@@ -74,7 +74,7 @@ def verify(url: str | Path) -> CollectionFaults:
 
 
 def _differing(snapshot: Snapshot, sha: str, facts: Facts) -> list[tuple[str, str, str]]:
-    """Return the catalogue tables whose rows for a bundle differ from the content of the bundle."""
+    """Return the catalogue tables whose rows for a bundle (store file) differ from its content."""
     faults: list[tuple[str, str, str]] = []
     for table in CATALOGUE:
         if table == "config":

@@ -176,7 +176,7 @@ class _Source:
         return names
 
     def _groups(self, names: Mapping[int, str]) -> list[dict[int, str]]:
-        """Return the new traces divided into groups, one group for each bundle."""
+        """Return the new traces divided into groups, one group for each bundle (store file)."""
         each = max(self.path.stat().st_size // max(len(BundleSource(self.path).names()), 1), 1)
         return groups(names, max(min(self.limit, self.about.bundle_bytes // each), 1))
 

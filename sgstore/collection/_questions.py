@@ -189,7 +189,7 @@ class Collection:
 
     @cached_property
     def catalog(self) -> Catalog:
-        """Return the contents of all bundles, and the user tables, as a catalog for compiling queries."""
+        """Return the contents of all stores, and the user tables, as a catalog for compiling queries."""
         found = self.snapshot.catalog
         return found if self._tables is None else replace(found, tables=self._table_facts())
 
@@ -282,7 +282,7 @@ class Collection:
         return PartedChecks(self, text, parameters, about)
 
     def sql(self, text: str, *, each: bool = False) -> PartedRows:
-        """Run an SQL statement on every bundle, and return the rows with an additional column ``bundle``.
+        """Run an SQL statement on every bundle (store), and return the rows after a column ``bundle``.
 
         Parameters
         ----------
@@ -352,7 +352,7 @@ class Collection:
         return self._at_home(frame, Store.pattern, {"frame": frame, "ignore": [*ignore]})
 
     def _at_home(self, frame: str, step: Callable[..., Any], values: dict[str, Any]) -> Any:
-        """Run a function on the bundle that contains a frame. Errors are the same as for a single store."""
+        """Run a function on the bundle (store) that contains a frame. Errors are those of a single store."""
         home = self._home_of(frame)
         try:
             for _, value in self.each(step, {home: values}):
@@ -362,7 +362,7 @@ class Collection:
         raise StoreError(self.missing[home])
 
     def _home_of(self, frame: str) -> str:
-        """Return the bundle that contains a frame, given by its name or id.
+        """Return the bundle (store file) that contains a frame, given by its name or id.
 
         Raises
         ------
@@ -380,7 +380,7 @@ class Collection:
     def each(
         self, step: Callable[..., Any], asked: Mapping[str, Mapping[str, Any]]
     ) -> Iterator[tuple[str, Any]]:
-        """Run a function on some bundles in parallel, and yield each bundle with its result on arrival.
+        """Run a function on some bundles (stores) in parallel, and yield each bundle with its result.
 
         Parameters
         ----------
@@ -411,7 +411,7 @@ class Collection:
         bundles: Sequence[str],
         each: Mapping[str, dict[str, Any]] = MappingProxyType({}),
     ) -> Iterator[dict[str, Any]]:
-        """Send a query to some bundles, and yield their results on arrival.
+        """Send a query to some bundles (store files), and yield their results on arrival.
 
         ``each`` has the parameters of single bundles.
 
@@ -446,7 +446,7 @@ class Collection:
             self._judge(failed, len(tasks))
 
     def _judge(self, failed: Mapping[str, str], asked: int) -> None:
-        """Raise an error if bundles failed to answer a query. With ``partial``, they are only recorded.
+        """Raise an error if stores of the collection failed to answer. With ``partial``, they are recorded.
 
         Earlier results may include bundles that answered then; such bundles cannot be left out now.
         """
@@ -495,7 +495,7 @@ class Collection:
         return "base64:" + base64.b64encode(path.read_bytes()).decode()
 
     def classes(self, questions: Iterable[ClassQuestion], folder: str | Path) -> dict[str, Path]:
-        """Write a file with the frame classes of all bundles, and return its path by table name.
+        """Write a file with the frame classes of all stores, and return its path by table name.
 
         Without abstractions, nothing is written.
         """
@@ -524,7 +524,7 @@ class Collection:
         return {CLASSES_GIVEN: path}
 
     def _counted(self, abstraction: str) -> list[tuple[str, str, str, int]]:
-        """Return the number of frames of each class in all bundles together, from the catalogue."""
+        """Return the number of frames of each class in the whole collection, from the catalogue."""
         counts: dict[str, int] = {}
         for _, of, name, frames, _ in self.snapshot.facts["class_count"]:
             if of == abstraction:
@@ -532,7 +532,7 @@ class Collection:
         return [("", abstraction, name, frames) for name, frames in counts.items()]
 
     def may_answer(self, compiled: Compiled) -> list[str]:
-        """Return the bundles that can contain a match of a query, the largest first."""
+        """Return the bundles (store files) that can contain a match of a query, the largest first."""
         chosen, left = traces_of(compiled.query, compiled.catalog)
         every = {t.trace_id for t in compiled.catalog.traces}
         asked = (every if chosen is None else chosen) - left
@@ -544,7 +544,7 @@ class Collection:
     def _held(
         self, catalog: Catalog, pruning: Pruning
     ) -> Callable[[str], tuple[frozenset[Triple], Sequence[frozenset[str]]]]:
-        """Return a function that gives the relevant triples and the kinds of a bundle, for an abstraction."""
+        """Return a function that gives the relevant triples and kinds of a store, for an abstraction."""
         snapshot, name, world = self.snapshot, catalog.name, catalog.world
         if name and name not in snapshot.sets:
 
@@ -624,7 +624,7 @@ class PartedMatches(Tabular):
 
     @property
     def of_all(self) -> bool:
-        """True if the query needs the frame classes of all bundles."""
+        """True if the query needs the frame classes of all bundles (store files)."""
         return bool(class_questions(self._ready.bound))
 
     @property
@@ -730,7 +730,7 @@ class PartedMatches(Tabular):
         return {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
 
     def explain(self) -> str:
-        """Return an explanation of the query: its SQL stages, and the merge of the bundles' results."""
+        """Return an explanation of the query: its SQL stages, and the merge of the results of all stores."""
         asked = parted(self._ready)
         bundles = self._whole.may_answer(self._ready)
         text, _ = asked.statement(self._ready.catalog)
@@ -761,7 +761,7 @@ class PartedMatches(Tabular):
         }
 
     def _answered(self, form: str, offsets: tuple[int, int] = (0, 0)) -> Iterator[tuple[Any, ...]]:
-        """Run the query, and yield the merged rows of all bundles in one form (rows, frames, intervals, …)."""
+        """Run the query, and yield the merged rows of all stores in one form (rows, frames, intervals, …)."""
         asked = parted(self._ready, form, *offsets)
         with self._tables(form, offsets) as tables:
             text, values = asked.statement(self._ready.catalog)
@@ -780,7 +780,7 @@ class PartedMatches(Tabular):
 
     @contextmanager
     def _tables(self, form: str, offsets: tuple[int, int]) -> Generator[dict[str, list[PartFile]]]:
-        """Run the query on the bundles, and yield their result files by table name for the merge."""
+        """Run the query on all stores, and yield their result files by table name for the merge."""
         with working_folder("parts") as folder:
             question = self._question(form, folder, offsets)
             tables: dict[str, list[PartFile]] = {}
@@ -803,7 +803,7 @@ class PartedUnion(UnionMatches):
 
     @property
     def of_all(self) -> bool:
-        """True if the query needs the frame classes of all bundles."""
+        """True if the query needs the frame classes of all bundles (store files)."""
         return any(part.of_all for part in self._parts)
 
     @property

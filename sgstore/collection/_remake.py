@@ -30,7 +30,7 @@ def rebuild(
     everything: bool = False,
     on_bundle: Callable[[int, int], None] | None = None,
 ) -> dict[str, str]:
-    """Rebuild the bundles of other schema versions from their recordings, with one commit for each.
+    """Rebuild the stores of other schema versions from their recordings, with one commit for each.
 
     A repeated run continues with the remaining bundles. Names of traces and maps stay.
 
@@ -73,7 +73,7 @@ def rebuild(
 
 
 def _remade(place: Place, bundle: str, look_in: Sequence[str | Path], jobs: int) -> Facts:
-    """Rebuild one bundle from its recordings, upload it, and return its catalogue rows."""
+    """Rebuild one bundle (store file) from its recordings, upload it, and return its catalogue rows."""
     with working_folder("rebuild") as folder:
         path = folder / "bundle.sgstore"
         shutil.copyfile(bundle_path(place, bundle), path)
@@ -89,7 +89,7 @@ def _remade(place: Place, bundle: str, look_in: Sequence[str | Path], jobs: int)
 
 
 def _replaced(place: Place, bundle: str, fresh: Facts) -> bool:
-    """Commit a snapshot with a rebuilt bundle in place of the old one.
+    """Commit a snapshot with a rebuilt bundle (store file) in place of the old one.
 
     Return False if the old bundle is no longer in the collection.
     """

@@ -95,10 +95,10 @@ def _with_relations(
 
 
 class PartMatches(TemporalMatches):
-    """Matches of a query in one bundle, in the forms that the merge of bundles needs."""
+    """Matches of a query in one bundle (store file), in the forms that the merge of bundles needs."""
 
     def written(self, form: str, offsets: tuple[int, int], folder: Path) -> list[PartFile]:
-        """Write the rows of a query on one bundle to files, in one form, and return the files."""
+        """Write the rows of a query on one bundle (store file) to files, in one form, and return the files."""
         with self._compiled() as compiled:
             if form == "count":
                 return [self._written(compiled, Compiled.count(compiled), folder)]
@@ -113,7 +113,7 @@ class PartMatches(TemporalMatches):
 
 
 def answer(task: dict[str, Any]) -> dict[str, Any]:
-    """Run a task of a query on one bundle, and return the result as JSON values.
+    """Run a task of a query on one bundle (store file), and return the result as JSON values.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _known(file: StoreFile, told: str) -> Catalog:
-    """Return the catalog of a bundle for compiling queries; it is cached, because bundles never change."""
+    """Return the catalog of a bundle (store file) for compiling queries; it is cached."""
     local = file.catalog()
     held = _catalogs.get((file.path, told))
     if held is None or held[0] is not local:
@@ -161,7 +161,7 @@ _catalogs: Final[dict[tuple[Path, str], tuple[Catalog, Catalog]]] = {}
 
 @contextmanager
 def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
-    """Yield a bundle as an open store. User tables and user SQL get a separate connection."""
+    """Yield a bundle (store file) as an open store. User tables and user SQL get a separate connection."""
     if task["bundle"] == EMPTY:
         path = held / "empty.sgstore"
         StoreFile.create(path).close()
@@ -180,7 +180,7 @@ def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
 
 @lru_cache(maxsize=KEPT)
 def _kept(path: Path) -> StoreFile:
-    """Return a bundle as an open store, from a cache."""
+    """Return a bundle (store file) as an open store, from a cache."""
     return StoreFile.together(path)
 
 
@@ -274,7 +274,7 @@ def as_verdict(values: list[Any]) -> Verdict:
 def _classes(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the classes of the frames of one bundle to a file."""
+    """Write the classes of the frames of one bundle (store) to a file."""
     path = to / f"{secrets.token_hex(8)}.parquet"
     part = PartFile.of_classes(file, task["abstraction"], task["traces"], task["table"], path)
     return {"parts": [part.as_dict()], "reasons": {}}
@@ -283,7 +283,7 @@ def _classes(
 def _sql(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the rows of a user's SQL statement on one bundle to a file, as JSON lines."""
+    """Write the rows of a user's SQL statement on one bundle (store file) to a file, as JSON lines."""
     path = to / f"{secrets.token_hex(8)}.ndjson"
 
     def find(text: str, **values: object) -> Matches:
@@ -311,7 +311,7 @@ def _coded(
 def _features(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the features of frames (label counts of their graphs) of one bundle to a file."""
+    """Write the features of frames (label counts of their graphs) of one bundle (store) to a file."""
     import numpy as np
 
     def rows() -> Iterator[tuple[int, str, int]]:
@@ -331,7 +331,7 @@ def _features(
 def _margins(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    """Write the robustness margins of a check for the frames or traces of one bundle to a file."""
+    """Write the robustness margins of a check for the frames or traces of one bundle (store) to a file."""
     import numpy as np
 
     run = CheckRun(file, catalog, task["text"], task["parameters"])
@@ -364,7 +364,7 @@ def _step(
 def _tables(
     _task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
 ) -> dict[str, Any]:
-    """Return how the rows of the user tables match the frames of one bundle."""
+    """Return how the rows of the user tables match the frames of one bundle (store file)."""
     joined, told = file.joined(), dict[str, Any]()
     for name, facts in file.catalog().tables.items():
         rows = joined.get(name)
@@ -379,12 +379,12 @@ def _tables(
 
 
 def example_in(store: Store, **asked: Any) -> dict[str, Any]:
-    """Return a frame of a bundle as an example, to find similar frames in other bundles."""
+    """Return a frame of a bundle (store file) as an example, to find similar frames in other bundles."""
     return asdict(Example.of(store.file, **asked))
 
 
 def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str, Any]]:
-    """Return the frames of one bundle that are most similar to an example frame."""
+    """Return the frames of one bundle (store file) that are most similar to an example frame."""
     return [asdict(one) for one in Example.find(store.file, Example(**example), **how)]
 
 

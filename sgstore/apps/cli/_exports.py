@@ -206,7 +206,7 @@ def _clips(
     parameters: Mapping[str, Any],
     margins: tuple[float, float],
 ) -> list[Clip]:
-    """Return the clips to export: around matches, around listed frames, or the unchanged cases of a lock."""
+    """Return the clips to export: around matches, around listed frames, or the cases of a lock file."""
     frames, lock = named
     if lock is not None:
         from sgstore.model.world import Clip

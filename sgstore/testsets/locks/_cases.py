@@ -37,7 +37,7 @@ CasePart = tuple["Ints", "Ints", str]
 
 
 def locked(trace: StoredTrace, mark: Mark) -> LockedTrace:
-    """Return a trace of a store as an entry of a lock, with its digests."""
+    """Return a trace of a store as an entry of a lock (list of test cases), with its digests."""
     source = trace.name, trace.digest, trace.ego, trace.flavour
     part = trace.frames, trace.since, trace.until
     return LockedTrace(*source, *part, mark.config, mark.map, trace.version)
@@ -51,7 +51,7 @@ def lock_of(
     payloads: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
-    """Return a lock of some clips of a store or collection, with the digests of their content.
+    """Return a lock (list of test cases) of some clips of a store, with the digests of their content.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def _lock_of_bundles(
 def lock_in(
     store: Store, parts: Sequence[tuple[list[int], list[int], str]], *, payloads: bool
 ) -> str:
-    """Return the text of a lock of some clips in one bundle of a collection."""
+    """Return the text of a lock (list of test cases) of some clips in one bundle of a collection."""
     own = [(np.array(ids, np.int64), np.array(times, np.int64), of) for ids, times, of in parts]
     return lock_of(store, own, {}, payloads=payloads).text()
 

@@ -54,7 +54,7 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
 
 
 def _same(trace: LockedTrace, store: Store) -> StoredTrace:
-    """Return the trace of a store with the same recording and settings as a trace of a lock."""
+    """Return the trace of a store with the same recording and settings as a trace of a lock file."""
     trace_id = Identity.id_of(trace.recording, trace.ego)
     found = next((one for one in store.info() if one.trace_id == trace_id), None)
     if found is None:
@@ -118,7 +118,7 @@ def frames_in(store: Store, lock: str) -> list[int]:
 def by_bundle(
     lock: Lock, whole: Collection, *, by_name: bool = False
 ) -> tuple[dict[str, Lock], list[LockedTrace]]:
-    """Return the parts of a lock by bundle of a collection, and the traces that no bundle contains."""
+    """Return the parts of a lock file by bundle (store) of a collection, and the traces without a bundle."""
     names = {row["name"]: row["bundle"] for row in whole.traces()} if by_name else {}
     home: dict[str, str] = {}
     for one in lock.traces:

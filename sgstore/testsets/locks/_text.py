@@ -35,7 +35,7 @@ ENDING: Final = ".lock"
 
 @dataclass(frozen=True, slots=True)
 class LockedTrace:
-    """Entry of a lock for a trace: name, recording, settings and digests.
+    """Entry of a lock (list of test cases) for a trace: name, recording, settings and digests.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class Lock:
         return tuple(sorted(self.cases, key=lambda case: places.get(case.id, len(places))))
 
     def write(self, path: str | Path) -> None:
-        """Write the lock to a text file.
+        """Write the lock (list of test cases) to a text file.
 
         Raises
         ------
@@ -159,12 +159,12 @@ class Lock:
         write_bytes(path, data)
 
     def trace(self, name: str) -> LockedTrace:
-        """Return the lock's entry for a trace name."""
+        """Return the entry of the lock (list of test cases) for a trace name."""
         return next(one for one in self.traces if one.name == name)
 
 
 def read_lock(path: str | Path) -> Lock:
-    """Return the lock in a text file.
+    """Return the lock (list of test cases) in a text file.
 
     Raises
     ------
@@ -187,7 +187,7 @@ def read_lock(path: str | Path) -> Lock:
 
 
 def lock_from(text: str) -> Lock:
-    """Return the lock that a text describes."""
+    """Return the lock (list of test cases) that a text describes."""
     return _lock(json.loads(text))
 
 

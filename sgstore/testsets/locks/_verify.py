@@ -87,7 +87,7 @@ def _missing(trace: LockedTrace) -> Difference:
 
 
 def _of_bundles(lock: Lock, whole: Collection, *, payloads: bool) -> Iterator[Difference]:
-    """Yield the differences between a lock and the bundles of a collection, in the order of the lock."""
+    """Yield the differences between a lock file and the bundles (stores) of a collection, in lock order."""
     own, lacking = by_bundle(lock, whole, by_name=True)
     asked = {bundle: {"lock": part.text(), "payloads": payloads} for bundle, part in own.items()}
     found = {one.name: [_missing(one)] for one in lacking}
@@ -98,7 +98,7 @@ def _of_bundles(lock: Lock, whole: Collection, *, payloads: bool) -> Iterator[Di
 
 
 def differences_in(store: Store, lock: str, *, payloads: bool) -> dict[str, list[Any]]:
-    """Return the differences between part of a lock and one bundle of a collection, by trace."""
+    """Return the differences between part of a lock file and one bundle of a collection, by trace."""
     whole = lock_from(lock)
     found: dict[str, list[Any]] = {}
     for trace in whole.traces:

@@ -47,7 +47,7 @@ class UnitsWished:
 def cheapest_units(
     chosen: ChosenFrames, whole: Collection, wish: UnitsWished
 ) -> tuple[Units, Holdings]:
-    """Return the cheapest clip (or frame or trace) for each set of scene classes in each bundle.
+    """Return the cheapest clip (or frame or trace) for each set of scene classes in each bundle (store).
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def cheapest_units(
 
 
 def cheapest_in(store: Store, frames: list[int] | None, wish: dict[str, Any]) -> dict[str, Any]:
-    """Return the cheapest clip (or frame or trace) for each set of scene classes in one bundle."""
+    """Return the cheapest clip (or frame or trace) for each set of scene classes in one bundle (store file)."""
     how = UnitsWished(**wish)
     chosen = ChosenFrames("", store, None if frames is None else np.array(frames, np.int64))
     units = units_of(chosen, SelectionUnit(how.unit), how.clip_s, how.stride_s)

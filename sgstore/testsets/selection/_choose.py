@@ -236,7 +236,7 @@ class SelectionSpec:
         return UnitsWished(self.unit.value, self.clip_s, self.stride_s, *least)
 
     def as_dict(self, query: str) -> dict[str, Any]:
-        """Return the specification as a dictionary of plain values, which a lock stores."""
+        """Return the specification of the selection as plain values, which a lock file stores."""
         cover = self.strategy in {Strategy.minimal, Strategy.per_class, Strategy.rarest}
         told = {
             "sequences": self.sequences,

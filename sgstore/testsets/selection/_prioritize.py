@@ -130,7 +130,7 @@ class PrioritySpec:
             )
 
     def as_dict(self, query: str) -> dict[str, Any]:
-        """Return the specification as a dictionary of plain values, which a lock stores."""
+        """Return the specification of the order as plain values, which a lock file stores."""
         clip = self.unit is SelectionUnit.clip
         return {
             "query": query or None,

@@ -137,7 +137,7 @@ class Units:
 
     @property
     def total(self) -> int:
-        """Return the number of selection units, including units that bundles left out."""
+        """Return the number of selection units, including units that bundles (store files) left out."""
         return len(self) + self.others
 
     @property
