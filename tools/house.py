@@ -25,6 +25,7 @@ import tempfile
 import threading
 import tomllib
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -129,7 +130,9 @@ def module_of(path: Path) -> str:
     return ".".join(part for part in parts if part != "__init__")
 
 
+@cache
 def survey() -> House:
+    """Look at all files of the package and of the tests; once in a process."""
     house = House()
     files = sorted(PACKAGE.rglob("*.py"))
     modules = {module_of(path) for path in files}

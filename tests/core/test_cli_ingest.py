@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,6 @@ from recordings import Recorder, car, drive
 from sgstore.apps.cli import run
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
-
-SAMPLE = Path(str(files("sgstore"))) / "apps" / "sample" / "town.mcap"
 
 
 def sgstore(*arguments: object, stdin: str = "") -> subprocess.CompletedProcess[bytes]:
@@ -72,12 +69,11 @@ def test_without_a_channel_those_of_the_frame_are_listed(store) -> None:
     assert {row["channel"] for row in rows} == {"camera", "truth"}
 
 
-def test_the_camera_of_the_sample_gives_a_jpeg_and_its_message_around_it(tmp_path) -> None:
-    ingest(tmp_path / "s.db", [SAMPLE])
+def test_the_camera_of_the_sample_gives_a_jpeg_and_its_message_around_it(town_store) -> None:
     topic = "/ego/camera/front/image"
 
-    picture = sgstore("payload", tmp_path / "s.db", "town#264", topic).stdout
-    message = sgstore("payload", tmp_path / "s.db", "town#264", topic, "--message").stdout
+    picture = sgstore("payload", town_store, "town#264", topic).stdout
+    message = sgstore("payload", town_store, "town#264", topic, "--message").stdout
 
     assert (picture[:3], picture[-2:]) == (b"\xff\xd8\xff", b"\xff\xd9")
     assert len(message) > len(picture)

@@ -38,7 +38,8 @@ def rows(store: Path, sql: str) -> list[tuple[Any, ...]]:
 def test_a_preset_by_name_is_recorded_with_the_trace(tmp_path: Path) -> None:
     store = tmp_path / "s.db"
 
-    assert run(["ingest", str(store), str(SAMPLE), "--preset", "carlasgg", "--json"]) == 0
+    line = ["ingest", str(store), str(SAMPLE), "--until", "1s", "--preset", "carlasgg", "--json"]
+    assert run(line) == 0
 
     (trace,) = StoreFile(store).traces()
     assert from_dict(trace.settings) == preset("carlasgg")

@@ -68,7 +68,7 @@ def town(
     return drive
 
 
-@pytest.mark.parametrize("text", [CHECKS, library_checks()], ids=["made", "library"])
+@pytest.mark.parametrize("text", [CHECKS, library_checks(2)], ids=["made", "library"])
 def test_a_recording_watched_has_the_verdicts_that_it_has_in_a_store(
     text: str, town: Drive
 ) -> None:

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from thorough import some
+
 from sgstore.apps.demo import RECORDING
 from sgstore.errors import SgstoreError
 from sgstore.ingest import ingest
@@ -274,8 +276,9 @@ def _name(verdict: Verdict) -> str:
     return verdict.check
 
 
-def library_checks() -> str:
-    found = [p.text for p in patterns().values() if p.is_check]
+def library_checks(one_in: int = 1) -> str:
+    """One of so many of the rules of the library, all of them in a long run."""
+    found = some([p.text for p in patterns().values() if p.is_check], one_in)
     return ";\n".join(text.strip().rstrip(";") for text in found)
 
 
