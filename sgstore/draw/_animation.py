@@ -15,15 +15,7 @@ from PIL import Image
 from PIL.GifImagePlugin import getdata, getheader
 
 from sgstore.base.output_files import OutputFile
-from sgstore.draw._page import (
-    COMMONEST,
-    FURTHEST,
-    MOST_COLOURS,
-    PLACES,
-    grown,
-    packed,
-    with_palette,
-)
+from sgstore.draw._page import greatest_change, quantized
 from sgstore.errors import ExportError, MissingExtraError
 
 if TYPE_CHECKING:
@@ -32,9 +24,8 @@ if TYPE_CHECKING:
 
     from av import VideoFrame, VideoStream
     from av.container import OutputContainer
-    from numpy.typing import NDArray
 
-    from sgstore.draw._page import Colours, Pixels
+    from sgstore.draw._page import Pixels
 
 
 LEAST_DELAY: Final = 2
@@ -49,14 +40,8 @@ CODECS: Final[dict[str, tuple[tuple[str, ...], dict[str, str]]]] = {
     ),
 }
 """Encoders of each kind of video, best first, with their settings."""
-_AREA: Final = 250
-"""Least number of pixels of one colour that make an area."""
-_CLOSE: Final = 10.0
-"""Greatest change of a mixed colour in RGB, if the palette has enough places."""
-_MOST_NEW: Final = 16_000
-"""Greatest number of colours of a picture that are looked up in the previous palette."""
-_KEPT_FREE: Final = 32
-"""Places of a palette for colours of later pictures."""
+MOST_CHANGE: Final = 40
+"""Greatest change of a colour channel by an earlier palette, 0 … 255."""
 
 
 class Animation(ABC):
@@ -143,7 +128,7 @@ class Gif(Animation):
         super().__init__(to)
         self._stream = self._output.stream()
         self._last: Pixels | None = None
-        self._palette = LastingPalette()
+        self._palette: Image.Image | None = None
 
     def _end(self) -> None:
         self._stream.write(b";")  # the trailer of a GIF
@@ -158,10 +143,10 @@ class Gif(Animation):
             # The frames have their own palettes: the palette of the file is not used.
             head, _ = getheader(Image.new("P", (width, height)), info={"loop": 0})
             self._stream.write(b"".join(head))
-        left, top, right, bottom = changed(self._last, pixels)
+        box = changed(self._last, pixels)
         pieces = getdata(
-            self._palette.indexed(pixels[top:bottom, left:right]),
-            (left, top),
+            self._indexed(Image.fromarray(pixels), box),
+            box[:2],
             duration=min(delay, MOST_DELAY) * 10,
             disposal=1,
             include_color_table=True,
@@ -171,6 +156,16 @@ class Gif(Animation):
         gc.collect(0)
         self._last = pixels
         self.frames += 1
+
+    def _indexed(self, picture: Image.Image, box: tuple[int, int, int, int]) -> Image.Image:
+        """Return a part in the palette of an earlier picture, or of this one if colours are new."""
+        if self._palette is not None:
+            part = picture.crop(box)
+            made = part.quantize(palette=self._palette, dither=Image.Dither.NONE)
+            if greatest_change(made, part) <= MOST_CHANGE:
+                return made
+        self._palette = quantized(picture)
+        return self._palette.crop(box)
 
 
 class Video(Animation):
@@ -267,68 +262,3 @@ def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
     if not len(lines):
         return 0, 0, 1, 1
     return int(columns[0]), int(lines[0]), int(columns[-1]) + 1, int(lines[-1]) + 1
-
-
-class LastingPalette:
-    """Palette of at most 256 colours that the pictures of an animation share.
-
-    New colours are added. A full palette is replaced.
-
-    Areas keep their colours if there are enough places. A mixed colour changes at most as much as
-    in :func:`sgstore.draw._page.indexed`.
-    """
-
-    def __init__(self) -> None:
-        self._colours = np.zeros((0, 3), np.float32)
-        self._places = np.full(1 << 24, -1, np.int16)  # index of each known colour
-
-    def indexed(self, picture: Pixels) -> Image.Image:
-        """Return an RGB picture (height, width, 3) as a picture with palette colours."""
-        whole = packed(picture)
-        places = self._places.take(whole)
-        unknown = places < 0
-        if not self._colours.size or (unknown.any() and not self._grows(whole[unknown])):
-            if not self._begins(whole):
-                photo = Image.fromarray(np.ascontiguousarray(picture))
-                return photo.quantize(PLACES, dither=Image.Dither.NONE)
-            unknown[:] = True
-        if unknown.any():
-            places[unknown] = self._places.take(whole[unknown])
-        return with_palette(places.astype(np.uint8), self._colours)
-
-    def _begins(self, whole: NDArray[np.int32]) -> bool:
-        """Create the palette from the colours of a picture; return False for more than 256 colours."""
-        found, many = np.unique(whole, return_counts=True)
-        if len(found) > MOST_COLOURS:
-            return False
-        found = found[np.argsort(-many, kind="stable")]
-        colours, most = _unpacked(found), PLACES - _KEPT_FREE
-        palette, nearest, furthest = grown(colours[:COMMONEST], colours, most, _CLOSE)
-        if furthest > FURTHEST or len(colours) <= PLACES:
-            palette, nearest, furthest = grown(colours[:COMMONEST], colours)
-        if furthest > FURTHEST:
-            return False
-        self._colours = palette
-        self._places.fill(-1)
-        self._places[found] = nearest
-        return True
-
-    def _grows(self, unknown: NDArray[np.int32]) -> bool:
-        """Add new colours to the palette; return False if they do not fit."""
-        found, many = np.unique(unknown, return_counts=True)
-        areas = np.flatnonzero(many > _AREA)
-        if len(found) > _MOST_NEW or len(self._colours) + len(areas) > PLACES:
-            return False
-        colours = _unpacked(found)
-        palette = np.concatenate((self._colours, colours[areas]))
-        few = len(self._colours) + len(found) <= PLACES - _KEPT_FREE
-        palette, nearest, furthest = grown(palette, colours, PLACES, 0.0 if few else FURTHEST)
-        if furthest > FURTHEST:
-            return False
-        self._colours = palette
-        self._places[found] = nearest
-        return True
-
-
-def _unpacked(found: NDArray[np.int32]) -> Colours:
-    return np.stack([found >> 16, found >> 8 & 255, found & 255], axis=1).astype(np.float32)

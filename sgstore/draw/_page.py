@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
-from PIL import Image
+from PIL import Image, ImageChops
 
 from sgstore.base.output_files import write_bytes
 from sgstore.draw._palette import FAINT_INK, GROUND, INK, PAPER, RULE
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
     Pixels = NDArray[np.uint8]
-    Colours = NDArray[np.float32]
 
 
 Rect = tuple[float, float, float, float]
@@ -60,86 +59,23 @@ CAPTIONS: Final = 7.0
 FURNITURE: Final = 9.0
 
 
-# Pictures use 256 colours if that is enough: a third of the bytes, without a visible difference. A
-# drawing has few colours on its areas, and thousands of mixed colours along its edges. The most
-# frequent colours keep their places in the palette, so that areas do not change. The other places
-# go to the colours furthest from all chosen ones, so that mixed colours change little. Photographs
-# stay as they are. Pillow's quantisers do not have both properties: each changes the colours of
-# areas (10 to 60 of the 64 most frequent).
-
-PLACES: Final = 256
-COMMONEST: Final = 64
-"""Places of the palette for the most frequent colours."""
-MOST_COLOURS: Final = 50_000
-"""A picture with more colours is a photograph."""
-FURTHEST: Final = 24.0
-"""Greatest change of a mixed colour; distance in RGB, 0 … 255 each."""
+MOST_CHANGE: Final = 24
+"""Pictures whose colours a palette changes by more stay without a palette; 0 … 255."""
 
 
-def indexed(picture: Image.Image) -> Image.Image:
-    """Return an RGB picture with a palette of 256 colours, or unchanged if it has more colours."""
-    counted = picture.getcolors(MOST_COLOURS)
-    if counted is None:
-        return picture
-    counted.sort(reverse=True)
-    colours = np.array([colour for _, colour in counted], dtype=np.float32)
-    palette, nearest, furthest = grown(colours[:COMMONEST], colours)
-    if furthest > FURTHEST:
-        return picture
-    places = np.zeros(1 << 24, np.uint8)
-    places[packed(colours)] = nearest
-    return with_palette(places[packed(np.asarray(picture))], palette)
+# Pictures use 256 colours if that is enough: a third of the bytes, without a visible difference. Of
+# Pillow's quantisers, only this one keeps rare colours; the k-means step keeps the colours of areas.
 
 
-def with_palette(places: Pixels, colours: Colours) -> Image.Image:
-    """Return a picture with a palette, from palette indices and colours."""
-    made = Image.fromarray(places)
-    made.putpalette(colours.astype(np.uint8).tobytes())
-    return made
+def quantized(picture: Image.Image) -> Image.Image:
+    """Convert an RGB picture to an indexed one of at most 256 colours."""
+    how = Image.Quantize.MAXCOVERAGE
+    return picture.quantize(256, how, kmeans=100_000, dither=Image.Dither.NONE)
 
 
-def grown(
-    palette: Colours, colours: Colours, most: int = PLACES, enough: float = 0.0
-) -> tuple[Colours, NDArray[np.intp], float]:
-    """Return a palette with added colours, each time the colour that differs most from the palette.
-
-    Parameters
-    ----------
-    palette, colours : (N, 3) float32
-        Integers up to 255: squares of their distances are exact.
-    most : int
-        Size of the palette.
-    enough : float
-        Distance up to which a colour needs no own place.
-
-    Returns
-    -------
-    palette : (N, 3) float32
-    nearest : (N,) intp
-        Nearest place of each colour.
-    furthest : float
-        Greatest distance of a colour from its nearest place.
-    """
-    squares = (colours * colours).sum(axis=1)
-    # The common term of a colour's distances is added only to the least one.
-    away = colours @ (-2 * palette.T)
-    away += (palette * palette).sum(axis=1)
-    nearest = away.argmin(axis=1)
-    least = squares + away[np.arange(len(colours)), nearest]
-    more: list[int] = []
-    while len(palette) + len(more) < most and least.max() > enough**2:
-        row = int(least.argmax())
-        away = squares - 2 * (colours @ colours[row]) + squares[row]
-        nearest[away < least] = len(palette) + len(more)
-        least = np.minimum(least, away)
-        more.append(row)
-    return np.concatenate((palette, colours[more])), nearest, float(np.sqrt(least.max()))
-
-
-def packed(colours: NDArray[np.generic]) -> NDArray[np.int32]:
-    """Return each colour (red, green, blue) as one integer."""
-    red, green, blue = (colours[..., axis].astype(np.int32) for axis in range(3))
-    return 65536 * red + 256 * green + blue
+def greatest_change(made: Image.Image, picture: Image.Image) -> int:
+    """Return the greatest change of a colour channel by a palette, 0 … 255."""
+    return int(np.asarray(ImageChops.difference(picture, made.convert("RGB"))).max())
 
 
 # A page is measured in points (1/72 inch) from its lower left corner. A stage is a window of the
@@ -421,7 +357,9 @@ class Page:
 
     def _png(self) -> bytes:
         written = io.BytesIO()
-        indexed(Image.fromarray(self.pixels())).save(written, "PNG")
+        picture = Image.fromarray(self.pixels())
+        made = quantized(picture)
+        (made if greatest_change(made, picture) <= MOST_CHANGE else picture).save(written, "PNG")
         return written.getvalue()
 
     def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:

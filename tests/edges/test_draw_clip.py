@@ -16,7 +16,7 @@ from PIL import Image
 
 from sgstore.apps.cli import run
 from sgstore.draw import draw_clip, draw_stored
-from sgstore.draw._animation import Gif, animation, changed
+from sgstore.draw._animation import MOST_CHANGE, Gif, animation, changed
 from sgstore.draw._film import FilmPage, TextSprites
 from sgstore.draw._page import TEXT, Page, own_style, printable
 from sgstore.draw._picture import diagram_page, frame_page
@@ -59,6 +59,11 @@ def noise(seed: int, height: int = 40, width: int = 60) -> NDArray[np.uint8]:
     return colours[rng.integers(0, 30, (height, width))]
 
 
+def alike(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
+    """True if no colour differs by more than a palette may change it."""
+    return bool(np.abs(a.astype(int) - b).max() <= MOST_CHANGE)
+
+
 # The container ------------------------------------------------------------------------------------
 
 
@@ -72,7 +77,7 @@ def test_pictures_come_back_as_they_were_at_their_times(tmp_path: Path) -> None:
 
     shown, durations = read(tmp_path / "a.gif")
 
-    assert all((a == b).all() for a, b in zip(shown, pictures, strict=True))
+    assert all(alike(a, b) for a, b in zip(shown, pictures, strict=True))
     assert durations == [100, 100, 50, 750, 750]
     with Image.open(tmp_path / "a.gif") as image:
         assert image.info["loop"] == 0
@@ -95,7 +100,7 @@ def test_a_picture_that_does_not_change_stays(tmp_path: Path) -> None:
             gif.add(noise(1), step / 10)
 
     shown, _ = read(tmp_path / "a.gif")
-    assert all((picture == noise(1)).all() for picture in shown)
+    assert all(alike(picture, noise(1)) for picture in shown)
     assert changed(noise(1), noise(1)) == (0, 0, 1, 1)
     assert changed(None, noise(1)) == (0, 0, 60, 40)
 
@@ -147,7 +152,7 @@ def test_memory_does_not_grow_with_the_length(tmp_path: Path) -> None:
     assert max(sizes[60:]) <= max(sizes[10:60]) + 20_000
 
 
-def test_a_palette_lasts_and_areas_that_come_later_keep_their_colours(tmp_path: Path) -> None:
+def test_a_palette_lasts_and_areas_that_come_later_change_little(tmp_path: Path) -> None:
     rng = np.random.default_rng(7)
     colours = rng.integers(0, 256, (900, 3)).astype(np.uint8)
     ground = colours[rng.integers(0, 900, (60, 60)) % 200]
@@ -161,7 +166,7 @@ def test_a_palette_lasts_and_areas_that_come_later_keep_their_colours(tmp_path: 
     shown, _ = read(tmp_path / "a.gif")
 
     for picture, seen in zip(pictures, shown, strict=True):
-        assert (picture == seen).all()
+        assert alike(seen, picture)
 
 
 def test_many_new_colours_make_a_palette_of_their_own(tmp_path: Path) -> None:
@@ -172,7 +177,8 @@ def test_many_new_colours_make_a_palette_of_their_own(tmp_path: Path) -> None:
         for number, picture in enumerate(pictures):
             gif.add(picture, number / 10)
 
-    assert all((a == b).all() for a, b in zip(read(tmp_path / "a.gif")[0], pictures, strict=True))
+    shown, _ = read(tmp_path / "a.gif")
+    assert all(alike(a, b) for a, b in zip(shown, pictures, strict=True))
 
 
 # Pages of films -----------------------------------------------------------------------------------
