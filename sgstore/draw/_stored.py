@@ -175,7 +175,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     diagram: bool = False,
     names: Names = "number",
 ) -> bool:
-    """Draw a picture of a stored frame seen from above; return True if a match is marked in it.
+    """Draw a picture of a stored frame seen from above; return True if the query matches in the frame.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     fps: float = FPS,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Draw a clip of a store as an animation at its original speed; return the number of pictures.
+    """Draw a clip of a store as an animation at its original speed; return the number of frames with matches.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Situation of the ego in a frame: its nearest possible conflict, from which side, and the place."""
+"""Situation of the ego in a frame: the entity of its first possible conflict, its direction, and the place."""
 
 from __future__ import annotations
 
