@@ -7,8 +7,8 @@ long). Its result has a limited number of rows and bytes. The process lives on b
 because its start takes a third of a second.
 
 The process is a worker of :mod:`sgstore.base.processes`. Other packages can run their own queries in
-such a process: the ``worker`` of a sandbox is a module that calls :func:`serve` with a function for
-its queries, and :meth:`Sandbox.ask` sends them.
+such a process: the ``worker`` of a sandbox is a module whose ``main`` calls :func:`serve`
+with a function for its queries, and :meth:`Sandbox.ask` sends them.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class Sandbox:
     tables : mapping of str to path, optional
         User tables for joins: Parquet, CSV or JSON files. They are also read in that process.
     worker : str
-        Module of the process, which calls :func:`serve`.
+        Module of the process, whose ``main`` calls :func:`serve`.
 
     Raises
     ------
@@ -655,5 +655,6 @@ def _limit(memory: int, *, files: int | None) -> None:
             resource.setrlimit(limit, (bound, bound))
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Answer queries in the sandbox process."""
     serve(rows_found)

@@ -34,16 +34,16 @@ NEEDED: Final = (
 """Packages that a child process imports, as folders."""
 
 _START: Final = (
-    "import json, runpy, sys\n"
+    "import importlib, json, sys\n"
     "sys.path[:0] = [p for p in json.loads(sys.argv.pop(1)) if p not in sys.path]\n"
-    "runpy.run_module(sys.argv.pop(1), run_name='__main__', alter_sys=True)\n"
+    "importlib.import_module(sys.argv.pop(1)).main()\n"
 )
 
 
 class WorkerProcess:
     """Child Python process that runs a module of sgstore and answers requests.
 
-    The module iterates over :func:`requests`.
+    It calls ``main`` of the module, which iterates over :func:`requests`.
 
     Parameters
     ----------
@@ -79,7 +79,6 @@ class WorkerProcess:
         assert self._process.stdin is not None  # noqa: S101 - both are pipes
         assert self._process.stdout is not None  # noqa: S101
         self._stdin = self._process.stdin
-        # The thread has no reference to this object, so that the process ends with a forgotten one.
         listening = self._process.stdout, longest, on_line
         self._listener = threading.Thread(target=_listen, args=listening, daemon=True)
         self._listener.start()

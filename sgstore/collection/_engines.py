@@ -257,6 +257,7 @@ def _done(name: str, task: Task) -> Outcome:
         return refusal(task, error)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Run tasks in a worker process."""
     for request in requests():
         send_reply(_done(sys.argv[1], request))

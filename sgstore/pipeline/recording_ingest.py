@@ -2,8 +2,8 @@
 
 Types for the progress and the outcome of an ingest.
 
-``python -m sgstore.pipeline.recording_ingest`` is a worker process (:mod:`sgstore.base.processes`). Its first
-request is the job, each further one a recording. Its replies are progress and outcomes.
+The function ``main`` runs in a worker process (:mod:`sgstore.base.processes`). Its first request is
+the job, each further one a recording. Its replies are progress and outcomes.
 """
 
 from __future__ import annotations
@@ -585,7 +585,3 @@ def main() -> None:
     for task in asked:
         views = reading.read(Path(task["path"]), Path(task["folder"]))
         send_reply({"done": [[one.as_dict(), sealed and str(sealed)] for one, sealed in views]})
-
-
-if __name__ == "__main__":
-    main()

@@ -267,11 +267,14 @@ def test_verdicts_are_those_of_one_store(store: Store, whole: Collection, text: 
     assert [one.robustness for one in found] == [one.robustness for one in expected]
 
 
-def test_processes_answer_as_this_one_does(whole: Collection, place: Path) -> None:
+def test_processes_answer_as_this_one_does(
+    whole: Collection, place: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     several = Collection(place, engine="local:2")
 
     assert several.find(QUESTIONS[7]).rows() == whole.find(QUESTIONS[7]).rows()
     assert list(map(str, several.check(CHECKS[0]))) == list(map(str, whole.check(CHECKS[0])))
+    assert capfd.readouterr().err == ""
 
 
 def test_tables_of_ones_own_are_joined(path: Path, place: Path, tmp_path: Path) -> None:

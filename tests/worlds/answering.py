@@ -7,7 +7,8 @@ import signal
 
 from sgstore.base.processes import requests, send_reply
 
-if __name__ == "__main__":
+
+def main() -> None:
     for request in requests():
         print("printed text")
         if request["do"] == "die":

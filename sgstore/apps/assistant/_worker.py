@@ -297,5 +297,7 @@ ANSWERS: Final = {
 }
 """Functions by query name; ``limit`` is the greatest number of rows."""
 
-if __name__ == "__main__":
+
+def main() -> None:
+    """Answer queries in the sandbox process."""
     serve(answer)

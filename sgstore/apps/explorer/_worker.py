@@ -128,5 +128,6 @@ def answer(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]
     return QUESTIONS[question["ask"]](store, question, most)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Answer queries in the sandbox process."""
     serve(answer)
