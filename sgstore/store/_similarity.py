@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from heapq import heappush, heapreplace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from sgstore.errors import AbstractionError
 from sgstore.graphs.abstractions import (
-    Abstraction,
     Classes,
     GraphFeatures,
     abstraction_named,
     of_frames,
     without,
 )
+from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.model.vocabulary import (
     RELATION_ALIASES,
     RELATIONS,
@@ -27,6 +25,7 @@ from sgstore.model.vocabulary import (
     natural,
     suggestion,
 )
+from sgstore.store._coded_classes import coded_classes
 from sgstore.store._engine_errors import translated
 from sgstore.store._graphs import Graphs
 from sgstore.store._traces import FrameRef, frame_named, stored_traces
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.graphs.abstractions import Labelled
+    from sgstore.model.world import Ints
     from sgstore.store._file import StoreFile
     from sgstore.store._traces import StoredTrace
 
@@ -71,22 +71,6 @@ class SimilarFrames:
     def __repr__(self) -> str:
         first = f"{self.frame.trace}#{self.frame.seq}"
         return f"<SimilarFrames from {first!r}: {self.frames} frames, similarity {self.similarity:.3g}>"
-
-
-@dataclass(slots=True)
-class _FrameRun:
-    """Run of consecutive frames of a trace with equal graph features and equal similarity to the example.
-
-    If the frames match all features, their class is equal, too.
-    """
-
-    key: tuple[Any, ...]
-    similarity: float
-    same: bool | None
-    trace: int
-    seq: int
-    frames: int
-    features: Counter[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +136,7 @@ class Example:
     ) -> list[SimilarFrames]:
         """Return runs of consecutive frames similar to the example: most similar first, then by trace and time.
 
-        Memory does not grow with the store: graphs are read window by window.
+        One frame of each stored class is read, in groups. Memory holds some 50 bytes for each frame.
 
         Parameters
         ----------
@@ -164,18 +148,14 @@ class Example:
         each_trace : bool
             True for only the best run of each trace, without frames near the example.
         """
-        abstraction, graphs = abstraction_named(example.abstraction), Graphs()
-        search = _RunSearch(example, max(limit, 0), each_trace=each_trace)
         first, last = example.beside
         beside = range(first, last + 1) if each_trace else range(0)
         with translated(file.path), file.access.reading() as connection:
             traces = stored_traces(connection)
-            for number, trace in enumerate(traces):
-                left_out = beside if trace.trace_id == example.trace_id else range(0)
-                for seq, block in _blocks(connection, graphs, trace, abstraction):
-                    search.look(number, seq, without(block, example.ignored), left_out)
-            search.close()
-            return [_like(connection, run, traces, search.example) for run in search.best()]
+            compared = _compared(connection, example)
+            runs = compared.runs([one.trace_id for one in traces], example.trace_id, beside)
+            best = runs.best(max(limit, 0), each_trace=each_trace)
+            return [*_described(connection, best, traces, example)]
 
     @staticmethod
     def best(found: Iterable[SimilarFrames], limit: int) -> list[SimilarFrames]:
@@ -192,13 +172,6 @@ BESIDE_S: Final = 5.0
 """Frames of the same trace within this time are near the example, and similar for that reason; s."""
 
 
-def _blocks(
-    connection: DuckDBPyConnection, graphs: Graphs, trace: StoredTrace, abstraction: Abstraction
-) -> Iterator[tuple[NDArray[np.int64], Labelled]]:
-    for seq, seen in graphs.of_trace(connection, trace.trace_id):
-        yield seq, abstraction.function(seen)
-
-
 def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
     """Return the numbers of the first and last frame close in time to a given frame."""
     sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
@@ -206,104 +179,139 @@ def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
     return found or (0, -1)
 
 
-class _RunSearch:
-    """Collector of the frame runs most similar to an example frame, overall or per trace."""
+@dataclass(frozen=True, slots=True)
+class _Runs:
+    """Runs of consecutive frames with equal features, each as one row.
 
-    def __init__(self, example: Example, limit: int, *, each_trace: bool) -> None:
-        self.example = Counter(example.features)
-        self._classes = Classes()
-        self._class = example.graph_class
-        self._limit = limit
-        self._each: dict[int, tuple[float, int, int, _FrameRun]] | None = {} if each_trace else None
-        self._heap: list[tuple[float, int, int, _FrameRun]] = []
-        self._last: _FrameRun | None = None
+    Attributes
+    ----------
+    frame_id, seq, frames : (N,) int64
+        First frame, its number in the trace, and the number of frames.
+    trace : (N,) int64
+        Number of the trace in natural order of names.
+    likeness : (N,) float64
+    same : (N,) int8
+        1 for the class of the example, 0 for another one, -1 where the graph is too symmetric.
+    """
 
-    def look(
-        self, trace: int, seq: NDArray[np.int64], graphs: Labelled, left_out: range = range(0)
-    ) -> None:
-        """Compare the next frames of a trace with the example frame. Some frame numbers can be excluded."""
-        features = GraphFeatures.of(graphs)
-        likeness, digest = features.likeness(self.example), features.digests()
-        same: list[bool | None] = [False] * graphs.frames
-        complete = likeness == 1
+    frame_id: Ints
+    seq: Ints
+    frames: Ints
+    trace: Ints
+    likeness: NDArray[np.float64]
+    same: NDArray[np.int8]
+
+    def best(self, limit: int, *, each_trace: bool) -> _Runs:
+        """Return the most similar runs; of equally similar runs, the first ones by trace and time."""
+        order = np.lexsort((self.seq, self.trace, -(self.likeness + (self.same == 1))))
+        if each_trace:
+            _, first = np.unique(self.trace[order], return_index=True)
+            order = order[np.sort(first)]
+        return self._rows(order[:limit])
+
+    def _rows(self, rows: Ints) -> _Runs:
+        return _Runs(
+            self.frame_id[rows],
+            self.seq[rows],
+            self.frames[rows],
+            self.trace[rows],
+            self.likeness[rows],
+            self.same[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Compared:
+    """Similarity of all frames of a store to an example, each (N,); frame ids ascend.
+
+    ``digest`` is equal for frames with equal features. ``same`` is as in :class:`_Runs`.
+    """
+
+    frame_id: Ints
+    seq: Ints
+    likeness: NDArray[np.float64]
+    digest: NDArray[np.uint64]
+    same: NDArray[np.int8]
+
+    def runs(self, trace_ids: Sequence[int], example_trace: int, beside: range) -> _Runs:
+        """Join consecutive frames with equal features. Leave out some frames of the example's trace."""
+        trace_id = self.frame_id >> SEQ_BITS
+        out = (trace_id == example_trace) & (self.seq >= beside.start) & (self.seq < beside.stop)
+        differs = np.ones(len(trace_id), np.bool_)
+        differs[1:] = np.diff(self.seq) != 1
+        for column in (trace_id, self.digest, self.same, out):
+            differs[1:] |= column[1:] != column[:-1]
+        first = np.flatnonzero(differs)
+        frames = np.diff(first, append=len(trace_id))
+        kept = ~out[first]
+        first, frames = first[kept], frames[kept]
+        ids = np.array(trace_ids, np.int64)
+        order = np.argsort(ids)
+        return _Runs(
+            self.frame_id[first],
+            self.seq[first],
+            frames,
+            order[np.searchsorted(ids[order], trace_id[first])],
+            self.likeness[first],
+            self.same[first],
+        )
+
+
+def _compared(connection: DuckDBPyConnection, example: Example) -> _Compared:
+    """Compare all frames with an example. Isomorphic graphs have equal features.
+
+    So one frame of each class is read. Frames without a stored class are read one by one.
+    """
+    abstraction = abstraction_named(example.abstraction)
+    rows = connection.execute("SELECT frame_id, seq FROM frame ORDER BY frame_id").fetchnumpy()
+    frame_id, seq = (rows[name].astype(np.int64) for name in ("frame_id", "seq"))
+    coded = coded_classes(connection, abstraction.name)
+    code = np.full(len(frame_id), -1)
+    code[np.searchsorted(frame_id, coded.frame_id)] = coded.code
+    alone = np.flatnonzero(code < 0)
+    code[alone] = len(coded.names) + np.arange(len(alone))
+    _, read, group = np.unique(code, return_index=True, return_inverse=True)
+    by_time = np.argsort(read)
+    likeness = np.zeros(len(read))
+    digest = np.zeros(len(read), np.uint64)
+    same = np.zeros(len(read), np.int8)
+    counts, classes = Counter(example.features), Classes()
+    for part, seen in Graphs().of_ids(connection, frame_id[read[by_time]]):
+        graphs = without(abstraction.function(seen), example.ignored)
+        features, groups = GraphFeatures.of(graphs), by_time[part]
+        likeness[groups] = of_part = features.likeness(counts)
+        digest[groups] = features.digests()
+        complete = of_part == 1
         if complete.any():
-            classes = self._classes.of(of_frames(graphs, complete))
-            for i in np.flatnonzero(complete).tolist():
-                same[i] = classes[i] == self._class if classes[i] and self._class else None
-        alike = (digest[1:] == digest[:-1]) & (np.diff(seq) == 1)
-        alike &= np.array([a is b for a, b in pairwise(same)], np.bool_)
-        out = (seq >= left_out.start) & (seq < left_out.stop)
-        alike &= out[1:] == out[:-1]
-        starts = np.flatnonzero(np.append(True, ~alike))
-        for start, end in zip(starts.tolist(), [*starts.tolist()[1:], len(seq)], strict=True):
-            if out[start]:
-                self.close()
-                continue
-            key = (trace, int(digest[start]), same[start])
-            last = self._last
-            if last is not None and last.key == key and last.seq + last.frames == seq[start]:
-                last.frames += end - start
-                continue
-            self.close()
-            counts = Counter[str]()
-            if self._wanted(trace, float(likeness[start])):
-                counts = features.counts(start)
-            self._last = _FrameRun(
-                key,
-                float(likeness[start]),
-                same[start],
-                trace,
-                int(seq[start]),
-                end - start,
-                counts,
-            )
-
-    def close(self) -> None:
-        """End the current run of frames. Keep it if it is among the most similar runs so far."""
-        run, self._last = self._last, None
-        if run is None or not self._wanted(run.trace, run.similarity):
-            return
-        # Among equally similar runs, a later one ranks lower.
-        entry = (run.similarity + (run.same is True), -run.trace, -run.seq, run)
-        if self._each is not None:
-            if run.trace not in self._each or entry > self._each[run.trace]:
-                self._each[run.trace] = entry
-        elif len(self._heap) < self._limit:
-            heappush(self._heap, entry)
-        elif entry > self._heap[0]:
-            heapreplace(self._heap, entry)
-
-    def _wanted(self, trace: int, similarity: float) -> bool:
-        if self._each is not None:
-            best = self._each.get(trace)
-            return best is None or similarity + (similarity == 1) > best[0]
-        if len(self._heap) < self._limit:
-            return True
-        return bool(self._limit) and similarity + (similarity == 1) > self._heap[0][0]
-
-    def best(self) -> list[_FrameRun]:
-        """Return the runs of frames most similar to the example, in descending order of similarity."""
-        every = self._heap if self._each is None else self._each.values()
-        ordered = sorted(every, key=lambda e: e[:-1], reverse=True)
-        return [entry[-1] for entry in ordered[: self._limit]]
+            own = example.graph_class
+            found = classes.of(of_frames(graphs, complete))
+            for row in np.flatnonzero(complete).tolist():
+                same[groups[row]] = found[row] == own if found[row] and own else -1
+    return _Compared(frame_id, seq, likeness[group], digest[group], same[group])
 
 
-def _like(
-    connection: DuckDBPyConnection,
-    run: _FrameRun,
-    traces: Sequence[StoredTrace],
-    example: Counter[str],
-) -> SimilarFrames:
-    frame = frame_named(connection, f"{traces[run.trace].name}#{run.seq}")
-    return SimilarFrames(
-        frame=frame,
-        frames=run.frames,
-        similarity=run.similarity,
-        same=run.same,
-        shared=_sorted(example & run.features),
-        missing=_sorted(example - run.features),
-        extra=_sorted(run.features - example),
-    )
+def _described(
+    connection: DuckDBPyConnection, runs: _Runs, traces: Sequence[StoredTrace], example: Example
+) -> Iterator[SimilarFrames]:
+    """Yield runs with their frames and with the features that they share with the example."""
+    function, counts = abstraction_named(example.abstraction).function, Counter(example.features)
+    features: dict[int, Counter[str]] = {}
+    ids = np.sort(runs.frame_id)
+    for part, seen in Graphs().of_ids(connection, ids):
+        of_part = GraphFeatures.of(without(function(seen), example.ignored))
+        features |= {int(ids[row]): of_part.counts(i) for i, row in enumerate(part.tolist())}
+    for i, frame_id in enumerate(runs.frame_id.tolist()):
+        own = features[frame_id]
+        name = traces[int(runs.trace[i])].name
+        yield SimilarFrames(
+            frame=frame_named(connection, f"{name}#{int(runs.seq[i])}"),
+            frames=int(runs.frames[i]),
+            similarity=float(runs.likeness[i]),
+            same=None if runs.same[i] < 0 else bool(runs.same[i]),
+            shared=_sorted(counts & own),
+            missing=_sorted(counts - own),
+            extra=_sorted(own - counts),
+        )
 
 
 def _sorted(counts: Counter[str]) -> dict[str, int]:
