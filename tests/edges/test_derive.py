@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from thorough import LONG, some
 
 import sgstore
 from sgstore.errors import AbstractionError, ConfigError
@@ -52,15 +53,19 @@ JOIN inside.bits b ON (n.mask & b.m) <> 0 WHERE n.set_name = '{0}'
 """
 
 
-def stored(path: Any, trace: Any, config: Any = None):
-    (outcome,) = ingest(path, [str(trace)], config=config, until=15.0)
+SECONDS = 15.0 if LONG else 11.0
+"""How much of the sample is derived with all settings."""
+
+
+def stored(path: Any, trace: Any, config: Any = None, until: float = 15.0):
+    (outcome,) = ingest(path, [str(trace)], config=config, until=until)
     assert outcome.error is None
     return sgstore.open(path)
 
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory):
-    return stored(tmp_path_factory.mktemp("derive") / "town.sgstore", SAMPLE)
+    return stored(tmp_path_factory.mktemp("derive") / "town.sgstore", SAMPLE, until=SECONDS)
 
 
 def same(derived: Any, name: Any, ingested: Any) -> None:
@@ -81,23 +86,22 @@ def test_a_derived_set_is_what_ingesting_with_its_settings_gives(
     town: Any, name: Any, tmp_path: Path
 ) -> None:
     (result,) = derive(town.file.path, OTHERS[name], name)
-    ingested = stored(tmp_path / "other.sgstore", SAMPLE, OTHERS[name])
+    ingested = stored(tmp_path / "other.sgstore", SAMPLE, OTHERS[name], SECONDS)
 
     assert (result.status, result.frames) == ("derived", town.info()[0].frames)
     same(town, name, ingested)
     assert not town.file.verify().faults
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "carla/Town01.carla.mcap",
-        "esmini/traffic_lights.mcap",
-        "esmini/swarm_Town04.mcap",
-        "osi_converter",
-    ],
+REAL = (
+    *("carla/Town01.carla.mcap", "esmini/traffic_lights.mcap"),
+    *("esmini/swarm_Town04.mcap", "osi_converter"),
 )
-@pytest.mark.parametrize("name", ["thresholds", "wider"])
+
+
+@pytest.mark.parametrize(
+    ("path", "name"), some([(path, name) for name in ("thresholds", "wider") for path in REAL], 3)
+)
 def test_real_traces_derive_to_what_ingesting_gives(
     data: Any, tmp_path: Path, path: Any, name: str
 ) -> None:

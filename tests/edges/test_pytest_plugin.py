@@ -10,6 +10,7 @@ import pytest
 from recordings import drive
 
 import sgstore
+import sgstore.temporal  # here, because pytester forgets the modules that its tests import first
 from sgstore.apps.demo import RECORDING
 from sgstore.ingest import ingest
 from sgstore.testsets.locks import lock_of
@@ -246,12 +247,20 @@ CHECK alone: FORALL (p:Person) ALWAYS dist(ego, p) > 15
 """
 
 
+@pytest.fixture(scope="module")
+def two_traces(store: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of two traces; each test has a copy."""
+    path = tmp_path_factory.mktemp("two") / "town.sgstore"
+    shutil.copy(store, path)
+    ingest(path, [drive(path.with_name("short.mcap"), frames=11)])
+    return path
+
+
 @pytest.fixture
-def rules(here: pytest.Pytester, tmp_path: Path) -> pytest.Pytester:
+def rules(here: pytest.Pytester, two_traces: Path) -> pytest.Pytester:
     """A folder with rules, a test of them, and a store of two traces."""
     (here.path / "town.sgstore").unlink()
-    ingest(here.path / "town.sgstore", [RECORDING], until=11)
-    ingest(here.path / "town.sgstore", [drive(tmp_path / "short.mcap", frames=11)])
+    shutil.copy(two_traces, here.path / "town.sgstore")
     (here.path / "rules.sgql").write_text(RULES)
     here.makepyfile(
         """
