@@ -144,7 +144,7 @@ def _touch(a: str, b: str, reach: RelationScope) -> Bound:
         return Value(value=False, type=Type.boolean)
     listed = _listed(a, b, reach.kinds)
     return all_of(
-        *solid, moves, *ego, *listed, _no_more(_pair("gap", a, b), Value(TOUCH, Type.number))
+        *solid, moves, *ego, *listed, _no_more(PairNumber("gap", a, b), Value(TOUCH, Type.number))
     )
 
 
@@ -166,9 +166,9 @@ def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
         return any_of(
             all_of(*tests, _no_more(distance, limit)) for tests, distance in _between_origins(a, b)
         )
-    distance = _pair("dist", a, b)
+    distance: Bound = PairNumber("dist", a, b)
     if reach.between == "footprints":  # one without extent is a point
-        distance = Operation("coalesce", (_pair("gap", a, b), distance), Type.number)
+        distance = Operation("coalesce", (PairNumber("gap", a, b), distance), Type.number)
     return _no_more(distance, limit)
 
 
@@ -182,7 +182,7 @@ def _between_origins(a: str, b: str) -> Iterable[tuple[list[Bound], Bound]]:
             tests = [_lies_low(a, yes=low_a), _lies_low(b, yes=low_b)]
             centres = _apart(_number(a, "z"), _number(b, "z"))
             origins = _apart(_origin(a, low=low_a), _origin(b, low=low_b))
-            dist = _pair("dist", a, b)
+            dist = PairNumber("dist", a, b)
             planar = _of("-", _of("*", dist, dist), _of("*", centres, centres))
             yield (
                 tests,
@@ -207,10 +207,6 @@ def _apart(a: Bound, b: Bound) -> Bound:
 def _no_more(distance: Bound, limit: Bound) -> Bound:
     near = Operation("<=", (distance, limit), Type.boolean)
     return Operation("coalesce", (near, Value(value=False, type=Type.boolean)), Type.boolean)
-
-
-def _pair(function: str, a: str, b: str) -> Bound:
-    return PairNumber(function, a, b)
 
 
 def _number(node: str, name: str) -> Bound:
