@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from sgstore.testsets.coverage import ChosenFrames
+    from sgstore.testsets.selection import FaultDetection
 
 Size = tuple[str, float | None, float | None]
 STRATEGIES: Final = {"random": "random strategy", "rl_based": "reinforcement learning"}
@@ -112,6 +113,15 @@ def run(quick: bool = False) -> Iterator[Measure]:
             yield from learned(title, runs[strategy], runs[other])
 
 
+def _note(found: FaultDetection) -> str:
+    shares = ", ".join(
+        f"{part:.0%} in the first {share:.0%}" for share, part in found.found.items()
+    )
+    interval = f"{found.low:.3f} to {found.high:.3f}; chance is 0.5"
+    of = f"of {found.failures:,} failures in {found.cases:,} cases"
+    return f"APFD {found.apfd:.3f} ({interval}): {of} {shares}"
+
+
 def by_risk(title: str, chosen: ChosenFrames, failed: dict[str, bool]) -> Iterator[Measure]:
     """Orders that nobody taught, and a random one."""
     for label, measures in {"risk": MEASURES, **BESIDE}.items():
@@ -119,12 +129,12 @@ def by_risk(title: str, chosen: ChosenFrames, failed: dict[str, bool]) -> Iterat
         order = prioritize(chosen, PrioritySpec(measures=measures))
         took = time.perf_counter() - begun
         found = fault_detection(failed_in_order(order, failed))
-        told = "; ".join([found.said, *order.said[1:]])
+        told = "; ".join([_note(found), *order.said[1:]])
         yield Measure(f"{title}, {label}", found.apfd, "APFD", told)
         yield Measure("  for a million frames", took / len(order.units) * 1e6, "s")
     rng = np.random.default_rng(0)
     chance = fault_detection(rng.permutation(np.array(list(failed.values()))))
-    yield Measure(f"{title}, in random order", chance.apfd, "APFD", chance.said)
+    yield Measure(f"{title}, in random order", chance.apfd, "APFD", _note(chance))
 
 
 _KINDS: Final = """
@@ -173,7 +183,7 @@ def learned(
     order = prioritize(chosen, spec, others[1], others[0])
     took = time.perf_counter() - begun
     found = fault_detection(failed_in_order(order, failed))
-    yield Measure(f"{title}, learned from the other", found.apfd, "APFD", found.said)
+    yield Measure(f"{title}, learned from the other", found.apfd, "APFD", _note(found))
     yield Measure("  for both", took, "s")
     halves: list[float] = []
     for seed in range(SPLITS):

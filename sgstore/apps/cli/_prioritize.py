@@ -245,7 +245,12 @@ def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path |
         say(f"none of the {len(failed):,} cases with a known outcome failed")
         return
     told = fault_detection(failed, order.spec.seed)
-    say(told.said)
+    found = ", ".join(f"{part:.0%} in the first {share:.0%}" for share, part in told.found.items())
+    interval = f"{told.low:.3f} to {told.high:.3f}"
+    say(
+        f"APFD {told.apfd:.3f} ({interval}; chance is 0.5): of {told.failures:,}"
+        f" failures in {told.cases:,} cases {found}"
+    )
     if picture is None:
         return
     from sgstore.draw import draw_curve
@@ -256,7 +261,7 @@ def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path |
         picture,
         unit="case",
         title=f"Failures found by an order ({order.spec.by})",
-        below=f"APFD {told.apfd:.3f} ({told.low:.3f} to {told.high:.3f})",
+        below=f"APFD {told.apfd:.3f} ({interval})",
         words=("failures found", "in order"),
     )
     say(f"drawn: {picture}")

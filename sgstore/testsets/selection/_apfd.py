@@ -45,15 +45,6 @@ class FaultDetection:
     high: float
     found: dict[float, float]
 
-    @property
-    def said(self) -> str:
-        """Return all values of the failure measures in a sentence."""
-        found = ", ".join(f"{self.found[s]:.0%} in the first {s:.0%}" for s in SHARES)
-        return (
-            f"APFD {self.apfd:.3f} ({self.low:.3f} to {self.high:.3f}; chance is 0.5): of {self.failures:,}"
-            f" failures in {self.cases:,} cases {found}"
-        )
-
 
 def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
     """Return measures of how soon an order of test cases finds the failures.
