@@ -61,6 +61,8 @@ OWNERS = {
     "lz4": {"mcap", "exporters"},
     "isal": {"mcap"},
     "numba": {"base/numba_loops"},
+    "subprocess": {"base/processes"},  # of the standard library: one protocol for worker processes
+    "multiprocessing": set[str](),  # it unpickles what a process sends
     "typer": {"apps/cli"},
     "rich": {"apps/cli"},
     "networkx": {"model/graph", "exporters"},
