@@ -415,7 +415,9 @@ USING SCOPE graph CHECK graph: FORALL (v:Vehicle) ALWAYS NOT lead(ego, v)
 @pytest.mark.parametrize("trace", sorted(SCENES))
 def test_monitor_in_world_equals_store(near: Store, trace: str) -> None:
     (scene,) = SCENES[trace]
-    texts = [MONITORED, *(patterns()[name].text for name in CHECKS)]
+    # Each rule is watched in every second scene, in ``make oracle`` in all of them.
+    names = CHECKS if LONG else CHECKS[sorted(SCENES).index(trace) % 2 :: 2]
+    texts = [MONITORED, *(patterns()[name].text for name in names)]
     monitor = Monitor(
         ";".join(texts), scene.road, ranged(50, 200), trace=trace, period_s=1 / scene.rate
     )

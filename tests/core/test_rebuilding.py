@@ -21,8 +21,7 @@ from sgstore.model.config import Config, RangeSettings, preset
 from sgstore.pipeline.derive import derive, keep_abstraction
 from sgstore.pipeline.importing import Words, import_graphs
 from sgstore.pipeline.rebuild import rebuild
-from sgstore.store import Remains, StoreFile
-from sgstore.store._classes import Abstracted
+from sgstore.store import Abstracted, Remains, StoreFile
 from sgstore.store._schema_text import schema_sql
 
 if TYPE_CHECKING:
