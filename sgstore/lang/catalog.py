@@ -788,6 +788,8 @@ class Catalog:
         Rows of table ``map_edge`` for each triple that occurs.
     moving, fixed, mapped : frozenset of str
         Kinds in table ``state``, kinds of static entities in ``entity``, and kinds in ``map_node``.
+    ego_signals : frozenset of str
+        Kinds of lights and signs that are an ego; empty in nearly every store.
     traces : tuple of TraceFacts
     classed : tuple of str
         Abstractions whose frame classes are in the store.
@@ -835,6 +837,7 @@ class Catalog:
     moving: frozenset[str] = field(default_factory=entity_kinds)
     fixed: frozenset[str] = frozenset()
     mapped: frozenset[str] = frozenset(MAP_KINDS)
+    ego_signals: frozenset[str] = frozenset(SIGNALS)
     traces: tuple[TraceFacts, ...] = ()
     classed: tuple[str, ...] = ()
     name: str = ""

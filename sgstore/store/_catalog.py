@@ -21,7 +21,7 @@ from sgstore.lang.catalog import (
     own_type,
     relations_of_set,
 )
-from sgstore.model.vocabulary import BEYOND, NAMES
+from sgstore.model.vocabulary import BEYOND, NAMES, SIGNALS
 from sgstore.store._schema import others_of
 from sgstore.store._traces import stored_traces
 
@@ -59,6 +59,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         moving=kinds("entity WHERE NOT is_static"),
         fixed=kinds("entity WHERE is_static"),
         mapped=kinds("map_node"),
+        ego_signals=kinds(f"state WHERE is_ego AND kind IN ({_words(SIGNALS)})"),
         traces=tuple(
             TraceFacts(
                 t.trace_id,

@@ -19,6 +19,7 @@ from sgstore.lang.ir import (
     FrameAttribute,
     GroupKey,
     Happened,
+    Kinds,
     NodeAttribute,
     NodeValue,
     Operation,
@@ -48,7 +49,13 @@ from sgstore.lang.sql._expressions import (
     leaves,
 )
 from sgstore.lang.sql._layers import Join, Layers, named, pairs_of
-from sgstore.lang.sql._lookups import LOOKED_UP, WayEnd, way_text
+from sgstore.lang.sql._lookups import (
+    LOOKED_UP,
+    WayEnd,
+    is_between_entities,
+    lane_distances,
+    way_text,
+)
 from sgstore.lang.sql._mask_counts import CountRange, frames_with
 from sgstore.lang.sql._masks import (
     BUCKET,
@@ -71,7 +78,7 @@ from sgstore.lang.sql._recorded_events import happened_text
 from sgstore.lang.sql._rewrite import INVARIANT, bounds, complement, counted_block, is_lasting
 from sgstore.lang.sql._select import Select, nested
 from sgstore.model.pair_numbers import MARKS, STOREYS, UNEVEN, WAYS
-from sgstore.model.vocabulary import VEHICLES
+from sgstore.model.vocabulary import SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -631,8 +638,27 @@ def _of_edge(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttr
 
 
 def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str:
-    ends = [WayEnd(join.nodes[key], scope.kinds(key)) for key in (leaf.a, leaf.b)]
-    return way_text(leaf.function, join.frame, (ends[0], ends[1]), sql.catalog)
+    """Return the SQL of a number along lanes. The lane distance of the ego is joined once for all mentions."""
+    nodes = join.nodes[leaf.a], join.nodes[leaf.b]
+    kinds = [scope.kinds(key) for key in (leaf.a, leaf.b)]
+    never = frozenset(SIGNALS) - sql.catalog.ego_signals
+    kinds = [Kinds(one.ego - never, one.other) for one in kinds]
+    ends = WayEnd(nodes[0], kinds[0]), WayEnd(nodes[1], kinds[1])
+    of_ego = any(one.one_a_frame for one in kinds)
+    if not (of_ego and is_between_entities(leaf, ends, sql.catalog)):
+        return way_text(leaf.function, join.frame, ends, sql.catalog)
+    alias = f":ways {leaf.a} {leaf.b}"
+    if alias not in join.lanes:
+        join.lanes.add(alias)
+        within = sql.within('":a"."frame_id"', 64, met=True)
+        on = [
+            f"{quoted(alias)}.{column} = {value}"
+            for column, value in zip(
+                ('"frame_id"', '"src"', '"dst"'), (join.frame, *nodes), strict=True
+            )
+        ]
+        join.select.join(nested(lane_distances(ends, sql.catalog, within), alias), on, "LEFT JOIN")
+    return f'{quoted(alias)}."value"'
 
 
 def _of_block(sql: SqlBuilder, join: Join, given: SharedRelation | None, leaf: BlockValue) -> str:

@@ -54,14 +54,51 @@ def way_text(function: str, frame: str, ends: tuple[WayEnd, WayEnd], catalog: Ca
         return _next_text(frame, ends[0], NEXT_PARTS[function], catalog)
     if function in COURSES:
         return _course_text(frame, ends[0], function, catalog)
-    signals = _SIGNALS & (catalog.moving | catalog.fixed | catalog.mapped)
-    if function == LANE_DIST and not any(end.kinds.every & signals for end in ends):
+    if function == LANE_DIST and not _has_signals(ends, catalog):
         return _between_entities(frame, ends, catalog)
     return _between(frame, ends, catalog, parts=function == PART_DIST)
 
 
 _AHEAD: Final = """min(CASE WHEN "way" >= 0 THEN "way" END)"""
 _BEHIND: Final = """max(CASE WHEN "way" < 0 THEN "way" END)"""
+
+
+def is_between_entities(value: PairNumber, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> bool:
+    """Return True for the lane distance between two entities that are neither lights nor signs."""
+    return value.function == LANE_DIST and not _has_signals(ends, catalog)
+
+
+def _has_signals(ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> bool:
+    signals = _SIGNALS & (catalog.moving | catalog.fixed | catalog.mapped)
+    return any(end.kinds.every & signals for end in ends)
+
+
+def lane_distances(ends: tuple[WayEnd, WayEnd], catalog: Catalog, within: list[str]) -> str:
+    """Return the SQL of all lane distances between entities: ``frame_id``, ``src``, ``dst`` and ``value``.
+
+    ``within`` has conditions on the frame ids of ``":a"``.
+    """
+    more = [
+        condition
+        for alias, end in zip((":a", ":b"), ends, strict=True)
+        for condition in _kinds_of(end, alias, catalog)
+    ]
+    where = " AND ".join(['":a"."is_own"', '":b"."is_own"', *more, *within])
+    return f"""
+    SELECT "frame_id", "src", "dst",
+      CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END AS "value"
+    FROM (
+      SELECT ":a"."frame_id", ":a"."node_id" AS "src", ":b"."node_id" AS "dst",
+        ":r"."start" + (CAST(":b"."along" AS DOUBLE) - CAST(":a"."along" AS DOUBLE)) AS "way"
+      FROM "lane_state" AS ":a"
+        JOIN "lane_state" AS ":b" ON ":b"."bucket" = ":a"."bucket" AND ":b"."frame_id" = ":a"."frame_id"
+        JOIN "bucket" AS ":g" ON ":g"."bucket" = ":a"."bucket"
+        JOIN "map_reach" AS ":r" ON ":r"."map_id" = ":g"."map_id" AND ":r"."src" = ":a"."lane"
+          AND ":r"."dst" = ":b"."lane"
+      WHERE {where}
+    ) AS "ways" WHERE "way" BETWEEN -200 AND 200
+    GROUP BY "frame_id", "src", "dst"
+  """  # noqa: S608  columns that the compiler named
 
 
 def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
