@@ -18,7 +18,7 @@ from PIL import Image
 
 import sgstore.draw._palette as palette
 from sgstore.draw import draw_frame, draw_map
-from sgstore.draw._page import FURTHEST
+from sgstore.draw._page import MOST_CHANGE
 from sgstore.draw._picture import title_of
 from sgstore.draw._scene import DrawnFrame
 from sgstore.draw._view import view_of
@@ -151,7 +151,7 @@ def test_a_highlight_changes_the_picture_about_its_node_and_not_elsewhere(tmp_pa
     draw_frame(two(), None, tmp_path / "a.png", radius=50.0, relations="none")
     draw_frame(two(), None, tmp_path / "b.png", radius=50.0, relations="none", highlight={"p": 17})
     difference = np.abs(pixels(tmp_path / "a.png") - pixels(tmp_path / "b.png")).max(axis=2)
-    changed = np.argwhere(difference > 2 * FURTHEST)
+    changed = np.argwhere(difference > 2 * MOST_CHANGE)
     scale = 130 / 72
     window = changed[changed[:, 1] < WINDOW[2] * scale]
     node = np.array((300.0 - 52.0, 274.0 + 41.6)) * scale
