@@ -33,7 +33,7 @@ from sgstore.store._locking import Access
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-pytestmark = pytest.mark.seconds(33)
+pytestmark = pytest.mark.seconds(42)
 
 NOT_ASKING = {
     *("ingest", "import", "rebuild", "derive", "remove", "verify", "info"),

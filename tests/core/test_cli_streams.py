@@ -19,7 +19,7 @@ from verb_lines import LINES, verbs
 
 from sgstore.apps.cli import app, run
 
-pytestmark = pytest.mark.seconds(22)
+pytestmark = pytest.mark.seconds(34)
 
 CONDITIONS = ("", "stdout full", "stdout closed", "reader gone", "stderr full", "stderr closed")
 SLOTS = """

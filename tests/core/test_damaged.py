@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     Had = Callable[[str], tuple[Any, list[Any], Any]]
 
-pytestmark = [pytest.mark.data, pytest.mark.seconds(13)]
+pytestmark = [pytest.mark.data, pytest.mark.seconds(6)]
 
 
 class Hurt(NamedTuple):

@@ -22,7 +22,7 @@ from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 
-pytestmark = pytest.mark.seconds(28)
+pytestmark = pytest.mark.seconds(33)
 
 
 def test_a_killed_run_goes_on_and_ends_as_where_nobody_killed_it(tmp_path: Path) -> None:

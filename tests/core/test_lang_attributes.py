@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     Found = Callable[[str], Sequence[tuple[Any, ...]]]
 
-pytestmark = pytest.mark.seconds(15)
+pytestmark = pytest.mark.seconds(20)
 
 SEQ = 300
 

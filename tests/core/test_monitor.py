@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from sgstore.temporal import MonitorEvent
 
-pytestmark = pytest.mark.seconds(15)
+pytestmark = pytest.mark.seconds(25)
 
 
 def thinned(recording: Path, folder: Path, every: int) -> Drive:

@@ -30,7 +30,7 @@ from sgstore.readers import channel_rank, open_trace
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-pytestmark = pytest.mark.seconds(50)
+pytestmark = pytest.mark.seconds(24)
 
 DATA = Path(os.environ.get("SGSTORE_DATA") or Path(__file__).parents[3] / "shared/data").resolve()
 SHARED = [

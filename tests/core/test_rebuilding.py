@@ -27,7 +27,7 @@ from sgstore.store._schema_text import schema_sql
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(25)
+pytestmark = pytest.mark.seconds(30)
 
 CSV = "graph,src,relation,dst,t\ng1,ego,near,elf_1,0\ng2,ego,visible,elf_1,0.5\n"
 

@@ -18,7 +18,7 @@ from sgstore.pipeline.derive import derive
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(24)
+pytestmark = pytest.mark.seconds(16)
 
 SAMPLE = resources.files("sgstore") / "apps" / "sample" / "town.mcap"
 
