@@ -149,7 +149,7 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
         [ribbons.along_at(lane, np.array([row[i] for row in rows], np.float64)) for i in (2, 3)],
         axis=0,
     )
-    return MapPlaces.of_lines(
+    return MapPlaces.of_broad_lines(
         [(row[0], row[1], *along) for row, along in zip(rows, ends.T.tolist(), strict=True)]
     )
 

@@ -50,9 +50,10 @@ from sgstore.maps.roads._map import (
     RoadMap,
     turn_words,
 )
+from sgstore.maps.roads._middle_lines import middle_between
 from sgstore.maps.roads._places import MapPlaces
 from sgstore.maps.roads._ribbons import LanePoints, Ribbons
-from sgstore.maps.roads._shared_borders import middle_between, with_shared_borders
+from sgstore.maps.roads._shared_borders import with_shared_borders
 
 __all__ = [
     "MAX_LANES",

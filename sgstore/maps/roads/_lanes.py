@@ -225,7 +225,7 @@ def road_map_of(
         stop_lines=np.array([first + r for r, s in enumerate(signals) if s.is_stop_line], np.int64),
         # Formats of lanes as lines use 0 for an unknown height.
         courses=LaneCourses.of(ribbons, ribbons.height if ribbons.z.any() else None),
-        broad_lines=MapPlaces.of_lines(
+        broad_lines=MapPlaces.of_broad_lines(
             [
                 (row, side == "left", 0.0, float(length))
                 for row, (lane, length) in enumerate(zip(lanes, ribbons.lengths, strict=True))

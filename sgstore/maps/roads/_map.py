@@ -19,10 +19,10 @@ from sgstore.maps.roads._footprints import LaneIndex
 from sgstore.maps.roads._places import (
     STOP_LINE,
     MapPlaces,
-    made_of_lanes,
-    of_signals,
-    on_crosswalks,
-    together,
+    crosswalk_places,
+    joined_places,
+    signal_places,
+    whole_lanes,
 )
 from sgstore.maps.roads._ribbons import LanePoints, Ribbons, lane_polygons, waypoints
 from sgstore.maps.roads._zones import zones
@@ -611,7 +611,7 @@ class RoadMap:
         columns["lane"] = {str(column): column for column in range(1, lanes.stop)}
         names = {"lane": list(columns["lane"]), "road": nodes.road[lanes]}
         names["junction"] = nodes.junction[lanes]
-        wholes = [made_of_lanes(self.ribbons, of, names[of], columns[of]) for of in columns]
+        wholes = [whole_lanes(self.ribbons, of, names[of], columns[of]) for of in columns]
         wholes += [self._on_roundabouts(), self._on_zones(), self._broad_lines]
         for column in self._stop_lines.tolist():
             what[column] = STOP_LINE
@@ -619,10 +619,9 @@ class RoadMap:
         shapes, z = self._shapes[crosswalks], nodes.z[crosswalks]
         control = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
         applies = -1 - self.edges.src[control], _FIRST_LANE - self.edges.dst[control]
-        signals = of_signals(self.ribbons, names["junction"], what, applies, self._stops)
-        return together(
-            [*wholes, on_crosswalks(self.ribbons, crosswalks, shapes, z, STOREY), signals]
-        )
+        signals = signal_places(self.ribbons, names["junction"], what, applies, self._stops)
+        crossed = crosswalk_places(self.ribbons, crosswalks, shapes, z, STOREY)
+        return joined_places([*wholes, crossed, signals])
 
     def _on_roundabouts(self) -> MapPlaces:
         """Return the lanes of each roundabout as intervals along these lanes."""

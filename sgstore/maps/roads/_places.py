@@ -59,14 +59,15 @@ class MapPlaces:
 
     def rows(self) -> Iterator[tuple[int, str, int, float, float]]:
         """Yield each lane interval as (map node id, kind, lane node id, start, end)."""
-        ids = ((-1 - self.part).tolist(), self.what, (-2 - self.lane).tolist())
-        return zip(*ids, self.start.tolist(), self.end.tolist(), strict=True)
+        # Map node c has the id -1 - c, and the lanes follow the first node of a map.
+        parts, lanes = (-1 - self.part).tolist(), (-2 - self.lane).tolist()
+        return zip(parts, self.what, lanes, self.start.tolist(), self.end.tolist(), strict=True)
 
     @classmethod
     def none(cls) -> MapPlaces:
         """Return an empty table of lane intervals."""
-        no_parts, nowhere = np.zeros(0, np.int64), np.zeros(0)
-        return cls(no_parts, (), no_parts, nowhere, nowhere)
+        no_rows, no_lengths = np.zeros(0, np.int64), np.zeros(0)
+        return cls(no_rows, (), no_rows, no_lengths, no_lengths)
 
     @classmethod
     def of(
@@ -74,18 +75,22 @@ class MapPlaces:
     ) -> MapPlaces:
         """Make a sorted table of lane intervals from columns in any order."""
         order = np.lexsort((end, start, lane, part))
-        told = tuple(what[int(row)] for row in order)
-        return cls(part[order], told, lane[order], start[order], end[order])
+        kinds = tuple(what[int(row)] for row in order)
+        return cls(part[order], kinds, lane[order], start[order], end[order])
 
-    @staticmethod
-    def of_lines(rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
-        """Make a table of lane intervals with broad markings, from rows of lane, side, start and end; m."""
+    @classmethod
+    def of_broad_lines(cls, rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
+        """Make a table of lane intervals with broad markings.
+
+        A row is the lane, True if the marking is on its left, and start and end; m.
+        """
         lane = np.array([row[0] for row in rows], np.int64)
         start, end = (np.array([row[i] for row in rows], np.float64) for i in (2, 3))
-        return MapPlaces.of(lane + 1, [BROAD_LINES[not row[1]] for row in rows], lane, start, end)
+        what = [BROAD_LINES[0 if is_left else 1] for _, is_left, _, _ in rows]
+        return cls.of(lane + 1, what, lane, start, end)
 
 
-def made_of_lanes(
+def whole_lanes(
     ribbons: Ribbons, what: str, names: Sequence[str], column: dict[str, int]
 ) -> MapPlaces:
     """Return whole lanes as lane intervals of their road or junction.
@@ -94,17 +99,18 @@ def made_of_lanes(
     ----------
     ribbons : Ribbons
     what : str
+        Kind of the parts: ``road``, ``junction`` or ``lane``.
     names : sequence of str
         Name of the part of each lane, or empty.
     column : dict of str to int
         Column of each part among the nodes.
     """
-    found = [(column[name], lane) for lane, name in enumerate(names) if name in column]
-    part, lane = np.array(found, np.int64).reshape(-1, 2).T
+    pairs = [(column[name], lane) for lane, name in enumerate(names) if name in column]
+    part, lane = np.array(pairs, np.int64).reshape(-1, 2).T
     return MapPlaces.of(part, [what] * len(part), lane, np.zeros(len(lane)), ribbons.lengths[lane])
 
 
-def on_crosswalks(
+def crosswalk_places(
     ribbons: Ribbons, columns: Ints, shapes: Any, z: Floats, storey: float
 ) -> MapPlaces:
     """Return, for each crosswalk, the intervals of the lanes that it crosses.
@@ -122,37 +128,41 @@ def on_crosswalks(
         Least difference of height between two storeys; m.
     """
     lines = centre_lines(ribbons)
-    lane, place = shapely.STRtree(shapes).query(lines, predicate="intersects")
-    inside: Any = shapely.intersection(lines[lane], shapes[place])
-    points, of = shapely.get_coordinates(inside, return_index=True)
-    if not len(of):
+    lane, crosswalk = shapely.STRtree(shapes).query(lines, predicate="intersects")
+    inside: Any = shapely.intersection(lines[lane], shapes[crosswalk])
+    points, pair = shapely.get_coordinates(inside, return_index=True)
+    if not len(pair):
         return MapPlaces.none()
-    at: Any = shapely.line_locate_point(lines[lane[of]], shapely.points(points))
-    starts = np.flatnonzero(np.diff(of, prepend=-1))
-    ends = [np.minimum.reduceat(at, starts), np.maximum.reduceat(at, starts)]
-    row = of[starts]
-    lane, place = lane[row], place[row]
-    start, end = (_by_length(ribbons, lane, along) for along in ends)
-    level = np.abs(ribbons.at(lane, (start + end) / 2).z - z[place])
-    on = np.flatnonzero(~(level > storey))
-    what = ["crosswalk"] * len(on)
-    return MapPlaces.of(columns[place[on]], what, lane[on], start[on], end[on])
+    along: Any = shapely.line_locate_point(lines[lane[pair]], shapely.points(points))
+    first_points = np.flatnonzero(np.diff(pair, prepend=-1))
+    extents = (reduce.reduceat(along, first_points) for reduce in (np.minimum, np.maximum))
+    lane, crosswalk = lane[pair[first_points]], crosswalk[pair[first_points]]
+    start, end = (_curve_lengths(ribbons, lane, extent) for extent in extents)
+    height = np.abs(ribbons.at(lane, (start + end) / 2).z - z[crosswalk])
+    same_storey = np.flatnonzero(~(height > storey))  # also if the height is unknown
+    return MapPlaces.of(
+        columns[crosswalk[same_storey]],
+        ["crosswalk"] * len(same_storey),
+        lane[same_storey],
+        start[same_storey],
+        end[same_storey],
+    )
 
 
-def _by_length(ribbons: Ribbons, lane: Ints, at: Floats) -> Floats:
+def _curve_lengths(ribbons: Ribbons, lane: Ints, along: Floats) -> Floats:
     """Convert lengths along straight pieces of a line to lengths along curved centre lines; m."""
     x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
-    found = np.empty(len(lane))
-    for one in np.unique(lane).tolist():
-        own = slice(ribbons.offsets[one], ribbons.offsets[one + 1])
+    lengths = np.empty(len(lane))
+    for row in np.unique(lane).tolist():
+        own = slice(ribbons.offsets[row], ribbons.offsets[row + 1])
         steps = np.hypot(np.diff(x[own]), np.diff(y[own]))
-        rows = lane == one
-        run = np.concatenate((np.zeros(1), np.cumsum(steps)))
-        found[rows] = np.interp(at[rows], run, ribbons.along[own])
-    return found
+        straight = np.concatenate((np.zeros(1), np.cumsum(steps)))
+        on_lane = lane == row
+        lengths[on_lane] = np.interp(along[on_lane], straight, ribbons.along[own])
+    return lengths
 
 
-def of_signals(
+def signal_places(
     ribbons: Ribbons,
     junction: Sequence[str],
     what: Sequence[str],
@@ -173,19 +183,26 @@ def of_signals(
     stops : (m,) int64, int64 and float64
         Signals, lanes, and the places along these from the map; m.
     """
-    within = np.array([bool(name) for name in junction], np.bool_)
-    told = {*zip(*(column.tolist() for column in stops[:2]), strict=True)}
+    in_junction = [bool(name) for name in junction]
+    stopping = {*zip(*(column.tolist() for column in stops[:2]), strict=True)}
     pairs = {*zip(*(column.tolist() for column in applies), strict=True)}
-    rows = [(*one, 0.0) for one in pairs if within[one[1]]]
-    rows += [(*one, float(ribbons.lengths[one[1]])) for one in pairs - told if not within[one[1]]]
-    columns = zip(*(column.tolist() for column in stops), strict=True)
-    rows += {one for one in columns if not within[one[1]] and one[:2] in pairs}
-    part, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
-    at = np.array([one[2] for one in rows], np.float64)
-    return MapPlaces.of(part, [what[int(one)] for one in part], lane, at, at)
+    rows = [(*pair, 0.0) for pair in pairs if in_junction[pair[1]]]
+    rows += [
+        (signal, lane, float(ribbons.lengths[lane]))
+        for signal, lane in pairs - stopping
+        if not in_junction[lane]
+    ]
+    rows += {
+        (signal, lane, along)
+        for signal, lane, along in zip(*(column.tolist() for column in stops), strict=True)
+        if not in_junction[lane] and (signal, lane) in pairs
+    }
+    part, lane = np.array([row[:2] for row in rows], np.int64).reshape(-1, 2).T
+    along = np.array([row[2] for row in rows], np.float64)
+    return MapPlaces.of(part, [what[int(column)] for column in part], lane, along, along)
 
 
-def together(parts: Sequence[MapPlaces]) -> MapPlaces:
-    """Concatenate several tables of lane intervals."""
-    one = chained(parts)
-    return MapPlaces.of(one.part, one.what, one.lane, one.start, one.end)
+def joined_places(tables: Sequence[MapPlaces]) -> MapPlaces:
+    """Concatenate several tables of lane intervals, and sort the rows."""
+    table = chained(tables)
+    return MapPlaces.of(table.part, table.what, table.lane, table.start, table.end)
