@@ -252,7 +252,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
         why = f": {verdict.reason}" if verdict.reason else ""
         pytest.skip(f"{verdict.trace} cannot answer {verdict.check}{why}")
     if verdict.verdict == "pending":
-        pytest.skip(f"{verdict.check} is still due at the end of {verdict.trace}")
+        pytest.skip(f"{verdict.check} is still pending at the end of {verdict.trace}")
 
 
 def violations_text(verdict: Verdict) -> str:

@@ -186,7 +186,7 @@ def _edges_between(nodes: Sequence[int]) -> int:
 
 
 def _no_columns(*_: Any) -> Any:
-    raise TypeError("a path is no column")
+    raise TypeError("a path is not a column")
 
 
 def _strict(

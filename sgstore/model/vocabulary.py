@@ -224,7 +224,7 @@ def learn(enum: str, name: str) -> int:
             _refuse_like_own(enum, name)
             if not _NAME.fullmatch(name):
                 raise ValueError(
-                    f"{name!r} is no name: letters, digits and _, a letter first, 40 at most"
+                    f"{name!r} is not a name: letters, digits and _, a letter first, 40 at most"
                 )
             if len(names) >= most:
                 raise ValueError(f"there are {most} {what}, and no room for {name!r}")

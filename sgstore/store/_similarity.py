@@ -326,4 +326,4 @@ def _check(ignored: Sequence[str], graphs: Labelled) -> None:
         if name.replace("_", "").lower() not in folds and not kinds_labelled(name):
             like = suggestion(name, sorted(known))
             hint = f"; did you mean {like!r}?" if like else "; expected a label or a relation"
-            raise AbstractionError(f"nothing to ignore is called {name!r}{hint}")
+            raise AbstractionError(f"unknown kind or relation {name!r} to ignore{hint}")

@@ -590,7 +590,7 @@ def _bound(
     named = {name for one in statements for name in _parameters(one)}
     unused = sorted(set(parameters) - named)
     if unused:
-        hint = f"it would be written ${unused[0]}"
+        hint = f"write a parameter as ${unused[0]}"
         raise QueryError(f"the text has no parameter '{unused[0]}'", hint=hint)
 
     def given(some: Sequence[Statement]) -> dict[str, Any]:

@@ -388,7 +388,7 @@ def test_build_servers_skip_what_is_not_decided(tmp_path: Path) -> None:
     (skipped,) = pending
     assert (skipped.tag, skipped.get("message")) == (
         "skipped",
-        "still due at the end of the recording",
+        "pending at the end of the recording",
     )
     assert [(one.tag, one.text) for one in kept] == [
         ("system-out", "an entity is absent in 3 frames")

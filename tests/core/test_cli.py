@@ -285,18 +285,18 @@ BAD: list[tuple[str, list[str], int, str]] = [
     ("no such picture format", ["show", "{store}", "town#3", "-o", "{out}.bmp"], 1, ".png"),
     ("a time that is none", ["export", "{store}", "MATCH (e:Ego)", "--before", "soon"], 2, "2s"),
     ("no such verb", ["fnd", "{store}"], 2, "fnd"),
-    ("a recording without a store", ["ingest", "{sample}"], 2, "'TRACE…'. The store comes first."),
+    ("a recording without a store", ["ingest", "{sample}"], 2, "'TRACE…'. Write the store first."),
     (
         "a frame before the store",
         ["why-not", "town#3", "{store}", "MATCH (e:Ego)"],
         2,
-        "town#3 is no store, but",
+        "town#3 is not a store, but",
     ),
     (
         "a recording before the store",
         ["ingest", "{sample}", "{store}"],
         2,
-        "is: the store comes first",
+        "is; write the store first",
     ),
     (
         "a limit that is an option",
@@ -487,7 +487,7 @@ def test_a_pattern_of_the_library_is_asked_by_its_name(
     code, out, _ = sgstore("why-not", store, frame, "-p", "jaywalking", "--json")
     assert (code, [step["matches"] for step in json.loads(out)["steps"]]) == (0, [True])
     code, _, err = sgstore("show", store, frame, "-p", "jaywalking", "-o", tmp_path / "it.png")
-    assert (code, "nothing is marked" in err) == (0, False)
+    assert (code, "no marks" in err) == (0, False)
     code, out, _ = sgstore("export", store, "-p", "jaywalking", "--to", tmp_path / "it", "--json")
     assert (code, bool(json.loads(out))) == (0, True)
 

@@ -122,7 +122,7 @@ def test_a_question_ends_at_its_deadline_and_leaves_nothing(
 
     assert code == 2
     assert "stopped after 0.2 s" in err
-    assert "give it more time, or ask for less" in err
+    assert "raise it, or reduce the query" in err
     assert not list(folder.iterdir())
 
 
@@ -562,7 +562,7 @@ def test_signals_end_a_run_in_order_and_leave_nothing_behind(
 
     assert process.returncode == 128 + sent, err
     word = "interrupted" if sent == signal.SIGINT else f"ended by {sent.name}"
-    stored = "; what was finished is in the store" if "ingest" in verb else ""
+    stored = "; the store has all finished work" if "ingest" in verb else ""
     assert err.splitlines()[-1:] == [f"sgstore: {word}{stored}"]
     assert "Traceback" not in err
     assert bool(workers) == (verb in {"ingest --jobs", "sql --safe"})

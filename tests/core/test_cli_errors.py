@@ -109,4 +109,4 @@ def test_a_file_that_is_no_store_is_told_so_whatever_its_name(
 
 def test_a_query_in_place_of_a_file_is_seen(store: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["check", store, "CHECK a: ALWAYS ego.speed < 50"]) == 2
-    assert "this is a query, and no file of that name" in capsys.readouterr().err
+    assert "this is a query, not the name of a file" in capsys.readouterr().err

@@ -112,7 +112,10 @@ def test_a_config_survives_json_and_toml(tmp_path: Path, config: Config) -> None
         ("ego = 7", "setting 'ego' is 7; expected a text"),
         ("[proximity]\nnames = 'near'", "setting 'proximity.names' is 'near'; expected a list"),
         ("[proximity]\nnames = ['isIn']", "setting 'proximity.names' is 'isIn'; expected one of"),
-        ("[proximity]\nnames = ['very near']", "setting 'proximity.names': 'very near' is no name"),
+        (
+            "[proximity]\nnames = ['very near']",
+            "setting 'proximity.names': 'very near' is not a name",
+        ),
         ("[proximity]\nnames = ['Near']", "setting 'proximity.names': 'Near' would be taken for"),
         ("[proximity]\nupper = [1]", "expected 6 bounds for 6 names"),
         ("[proximity]\nupper = [1,2,3,4,4,5]", "expected ascending bounds above 0"),

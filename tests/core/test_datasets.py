@@ -209,15 +209,18 @@ def test_a_dataset_may_be_a_parameter(worlds: tuple[World, Path]) -> None:
     ("query", "reason"),
     [
         ("USING DATASET 'twon' MATCH (e)", "unknown dataset 'twon'\n.*\n.*\ndid you mean 'town'"),
-        ("USING DATASET 'frames_' MATCH (e)", "is a table of single frames"),
+        ("USING DATASET 'frames_' MATCH (e)", "is a table of frames"),
         ("MATCH (e) WHERE frame.class IN dataset_classes('twon')", "unknown dataset 'twon'"),
-        ("MATCH (e) WHERE e.kind IN dataset_classes('town')", "only classes of frames are in it"),
+        (
+            "MATCH (e) WHERE e.kind IN dataset_classes('town')",
+            "a dataset has only frame classes",
+        ),
         (
             "MATCH (e) WHERE frame.class IN dataset_classes('town', 'E')",
-            "classes of RSV are not those of E",
+            "classes of RSV cannot be compared with classes of E",
         ),
         ("MATCH (e) WHERE frame.class IN dataset_classes(3)", "takes the name of a dataset"),
-        ("MATCH (e) WHERE frame.class = dataset_classes('town')", "may stand after IN only"),
+        ("MATCH (e) WHERE frame.class = dataset_classes('town')", "is allowed only after IN"),
         ("MATCH (e) WHERE class_count('RSW') > 1", "unknown abstraction 'RSW'"),
         ("MATCH (e) WHERE class_count(3) > 1", "takes the name of an abstraction"),
     ],

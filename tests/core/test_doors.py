@@ -373,7 +373,7 @@ def test_tables_of_somebody_else_are_left_alone_and_told(
 
     verified = run("verify", store)
     assert verified.exit_code == 0
-    assert "none of sgstore's, so not looked at: broken, labels, mine.trace" in verified.output
+    assert "tables of other programs, not checked: broken, labels, mine.trace" in verified.output
     assert run("find", store, "MATCH (e:Ego)", "--count").exit_code == 0
     assert run("derive", store, "--as", "again").exit_code == 0
     assert run("sql", store, "SELECT sum(label) FROM labels").exit_code == 0

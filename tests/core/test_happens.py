@@ -246,7 +246,7 @@ def test_what_a_table_of_ones_own_says_happens_in_the_same_place(
     assert len(found("MATCH (e:Ego) WHERE frame.seq < 5 AND NOT HAPPENS label()")) == 9
     assert found("MATCH (e:Ego) WHERE NEXT HAPPENS label()") == [("told", 2)]
     with pytest.raises(
-        QueryError, match="label does not say to whom: it has no column node_id or ident"
+        QueryError, match="label does not name the nodes: it lacks the column node_id or ident"
     ):
         found("MATCH (e:Ego) WHERE HAPPENS label(e)")
 

@@ -238,7 +238,7 @@ def test_a_time_along_the_lanes_goes_by_the_speeds_along_them(
 
 
 def test_a_time_along_the_lanes_is_of_two_entities(store: Store) -> None:
-    with pytest.raises(QueryError, match=r"ttc_lane\(\) takes two entities, and this is a lane"):
+    with pytest.raises(QueryError, match=r"ttc_lane\(\) takes two entities, but this is a lane"):
         store.find("MATCH (e:Car), (l:Lane) WHERE ttc_lane(e, l) < 3").rows()
 
 

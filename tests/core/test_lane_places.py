@@ -346,10 +346,10 @@ def test_a_variable_that_may_be_an_entity_is_no_part_of_the_map(store: Store) ->
         ("MATCH (e:Ego) WHERE to_junction(e, e) < 3", "to_junction() takes 1 argument, found 2"),
         (
             "MATCH (l:Lane) WHERE to_junction(l) < 3",
-            "to_junction() takes an entity, and this is a lane",
+            "to_junction() takes an entity, but this is a lane",
         ),
-        ("MATCH (e:Ego) WHERE lane_dist(e, junction) < 3", "the next one it is to_junction(e)"),
-        ("MATCH (e:Ego), (w:Waypoint) WHERE lane_dist(e, w) < 3", "and this is a waypoint"),
+        ("MATCH (e:Ego) WHERE lane_dist(e, junction) < 3", "the next one write to_junction(e)"),
+        ("MATCH (e:Ego), (w:Waypoint) WHERE lane_dist(e, w) < 3", "but this is a waypoint"),
         ("MATCH (e:Ego), (l:Lane) WHERE gap(e, l) < 3", "gap() takes two entities"),
     ],
 )

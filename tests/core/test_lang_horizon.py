@@ -89,7 +89,7 @@ def test_reason_names_needed_and_known_range() -> None:
     ("text", "said"),
     [
         ("USING SCOPE roads MATCH (e:Ego)", "unknown value of SCOPE 'roads'"),
-        ("USING RANGE 50 MATCH (e:Ego)", "USING RANGE belongs to CHECK"),
+        ("USING RANGE 50 MATCH (e:Ego)", "USING RANGE is allowed only in a CHECK"),
     ],
 )
 def test_invalid_settings_are_refused(text: str, said: str) -> None:
@@ -99,7 +99,7 @@ def test_invalid_settings_are_refused(text: str, said: str) -> None:
 
 @pytest.mark.parametrize("said", ["far", "-3"])
 def test_range_is_a_distance(said: str) -> None:
-    with pytest.raises(QueryError, match="is no distance"):
+    with pytest.raises(QueryError, match="is not a distance"):
         looked(f"USING RANGE '{said}' CHECK ALWAYS ego.speed < 3")
 
 

@@ -53,7 +53,7 @@ def test_node_named_ego_is_the_ego_with_any_label() -> None:
         "MATCH (ego:Car&Ego)-[:near]->(p:Person)"
     )
     assert sql(inside.format("Car")) == sql(inside.format("Car&Ego"))
-    assert "no node" in refused("MATCH (ego:Lane)").reason
+    assert "exclude each other" in refused("MATCH (ego:Lane)").reason
 
 
 def test_label_without_colon_is_not_a_name() -> None:
@@ -71,7 +71,7 @@ def test_count_is_equal_with_and_without_distinct() -> None:
 
 @pytest.mark.parametrize("text", ["[[:alpha:]]+", "[[a]", "[a&&b]", "[a--b]", "[a||b]", "[a~~b]"])
 def test_nested_regex_set_is_refused(text: str) -> None:
-    assert "a set in a set" in refused(f"MATCH (v:Car) WHERE v.ident =~ '{text}'").reason
+    assert "a set contains a set" in refused(f"MATCH (v:Car) WHERE v.ident =~ '{text}'").reason
     escaped = text[0] + text[1:].replace("[", r"\\[")
     if "[[" in text:
         assert sql(f"MATCH (v:Car) WHERE v.ident =~ '{escaped}'")
@@ -199,9 +199,13 @@ DIGITS = "9" * 400
 def test_number_of_400_digits_is_refused_at_its_place(text: str) -> None:
     error = refused(text)
 
-    assert str(error).startswith(("too large a number", "no length of time"))
+    assert str(error).startswith(
+        ("the number is too large", "this duration is longer than any trace")
+    )
 
 
 @pytest.mark.parametrize("value", [10**400, 1e300, -1e300, f"{DIGITS}s", f"{DIGITS}frames"])
 def test_parameter_with_invalid_duration_is_refused(value: object) -> None:
-    assert "no length of time" in str(refused("MATCH (e:Ego) FOR >= $p", p=value))
+    assert "this duration is longer than any trace" in str(
+        refused("MATCH (e:Ego) FOR >= $p", p=value)
+    )

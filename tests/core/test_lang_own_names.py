@@ -113,5 +113,5 @@ def test_parameter_name_hides_variable() -> None:
     text = "DEFINE SCENARIO fast(v = 3) AS MATCH (v:Car) WHERE v.speed > $v; MATCH fast(v = {})"
 
     assert "v.speed > 5" in str(told(text.format(5)))
-    with pytest.raises(QueryError, match="'v' is a parameter of fast, and takes a value"):
+    with pytest.raises(QueryError, match="'v' is a parameter of fast and takes a value"):
         compile_query(text.format("w"), CATALOG)

@@ -89,7 +89,7 @@ def test_what_is_never_known_is_neither_kept_nor_violated(silent: Store, name: s
         verdicts = list(silent.check(f"CHECK c: FORALL (v:{kind} WHERE NOT v.is_static) {formula}"))
         told = {one.trace: (one.verdict, one.reason) for one in verdicts}
 
-        assert told["trace2"] == ("unknown", f"{name} of v is never known"), formula
+        assert told["trace2"] == ("unknown", f"{name} of v never has a value"), formula
 
     found = silent.find(f"MATCH (v:{kind} WHERE NOT v.is_static) WHERE ALWAYS NOT {test}")
     assert "trace2" in found.left_out
@@ -134,7 +134,7 @@ def test_numbers_of_two_need_what_they_are_made_of(
     (told,) = (one for one in silent.check(text) if one.trace == "trace2")
 
     assert told.verdict == "unknown"
-    assert f"{missing} of a is never known" in told.reason
+    assert f"{missing} of a never has a value" in told.reason
 
 
 WITHOUT_EGO = {
@@ -143,8 +143,8 @@ WITHOUT_EGO = {
     "FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 1": "it has no ego",
     "FORALL (v:Vehicle) ALWAYS v.speed < 20": "",
     "FORALL (p:Person) ALWAYS p.speed < 3": "",
-    "FORALL (v:Vehicle) ALWAYS v.throttle < 1": "throttle of v is never known",
-    "ALWAYS NOT env.fog = 'dense'": "env.fog is never known",
+    "FORALL (v:Vehicle) ALWAYS v.throttle < 1": "throttle of v never has a value",
+    "ALWAYS NOT env.fog = 'dense'": "env.fog never has a value",
 }
 
 
@@ -238,13 +238,13 @@ def test_traces_come_as_people_count() -> None:
         ("CHECK c: ALWAYS ego.speed < 20", {"without": "it has no ego"}),
         (
             "CHECK c: FORALL (v:Vehicle) ALWAYS v.brake < 0.5",
-            dict.fromkeys(("with", "without"), "brake of v is never known"),
+            dict.fromkeys(("with", "without"), "brake of v never has a value"),
         ),
         (
             "CHECK c: EVENTUALLY lane_dist(ego, ego) < 3 OR EXISTS {(ego)-[:isIn]->(:Lane)}",
             {
-                "with": "it knows nothing of isIn; it has no map of lanes",
-                "without": "it knows nothing of isIn; it has no map of lanes; it has no ego",
+                "with": "it does not contain isIn; it has no map of lanes",
+                "without": "it does not contain isIn; it has no map of lanes; it has no ego",
             },
         ),
     ],

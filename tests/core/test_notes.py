@@ -62,7 +62,7 @@ def test_a_text_that_the_store_has_not_is_told_with_the_nearest(
 
     assert notes(FORMS["equal"], attribute, value, store) == ()
     (note,) = notes(FORMS["equal"], attribute, f"{value}_x", store)
-    assert note.startswith(f"nothing in the store has the {name} {value + '_x'!r}")
+    assert note.startswith(f"the store has no {name} {value + '_x'!r}")
     assert repr(value) in note or "the nearest is" in note
 
 
@@ -80,34 +80,34 @@ def test_wherever_it_is_compared(form: str, store: Store) -> None:
     [
         (
             "MATCH (l:Lane {lane_type: 'drivng'})",
-            "the lane_type 'drivng'; the nearest is 'driving'",
+            "lane_type 'drivng'; the nearest is 'driving'",
         ),
-        ("MATCH (l:Lane {type: 'Driving'})", "the lane_type 'Driving'; the nearest is 'driving'"),
+        ("MATCH (l:Lane {type: 'Driving'})", "lane_type 'Driving'; the nearest is 'driving'"),
         (
             "MATCH (e:Ego) WHERE trace.map = 'town.xord'",
-            "the trace.map 'town.xord'; the nearest is 'town.xodr'",
+            "trace.map 'town.xord'; the nearest is 'town.xodr'",
         ),
-        ("MATCH (v {name: 'cutter'})", "the name 'cutter'; it is a value of ident"),
-        ("MATCH (v {ident: 'car 0'})", "the ident 'car 0'; it is a value of name"),
-        ("MATCH (v:Car {name: 'Car 0'})", "the name 'Car 0'; the nearest is 'car 0'"),
+        ("MATCH (v {name: 'cutter'})", "name 'cutter'; it is a value of ident"),
+        ("MATCH (v {ident: 'car 0'})", "ident 'car 0'; it is a value of name"),
+        ("MATCH (v:Car {name: 'Car 0'})", "name 'Car 0'; the nearest is 'car 0'"),
     ],
 )
 def test_what_was_meant_is_said(text: str, says: str, store: Store) -> None:
-    assert store.find(text).notes == (f"nothing in the store has {says}",)
+    assert store.find(text).notes == (f"the store has no {says}",)
 
 
 def test_several_are_told_each_once(store: Store) -> None:
     text = "MATCH (v:Car), (w:Car) WHERE v.name = 'a' OR w.name = 'a' OR v.ident IN ['b', 'ego']"
 
     assert [note.split(";")[0] for note in store.find(text).notes] == [
-        "nothing in the store has the name 'a'",
-        "nothing in the store has the ident 'b'",
+        "the store has no name 'a'",
+        "the store has no ident 'b'",
     ]
 
 
 def test_other_faces_say_it_too(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     path: Path = store.file.path
-    says = "nothing in the store has the name 'nobody'"
+    says = "the store has no name 'nobody'"
     text = "MATCH (v {name: 'nobody'})"
     check = "CHECK ALWAYS NOT EXISTS {(v:Car {name: 'nobody'})} RESET WHEN ego.ident = 'nothing'"
 
@@ -122,7 +122,7 @@ def test_other_faces_say_it_too(store: Store, capsys: pytest.CaptureFixture[str]
     assert f"note: {says}" in capsys.readouterr().err
     assert [note.split(";")[0] for note in store.check(check).notes] == [
         says,
-        "nothing in the store has the ident 'nothing'",
+        "the store has no ident 'nothing'",
     ]
     with Sandbox(path) as sandbox:
         assert sandbox.find(text).notes[0].startswith(says)

@@ -636,20 +636,20 @@ def test_a_check_tells_who_violates_it_and_when(store: Store) -> None:
     [
         (
             "MATCH (e:Ego) WHERE EXISTS {(e)-[:near]->(v) WHERE EVENTUALLY v.speed > 1}",
-            "inside braces",
+            "in braces",
         ),
         ("MATCH (e:Ego) WHERE e.speed > 10frames", "a number of frames is compared"),
-        ("MATCH (e:Ego) THEN NOT MATCH (e) WHERE e.speed > 1", "says for how long"),
-        ("NOT MATCH (e:Ego) THEN MATCH (e)", "begins with something that happens"),
-        ("MATCH (e:Ego) THEN AFTER 4s WITHIN 2s MATCH (e)", "ends before it begins"),
-        ("MATCH (e:Ego) WHERE EVENTUALLY[2s, 1s] e.speed > 1", "ends before it begins"),
+        ("MATCH (e:Ego) THEN NOT MATCH (e) WHERE e.speed > 1", "needs a duration"),
+        ("NOT MATCH (e:Ego) THEN MATCH (e)", "a sequence cannot begin with NOT MATCH"),
+        ("MATCH (e:Ego) THEN AFTER 4s WITHIN 2s MATCH (e)", "the bound is before its start"),
+        ("MATCH (e:Ego) WHERE EVENTUALLY[2s, 1s] e.speed > 1", "the bound is before its start"),
         ("MATCH (e:Ego) RETURN t(e)", "takes the name of a step"),
         ("MATCH (e:Ego) WHERE run_length(NEXT e.speed > 1) > 2frames", "looks ahead"),
         ("MATCH nothing()", "unknown scenario"),
         ("DEFINE SCENARIO f(w) AS MATCH (e:Ego) FOR >= $w; MATCH f()", "needs a value of w"),
         ("DEFINE SCENARIO f() AS MATCH f(); MATCH f()", "defined by itself"),
         ("CHECK ALWAYS ego.speed > 1", "a CHECK has a verdict"),
-        ("USING END weak MATCH (e:Ego)", "USING END belongs to CHECK"),
+        ("USING END weak MATCH (e:Ego)", "USING END is allowed only in a CHECK"),
     ],
 )
 def test_what_has_no_meaning_is_refused_with_its_place(
@@ -665,10 +665,13 @@ def test_what_has_no_meaning_is_refused_with_its_place(
     ("text", "complaint"),
     [
         ("MATCH (e:Ego)", "a MATCH has matches"),
-        ("DEFINE PREDICATE p(x) AS x.speed > 1", "nothing is checked"),
-        ("CHECK a: ALWAYS ego.speed > 1; CHECK a: ALWAYS ego.speed > 2", "two checks are called"),
+        ("DEFINE PREDICATE p(x) AS x.speed > 1", "the text contains no CHECK"),
+        (
+            "CHECK a: ALWAYS ego.speed > 1; CHECK a: ALWAYS ego.speed > 2",
+            "two checks have the name",
+        ),
         ("CHECK FORALL (ego:Car, v:Car) ALWAYS v.sped > 1", "unknown attribute"),
-        ("USING MATCHES first CHECK ALWAYS ego.speed > 1", "belongs to sequences"),
+        ("USING MATCHES first CHECK ALWAYS ego.speed > 1", "allowed only in sequences"),
     ],
 )
 def test_what_is_no_check_is_refused(store: Store, text: str, complaint: str) -> None:

@@ -108,7 +108,7 @@ def test_margins_of_conditions(town: Store, formula: str, value: float, conditio
 
 
 def test_a_forgiving_end_has_no_robustness(town: Store) -> None:
-    with pytest.raises(QueryError, match="forgives what is due") as refused:
+    with pytest.raises(QueryError, match="weak cannot be combined with ROBUSTNESS") as refused:
         town.check("USING END weak CHECK EVENTUALLY ego.speed > 99 ROBUSTNESS")
 
     assert refused.value.hint is not None

@@ -140,11 +140,11 @@ def test_what_is_no_call_stays_as_it_is(sql: str) -> None:
     [
         ("sgql(MATCH)", r"sgql\(\) takes a query in quotes", "sgql(M"),
         ("sgql()", r"sgql\(\) takes a query in quotes", "sgql()"),
-        ("sgql('a' 'b')", r"expected ',' or '\)' behind the query", "sgql('a' '"),
-        ("sgql('a', 5)", "a value of a query has the name of a parameter", "sgql('a', 5"),
+        ("sgql('a' 'b')", r"expected ',' or '\)' after the query", "sgql('a' '"),
+        ("sgql('a', 5)", "expected the name of a parameter before the value", "sgql('a', 5"),
         ("sgql('a', x := now())", "expected a number, a text, true or false", "sgql('a', x := n"),
         ("sgql('a', x := [1, y])", "a list holds numbers, texts", "sgql('a', x := [1, y"),
-        ("sgql('a'", r"expected ',' or '\)' behind the query", "sgql('a'"),
+        ("sgql('a'", r"expected ',' or '\)' after the query", "sgql('a'"),
         ("sgql('a', x := [1", "a list holds numbers, texts", "sgql('a', x := [1"),
     ],
 )
@@ -165,7 +165,7 @@ def test_a_call_that_is_none_is_refused_where_it_stands(call: str, reason: str, 
         ("MATCH (e:Ego", "the text ends"),
         ("MATCH (e:Ego) RETURN SUBGRAPHS", "a table has values, and SUBGRAPHS are graphs"),
         ("MATCH (e:Ego) WHERE e.speed > $x", r"the parameter \$x has no value"),
-        ("CHECK ALWAYS ego.speed < 9", "a CHECK has a verdict, and no matches"),
+        ("CHECK ALWAYS ego.speed < 9", "a CHECK has a verdict, not matches"),
     ],
 )
 def test_a_mistake_in_the_pattern_is_told_in_its_text(text: str, reason: str, store: Store) -> None:
@@ -204,4 +204,4 @@ def test_traces_that_a_pattern_leaves_out_are_told(
 
     assert store.sql(f"FROM sgql('{text}')").reasons == reasons
     assert run_verb(["sql", str(store.file.path), f"FROM sgql('{text}')"]) == 0
-    assert "left out, because they cannot answer this query" in capsys.readouterr().err
+    assert "skipped, because they lack data for this query" in capsys.readouterr().err

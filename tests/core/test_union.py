@@ -139,7 +139,10 @@ def test_nodes_of_several_traces_are_not_mixed_up(store: Store) -> None:
             "'x' is a number in the first part of the UNION, and a text here",
         ),
         ("MATCH (v:Car) UNION MATCH (v:Car) WHERE v.sped > 3", "unknown attribute 'sped'"),
-        ("MATCH (v:Car) UNION MATCH (v:Car) UNION ALL MATCH (v:Car)", "one of UNION and UNION ALL"),
+        (
+            "MATCH (v:Car) UNION MATCH (v:Car) UNION ALL MATCH (v:Car)",
+            "a query cannot contain both UNION and UNION ALL",
+        ),
         ("MATCH (v:Car) UNION MATCH (v:Car); MATCH (v)", "a UNION stands alone"),
         ("MATCH (v:Car) UNION", "expected MATCH or USING, but the text ends"),
     ],
@@ -157,7 +160,7 @@ def test_a_parameter_that_no_part_has_is_refused(store: Store) -> None:
 
 
 def test_what_takes_one_pattern_says_so(store: Store) -> None:
-    with pytest.raises(QueryError, match="a UNION joins the answers of several queries"):
+    with pytest.raises(QueryError, match="a UNION combines several queries"):
         store.why_not(next(store.find("MATCH (e:Ego)").frames()), f"{NEAR} UNION {NEAR}")
 
 

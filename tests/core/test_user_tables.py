@@ -256,7 +256,7 @@ def test_rows_that_belong_to_no_frame_are_told(path, frames, table) -> None:
 
     result = run("sql", path, "SELECT count(*) FROM labels", "--with", file)
 
-    assert "labels: 2 of 3 rows belong to no frame of the store" in result.stderr
+    assert "labels: 2 of 3 rows do not refer to a frame of the store" in result.stderr
 
 
 @pytest.mark.parametrize("ending", ["csv", "json", "ndjson", "parquet", "arrow"])

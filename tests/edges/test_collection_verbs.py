@@ -212,7 +212,7 @@ def test_partial_answers_are_those_of_the_bundles_that_answered_first(
         lock = places["lock"].read_bytes() if places["lock"].exists() else b""
         told.append((out.out.replace(str(places[where]), "PLACE"), lock))
     assert code == LOSS
-    assert f"bundle {gone[:12]}… did not answer: the machine is away" in out.err
+    assert f"bundle {gone[:12]}… failed: the machine is away" in out.err
     assert len(failed) == 1  # it is not asked again
     assert told[0] == told[1]
 

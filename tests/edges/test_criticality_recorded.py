@@ -478,9 +478,7 @@ def test_a_monitor_refuses_what_is_recorded_later(open_town: Store) -> None:
     close = "(e:Ego), (v:Vehicle) WHERE pet(e, v) < 1"
 
     for text in (f"MATCH {close}", f"CHECK ALWAYS NOT EXISTS {{{close}}}"):
-        with pytest.raises(
-            QueryError, match=r"pet\(\) needs what is recorded later, which a monitor"
-        ):
+        with pytest.raises(QueryError, match=r"pet\(\) needs later frames, which a monitor"):
             Monitor(text)
     with pytest.raises(QueryError, match=r"pet\(\) takes 2 arguments(.|\n)*post-encroachment time"):
         open_town.find("MATCH (e:Ego) WHERE pet(e) < 1")

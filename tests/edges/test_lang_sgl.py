@@ -140,7 +140,7 @@ def test_carla_steers_to_the_other_side() -> None:
             "expected a set of nodes, found relation",
         ),
         ("x = P.gt(P.size(P.filterByAttr('G', 'colour', 'red')), 0)", "unknown attribute 'colour'"),
-        ("x = P.gt(P.size(P.filterByAttr('G', 'name', 'spaceship')), 0)", "nothing is called like"),
+        ("x = P.gt(P.size(P.filterByAttr('G', 'name', 'spaceship')), 0)", "no name matches"),
         (
             "x = P.gt(P.size(P.filterByAttr('G', 'speed', lambda x: exit())), 0)",
             "expected a text, or lambda",
@@ -150,8 +150,8 @@ def test_carla_steers_to_the_other_side() -> None:
         ("Property('p', 'G(q', [('q', P.gt(1, 0))])", r"expected '\\)'"),
         ("Property('p', 'G(r)', [('q', P.gt(1, 0))])", "unknown proposition 'r'"),
         ("Property('p')", "expected Property"),
-        ("def", "this is no Python"),
-        ("x = " + "(" * 5000, "this is no Python"),
+        ("def", "invalid Python"),
+        ("x = " + "(" * 5000, "invalid Python"),
     ],
 )
 def test_what_is_not_sgl_is_refused_with_its_place(text: str, reason: str) -> None:
@@ -164,17 +164,17 @@ def test_what_stands_in_one_another_without_end_is_refused() -> None:
     doubled = "\n".join(f"a{i + 1} = P.union(a{i}, a{i})" for i in range(40))
     asked = "x = P.gt(P.size(a{}), 0)"
 
-    with pytest.raises(QueryError, match="too much stands in one another"):
+    with pytest.raises(QueryError, match="the expressions are nested too deeply"):
         translated(f'a0 = "Ego"\n{chain}\n{asked.format(2000)}')
     with pytest.raises(QueryError, match="more than 100000 calls"):
         translated(f'a0 = "Ego"\n{doubled}\n{asked.format(40)}')
-    with pytest.raises(QueryError, match="too much stands in one another"):
+    with pytest.raises(QueryError, match="the expressions are nested too deeply"):
         translated(f"Property('p', '{'(' * 20000}q', [('q', P.gt(1, 0))])")
 
 
 @pytest.mark.parametrize("text", ["", "import os\nos.system('ls')", "# nothing"])
 def test_a_text_without_properties_is_refused(text: str) -> None:
-    with pytest.raises(QueryError, match="no property"):
+    with pytest.raises(QueryError, match="neither a property nor"):
         translated(text)
 
 
@@ -282,7 +282,7 @@ def test_whatever_is_translated_can_be_read_or_is_refused(seed: int) -> None:
         ("P.gt(P.size(), 0)", "size takes 1 argument, found 0"),
         ("P.logic_not()", "logic_not takes 1 argument, found 0"),
         ("P.gt(P.size('Ego'), True)", "expected a number"),
-        ("P.gt(P.size('Ego'), 1e999)", "too large a number"),
+        ("P.gt(P.size('Ego'), 1e999)", "the number is too large"),
         ("partial(P.union, 'Ego')", "union takes 2 arguments, found 1"),
     ],
 )
@@ -303,5 +303,5 @@ def test_a_set_in_a_set_is_refused_and_not_warned_of() -> None:
     red = 'P.filterByAttr("Ego", "light_state", "[[a]")'
     text = f'import SG_Primitives as P\nProperty("a", "G(p)", [("p", P.gt(P.size({red}), 0))])\n'
 
-    with pytest.raises(QueryError, match="a set in a set"):
+    with pytest.raises(QueryError, match="a set contains a set"):
         translated(text)

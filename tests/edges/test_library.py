@@ -136,10 +136,10 @@ def test_a_parameter_that_a_pattern_does_not_have_is_refused() -> None:
         ("MATCH (e)", "line 1: expected '-- KIND NAME: sentence'"),
         ("-- concept x: S.\n-- param a: 3", "line 2: expected '-- param NAME = DEFAULT: meaning'"),
         ("-- concept x: S.\n-- param a = soon: m", "line 2: expected '-- param NAME = DEFAULT"),
-        ("-- concept x: S.\n-- param a = 3: m\nMATCH (e)", "'a' is not both told and used"),
-        ("-- concept x: S.\n-- source: s\nMATCH (e) LIMIT $n", "'n' is not both told and used"),
-        ("-- concept x: S.\nMATCH (e)", "'x': it has no source"),
-        ("-- concept x: S.\n-- source: s\n", "'x': it has no text"),
+        ("-- concept x: S.\n-- param a = 3: m\nMATCH (e)", "'a' is not both declared and used"),
+        ("-- concept x: S.\n-- source: s\nMATCH (e) LIMIT $n", "'n' is not both declared and used"),
+        ("-- concept x: S.\nMATCH (e)", "'x': the source is missing"),
+        ("-- concept x: S.\n-- source: s\n", "'x': the text is missing"),
     ],
 )
 def test_a_file_that_cannot_be_read_says_where(text: str, reason: str) -> None:
@@ -222,7 +222,7 @@ def test_a_pattern_finds_its_drawn_example_and_not_its_counter_example(
 
     assert example in found
     assert not set(others) & found
-    assert "town" not in matches.left_out or "never known" in matches.reasons["town"]
+    assert "town" not in matches.left_out or "never has a value" in matches.reasons["town"]
 
 
 @pytest.mark.parametrize("name", FOUND)
@@ -312,7 +312,7 @@ def test_a_rule_says_by_how_much_it_is_kept(store: Store, name: str) -> None:
 
 def answered(verdict: Verdict) -> bool:
     """Whether a verdict is told, or what the recording does not say is: it has no control inputs."""
-    return verdict.verdict != "unknown" or "never known" in verdict.reason
+    return verdict.verdict != "unknown" or "never has a value" in verdict.reason
 
 
 def broken_in(verdict: Verdict) -> set[int]:

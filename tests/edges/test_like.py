@@ -180,7 +180,7 @@ def test_less_is_asked_of_more_frames(store: Store) -> None:
 
 
 def test_a_pattern_without_what_nothing_is_called_is_refused(store: Store) -> None:
-    with pytest.raises(QueryError, match="nothing to ignore is called 'buss'"):
+    with pytest.raises(QueryError, match="unknown kind or relation 'buss' to ignore"):
         store.pattern("town#3", ignore=["buss"])
 
 

@@ -527,7 +527,7 @@ def test_an_order_is_learned_from_another_store(
     ("options", "told"),
     [
         (["--by", "learned"], "--by learned needs --outcomes or --learn-outcomes"),
-        (["--learn-outcomes", "x.csv"], "belong to --by learned"),
+        (["--learn-outcomes", "x.csv"], "need --by learned"),
         (["--by", "learned", "--learn-from", "x"], "--learn-from needs --learn-outcomes"),
         (["--picture", "x.svg"], "--picture needs --outcomes"),
     ],
@@ -564,7 +564,7 @@ def test_a_measure_that_is_none_is_refused(
 @pytest.mark.parametrize(
     ("unit", "status", "told"),
     [
-        ("town#0", 0, "none of the 1 cases with a known outcome failed"),
+        ("town#0", 0, "all 1 cases with a known outcome passed"),
         ("nowhere#0", 2, "none of the 1 outcomes is about a case of"),
     ],
 )

@@ -95,7 +95,7 @@ def test_only_traces_with_a_hit_are_shown_unless_all_are_asked_for(
     out, err = capsys.readouterr()
     assert out.startswith("town  0 … ")
     assert "graphs  0" not in out
-    assert "in 1 more traces; --all shows them" in err
+    assert "1 more traces without matches or violations; --all shows them" in err
     assert run(["timeline", str(store), rule, "--all"]) == 0
     assert "graphs  0" in capsys.readouterr().out
 

@@ -97,11 +97,11 @@ def _bound(e: s.Temporal) -> Bound:
         raise _Refused("a formula over given propositions has no parameters", e.span)
     units = {end.unit == "frames" for end in (low, high) if end is not None and end.amount}
     if len(units) > 1:
-        raise _Refused("a bound is either in time or in frames", e.span)
+        raise _Refused("a bound must be in time or in frames, not both", e.span)
     frames = units == {True}
     ends = [None if end is None else int(end.amount) if frames else end.ns for end in (low, high)]
     if ends[1] is not None and ends[1] < (ends[0] or 0):
-        raise _Refused("the bound ends before it begins", e.span)
+        raise _Refused("the end of the bound is before its start", e.span)
     return Bound(ends[0] or 0, ends[1], frames)
 
 

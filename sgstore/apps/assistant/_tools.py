@@ -415,7 +415,7 @@ class StoreTools:
         if self._write_to is None:
             raise ExportError("nothing may be written: the server was started without --write-to")
         if not _NAME.fullmatch(name):
-            raise ExportError(f"{name!r} is no name of a folder; expected such as 'cut-ins_1'")
+            raise ExportError(f"{name!r} is not a folder name; expected such as 'cut-ins_1'")
         exporter_named(form)  # before the search starts
         reply = self._ask(
             "clips",

@@ -155,7 +155,7 @@ def run(arguments: list[str]) -> int:
         forget_asked()
     if code == ending.INTERRUPTED:  # typer also converts Ctrl-C to this code
         more = (
-            "; what was finished is in the store" if {*_verb_in(arguments)} & {*_PUBLISHING} else ""
+            "; the store has all finished work" if {*_verb_in(arguments)} & {*_PUBLISHING} else ""
         )
         complain(f"{ending.word()}{more}")
         return ending.exit_code()

@@ -42,17 +42,17 @@ def check(
     store: AskedPath,
     files: Annotated[
         list[Path] | None,
-        Argument(metavar="[FILE…]", help="Files of CHECK statements; - is stdin."),
+        Argument(metavar="[FILE…]", help="Files of CHECK statements; - reads stdin."),
     ] = None,
     explain: Annotated[
-        bool, Option("--explain", help="Print how the checks are understood, and their SQL.")
+        bool, Option("--explain", help="Print the parsed checks and their SQL.")
     ] = False,
     require: Annotated[
         bool, Option("--require", help="End with exit code 4 if a trace violates a check.")
     ] = False,
     junit: Annotated[
         Path | None,
-        Option(metavar="FILE", help="Write the verdicts as JUnit's XML, too, for build servers."),
+        Option(metavar="FILE", help="Also write the verdicts as JUnit XML, for build servers."),
     ] = None,
     *,
     whole: CollectionOptions,

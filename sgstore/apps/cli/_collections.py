@@ -44,14 +44,14 @@ def _statuses(done: Commit) -> list[tuple[str, str]]:
 
 def _new_in(done: Commit) -> str:
     if not done.added:
-        return f"nothing new; the last snapshot is {done.number}"
+        return f"no new traces; the last snapshot is {done.number}"
     told = f"{number_of(len(done.added), 'trace')} in {number_of(len(done.bundles), 'bundle')}"
     return f"{told}, snapshot {done.number}"
 
 
 collection = Verbs(
     name="collection",
-    help="Collections of stores, in a folder or an object store: make and look after them.",
+    help="Create and maintain collections of stores, in a folder or an object store.",
     no_args_is_help=True,
 )
 
@@ -62,7 +62,7 @@ def pack(
     url: Place,
     bundle_traces: Annotated[
         int | None,
-        Option("--bundle-traces", min=1, help="Most traces of a bundle.", show_default="1000"),
+        Option("--bundle-traces", min=1, help="Maximum traces in a bundle.", show_default="1000"),
     ] = None,
     *,
     out: PrintedRows,
@@ -76,7 +76,7 @@ def pack(
         )
     out.write(("trace", "status"), _statuses(done))
     for old, new in done.renamed.items():
-        say(f"{old}: the collection has another trace of this name, so it is {new!r} there")
+        say(f"{old}: the collection has another trace of this name; renamed to {new!r}")
     _say(url, _new_in(done))
     return 0
 
@@ -97,7 +97,7 @@ def commit(url: Place, *, out: PrintedRows) -> int:
 @collection.command()
 def unpack(
     url: Place,
-    store: Annotated[Path, Argument(metavar="STORE", help="The store that is made.")],
+    store: Annotated[Path, Argument(metavar="STORE", help="The store to write.")],
 ) -> int:
     """Copy all traces of a collection into one new store."""
     from sgstore.collection import unpack as unpack_all
@@ -125,7 +125,7 @@ def rebuild(
     url: Place,
     look_in: LookIn = None,
     everything: Annotated[
-        bool, Option("--all", help="Also bundles of this version of the schema.")
+        bool, Option("--all", help="Also rebuild bundles of the current schema version.")
     ] = False,
     jobs: Jobs = 1,
     *,
@@ -143,19 +143,19 @@ def rebuild(
             on_bundle=on_bundle,
         )
     out.write(("bundle", "is now"), made.items())
-    _say(url, f"{number_of(len(made), 'bundle')} made anew")
+    _say(url, f"{number_of(len(made), 'bundle')} rebuilt")
     return 0
 
 
 @collection.command()
 def gc(
     url: Place,
-    keep: Annotated[int, Option("--keep", min=1, help="Snapshots that stay, the last ones.")] = 1,
+    keep: Annotated[int, Option("--keep", min=1, help="Number of last snapshots to keep.")] = 1,
     older: Annotated[
         str,
-        Option("--older", metavar="TIME", help="Remove only files that were written so long ago."),
+        Option("--older", metavar="TIME", help="Remove only files older than this."),
     ] = "86400s",
-    dry_run: Annotated[bool, Option("--dry-run", help="Only say what would be removed.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Only list the files to remove.")] = False,
     *,
     out: PrintedRows,
 ) -> int:

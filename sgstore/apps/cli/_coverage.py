@@ -40,13 +40,14 @@ A = Annotated[
     str,
     Argument(
         metavar="A",
-        help="Frames: a store or a collection, STORE:QUERY for those that match, STORE:TESTS.lock for those of"
-        " a lock; TESTS.lock alone takes the store beside it that has its recordings.",
+        help="Frames: a store or a collection, STORE:QUERY for matching frames, STORE:TESTS.lock for the"
+        " frames of a lock; TESTS.lock alone uses the store in its folder with its recordings.",
     ),
 ]
-B = Annotated[str, Argument(metavar="B", help="Frames, as A.")]
+B = Annotated[str, Argument(metavar="B", help="Frames, written like A.")]
 Limit = Annotated[
-    int | None, Option("--limit", min=0, help="Rows at most; 0: all.", show_default="40 in a table")
+    int | None,
+    Option("--limit", min=0, help="Maximum rows; 0: all.", show_default="40 in a table"),
 ]
 Unit = Annotated[
     Literal["frame", "run", "trace"],
@@ -63,9 +64,9 @@ Slots = Annotated[
     Path | None, Option("--slots", metavar="FILE", help="TOML file with declared slots.")
 ]
 Missing = Annotated[
-    bool, Option("--missing", help="List what is missing, each with a query for it.")
+    bool, Option("--missing", help="List the missing items, each with a query for it.")
 ]
-Covered = Annotated[bool, Option("--covered", help="List what is covered, with its frames.")]
+Covered = Annotated[bool, Option("--covered", help="List the covered items, with their frames.")]
 Manoeuvres = Annotated[
     list[str] | None,
     Option(
@@ -164,7 +165,7 @@ def classes_(
 @coverage.command("of")
 def of_(
     a: A,
-    by: Annotated[str, Option("--by", metavar="B", help="Frames that cover it, as A.")],
+    by: Annotated[str, Option("--by", metavar="B", help="Frames that cover A, written like A.")],
     *,
     scenes: SceneOptions,
     ask: FrameAskOptions,
@@ -178,7 +179,7 @@ def of_(
 @coverage.command("novel")
 def novel_(
     a: A,
-    than: Annotated[str, Option("--not-in", metavar="B", help="Known frames, as A.")],
+    than: Annotated[str, Option("--not-in", metavar="B", help="Known frames, written like A.")],
     listing: Annotated[
         Literal["classes", "frames", "clips"],
         Option("--list", help="Classes, frames, or clips of consecutive frames."),
@@ -207,7 +208,7 @@ def venn_(a: A, b: B, *, scenes: SceneOptions, ask: FrameAskOptions) -> None:
 def growth_(
     a: A,
     unit: Unit = "frame",
-    points: Annotated[int, Option("--points", min=2, help="Rows of the curve.")] = 40,
+    points: Annotated[int, Option("--points", min=2, help="Number of rows of the curve.")] = 40,
     picture: Picture = None,
     *,
     scenes: SceneOptions,
@@ -240,14 +241,14 @@ def combos_(
     ] = None,
     abstraction: Abstraction = "RSV",
     of_ego: Annotated[
-        bool, Option("--ego", help="Only features of the ego, and of lanes as it has them.")
+        bool, Option("--ego", help="Use only features of the ego and of its lanes.")
     ] = False,
     slots: Slots = None,
     missing: Missing = False,
     covered: Covered = False,
     picture: Picture = None,
     top: Annotated[
-        int, Option("--top", min=2, help="Features in the picture: those with the most gaps.")
+        int, Option("--top", min=2, help="Features in the picture, most gaps first.")
     ] = 40,
     limit: Limit = None,
     *,
@@ -258,7 +259,7 @@ def combos_(
 
     if slots is not None:
         if by or of_ego:
-            raise typer.BadParameter("--slots declares what there is: not with --by or --ego")
+            raise typer.BadParameter("--slots cannot be combined with --by or --ego")
         ask.report(_slot_table(a, slots, k, ask, covered=covered, missing=missing), limit)
         if picture is not None:
             _slot_picture(a, slots, ask, picture)
@@ -288,9 +289,9 @@ def sequences_(
     ] = None,
     manoeuvres: Manoeuvres = None,
     within: Within = None,
-    missing: Annotated[bool, Option("--missing", help="List what is missing.")] = False,
+    missing: Annotated[bool, Option("--missing", help="List the missing items.")] = False,
     covered: Annotated[
-        bool, Option("--covered", help="List what is covered, with where it happens first.")
+        bool, Option("--covered", help="List the covered items, with their first place.")
     ] = False,
     limit: Limit = None,
     *,
@@ -324,11 +325,9 @@ def spec_(
         Argument(metavar="QUERY", help="'MATCH … RETURN a, b': each combination is a cell."),
     ] = None,
     slots: Slots = None,
-    cells: Annotated[
-        int, Option("--cells", min=0, help="How many cells there are, if that is known.")
-    ] = 0,
+    cells: Annotated[int, Option("--cells", min=0, help="Number of cells, if known.")] = 0,
     by: Annotated[
-        str | None, Option("--by", metavar="B", help="The cells are those that occur in B.")
+        str | None, Option("--by", metavar="B", help="Use the cells that occur in B.")
     ] = None,
     missing: Missing = False,
     covered: Covered = False,
@@ -341,19 +340,19 @@ def spec_(
     from sgstore.testsets.coverage import specification
 
     if (query is None) == (slots is None):
-        raise typer.BadParameter("give a query, or a file with --slots FILE")
+        raise typer.BadParameter("add a query, or a file with --slots FILE")
     if query is None or slots is not None:
         if by or cells:
-            raise typer.BadParameter("--slots declares what there is: not with --by or --cells")
+            raise typer.BadParameter("--slots cannot be combined with --by or --cells")
         declared = slots or Path()
         ask.report(_slot_table(a, declared, 0, ask, covered=covered, missing=missing), limit)
         if picture is not None:
             _slot_picture(a, declared, ask, picture)
         return
     if picture is not None:
-        raise typer.BadParameter("--picture draws pairs of values of declared slots: give --slots")
+        raise typer.BadParameter("--picture draws pairs of values of declared slots; add --slots")
     if by and cells:
-        raise typer.BadParameter("give one of --by and --cells")
+        raise typer.BadParameter("expected only one of --by and --cells")
     chosen, *reference = ask.frames(a, *([by] if by else []))
     say_scope(chosen.scope(world=False), ask.chosen)
     tables = specification(chosen, query, cells, *reference)
@@ -380,12 +379,12 @@ def windows_(
 @coverage.command("explain")
 def explain_(
     b: B,
-    versus: Annotated[str, Option("--vs", metavar="A", help="Frames to compare with, as B.")],
+    versus: Annotated[str, Option("--vs", metavar="A", help="Frames to compare with, like B.")],
     abstraction: Abstraction = "RSV",
     tree: Annotated[
         bool, Option("--tree", help="Print a decision tree of a few questions instead.")
     ] = False,
-    depth: Annotated[int, Option("--depth", min=1, max=10, help="Questions at most.")] = 4,
+    depth: Annotated[int, Option("--depth", min=1, max=10, help="Maximum questions.")] = 4,
     frames: Annotated[bool, Option("--frames", help="Weight classes by their frames.")] = False,
     limit: Limit = None,
     *,

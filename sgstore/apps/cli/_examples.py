@@ -7,19 +7,19 @@ from typing import Final
 EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     "": (
         "demo  # all of it on the bundled recording, into sgstore-demo/",
-        "find drives.sgstore -p jaywalking  # when a pattern of the library holds",
+        "find drives.sgstore -p jaywalking  # the matches of a library pattern",
     ),
     "ingest": (
-        "ingest drives.sgstore recordings/  # what is new in a folder",
+        "ingest drives.sgstore recordings/  # the new recordings of a folder",
         "ingest drives.sgstore 'day*/**/*.mcap' --jobs 4  # four recordings at a time",
     ),
     "info": (
         "info drives.sgstore  # its traces",
-        "info drives.sgstore --trace town  # all about one of them",
+        "info drives.sgstore --trace town  # details of one trace",
     ),
     "doctor": (
-        "doctor town.mcap  # what would be read of it, and what is wrong with it",
-        "doctor recordings/ --json  # the same of all in a folder, for a program",
+        "doctor town.mcap  # list the readable contents and the faults",
+        "doctor recordings/ --json  # the same for all files of a folder, for a program",
     ),
     "record": (
         "record drive.mcap --duration 60s  # a minute of a running CARLA",
@@ -30,31 +30,31 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "import graphs.sgstore edges.csv --format csv --kind sedan=car  # edges of a graph, a line each",
     ),
     "verify": (
-        "verify drives.sgstore  # is the store as it was published",
-        "verify drives.sgstore --payloads  # are its recordings, too",
+        "verify drives.sgstore  # check that the store is unchanged",
+        "verify drives.sgstore --payloads  # check its recordings, too",
     ),
     "remove": (
-        "remove drives.sgstore monday  # take a trace out",
-        "remove drives.sgstore --compact  # free the space of what was taken out",
+        "remove drives.sgstore monday  # remove a trace",
+        "remove drives.sgstore --compact  # free the space of removed traces",
     ),
     "rebuild": (
-        "rebuild drives.sgstore --jobs 4  # anew from its recordings",
-        "rebuild drives.sgstore --look-in /data/moved  # which have moved",
+        "rebuild drives.sgstore --jobs 4  # from its recordings",
+        "rebuild drives.sgstore --look-in /data/moved  # after the recordings moved",
     ),
     "derive": (
         "derive drives.sgstore --config near.toml --as near  # relations with other thresholds",
-        "derive drives.sgstore  # which sets there are",
+        "derive drives.sgstore  # list the sets of relations",
     ),
     "map": (
-        "map Town01.xodr -o map.png  # what is in it, and a picture",
-        "map town.mcap --json  # of the map that a recording carries",
+        "map Town01.xodr -o map.png  # list the contents and draw a picture",
+        "map town.mcap --json  # the map in a recording",
     ),
     "payload": (
         "payload drives.sgstore town#264  # channels of a frame",
-        "payload drives.sgstore town#264 /ego/camera/front/image -o frame.jpg  # what the camera saw",
+        "payload drives.sgstore town#264 /ego/camera/front/image -o frame.jpg  # the camera picture",
     ),
     "config": (
-        "config > settings.toml  # all settings, each with what it means",
+        "config > settings.toml  # all settings, each with its meaning",
         "config --list  # the presets",
     ),
     "demo": (
@@ -63,18 +63,18 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "find": (
         "find drives.sgstore 'MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 5'  # near misses",
-        "find drives.sgstore -p jaywalking --count  # in how many frames a pattern of the library holds",
+        "find drives.sgstore -p jaywalking --count  # the number of frames with a match",
     ),
     "why-not": (
-        "why-not drives.sgstore town@20s -p jaywalking  # what fails first in this frame",
-        "why-not drives.sgstore town#200 'MATCH (e:Ego) WHERE e.speed > 20'  # and how near it came",
+        "why-not drives.sgstore town@20s -p jaywalking  # the first condition that fails in this frame",
+        "why-not drives.sgstore town#200 'MATCH (e:Ego) WHERE e.speed > 20'  # and the nearest value",
     ),
     "like": (
-        "like drives.sgstore town@20s  # the best of each trace",
-        "like drives.sgstore town@20s --ignore person --all  # all runs of frames, whoever walks there",
+        "like drives.sgstore town@20s  # the best frames of each trace",
+        "like drives.sgstore town@20s --ignore person --all  # all runs of frames, without persons",
     ),
     "translate": (
-        "translate properties.py  # SGSM's properties in this language",
+        "translate properties.py  # translate SGSM properties to the query language",
         "translate properties.py -o properties.sgql  # to be checked: sgstore check STORE properties.sgql",
     ),
     "sql": (
@@ -83,7 +83,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "patterns": (
         "patterns search pedestrian crossing  # by words",
-        "patterns run drives.sgstore cut_in  # when it holds, and who takes part",
+        "patterns run drives.sgstore cut_in  # the matches and their entities",
     ),
     "patterns list": (
         "patterns list  # all of them",
@@ -106,7 +106,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "check drives.sgstore rules.sgql --require --junit verdicts.xml  # in a build, with exit code 4",
     ),
     "monitor": (
-        "monitor town.mcap rules.sgql  # frame by frame, as if live",
+        "monitor town.mcap rules.sgql  # frame by frame, like a live run",
         "monitor carla://localhost:2000 -p phi1 --duration 60s  # a running CARLA",
     ),
     "timeline": (
@@ -114,16 +114,16 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "timeline drives.sgstore -p crossing_pedestrian --parts town@26.4s  # where each part of it holds",
     ),
     "coverage": (
-        "coverage classes drives.sgstore  # which scenes there are, and how many are unseen",
-        "coverage of new.sgstore --by drives.sgstore  # what of the new is known",
+        "coverage classes drives.sgstore  # count the scenes and estimate the unseen ones",
+        "coverage of new.sgstore --by drives.sgstore  # the share of known scenes",
     ),
     "coverage classes": (
-        "coverage classes drives.sgstore --picture classes.png  # and how frequent they are",
-        "coverage classes drives.sgstore --abstraction EL --unit trace  # how many traces have each",
+        "coverage classes drives.sgstore --picture classes.png  # and their frequencies",
+        "coverage classes drives.sgstore --abstraction EL --unit trace  # the number of traces with each class",
     ),
     "coverage of": (
         "coverage of new.sgstore --by drives.sgstore  # by classes and by frames",
-        "coverage of drives.sgstore --by tests.lock  # how much a test set has",
+        "coverage of drives.sgstore --by tests.lock  # the coverage of a test set",
     ),
     "coverage novel": (
         "coverage novel new.sgstore --not-in drives.sgstore  # the rarest first",
@@ -134,7 +134,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "coverage venn 'drives.sgstore:MATCH (e:Ego) WHERE e.speed > 8' drives.sgstore  # fast frames, and all",
     ),
     "coverage growth": (
-        "coverage growth drives.sgstore --picture growth.png  # would more data help",
+        "coverage growth drives.sgstore --picture growth.png  # estimate the gain of more data",
         "coverage growth drives.sgstore --unit trace --points 10  # trace by trace",
     ),
     "coverage combos": (
@@ -143,7 +143,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "coverage sequences": (
         "coverage sequences drives.sgstore --covered  # sequences of manoeuvres, with a place",
-        "coverage sequences new.sgstore --by drives.sgstore --missing  # what the new one lacks",
+        "coverage sequences new.sgstore --by drives.sgstore --missing  # the missing sequences",
     ),
     "coverage spec": (
         "coverage spec drives.sgstore --slots slots.toml --missing  # of a declared specification",
@@ -155,30 +155,30 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "coverage explain": (
         "coverage explain new.sgstore --vs drives.sgstore  # features that differ most",
-        "coverage explain new.sgstore --vs drives.sgstore --tree  # a few questions that tell them apart",
+        "coverage explain new.sgstore --vs drives.sgstore --tree  # a decision tree that separates them",
     ),
     "coverage failures": (
-        "coverage failures --train old.sgstore --test new.sgstore --outcomes runs.csv  # which are novel",
+        "coverage failures --train old.sgstore --test new.sgstore --outcomes runs.csv  # the novel failures",
         "coverage failures --train old.sgstore --test new.sgstore --outcomes runs.csv --json  # for a program",
     ),
     "select": (
-        "select drives.sgstore --minimal --unit clip -o tests.lock  # few clips that keep all classes",
+        "select drives.sgstore --minimal --unit clip -o tests.lock  # the fewest clips with all classes",
         "select drives.sgstore --rarest --budget 10min --unit clip  # ten minutes of the rarest",
     ),
     "criticality": (
-        "criticality drives.sgstore -m pet -m tet  # measures of recorded encounters, one row per pair",
-        "criticality drives.sgstore -m pet --most 1.5 -o close.csv  # as a table: who came close",
+        "criticality drives.sgstore -m pet -m tet  # criticality measures, one row for each pair",
+        "criticality drives.sgstore -m pet --most 1.5 -o close.csv  # the close pairs, as a table",
     ),
     "prioritize": (
         "prioritize drives.sgstore --unit clip -o order.lock  # the most critical first",
-        "prioritize drives.sgstore --outcomes runs.csv --picture found.png  # how soon failures come",
+        "prioritize drives.sgstore --outcomes runs.csv --picture found.png  # the failures found over time",
     ),
     "diff": (
-        "diff before.sgstore after.sgstore -p cut_in  # which matches came and went",
+        "diff before.sgstore after.sgstore -p cut_in  # list new and lost matches",
         "diff before.sgstore after.sgstore --by-frame --require  # in a build: exit code 4 if scenes differ",
     ),
     "lock": (
-        "lock verify tests.lock drives.sgstore  # is it the very same set",
+        "lock verify tests.lock drives.sgstore  # check that the set is unchanged",
         "lock union monday.lock tuesday.lock -o both.lock  # two sets as one",
     ),
     "lock verify": (
@@ -195,14 +195,14 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "lock intersect": (
         "lock intersect monday.lock tuesday.lock -o same.lock  # cases of both",
-        "lock intersect tests.lock failed.lock -o again.lock  # of a set, those that failed",
+        "lock intersect tests.lock failed.lock -o again.lock  # the failed cases of a set",
     ),
     "lock minus": (
-        "lock minus tests.lock known.lock -o open.lock  # cases that are left",
-        "lock minus new.lock tests.lock -o added.lock  # what came anew",
+        "lock minus tests.lock known.lock -o open.lock  # the remaining cases",
+        "lock minus new.lock tests.lock -o added.lock  # the added cases",
     ),
     "show": (
-        "show drives.sgstore town@26.4s -o frame.png  # from above, and what the camera saw",
+        "show drives.sgstore town@26.4s -o frame.png  # the top view and the camera picture",
         "show drives.sgstore town@25s..31s -p crossing_pedestrian -o clip.gif  # a clip, the match marked",
     ),
     "export": (
@@ -210,7 +210,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "export drives.sgstore -p cut_in --format xosc --to scenarios  # to be driven again",
     ),
     "shrink": (
-        "shrink drives.sgstore -p cut_in --to least  # the fewest frames that still match",
+        "shrink drives.sgstore -p cut_in --to least  # cut to the fewest frames that still match",
         "shrink drives.sgstore 'CHECK ALWAYS ego.speed < 9' --clip town@0s..30s --to least  # that violate",
     ),
     "serve": (
@@ -227,14 +227,14 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
     ),
     "collection": (
         "collection pack drives.sgstore fleet/  # a store becomes a collection",
-        "collection verify fleet/  # is all as it was committed",
+        "collection verify fleet/  # check that all files are unchanged",
     ),
     "collection pack": (
         "collection pack drives.sgstore fleet/  # into a folder",
         "collection pack drives.sgstore s3://bucket/fleet --bundle-traces 100  # into an object store",
     ),
     "collection commit": (
-        "collection commit fleet/  # what has landed becomes part of it",
+        "collection commit fleet/  # add the landed recordings",
         "collection commit s3://bucket/fleet --json  # for a program",
     ),
     "collection unpack": (
@@ -242,7 +242,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "collection unpack s3://bucket/fleet drives.sgstore  # from an object store",
     ),
     "collection verify": (
-        "collection verify fleet/  # is all as it was committed",
+        "collection verify fleet/  # check that all files are unchanged",
         "collection verify s3://bucket/fleet --json  # for a program",
     ),
     "collection rebuild": (
@@ -250,7 +250,7 @@ EXAMPLES: Final[dict[str, tuple[str, ...]]] = {
         "collection rebuild fleet/ --all --look-in /data/moved  # all of them, from recordings that moved",
     ),
     "collection gc": (
-        "collection gc fleet/ --dry-run  # what nobody needs any more",
+        "collection gc fleet/ --dry-run  # list the unused files",
         "collection gc fleet/ --keep 3 --older 60min  # remove it, but keep three snapshots",
     ),
 }

@@ -60,7 +60,7 @@ class ClipOptions:
         bool,
         Option(
             "--with-graph",
-            help="mcap: with the scene graphs, as JSON and to draw.",
+            help="mcap: include the scene graphs, as JSON and as drawings.",
         ),
     ] = False
     mounts: Annotated[
@@ -76,7 +76,7 @@ class ClipOptions:
         bool,
         Option(
             "--rebase-context",
-            help="mcap: put the map and the like, which stand before a clip, right beside it.",
+            help="mcap: move static messages, such as the map, to the start of each clip.",
         ),
     ] = False
     abstraction: Annotated[
@@ -85,14 +85,14 @@ class ClipOptions:
     ] = ""
     graphml: Annotated[
         bool,
-        Option("--graphml", help="nx: each frame as GraphML, too, for Gephi."),
+        Option("--graphml", help="nx: also write each frame as GraphML, for Gephi."),
     ] = False
     channels: Annotated[
         list[str] | None,
         Option(
             "--channel",
             metavar="TOPIC",
-            help="frames: only of this sensor; repeatable.",
+            help="frames: use only this sensor; repeatable.",
         ),
     ] = None
     clouds: Annotated[
@@ -123,7 +123,8 @@ def export(
     store: StorePath,
     question: Question,
     to: Annotated[
-        Path, Option("--to", metavar="DIR", help="Folder to write into; nothing is overwritten.")
+        Path,
+        Option("--to", metavar="DIR", help="Folder to write; no file is overwritten."),
     ] = Path("clips"),
     frames: Annotated[
         Path | None,
@@ -139,7 +140,7 @@ def export(
         str,
         Option(
             "--format",
-            help="mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, or of a package.",
+            help="mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, or that of a package.",
             autocompletion=completion.formats,
         ),
     ] = "mcap",
@@ -170,13 +171,13 @@ def export(
     values = parameters_of(question.parameters)
     margins = seconds_of(clip.before, "--before"), seconds_of(clip.after, "--after")
     if sum((frames is not None, lock is not None, bool(question))) > 1:
-        raise typer.BadParameter("give one of: a QUERY, --frames, --lock")
+        raise typer.BadParameter("expected one of: a QUERY, --frames, --lock")
     text, held = "", {}
     if frames is None and lock is None:
         text, held = question.asked()
     clips = _clips(opened, (frames, lock), text, held, margins)
     if not clips:
-        say("nothing matches: nothing to export")
+        say("no matches to export")
         return 0
     with count_bar(to.name or "export", "clips") as progress:
         told = {"query": text} if text else {"lock": lock.name} if lock else {}
@@ -239,7 +240,7 @@ def shrink(
         Option(
             "--to",
             metavar="DIR",
-            help="Folder to write the clips into, with the original messages; nothing is overwritten.",
+            help="Folder for the clips, with the original messages; existing files are not overwritten.",
         ),
     ] = None,
     *,
@@ -266,7 +267,7 @@ def shrink(
     else:
         say_left_out(opened.find(text, **values))
     if not found:
-        say(f"nothing {'violates' if checks else 'matches'}: nothing to cut")
+        say(f"no {'violations' if checks else 'matches'} to cut")
     written: dict[Clip, WrittenClip | WrittenFile] = {}
     if to is not None and found:
         written = _cut_out(opened, list(dict.fromkeys(one.clip for one in found)), text, to)
@@ -303,7 +304,7 @@ class DrawOptions:
     """Command line options for drawing a frame or an animation."""
 
     relations: Annotated[
-        Literal["ego", "all", "none"], Option("--relations", help="Which edges are drawn.")
+        Literal["ego", "all", "none"], Option("--relations", help="Edges to draw.")
     ] = "ego"
     camera: Annotated[
         str | None,
@@ -312,18 +313,18 @@ class DrawOptions:
     radius: Annotated[
         float | None, Option("--radius", help="Half the side of the window, in metres.")
     ] = None
-    north_up: Annotated[bool, Option("--north-up", help="North is up, not the ego's heading.")] = (
-        False
-    )
-    diagram: Annotated[bool, Option("--graph", help="Beside it the graph as nodes and edges.")] = (
+    north_up: Annotated[
+        bool, Option("--north-up", help="Draw north up, not the ego's heading.")
+    ] = False
+    diagram: Annotated[bool, Option("--graph", help="Also draw the graph as nodes and edges.")] = (
         False
     )
     names: Annotated[
         Literal["number", "ident", "type"],
-        Option("--names", help="What entities are called: by number, the simulator's id or type."),
+        Option("--names", help="Labels of entities: number, id or type of the simulator."),
     ] = "number"
     fps: Annotated[
-        float, Option("--fps", min=0.1, max=50.0, help="Pictures a second of an animation.")
+        float, Option("--fps", min=0.1, max=50.0, help="Pictures per second of an animation.")
     ] = 10.0
 
     def options(self, matches: Matches | None) -> dict[str, Any]:
@@ -373,6 +374,6 @@ def show(
         with count_bar(output.name, "pictures") as bar:
             marked = draw_clip(opened, clip, output, fps=drawn.fps, on_frame=bar, **options)
     if text and not marked:
-        say(f"the query does not match in {frame}: nothing is marked")
+        say(f"the query does not match in {frame}; the picture has no marks")
     typer.echo(output)
     return 0

@@ -64,7 +64,7 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
 def _word(verdict: Verdict) -> str:
     """Return a verdict of a check as text for a report, without its reason."""
     return (
-        "still due at the end of the recording" if verdict.verdict == "pending" else verdict.verdict
+        "pending at the end of the recording" if verdict.verdict == "pending" else verdict.verdict
     )
 
 

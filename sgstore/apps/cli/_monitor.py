@@ -37,7 +37,7 @@ verbs = Verbs()
 
 SensorFile = Annotated[
     Path | None,
-    Option("--sensors", help="With --serve, of a CARLA: cameras for its ego, as record has them."),
+    Option("--sensors", help="With --serve: cameras for the ego of CARLA, as for record."),
 ]
 
 
@@ -48,20 +48,22 @@ def monitor(
     ],
     files: Annotated[
         list[Path] | None,
-        Argument(metavar="[FILE…]", help="Files of CHECK and MATCH statements; - is stdin."),
+        Argument(metavar="[FILE…]", help="Files of CHECK and MATCH statements; - reads stdin."),
     ] = None,
     ego: Annotated[
-        str, Option("--ego", help="Id, role or name of the ego; else as the recording says.")
+        str,
+        Option("--ego", help="Ego: id, role or name; by default that of the recording."),
     ] = "",
     duration: Annotated[
-        str | None, Option("--duration", metavar="TIME", help="Simulation time: 60s.")
+        str | None,
+        Option("--duration", metavar="TIME", help="Simulation time: 60s."),
     ] = None,
     require: Annotated[
         bool, Option("--require", help="End with exit code 4 if a check is violated.")
     ] = False,
     as_json: AsJson = False,
-    serve: Annotated[bool, Option("--serve", help="Show a page of it while it goes on.")] = False,
-    port: Annotated[int, Option("--port", min=0, max=65535, help="Of the page; 0: any.")] = 0,
+    serve: Annotated[bool, Option("--serve", help="Show the running monitor on a page.")] = False,
+    port: Annotated[int, Option("--port", min=0, max=65535, help="Its port; 0: any free.")] = 0,
     sensors: SensorFile = None,
     *,
     statements: Statements,
@@ -113,7 +115,7 @@ def _sensors(file: Path | None, *, shown: bool) -> list[Sensor]:
     from sgstore.readers import load_sensors
 
     if file is not None and not shown:
-        told = "--sensors is for the page of a running CARLA: carla://HOST:PORT --serve"
+        told = "--sensors needs the page of a running CARLA: carla://HOST:PORT --serve"
         raise typer.BadParameter(told)
     return [] if file is None else load_sensors(file)
 
@@ -142,7 +144,7 @@ def _watched_on_a_page(
         verdicts = watched.run(frames, duration_s=longest)
         page.end(verdicts)
         if not was_ended():
-            say("the page stays until Ctrl-C")
+            say("the page is served until Ctrl-C")
             with suppress(KeyboardInterrupt):
                 threading.Event().wait()
     return watched, verdicts

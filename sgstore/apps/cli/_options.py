@@ -49,7 +49,7 @@ class Verb(TyperCommand):
             for parameter, times in given.items():
                 if times > 1 and _says_one_thing(parameter):
                     raise typer.BadParameter(
-                        f"given {times} times, but it takes one value", ctx=ctx, param=parameter
+                        f"has {times} values; expected one", ctx=ctx, param=parameter
                     )
             rest = super().parse_args(ctx, args)
         except Exception as error:
@@ -114,7 +114,7 @@ def _advise(error: Any, verb: Verb) -> None:
         error.message = f"{error.message}; write LIMIT 10 at the end of {_LIMITED[verb.name]}"
     places = _places(verb)
     if type(error).__name__ == "MissingParameter" and error.param.name in places[1:]:
-        error.message = "The store comes first."
+        error.message = "Write the store first."
 
 
 def _places(verb: Verb) -> list[str]:
@@ -132,7 +132,7 @@ def _refuse_late_store(verb: Verb, ctx: Any) -> None:
     found = next((one for one in later if one is not None and _is_database(one)), None)
     if found is not None:
         raise typer.BadParameter(
-            f"{values[0]} is no store, but {found} is: the store comes first", ctx=ctx
+            f"{values[0]} is not a store, but {found} is; write the store first", ctx=ctx
         )
 
 
@@ -242,7 +242,7 @@ AskedPath = Annotated[
     Argument(
         metavar="STORE",
         envvar=STORE,
-        help="The store: one DuckDB file; or a collection of them.",
+        help="The store, one DuckDB file; or a collection of stores.",
         autocompletion=completion.stores,
     ),
 ]
@@ -259,7 +259,7 @@ Parameters = Annotated[
     Option(
         "--param",
         metavar="NAME=VALUE",
-        help="Value of $NAME in the query, a list as [1, 2]; repeatable.",
+        help="Value of $NAME in the query; write a list as [1, 2]; repeatable.",
     ),
 ]
 With = Annotated[
@@ -273,7 +273,7 @@ With = Annotated[
 ]
 QueryText = Annotated[str | None, Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")]
 QueryFile = Annotated[
-    Path | None, Option("--file", "-f", help="Read the query from a file; - is stdin.")
+    Path | None, Option("--file", "-f", help="Read the query from a file; - reads stdin.")
 ]
 
 
@@ -299,33 +299,33 @@ Abstraction = Annotated[
     ),
 ]
 Picture = Annotated[
-    Path | None, Option("--picture", metavar="FILE", help="Also draw it: .png or .svg.")
+    Path | None, Option("--picture", metavar="FILE", help="Picture to draw: .png or .svg.")
 ]
 Traces = Annotated[
     list[str] | None,
-    Option("--trace", help="Only this trace; repeatable.", autocompletion=completion.traces),
+    Option("--trace", help="Use only this trace; repeatable.", autocompletion=completion.traces),
 ]
 LookIn = Annotated[
     list[Path] | None,
     Option(
         "--look-in",
         metavar="FOLDER",
-        help="Folder to look in for recordings that were moved; repeatable.",
+        help="Folder with recordings that were moved; repeatable.",
     ),
 ]
 Jobs = Annotated[
-    int, Option("--jobs", "-j", min=0, help="Recordings read at a time; 0: one for each core.")
+    int, Option("--jobs", "-j", min=0, help="Recordings to read at a time; 0: one per core.")
 ]
 ROWS: Final = "Rows"
 LIMITS: Final = "Limits"
 MESSAGES: Final = "Messages"
 Quiet = Annotated[
     bool,
-    Option("--quiet", help="Only results and errors, no remarks.", rich_help_panel=MESSAGES),
+    Option("--quiet", help="Print only results and errors.", rich_help_panel=MESSAGES),
 ]
 Verbose = Annotated[
     bool,
-    Option("--verbose", help="Also what is done, and when, on stderr.", rich_help_panel=MESSAGES),
+    Option("--verbose", help="Also log steps and times on stderr.", rich_help_panel=MESSAGES),
 ]
 _TALK: Final = {"quiet": Quiet, "verbose": Verbose}
 """Options of every verb."""
@@ -437,7 +437,7 @@ class QueryLimits:
         Option(
             "--max-spill",
             metavar="SIZE",
-            help="Most disk space for what does not fit into memory: 500MB, 50GB.",
+            help="Maximum disk space for data that exceeds memory: 500MB, 50GB.",
             show_default="10GB",
             rich_help_panel=LIMITS,
         ),
@@ -467,7 +467,7 @@ class QueryLimits:
         for name, joined in opened.file.joined().items():
             if joined.matched < joined.rows:
                 lost = joined.rows - joined.matched
-                say(f"{name}: {lost} of {joined.rows} rows belong to no frame of the store")
+                say(f"{name}: {lost} of {joined.rows} rows do not refer to a frame of the store")
         return opened
 
 
@@ -507,10 +507,7 @@ class Statements:
     ] = None
     parameters: Parameters = None
     sgsm_compat: Annotated[
-        bool,
-        Option(
-            "--sgsm-compat", help="Violated if any beginning of a trace is, as SGSM reports it."
-        ),
+        bool, Option("--sgsm-compat", help="Violated if any prefix of a trace is, as in SGSM.")
     ] = False
 
     def asked(self, files: Sequence[Path] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
@@ -528,7 +525,7 @@ class Statements:
 
         values, texts = parameters_of(self.parameters), self.texts or []
         if not (files or self.names or texts):
-            raise typer.BadParameter("give a FILE, -p NAME or -e TEXT; several are asked together")
+            raise typer.BadParameter("add a FILE, -p NAME or -e TEXT; they can be combined")
         found = {one.name: one for one in map(pattern_named, self.names or ())}
         taken = {name for one in found.values() for name in one.parameters}
         rest = {name: value for name, value in values.items() if name not in taken}
@@ -553,7 +550,7 @@ class GraphOptions:
         Option(
             "--preset",
             metavar="NAME",
-            help="Settings with a name: see config --list.",
+            help="Name of a preset; config --list shows them.",
             autocompletion=completion.presets,
         ),
     ] = None
@@ -567,7 +564,7 @@ class GraphOptions:
         from sgstore.model.config import preset as preset_named
 
         if self.config and self.preset:
-            raise typer.BadParameter("give --config or --preset; a file may name a preset itself")
+            raise typer.BadParameter("use --config or --preset; a file can name a preset")
         if self.preset:
             return preset_named(self.preset)
         return load(self.config) if self.config else None
@@ -581,7 +578,7 @@ class ReadingOptions(GraphOptions):
         Path | None,
         Option(
             "--map",
-            help="OpenDRIVE or Lanelet2 file, or folder of them, for recordings without a map of their own.",
+            help="OpenDRIVE or Lanelet2 file, or a folder of them, for recordings without a map.",
         ),
     ] = None
 
@@ -602,14 +599,14 @@ _ENDINGS: Final = {
 def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Format:
     """Return the output format that ``--format``, ``--json`` or the suffix of the output file selects."""
     if as_json and form not in {Format.table, Format.json}:
-        raise typer.BadParameter(f"give one of --json and --format {form}")
+        raise typer.BadParameter(f"expected only one of --json and --format {form}")
     if as_json or form is not Format.table or output is None:
         return Format.json if as_json else form
     found = _ENDINGS.get(output.suffix.lower())
     if found is None:
         known = ", ".join(filter(None, _ENDINGS))
         raise typer.BadParameter(
-            f"--output {output}: nothing is written as '{output.suffix}'; expected one of {known}"
+            f"--output {output}: unknown format '{output.suffix}'; expected one of {known}"
         )
     return found
 
@@ -624,7 +621,7 @@ def tables_of(given: list[str] | None) -> dict[str, Path]:
         if not name.isidentifier():
             raise typer.BadParameter(f"--with {text!r}: expected NAME=FILE, such as labels={file}")
         if name in tables:
-            raise typer.BadParameter(f"--with: two tables are called {name!r}; write NAME=FILE")
+            raise typer.BadParameter(f"--with: two tables have the name {name!r}; write NAME=FILE")
         tables[name] = file
     return tables
 
@@ -632,7 +629,7 @@ def tables_of(given: list[str] | None) -> dict[str, Path]:
 def query_of(text: str | None, file: Path | None) -> str:
     """Return the text of a query, from an argument or from a file."""
     if (text is None) == (file is None):
-        raise typer.BadParameter("give a query as an argument, or a file with -f FILE")
+        raise typer.BadParameter("add a query as an argument, or a file with -f FILE")
     return text if text is not None else text_of(file or Path("-"))
 
 
@@ -641,7 +638,7 @@ def asked_of(
 ) -> tuple[str, Mapping[str, Any]]:
     """Return the text of a query (argument, file or library name), and the values of its parameters."""
     if sum(source is not None for source in (text, file, name)) != 1:
-        raise typer.BadParameter("give one of: a query as a text, a file with it, -p NAME")
+        raise typer.BadParameter("expected one of: a query, -f FILE, -p NAME")
     if name is None:
         return query_of(text, file), values
     from sgstore.lang.library import pattern_named
@@ -655,7 +652,7 @@ def text_of(file: Path) -> str:
         return sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         written = re.match(r"\s*(MATCH|CHECK|DEFINE|USING)\b", str(file))
-        hint = "; this is a query, and no file of that name" if written else ""
+        hint = "; this is a query, not the name of a file" if written else ""
         raise ConfigError(f"{file}: {getattr(error, 'strerror', None) or error}{hint}") from error
 
 
@@ -735,7 +732,7 @@ def say_left_out(
     for name, reason in matches.reasons.items():
         of.setdefault(reason, []).append(name)
     for reason, names in of.items():
-        say(f"left out, because they cannot answer this query ({reason}): {', '.join(names)}")
+        say(f"skipped, because they lack data for this query ({reason}): {', '.join(names)}")
     say_notes(getattr(matches, "notes", ()))
 
 

@@ -359,7 +359,7 @@ def write_binary(write: Callable[[Path], int], form: Format, output: Path | None
         return write(output)
     if output is None and sys.stdout.isatty():
         raise ExportError(
-            f"{form.capitalize()} is not for a terminal: name a file with -o FILE, or redirect stdout"
+            f"{form.capitalize()} cannot be printed on a terminal; add -o FILE, or redirect stdout"
         )
     from sgstore.store import ParquetTable
 

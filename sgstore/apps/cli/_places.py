@@ -50,7 +50,7 @@ class CollectionOptions:
         bool,
         Option(
             "--partial",
-            help="Of a collection: answer without bundles that cannot be asked; exit code 3.",
+            help="Skip bundles of a collection that fail; exit code 3.",
             rich_help_panel=COLLECTIONS,
         ),
     ] = False
@@ -63,9 +63,9 @@ class CollectionOptions:
         from sgstore.collection import Collection
 
         if safe:
-            raise typer.BadParameter("--safe asks one store; a collection is asked without it")
+            raise typer.BadParameter("--safe is not supported for a collection; leave it out")
         if bounds.max_spill is not None:
-            reason = "--max-spill bounds a question to one store, not to a collection"
+            reason = "--max-spill is not supported for a collection; use one store"
             raise typer.BadParameter(reason)
         bounds.spill()
         how: dict[str, Any] = {"engine": self.engine, "partial": self.partial}
@@ -91,8 +91,8 @@ def note_asked(store: Store | Collection) -> None:
         _asked.append(whole)
         if not whole.snapshot.bundles:
             say(
-                f"{whole.place.url}: nothing is committed here yet;"
-                " 'sgstore collection commit' makes bundles of what has landed"
+                f"{whole.place.url}: the collection has no committed bundle;"
+                " run 'sgstore collection commit'"
             )
 
 
@@ -100,7 +100,7 @@ def with_missing(code: int) -> int:
     """Report the bundles of a collection without a result, and return the final exit code."""
     missing = {name: why for whole in _asked for name, why in whole.missing.items()}
     for bundle, why in missing.items():
-        say(f"bundle {bundle[:12]}… did not answer: {why}")
+        say(f"bundle {bundle[:12]}… failed: {why}")
     return LOSS if missing else code
 
 

@@ -40,13 +40,13 @@ def criticality(
     store: StorePath,
     measures: Annotated[
         list[str] | None,
-        Option("--measure", "-m", metavar="NAME", help="Such as pet; by default all; repeatable."),
+        Option(
+            "--measure", "-m", metavar="NAME", help="A measure: pet; by default all; repeatable."
+        ),
     ] = None,
     most: Annotated[
         float | None,
-        Option(
-            "--most", metavar="X", help="Only pairs whose first measure is known, and at most X."
-        ),
+        Option("--most", metavar="X", help="Keep only pairs with a first measure of at most X."),
     ] = None,
     *,
     out: RowOptions,
@@ -78,7 +78,7 @@ class OrderOptions:
         Literal["risk", "diverse", "both", "learned"],
         Option(
             "--by",
-            help="The most critical first, one of each class first, both, or the likeliest to fail.",
+            help="Order: most critical first, one of each class first, both, or most likely to fail first.",
         ),
     ] = "risk"
     measures: Annotated[
@@ -99,7 +99,7 @@ class OrderOptions:
         Option(
             "--abstraction",
             metavar="NAME",
-            help="Classes that are told apart: situations of the ego, or those of an abstraction.",
+            help="Classes to distinguish: situations of the ego, or classes of an abstraction.",
         ),
     ] = "situation"
     seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
@@ -135,7 +135,7 @@ class OutcomeOptions:
         Option(
             "--outcomes",
             metavar="CSV",
-            help="Known outcomes: tell how soon failures come; and learn from them.",
+            help="Known outcomes, to measure how early failures come and to learn from.",
         ),
     ] = None
     learn_outcomes: Annotated[
@@ -167,15 +167,13 @@ class OutcomeOptions:
         typer.BadParameter
         """
         if by != "learned" and (self.learn_outcomes or self.learn_from):
-            raise typer.BadParameter("--learn-outcomes and --learn-from belong to --by learned")
+            raise typer.BadParameter("--learn-outcomes and --learn-from need --by learned")
         if self.learn_from is not None and self.learn_outcomes is None:
-            raise typer.BadParameter("--learn-from needs --learn-outcomes: those of its runs")
+            raise typer.BadParameter("--learn-from needs --learn-outcomes")
         if by == "learned" and self.outcomes is None and self.learn_outcomes is None:
             raise typer.BadParameter("--by learned needs --outcomes or --learn-outcomes")
         if self.picture is not None and self.outcomes is None:
-            raise typer.BadParameter(
-                "--picture needs --outcomes: it draws how soon failures are found"
-            )
+            raise typer.BadParameter("--picture needs --outcomes, to draw the failures found")
 
 
 @verbs.command(rich_help_panel=PANEL)
@@ -206,7 +204,7 @@ def prioritize(
 
     spec = order.spec()
     if output is not None and output.suffix != ENDING:  # before the search starts
-        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
+        raise typer.BadParameter(f"--output {output}: the name of a lock must end in {ENDING}")
     given.check(order.by)
     known = None if given.outcomes is None else read_outcomes(given.outcomes)
     lessons = known if given.learn_outcomes is None else read_outcomes(given.learn_outcomes)
@@ -242,7 +240,7 @@ def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path |
 
     failed = failed_in_order(order, known)
     if not failed.any():
-        say(f"none of the {len(failed):,} cases with a known outcome failed")
+        say(f"all {len(failed):,} cases with a known outcome passed")
         return
     told = fault_detection(failed, order.spec.seed)
     found = ", ".join(f"{part:.0%} in the first {share:.0%}" for share, part in told.found.items())

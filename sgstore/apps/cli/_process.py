@@ -134,7 +134,7 @@ def refuse_late() -> None:
     """
     if _run.late:
         raise SqlError(
-            f"stopped after {_run.deadline_s:g} s, as --timeout says; give it more time, or ask for less:"
+            f"stopped after {_run.deadline_s:g} s, the limit of --timeout; raise it, or reduce the query:"
             " fewer variables, a narrower WHERE, one trace"
         )
 

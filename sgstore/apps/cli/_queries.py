@@ -64,7 +64,7 @@ Safe = Annotated[
     bool,
     Option("--safe", help="Run in a separate process with bounded time (5s), memory and rows."),
 ]
-MaxRows = Annotated[int, Option("--max-rows", min=0, help="With --safe: maximum number of rows.")]
+MaxRows = Annotated[int, Option("--max-rows", min=0, help="Maximum number of rows, with --safe.")]
 
 
 @verbs.command(rich_help_panel=PANEL)
@@ -72,19 +72,20 @@ def find(
     store: AskedPath,
     question: Question,
     count: Annotated[
-        bool, Option("--count", help="Print the number of distinct frames and nothing else.")
+        bool, Option("--count", help="Print only the number of distinct frames.")
     ] = False,
     explain: Annotated[
-        bool, Option("--explain", help="Print the stages of the query, and its SQL.")
+        bool, Option("--explain", help="Print the stages of the query and its SQL.")
     ] = False,
     require: Annotated[
-        bool, Option("--require", help="End with exit code 4 if nothing matches.")
+        bool, Option("--require", help="End with exit code 4 without matches.")
     ] = False,
     safe: Safe = False,
     max_rows: MaxRows = 10_000,
     tables: With = None,
     each_frame: Annotated[
-        bool, Option("--rows", help="On a terminal too, one row for each match in each frame.")
+        bool,
+        Option("--rows", help="Print one row for each match and frame, always."),
     ] = False,
     *,
     whole: CollectionOptions,
@@ -103,7 +104,7 @@ def find(
             )
     if safe:
         if count or explain:
-            raise typer.BadParameter("--safe gives rows: not with --count or --explain")
+            raise typer.BadParameter("--safe cannot be combined with --count or --explain")
         with _sandbox(store, ask, max_rows, tables) as box:
             answer = box.find(text, **values)
         _say_all(answer)
@@ -255,7 +256,7 @@ def like(
     every: Annotated[
         bool,
         Option(
-            "--all", help="All runs of a trace, and frames beside this one, not the best of each."
+            "--all", help="Show all runs of a trace, not only the best, and those near the frame."
         ),
     ] = False,
     pattern: Annotated[
@@ -321,7 +322,7 @@ def _differing(features: dict[str, int]) -> str:
 
 @verbs.command(rich_help_panel=PANEL)
 def translate(
-    file: Annotated[Path, Argument(metavar="FILE", help="What to translate; - is stdin.")],
+    file: Annotated[Path, Argument(metavar="FILE", help="File to translate; - reads stdin.")],
     language: Annotated[
         Literal["sgl"], Option("--from", help="sgl: properties of SGSM, as Python.")
     ] = "sgl",
@@ -348,7 +349,7 @@ def sql(
         bool,
         Option(
             "--each",
-            help="Of a collection: run it in every bundle, with a column 'bundle'.",
+            help="Run it in each bundle of a collection, with a column 'bundle'.",
             rich_help_panel=COLLECTIONS,
         ),
     ] = False,
@@ -396,7 +397,7 @@ def _sandbox(store: Path, bounds: QueryLimits, max_rows: int, tables: list[str] 
     from sgstore.apps.sandbox import Sandbox
 
     if bounds.max_spill is not None:
-        raise typer.BadParameter("--max-spill: with --safe nothing is put on disk")
+        raise typer.BadParameter("--max-spill cannot be combined with --safe, which uses no disk")
     return Sandbox(
         store,
         timeout_s=seconds_of(bounds.timeout or "5s", "--timeout"),
@@ -413,7 +414,7 @@ def _say_all(answer: Answer) -> None:
 
 library = Verbs(
     name="patterns",
-    help="The library of named patterns: list, search, show, run them.",
+    help="List, search, show and run the named patterns of the library.",
     no_args_is_help=True,
 )
 
@@ -421,7 +422,7 @@ LibraryName = Annotated[
     str,
     Argument(
         metavar="NAME",
-        help="Of a pattern, such as cut_in or ParkingExit.",
+        help="Name of a pattern, such as cut_in or ParkingExit.",
         autocompletion=completion.patterns,
     ),
 ]
@@ -436,7 +437,7 @@ class Kind(StrEnum):
     property = "property"
 
 
-PatternKinds = Annotated[list[Kind] | None, Option("--kind", help="Only of this kind; repeatable.")]
+PatternKinds = Annotated[list[Kind] | None, Option("--kind", help="Only this kind; repeatable.")]
 
 
 @library.command("list")
@@ -469,7 +470,8 @@ def _write_patterns(found: list[NamedPattern], out: RowOptions) -> None:
 @library.command("search")
 def search_patterns(
     words: Annotated[
-        list[str], Argument(metavar="WORD…", help="Such as: pedestrian crossing; in any order.")
+        list[str],
+        Argument(metavar="WORD…", help="Words, in any order: pedestrian crossing."),
     ],
     kinds: PatternKinds = None,
     *,
@@ -510,16 +512,16 @@ def run_pattern(
         bool, Option("--clips", help="Print clips (trace, start_ns, end_ns) in log time.")
     ] = False,
     before: Annotated[
-        str, Option("--before", metavar="TIME", help="With --clips: time before each match.")
+        str, Option("--before", metavar="TIME", help="Time before each match, with --clips.")
     ] = "0s",
     after: Annotated[
-        str, Option("--after", metavar="TIME", help="With --clips: time after each match.")
+        str, Option("--after", metavar="TIME", help="Time after each match, with --clips.")
     ] = "0s",
     require: Annotated[
         bool,
         Option(
             "--require",
-            help="End with exit code 4 if nothing matches, or if the property is violated.",
+            help="End with exit code 4 without matches, or if the property is violated.",
         ),
     ] = False,
     *,

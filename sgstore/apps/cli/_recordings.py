@@ -50,9 +50,7 @@ Recordings = Annotated[
         help="Recordings, folders of them, patterns ('drives/**/day?.mcap'); - reads a list from stdin.",
     ),
 ]
-Force = Annotated[
-    bool, Option("--force", help="Read again and replace what is in the store already.")
-]
+Force = Annotated[bool, Option("--force", help="Read again and replace traces of the store.")]
 
 
 @verbs.command(rich_help_panel=PANEL)
@@ -77,7 +75,7 @@ def ingest(
     ] = None,
     force: Force = False,
     dry_run: Annotated[
-        bool, Option("--dry-run", help="Report what would be done, and do nothing.")
+        bool, Option("--dry-run", help="Report the planned work without doing it.")
     ] = False,
     shard: Annotated[
         str | None,
@@ -157,7 +155,7 @@ def _landed(
     ``alone`` is true if an option for single stores was given, which is an error.
     """
     if alone:
-        raise typer.BadParameter("--force and --dry-run are for a store, not for a collection")
+        raise typer.BadParameter("--force and --dry-run are not supported for a collection")
     from sgstore.collection import land
 
     number, stroke, of = (shard or "1/1").partition("/")
@@ -165,7 +163,7 @@ def _landed(
         raise typer.BadParameter(f"--shard {shard}: expected I/N, such as 3/16; I is 1 to N")
     outcomes = land(url_of(store) or store, paths, shard=(int(number), int(of)), **how)
     if not outcomes:
-        say(f"share {shard} has none of {len(paths)} recordings")
+        say(f"share {shard} of {len(paths)} recordings is empty")
     return outcomes
 
 
@@ -213,7 +211,7 @@ def info(
         list[str] | None,
         Option(
             "--trace",
-            help="A trace in full: a name, id, or beginning of one; repeatable.",
+            help="Show details of a trace, by name, id, or start of one; repeatable.",
             autocompletion=completion.traces,
         ),
     ] = None,
@@ -329,9 +327,7 @@ PORT: Final = 2000
 
 @verbs.command(rich_help_panel=PANEL)
 def record(
-    output: Annotated[
-        Path, Argument(metavar="FILE", help="The recording: FILE.mcap; nothing is overwritten.")
-    ],
+    output: Annotated[Path, Argument(metavar="FILE", help="Recording to write: a new FILE.mcap.")],
     host: Annotated[str, Option("--host", help="Host of the CARLA server.")] = "localhost",
     port: Annotated[int, Option("--port", help="Its port.")] = PORT,
     ego: Annotated[
@@ -343,14 +339,20 @@ def record(
     ] = None,
     duration: Annotated[
         str | None,
-        Option("--duration", metavar="TIME", help="Simulation time: 60s; else until Ctrl-C."),
+        Option("--duration", metavar="TIME", help="Simulation time: 60s; by default until Ctrl-C."),
     ] = None,
     step: Annotated[
         str | None,
-        Option("--step", metavar="TIME", help="Drive the world in steps: 50ms; else follow it."),
+        Option(
+            "--step", metavar="TIME", help="Drive the world in steps: 50ms; by default follow it."
+        ),
     ] = None,
     scenery: Annotated[
-        bool, Option("--scenery/--no-scenery", help="Include buildings, poles, … of the level.")
+        bool,
+        Option(
+            "--scenery/--no-scenery",
+            help="Include buildings, poles and other objects of the level.",
+        ),
     ] = True,
 ) -> int:
     """Record a running CARLA into an MCAP file: frames, road map and sensors of the ego."""
@@ -412,25 +414,25 @@ class ImportOptions:
         Option(
             "--unknown-as",
             metavar="KIND",
-            help="Take labels that nobody knows for this kind ('other': unknown), leave out relations; "
-            "'own': labels become kinds, names relations.",
+            help="Import unknown labels as this kind ('other': unknown kind) and skip unknown relations; "
+            "'own': use labels as kinds and names as relations.",
         ),
     ] = ""
     new_kind: Annotated[
         list[str] | None,
-        Option("--new-kind", metavar="KIND", help="A kind that --kind may name; repeatable."),
+        Option("--new-kind", metavar="KIND", help="Additional kind for --kind; repeatable."),
     ] = None
     answers: Annotated[
         list[str] | None,
         Option(
             "--answers",
             metavar="RELATION",
-            help="A relation that the graphs can hold, even if none of them does; repeatable.",
+            help="Relation that the graphs can contain, even if it never occurs; repeatable.",
         ),
     ] = None
     period: Annotated[
         str,
-        Option("--period", metavar="TIME", help="Time between frames, where the file has none."),
+        Option("--period", metavar="TIME", help="Time between frames, if the file has no times."),
     ] = "1s"
 
 
@@ -464,7 +466,7 @@ def import_(
     answers = {name: relation_named(name) for name in meaning.answers or ()}
     for name, known in answers.items():
         if known is None:
-            raise typer.BadParameter(f"--answers {name}: no such relation")
+            raise typer.BadParameter(f"--answers {name}: unknown relation")
     seconds = seconds_of(meaning.period, "--period")
     if seconds <= 0:
         raise typer.BadParameter("--period: expected more than 0s")

@@ -29,7 +29,7 @@ verbs = Verbs()
 def serve(
     store: StorePath,
     compare: Annotated[
-        Path | None, Option("--compare", metavar="STORE", help="A second store, side by side.")
+        Path | None, Option("--compare", metavar="STORE", help="Second store to show side by side.")
     ] = None,
     write_to: Annotated[
         Path | None,
@@ -38,7 +38,7 @@ def serve(
     host: Annotated[
         str, Option("--host", help="Address to listen on; by default only this machine.")
     ] = "127.0.0.1",
-    port: Annotated[int, Option("--port", min=0, max=65535, help="0: any that is free.")] = 0,
+    port: Annotated[int, Option("--port", min=0, max=65535, help="Port; 0: any free.")] = 0,
     browse: Annotated[bool, Option("--open/--no-open", help="Open the page in a browser.")] = False,
 ) -> int:
     """Explore a store in a browser: search, view matches, and see why a frame matches or not.
@@ -48,13 +48,13 @@ def serve(
     from sgstore.apps.explorer import serve as run
 
     if write_to is not None and not write_to.is_dir():
-        raise typer.BadParameter(f"--write-to {write_to}: no such folder")
+        raise typer.BadParameter(f"--write-to {write_to}: the folder does not exist")
     if host not in {"127.0.0.1", "localhost", "::1"}:
-        say(f"{host}: whoever on the network has the address with its token sees the store")
+        say(f"{host}: the store is visible on the network with the address and its token")
 
     def tell(address: str) -> None:
         typer.echo(address)
-        say("Ctrl-C ends it")
+        say("stop it with Ctrl-C")
 
     run(
         store,
@@ -76,14 +76,14 @@ def report(
         Path, Option("--output", "-o", help="The page: FILE.html.", show_default="report.html")
     ] = Path("report.html"),
     limit: Annotated[
-        int, Option("--limit", min=1, help="Most matches, or violations, in the page.")
+        int, Option("--limit", min=1, help="Maximum number of matches or violations in the page.")
     ] = 100,
     around: Annotated[
         str, Option("--around", metavar="TIME", help="Time before and after each match.")
     ] = "2s",
     pictures: Annotated[
         bool,
-        Option("--pictures/--no-pictures", help="A camera picture for each second of a match."),
+        Option("--pictures/--no-pictures", help="Add a camera picture for each second of a match."),
     ] = False,
     *,
     bounds: QueryLimits,
@@ -95,7 +95,7 @@ def report(
     from sgstore.apps.report import report as write
 
     if not question:
-        raise typer.BadParameter("give a QUERY, -f FILE or -p NAME")
+        raise typer.BadParameter("add a QUERY, -f FILE or -p NAME")
     text, values = question.asked()
     many, more = write(
         bounds.opened(store),
@@ -107,7 +107,7 @@ def report(
         pictures=pictures,
     )
     if more:
-        say(f"there are more matches: the first {many} are in the page (--limit)")
+        say(f"the page has only the first {many} matches; raise --limit")
     typer.echo(output)
     return 0
 
@@ -117,12 +117,12 @@ def mcp(
     store: StorePath,
     write_to: Annotated[
         Path | None,
-        Option("--write-to", metavar="DIR", help="Let clips be exported into this folder."),
+        Option("--write-to", metavar="DIR", help="Allow the export of clips to this folder."),
     ] = None,
     question_timeout: Annotated[
-        str, Option("--timeout", metavar="TIME", help="Longest time for a question.")
+        str, Option("--timeout", metavar="TIME", help="Maximum time for a query.")
     ] = "10s",
-    max_rows: Annotated[int, Option("--max-rows", min=1, help="Rows of an answer at most.")] = 1000,
+    max_rows: Annotated[int, Option("--max-rows", min=1, help="Maximum rows of an answer.")] = 1000,
     tables: With = None,
 ) -> None:
     """Serve a store to an AI assistant by the Model Context Protocol, on stdin and stdout.

@@ -54,7 +54,7 @@ def verify(
     hashed = f", {found.recordings} recordings" if payloads else ""
     wrong = f"{len(rows)} faults" if rows else "no fault"
     if found.others:
-        say(f"{store}: none of sgstore's, so not looked at: {', '.join(found.others)}")
+        say(f"{store}: tables of other programs, not checked: {', '.join(found.others)}")
     say(f"{store}: {found.traces} traces, {found.rows} rows{hashed}: {wrong}")
     return ERROR if rows else 0
 
@@ -80,7 +80,7 @@ def remove(
     from sgstore.store import StoreFile
 
     if not traces and not compact:
-        raise typer.BadParameter("say which traces, or --compact")
+        raise typer.BadParameter("add the names of traces, or --compact")
     file = StoreFile(store)
     if compact:
         file.refuse_others()
@@ -101,7 +101,7 @@ def rebuild(
         Option(
             "--leave-out",
             metavar="TRACE",
-            help="Leave out a trace that cannot be rebuilt; repeatable.",
+            help="Trace to leave out, if it cannot be rebuilt; repeatable.",
             autocompletion=completion.traces,
         ),
     ] = None,
@@ -136,7 +136,7 @@ def derive(
         Option(
             "--abstraction",
             metavar="NAME",
-            help="Keep what this makes of the graphs: roadscene2vec.",
+            help="Abstraction whose graphs to store, such as roadscene2vec.",
         ),
     ] = None,
     trace: Traces = None,
@@ -159,12 +159,12 @@ def derive(
     given = graphs.config or graphs.preset
     if abstraction is not None:
         if name is not None or remove is not None or given or force:
-            raise typer.BadParameter("--abstraction NAME stands alone, or with --trace")
+            raise typer.BadParameter("--abstraction NAME can be combined only with --trace")
         kept = keep_abstraction(store, abstraction, trace or ())
         return _write_derived(kept, out)
     if name is None or remove is not None:
         if name is not None or given or (remove is None and (trace or force)):
-            raise typer.BadParameter("give --as NAME with settings, --remove NAME, or nothing")
+            raise typer.BadParameter("use --as NAME with settings, --remove NAME, or no option")
         deriving = StoreFile(store).deriving
         if remove is not None:
             say(f"removed {remove} of {', '.join(deriving.remove(remove))}")
@@ -196,7 +196,7 @@ def map_(
         ),
     ],
     picture: Annotated[
-        Path | None, Option("--output", "-o", help="Draw it there, north up: .png or .svg.")
+        Path | None, Option("--output", "-o", help="Picture to draw, north up: .png or .svg.")
     ] = None,
     *,
     out: PrintedRows,
@@ -253,13 +253,13 @@ def payload(
         str | None,
         Argument(
             metavar="CHANNEL",
-            help="Topic; without it, list those there are.",
+            help="Topic; by default list the topics.",
             autocompletion=completion.channels,
         ),
     ] = None,
     output: Output = None,
     message: Annotated[
-        bool, Option("--message", help="The message as it was recorded, not the picture in it.")
+        bool, Option("--message", help="Write the message as recorded, not the picture in it.")
     ] = False,
     *,
     out: PrintedRows,
@@ -273,7 +273,7 @@ def payload(
         return 0
     if output is None and sys.stdout.isatty():
         raise ExportError(
-            "a payload is not for a terminal: name a file with -o, or redirect stdout"
+            "a payload cannot be printed on a terminal; add -o FILE, or redirect stdout"
         )
     if message:
         data, what = file.payload(frame, channel), "message"
@@ -304,14 +304,15 @@ def _list_channels(file: StoreFile, frame: str, out: PrintedRows) -> None:
 @verbs.command(rich_help_panel=PANEL)
 def config(
     file: Annotated[
-        Path | None, Argument(metavar="FILE", help="A TOML file: check it, and print it whole.")
+        Path | None,
+        Argument(metavar="FILE", help="TOML file to check and print in full."),
     ] = None,
     preset: Annotated[
         str | None,
         Option(
             "--preset",
             metavar="NAME",
-            help="Settings of this preset.",
+            help="Print the settings of this preset.",
             autocompletion=completion.presets,
         ),
     ] = None,
@@ -327,7 +328,7 @@ def config(
     from sgstore.model.config import preset as preset_named
 
     if sum((file is not None, preset is not None, every, page)) > 1:
-        raise typer.BadParameter("give one of FILE, --preset, --list and --page")
+        raise typer.BadParameter("expected only one of FILE, --preset, --list and --page")
     if every:
         rows = ((name, one.summary) for name, one in PRESETS.items())
         out.write(("preset", "what it is"), rows)

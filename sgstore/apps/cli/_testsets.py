@@ -70,12 +70,13 @@ class ChoiceOptions:
     """Command line options for selecting test cases: strategy, units and limits."""
 
     minimal: Annotated[
-        bool, Option("--minimal", help="The fewest that keep everything that occurs.")
+        bool, Option("--minimal", help="Select the smallest set that keeps all items.")
     ] = False
     per_class: Annotated[
-        int | None, Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times.")
+        int | None,
+        Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times."),
     ] = None
-    rarest: Annotated[bool, Option("--rarest", help="Rarest classes first.")] = False
+    rarest: Annotated[bool, Option("--rarest", help="Select the rarest classes first.")] = False
     stratify: Annotated[
         str, Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
     ] = ""
@@ -91,7 +92,7 @@ class ChoiceOptions:
         Option(
             "--stride",
             metavar="TIME",
-            help="Time from the start of a clip to that of the next; below --clip, they overlap.",
+            help="Time between the starts of two clips; clips overlap if it is less than --clip.",
             show_default="--clip",
         ),
     ] = ""
@@ -99,7 +100,7 @@ class ChoiceOptions:
     combos: Annotated[
         int, Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
     ] = 0
-    ego: Annotated[bool, Option("--ego", help="--combos: only features of the ego.")] = False
+    ego: Annotated[bool, Option("--ego", help="With --combos: only of the ego.")] = False
     sequences: Annotated[
         int, Option("--sequences", metavar="K", min=0, help="Keep sequences of K manoeuvres.")
     ] = 0
@@ -109,7 +110,8 @@ class ChoiceOptions:
         Objective, Option("--objective", help="Quantity that --minimal minimizes.")
     ] = "units"
     alpha: Annotated[
-        float, Option("--alpha", help="Weight of strata: 1: as frequent as they are, 0: all equal.")
+        float,
+        Option("--alpha", help="Weight of strata: 1 by frequency, 0 all equal."),
     ] = 1.0
     least: Annotated[Objective | None, Option("--least", hidden=True)] = None  # until 0.3
     temper: Annotated[float | None, Option("--temper", hidden=True)] = None  # until 0.3
@@ -152,7 +154,7 @@ class ChoiceOptions:
         asked = [way for way, wanted in ways.items() if wanted]
         if len(asked) > 1:
             known = "--minimal, --per-class, --rarest, --stratify, --weakest"
-            raise typer.BadParameter(f"give one of {known}")
+            raise typer.BadParameter(f"expected one of {known}")
         return asked[0] if asked else Strategy.every
 
 
@@ -192,7 +194,7 @@ def select(
 
     spec = choice.spec()
     if output is not None and output.suffix != ENDING:  # before the search starts
-        raise typer.BadParameter(f"--output {output}: the name of a lock ends in {ENDING}")
+        raise typer.BadParameter(f"--output {output}: the name of a lock must end in {ENDING}")
     shares = parse_split(split) if split else {}
     opened = whole.opened_at(store, bounds)
     chosen = chosen_frames(opened, str(store), query, parameters)
@@ -220,7 +222,7 @@ def chosen_frames(
 
     if query is None:
         if parameters:
-            raise typer.BadParameter("--param belongs to a QUERY")
+            raise typer.BadParameter("--param needs a QUERY")
         return ChosenFrames(name, opened)
     values = parameters_of(parameters)
     matches = opened.find(query, **values)
@@ -247,7 +249,7 @@ def _curve(found: Selection, picture: Path | None, out: PrintedRows, *, printed:
             found.holdings.total,
             picture,
             unit=found.units.unit,
-            title=f"What a selection keeps: {found.holdings.kind}",
+            title=f"Items of a selection: {found.holdings.kind}",
             below=drawn.table.said[0],
         )
         say(f"drawn: {picture}")
@@ -296,7 +298,7 @@ def verify_(
     wrong = [one for one in found if strict or one.matters]
     unread = sum(case.payload is None for case in known.cases)
     if unread or no_payloads:
-        say(f"payloads of {len(known.cases) if no_payloads else unread} cases were not looked at")
+        say(f"payloads of {len(known.cases) if no_payloads else unread} cases were not checked")
     said = f"{len(wrong)} differences" if wrong else "as locked"
     say(f"{path}: {len(known.cases)} cases of {len(known.traces)} traces: {said}")
     return ERROR if wrong else 0
@@ -348,18 +350,18 @@ def diff(
         str, Argument(metavar="A", help="Before: a store or collection, STORE:QUERY, or a lock.")
     ],
     b: Annotated[str, Argument(metavar="B", help="After, as A.")],
-    name: Annotated[str | None, pattern_option("Compare by a pattern of the library.")] = None,
+    name: Annotated[str | None, pattern_option("Compare the matches of a library pattern.")] = None,
     query: Annotated[
         str | None,
         Option("--query", "-q", metavar="TEXT", help="Compare by a query, or by 'CHECK …'."),
     ] = None,
     by_frame: Annotated[
-        bool, Option("--by-frame", help="Scenes of traces of one name, frame by frame.")
+        bool, Option("--by-frame", help="Compare traces of the same name frame by frame.")
     ] = False,
     abstraction: Abstraction = "RSV",
     parameters: Parameters = None,
     require: Annotated[
-        bool, Option("--require", help="End with exit code 4 if anything is different.")
+        bool, Option("--require", help="End with exit code 4 if the results differ.")
     ] = False,
     *,
     ask: FrameAskOptions,
@@ -369,7 +371,7 @@ def diff(
     from sgstore.testsets.coverage import classed
 
     if (name is not None) + (query is not None) + by_frame > 1:
-        raise typer.BadParameter("give one of -p NAME, -q TEXT, --by-frame")
+        raise typer.BadParameter("expected one of -p NAME, -q TEXT, --by-frame")
     values = parameters_of(parameters)
     if name is not None or query is not None:
         text, values = asked_of(query, None, name, values)

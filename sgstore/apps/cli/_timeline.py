@@ -45,17 +45,17 @@ def timeline(
     parameters: Parameters = None,
     traces: Traces = None,
     output: Annotated[
-        Path | None, Option("--output", "-o", help="A picture: FILE.png or FILE.svg.")
+        Path | None, Option("--output", "-o", help="Picture to write: FILE.png or FILE.svg.")
     ] = None,
     every: Annotated[
-        bool, Option("--all", help="Also traces in which nothing is found or violated.")
+        bool, Option("--all", help="Include traces without matches and violations.")
     ] = False,
     parts: Annotated[
         str | None,
         Option(
             "--parts",
             metavar="FRAME",
-            help="Where each part of one pattern holds for the match in this frame.",
+            help="Show where each part of one pattern holds for the match in this frame.",
         ),
     ] = None,
     *,
@@ -73,7 +73,7 @@ def timeline(
         found = timelines(bounds.opened(store), asked, traces or ())
     else:
         if len(asked) > 1 or traces:
-            raise typer.BadParameter("--parts FRAME takes one pattern, and the trace of the frame")
+            raise typer.BadParameter("--parts FRAME needs one pattern, and the trace of the frame")
         ((text, values),) = asked.values()
         found = [parts_timeline(bounds.opened(store), text, parts, values)]
     for name in {*(traces or ())} - {one.trace for one in found}:
@@ -83,7 +83,7 @@ def timeline(
     if not every and hits:
         if len(hits) < len(found):
             say(
-                f"nothing is found or violated in {len(found) - len(hits)} more traces; --all shows them"
+                f"{len(found) - len(hits)} more traces without matches or violations; --all shows them"
             )
         found = hits
     if output is None:
@@ -115,7 +115,7 @@ def _asked(
         own = {key: value for key, value in values.items() if key in one.parameters}
         found[_free(name, f"pattern {name}", found)] = one.written(**own), {}
     if not found:
-        raise typer.BadParameter("give a QUERY, -f FILE or -p NAME")
+        raise typer.BadParameter("add a QUERY, -f FILE or -p NAME")
     return found
 
 

@@ -105,9 +105,7 @@ def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
     function = AGGREGATES[name]
     wanted = 2 if function.share else 1
     if len(e.arguments) != wanted:
-        hint = (
-            f"the value below which 95 % lie is {e.name}(x.speed, 95)" if function.share else None
-        )
+        hint = f"write {e.name}(x.speed, 95) for the 95th percentile" if function.share else None
         reason = f"{e.name}() takes {wanted} argument{'s' * (wanted > 1)}, found {len(e.arguments)}"
         session.refuse(reason, e.span, hint)
     inner = replace(names, aggregates=False, aggregated=True, aliases={})
@@ -128,9 +126,9 @@ def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
     found = names.bind(written)
     if not isinstance(found, b.Value) or isinstance(found.value, bool | str | None):
         names.session.refuse(
-            f"the second argument of {e.name}() is a number, the same for all matches",
+            f"the second argument of {e.name}() must be a number, equal for all matches",
             written.span,
-            f"the value below which 95 % lie is {e.name}(x.speed, 95)",
+            f"write {e.name}(x.speed, 95) for the 95th percentile",
         )
     if not (math.isfinite(found.value) and 0 <= found.value <= 100):
         names.session.refuse(f"{e.name}() takes a number from 0 to 100", written.span)

@@ -68,17 +68,17 @@ def bind_checks(
         if isinstance(statement, Define):
             defined[normalize_name(statement.name)] = statement
         elif isinstance(statement, MatchClause | s.UnionClause):
-            session.refuse("a MATCH has matches, and no verdict", statement.span, "ask it by find")
+            session.refuse("a MATCH has matches, not a verdict", statement.span, "run it with find")
         else:
             catalog = seen(statement)
             session.ask(catalog)
             name = statement.name or f"check {len(found) + 1}"
             if name in {one.check.name for one in found}:
-                session.refuse(f"two checks are called '{name}'", statement.span)
+                session.refuse(f"two checks have the name '{name}'", statement.span)
             found.append(CheckInCatalog(_check(statement, name, session, catalog), catalog))
     session = Session(text, parameters, ALL_BINDERS, used=used)
     if not found:
-        session.refuse("nothing is checked", TextSpan(0, len(text)), "add CHECK ALWAYS …")
+        session.refuse("the text contains no CHECK", TextSpan(0, len(text)), "add CHECK ALWAYS …")
     refuse_unused(session)
     return tuple(found)
 
@@ -87,7 +87,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
     settings = chosen(written.settings, session, catalog)
     session.look_beyond(catalog, world=settings.scope != "graph")
     if settings.policy is not None:
-        session.refuse("USING MATCHES belongs to sequences", written.settings[0].span)
+        session.refuse("USING MATCHES is allowed only in sequences", written.settings[0].span)
     scope = StepScope(session)
     names = SymbolTable(session, scope)
     quantifiers = tuple(_quantifier(one, names, scope) for one in written.quantifiers)
@@ -97,9 +97,9 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         reset = settled(names.condition(written.reset), session)
     if written.robustness and settings.end == "weak":
         session.refuse(
-            "USING END weak forgives what is due at the end of a trace, and robustness counts it",
+            "USING END weak cannot be combined with ROBUSTNESS",
             written.span,
-            "leave out USING END weak, or ROBUSTNESS; bound the formula: EVENTUALLY[0s, 5s] …",
+            "remove USING END weak or ROBUSTNESS, or bound the formula: EVENTUALLY[0s, 5s] …",
         )
     returns = _returned(written, names)
     refuse_strange(session, catalog)
@@ -139,10 +139,10 @@ def _returned(written: WrittenCheck, names: SymbolTable) -> tuple[b.ReturnColumn
     called = [column.name for column in found]
     for item, column in zip(written.returns, found, strict=True):
         if [*taken, *called].count(column.name) > 1:
-            reason = f"two results are called '{column.name}'"
+            reason = f"two results have the name '{column.name}'"
             names.session.refuse(reason, item.span, "name them with AS")
         if column.value.type is Type.node:
-            hint = "its name, v.name, or a number: v.speed"
+            hint = "return its name, v.name, or a number: v.speed"
             names.session.refuse("a violation has values, not nodes", item.span, hint)
     return found
 
@@ -166,7 +166,7 @@ def _quantifier(
         where = settled(names.condition(written.where), session)
         if b.is_temporal(where):
             session.refuse(
-                "what restricts a quantifier looks at one frame",
+                "the condition of a quantifier must refer to one frame",
                 written.where.span,
                 "put it into the formula: … IMPLIES …",
             )

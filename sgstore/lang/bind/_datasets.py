@@ -62,7 +62,7 @@ def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
     found = traces_in(name, session.traces, session.tables, part=session.part)
     if found is None and name in session.tables:
         session.refuse(
-            f"'{name}' is a table of single frames, and USING DATASET chooses traces",
+            f"'{name}' is a table of frames; USING DATASET needs a table of traces",
             span,
             f"ask for its columns: WHERE {name}.… IS NOT NULL",
         )
@@ -82,7 +82,7 @@ def seen_in(
     found = traces_in(name, session.traces, session.tables, part=session.part)
     table = session.tables.get(name)
     if found is None and table is not None and not table.joins:
-        session.refuse(f"the rows of '{name}' belong to no frames", span)
+        session.refuse(f"the rows of '{name}' do not refer to frames", span)
     if table is None:
         found = _known(found, name, span, session)
     (abstraction,) = classes.attribute.columns.values()

@@ -83,7 +83,7 @@ def parameter(e: s.Parameter, names: SymbolTable) -> Any:
         session.refuse(
             f"the parameter ${e.name} has no value",
             e.span,
-            f"give it one: find(…, {e.name}=…), or --param {e.name}=…",
+            f"set it: find(…, {e.name}=…), or --param {e.name}=…",
         )
     session.used.add(e.name)
     return session.parameters[e.name]
@@ -111,7 +111,7 @@ def _variable(e: s.Variable, names: SymbolTable) -> b.Bound:
             "frame": "its id is frame.id",
             "env": "it has env.precipitation, env.fog, env.illumination, …",
         }.get(e.name, f"its name is {e.name}.name")
-        names.session.refuse(f"'{e.name}' has attributes, but is no value itself", e.span, hint)
+        names.session.refuse(f"'{e.name}' has attributes, but is not a value", e.span, hint)
     if e.name in names.aliases:
         return names.aliases[e.name]
     meaning = names.meaning(e.name)
@@ -155,7 +155,7 @@ def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
         session.refuse(
             f"the columns of {table.name} are not attributes of frames: it has {table.refused}",
             e.span,
-            "in SQL it can be joined by whatever it has",
+            "join it in SQL with its own columns",
         )
     return b.FrameAttribute(found, found.type)
 
@@ -204,9 +204,9 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
         owners = [kind for kind in KINDS if kind in found.kinds]
         hint = hint_at(name, possible)
         if found.name in COURSES and kinds <= entity_kinds():
-            hint = f"of the lane where it is, it is a function: {found.name}(x)"
+            hint = f"for the lane of the entity, write the function {found.name}(x)"
         elif "lane" in owners and kinds <= entity_kinds():
-            hint = f"the lanes that it is in are nodes: (x)-[:isIn]->(l:Lane), l.{found.name}"
+            hint = f"write its lane as a node: (x)-[:isIn]->(l:Lane), l.{found.name}"
         elif hint is None or not hint.startswith("did"):
             hint = f"it belongs to: {', '.join(owners)}"
         raise QueryNameError(
@@ -262,16 +262,16 @@ def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
         names.session.unknown("attribute of an edge", name, span, known, hint)
     edge = next((edge for edge in names.scope.edges if edge.key == key), None)
     if edge is None:
-        names.session.refuse("an edge is known only in the pattern that binds it", span)
+        names.session.refuse("an edge can be used only in the pattern that binds it", span)
     if found.unit is DisplayUnit.own:
         if edge.high > 1 or edge.both:
             names.session.refuse(
-                f"only a single edge, one way, has '{found.name}'", span, "write -[…]->"
+                f"only a single directed edge has '{found.name}'", span, "write -[…]->"
             )
     elif found.name == "gap":
         if not (edge.relations in FOLLOWED and edge.high == 1 and not edge.both):
             names.session.refuse(
-                "only edges leads or follows, one of them and one way, have 'gap'",
+                "only a directed edge of one relation, leads or follows, has 'gap'",
                 span,
                 "write -[:follows]->",
             )
@@ -288,7 +288,7 @@ def _list(e: s.ListOf, names: SymbolTable) -> b.Choices:
     items = [names.bind(item) for item in e.items]
     for item, written in zip(items, e.items, strict=True):
         if not isinstance(item, b.Value):
-            names.session.refuse("a list holds constants and parameters only", written.span)
+            names.session.refuse("a list can contain only constants and parameters", written.span)
     return b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
 
 
@@ -320,12 +320,12 @@ def _comparison(e: s.Comparison, names: SymbolTable) -> b.Operation:
             hint or comparison_hint(left.type, right.type, texts),
         )
     if e.word in _ORDERED and left.type in {Type.node, Type.boolean}:
-        names.session.refuse(f"a {left.type.value} is not more or less than another", e.span)
+        names.session.refuse(f"a {left.type.value} has no order", e.span)
     closed = next((side for side in (left, right) if _vocabulary(side)), None)
     if e.word in _ORDERED and closed is not None:
         words = ", ".join(f"'{word}'" for word in _vocabulary(closed)[:2])
         names.session.refuse(
-            f"the words of {_what(closed)} have no order", e.span, f"write IN [{words}, …]"
+            f"the values of {_what(closed)} have no order", e.span, f"write IN [{words}, …]"
         )
     left, right = (
         _canonical(left, right, e.left.span, names),
@@ -389,7 +389,7 @@ def _canonical(value: b.Bound, other: b.Bound, span: TextSpan, names: SymbolTabl
     if word is None and isinstance(other, b.NodeAttribute) and other.attribute.name == "kind":
         word = _kind(value.value, span, names)
     if word is None:
-        lane = "of a lane it is the type: l.type" if value.value in LANE_TYPES else None
+        lane = "for a lane, write l.type" if value.value in LANE_TYPES else None
         names.session.unknown(_what(other), value.value, span, known, lane)
     return b.Value(word, Type.text, closed=True)
 
@@ -421,7 +421,7 @@ def _null_test(e: s.NullTest, names: SymbolTable) -> b.Operation:
     operand = names.bind(e.operand)
     maybe = isinstance(operand, b.NodeValue) and operand.node in names.session.maybe
     if operand.type in {Type.node, Type.list} and not maybe:
-        hint = "what may be absent is asked by EXISTS {…}" if operand.type is Type.node else None
+        hint = "write EXISTS {…} for an optional node" if operand.type is Type.node else None
         names.session.refuse(f"a {operand.type.value} is never NULL", e.operand.span, hint)
     word = "IS NOT NULL" if e.negated else "IS NULL"
     return b.Operation(word, (operand,), Type.boolean)
@@ -438,11 +438,11 @@ def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
         if isinstance(e.choices, s.Parameter):
             hint = f"give ${e.choices.name} a list: find(…, {e.choices.name}=['a', 'b'])"
         if choices.type is Type.text and not isinstance(choices, b.Value):
-            hint = "whether a text is in another: x.name CONTAINS 'a'"
+            hint = "write x.name CONTAINS 'a' to search in a text"
         names.session.refuse("expected a list after IN", e.choices.span, hint)
     for item in choices.items:
         if item.type is Type.null:
-            names.session.refuse("NULL is in no list", e.choices.span)
+            names.session.refuse("NULL cannot be in a list", e.choices.span)
         if item.type is not operand.type:
             names.session.refuse(
                 f"a {operand.type.value} cannot be in a list with a {item.type.value}",
@@ -465,18 +465,18 @@ def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttri
         not isinstance(operand, b.FrameAttribute)
         or operand.attribute.unit is not DisplayUnit.classed
     ):
-        session.refuse("only classes of frames are in it", e.span, "write frame.class IN …")
+        session.refuse("a dataset has only frame classes", e.span, "write frame.class IN …")
     texts = [names.bind(argument) for argument in e.arguments]
     words = [t.value for t in texts if isinstance(t, b.Value) and isinstance(t.value, str)]
     if not 1 <= len(words) == len(texts) <= 2:
         session.refuse(
-            f"{e.name}() takes the name of a dataset and, if wanted, of an abstraction", e.span
+            f"{e.name}() takes the name of a dataset and, optionally, of an abstraction", e.span
         )
     if len(words) == 2:
         (mine,) = operand.attribute.columns.values()
         if abstraction_named(words[1], e.arguments[1].span, session) != mine:
             session.refuse(
-                f"classes of {mine} are not those of {words[1]}",
+                f"classes of {mine} cannot be compared with classes of {words[1]}",
                 e.span,
                 f"write frame.class('{words[1]}')",
             )
@@ -497,7 +497,7 @@ def _case(e: s.Case, names: SymbolTable) -> b.Operation:
     for value, at in known:
         if value.type in {Type.node, Type.list}:
             hint = f"one of its attributes: {at.name}.name" if isinstance(at, s.Variable) else None
-            names.session.refuse(f"a {value.type.value} is no value of CASE", at.span, hint)
+            names.session.refuse(f"CASE cannot return a {value.type.value}", at.span, hint)
         if value.type is not known[0][0].type:
             names.session.refuse(
                 f"CASE has values of one type, and this is a {value.type.value} beside a"
@@ -531,10 +531,10 @@ def _negative(e: s.Negative, names: SymbolTable) -> b.Bound:
 
 def _count_all(e: s.CountAll, names: SymbolTable) -> b.Aggregate:
     if names.aggregated:
-        names.session.refuse("what is counted of all matches cannot stand in another", e.span)
+        names.session.refuse("an aggregate cannot contain another aggregate", e.span)
     if not names.aggregates:
         names.session.refuse(
-            "COUNT(*) may stand after RETURN only", e.span, "COUNT {…} counts in a condition"
+            "COUNT(*) is allowed only after RETURN", e.span, "write COUNT {…} in a condition"
         )
     return b.Aggregate("count", None, distinct=False, type=Type.number)
 

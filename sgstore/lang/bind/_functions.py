@@ -104,7 +104,7 @@ def call(e: s.Call, names: SymbolTable) -> b.Bound:
             return aggregate(e, names)
         if names.over:
             names.session.refuse(
-                f"a CHECK returns values of each violation, and {e.name}() is of all rows",
+                f"a CHECK returns values of each violation; {e.name}() needs all rows",
                 e.span,
                 f"during it: {e.name}(x) OVER match" if name in b.OF_MATCH else None,
             )
@@ -119,11 +119,11 @@ def _refuse_aggregate(e: s.Call, names: SymbolTable) -> NoReturn:
     """Raise an error for an aggregate such as ``COUNT(x)`` outside ``RETURN`` or inside another aggregate."""
     word = e.name.upper()
     if names.aggregated:
-        names.session.refuse("what is counted of all matches cannot stand in another", e.span)
+        names.session.refuse("an aggregate cannot contain another aggregate", e.span)
     inner = "(a)-[:near]->(b)" if word == "COUNT" else "(a)-[:near]->(b) | b.speed"
     of_blocks = word in {"COUNT", "MIN", "MAX", "AVG", "SUM"}
     names.session.refuse(
-        f"{e.name}() may stand after RETURN only",
+        f"{e.name}() is allowed only after RETURN",
         e.span,
         f"in a condition: {word} {{{inner}}} > 2"
         if of_blocks
@@ -191,9 +191,9 @@ def _pair(e: s.Call, names: SymbolTable) -> b.PairNumber:
     function = PAIR_NAMES[normalize_name(e.name)]
     if function in RECORDED and names.session.online:
         names.session.refuse(
-            f"{function}() needs what is recorded later, which a monitor cannot know",
+            f"{function}() needs later frames, which a monitor does not have",
             e.span,
-            "ask a store: sgstore find, sgstore check; what looks ahead from one frame is ttc, pret, dce",
+            "use a store: sgstore find, sgstore check; or use ttc, pret or dce, which need one frame",
         )
     if function == LANE_DIST:
         _refuse_sort(e, names)
@@ -231,7 +231,7 @@ def _refuse_sort(e: s.Call, names: SymbolTable) -> None:
             names.bind(other)
         except QueryError as error:
             who = one.name if isinstance(one, s.Variable) else "v"
-            hint = f"as far as the next one it is {sorts[sort]}({who})"
+            hint = f"for the distance to the next one write {sorts[sort]}({who})"
             raise type(error)(error.reason, text=error.text, span=error.span, hint=hint) from None
 
 
@@ -254,12 +254,12 @@ def _entity(function: str, argument: s.Expression, names: SymbolTable) -> str:
     kinds = names.scope.kinds(found.node).every
     if not kinds & (on_lanes() if function == LANE_DIST else entity_kinds()):
         hint = (
-            "how an entity lies in a lane stands on the edge: (e)-[r:isIn]->(l), r.offset, r.along"
+            "the edge holds the place of an entity in a lane: (e)-[r:isIn]->(l), r.offset, r.along"
         )
         if function in COURSES:
-            hint = f"it is told of the lane where an entity is: (e)-[:isIn]->(l), {function}(e)"
+            hint = f"write it for an entity in the lane: (e)-[:isIn]->(l), {function}(e)"
         names.session.refuse(
-            f"{function}() takes {takes}, and this is a {' or '.join(sorted(kinds))}",
+            f"{function}() takes {takes}, but this is a {' or '.join(sorted(kinds))}",
             argument.span,
             hint,
         )
@@ -313,7 +313,7 @@ def _type(e: s.Call, names: SymbolTable) -> b.EdgeRelation:
             "type() takes an edge variable", argument.span, "-[d:near|visible]-> and type(d)"
         )
     if all(edge.key != meaning.edge for edge in names.scope.edges):
-        names.session.refuse("an edge is known only in the pattern that binds it", argument.span)
+        names.session.refuse("an edge can be used only in the pattern that binds it", argument.span)
     return b.EdgeRelation(meaning.edge)
 
 
@@ -350,7 +350,7 @@ def _class_count(e: s.Call, names: SymbolTable) -> b.FrameAttribute:
 
 def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:
     names.session.refuse(
-        f"{e.name}() may stand after IN only", e.span, f"write frame.class IN {e.name}('train')"
+        f"{e.name}() is allowed only after IN", e.span, f"write frame.class IN {e.name}('train')"
     )
 
 
@@ -359,7 +359,7 @@ def _predicate(e: s.Call, names: SymbolTable) -> b.Bound:
     definition = session.predicates[normalize_name(e.name)]
     if isinstance(definition.body, s.SequenceClause):
         session.refuse(
-            f"{definition.name} is a scenario, which is a sequence and no condition",
+            f"{definition.name} is a scenario, which is a sequence, not a condition",
             e.name_span,
             f"write MATCH {definition.name}()",
         )

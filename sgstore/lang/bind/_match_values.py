@@ -28,20 +28,20 @@ def over_match(e: s.OverExpression, names: SymbolTable) -> b.OverMatch:
     """
     session = names.session
     if not names.over and names.aggregated:
-        session.refuse("a value over a match is made of values of its frames", e.span)
+        session.refuse("a value over a match needs values of its frames", e.span)
     if not names.over:
         session.refuse(
-            "OVER is about a match that was found, so it stands after RETURN",
+            "OVER is allowed only after RETURN",
             e.span,
-            "in a condition: min_over(x, 2s), run_length(p), EVENTUALLY[0s, 2s] p",
+            "write min_over(x, 2s), run_length(p) or EVENTUALLY[0s, 2s] p in a condition",
         )
     call = e.call
     counted = isinstance(call, s.CountAll)
     word = normalize_name(call.name) if isinstance(call, s.Call) else ""
     if word not in b.OF_MATCH:
-        hint = "during the match: MIN(x) OVER match, LAST(x) OVER match"
+        hint = "write MIN(x) OVER match or LAST(x) OVER match for a value during the match"
         if counted or word == "count":
-            hint = "how long it lasts is LAST(frame.t) OVER match - FIRST(frame.t) OVER match"
+            hint = "write LAST(frame.t) OVER match - FIRST(frame.t) OVER match for the duration"
         known = ", ".join(map(str.upper, b.OF_MATCH))
         session.refuse(f"expected one of {known} before OVER", call.span, hint)
     assert isinstance(call, s.Call)  # noqa: S101 - COUNT(*) was rejected
@@ -67,9 +67,9 @@ def _operand(word: str, argument: s.Expression, names: SymbolTable) -> b.Bound:
     _refuse_steps(found, argument.span, names)
     if word == "avg" and b.is_angle(found):
         names.session.refuse(
-            "angles have no average: they come round after 360 degrees",
+            "angles have no average, because they repeat after 360 degrees",
             argument.span,
-            "that of directions is atan2(AVG(sin(radians(x))) OVER match, AVG(cos(radians(x))) OVER match)",
+            "average directions with atan2(AVG(sin(radians(x))) OVER match, AVG(cos(radians(x))) OVER match)",
         )
     return found
 
@@ -80,7 +80,7 @@ def _value(argument: s.Expression, names: SymbolTable) -> b.Bound:
         names.session.refuse(
             f"expected a value, but this is a {found.type.value}",
             argument.span,
-            "an attribute of it: v.name, v.speed" if found.type is Type.node else None,
+            "write one of its attributes: v.name, v.speed" if found.type is Type.node else None,
         )
     _refuse_steps(found, argument.span, names)
     return found
@@ -117,6 +117,6 @@ def _step(name: s.Variable, names: SymbolTable) -> int:
     if meaning is None or not isinstance(meaning.value, b.StepTime):
         meanings = {one: names.meaning(one) for one in sorted(names.visible())}
         known = [o for o, told in meanings.items() if told and isinstance(told.value, b.StepTime)]
-        hint = None if known else "OVER match is all of it; MATCH … AS name gives a step a name"
+        hint = None if known else "OVER match is the whole match; MATCH … AS name names a step"
         names.session.unknown("step", name.name, name.span, known, hint)
     return meaning.value.step

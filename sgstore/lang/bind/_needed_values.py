@@ -87,7 +87,7 @@ class Need:
         if self.attribute is None:
             return "it has no ego"
         of = "" if self.kinds is None else f" of {self.node}"
-        return f"{self.attribute.name}{of} is never known"
+        return f"{self.attribute.name}{of} never has a value"
 
 
 def of_check(check: BoundCheck) -> tuple[Need, ...]:
@@ -113,7 +113,7 @@ def not_computed(check: BoundCheck, facts: TraceFacts) -> str:
     if facts.reach is not None and facts.reach.without:
         spoken = (check.formula, *(q.where for q in check.quantifiers if q.where is not None))
         missing |= facts.reach.without & frozenset().union(*map(_of_entities, spoken))
-    return f"it knows nothing of {', '.join(sorted(missing))}" if missing else ""
+    return f"it does not contain {', '.join(sorted(missing))}" if missing else ""
 
 
 def _of_entities(expression: Bound) -> frozenset[str]:

@@ -87,7 +87,7 @@ def _node(node: s.NodePattern, names: SymbolTable) -> str:
     if node.label:
         names.scope.narrow(key, kinds)
         if not names.scope.kinds(key):
-            names.session.refuse(f"'{node.name}' has two labels that no node has both", node.span)
+            names.session.refuse(f"'{node.name}' has two labels that exclude each other", node.span)
         if key in names.scope.outer:
             names.scope.where.append(b.LabelTest(key, kinds))
     return key
@@ -97,9 +97,9 @@ def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
     """Raise an error for ``(Car)``, a node with the name of a label. The user probably means ``(:Car)``."""
     if node.name and node.name[0].isupper() and not node.label and node.name in labels():
         names.session.refuse(
-            f"({node.name}) would be any node, called {node.name}",
+            f"({node.name}) matches any node and names it {node.name}",
             node.name_span,
-            f"a label stands behind a colon: (:{node.name})",
+            f"write a label after a colon: (:{node.name})",
         )
 
 
@@ -143,9 +143,9 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str
         )
     if edge.name is not None and not edge.label and relation_named(edge.name):
         session.refuse(
-            f"-[{edge.name}]-> would be an edge of any relation, called {edge.name}",
+            f"-[{edge.name}]-> matches an edge of any relation and names it {edge.name}",
             edge.span,
-            f"a relation stands behind a colon: -[:{edge.name}]->",
+            f"write a relation after a colon: -[:{edge.name}]->",
         )
     relations = _relations(edge.label, session) if edge.label else b.any_relation()
     if not relations:

@@ -78,11 +78,11 @@ def bind_query(
     settings = chosen(match.settings, session, catalog)
     session.look_beyond(catalog, world=settings.scope == "world")
     if settings.end is not None:
-        session.refuse("USING END belongs to CHECK", match.settings[0].span)
+        session.refuse("USING END is allowed only in a CHECK", match.settings[0].span)
     if settings.gaps == "unknown":
-        session.refuse("USING GAPS unknown belongs to CHECK", match.settings[0].span)
+        session.refuse("USING GAPS unknown is allowed only in a CHECK", match.settings[0].span)
     if settings.range is not None:
-        session.refuse("USING RANGE belongs to CHECK", match.settings[0].span)
+        session.refuse("USING RANGE is allowed only in a CHECK", match.settings[0].span)
     query = _of_match(match, session)
     refuse_unused(session)
     refuse_strange(session, catalog)
@@ -104,9 +104,9 @@ def _of_match(match: s.MatchClause, session: Session) -> b.Query:
         return _of_one_step(match, session) if _is_plain(match) else _of_steps(match, session)
     if not _is_plain(match):
         session.refuse(
-            "OPTIONAL MATCH and WITH go on from a pattern of one frame, and this is a sequence",
+            "OPTIONAL MATCH and WITH need a pattern of one frame; this is a sequence",
             match.later[0].span,
-            "what a step finds is returned as it is; EXISTS {…} and COUNT {…} ask for what may be absent",
+            "return the values of a step directly; use EXISTS {…} or COUNT {…} for optional parts",
         )
     stages = StageBinder(match, session, bind_block, bind_columns)
     result = stages.result(bind_result(match.returns, stages.names))
@@ -170,18 +170,18 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.MatchC
             define(statement, session)
         elif isinstance(statement, s.CheckClause):
             session.refuse(
-                "a CHECK has a verdict, and no matches",
+                "a CHECK has a verdict, not matches",
                 statement.span,
-                "ask for it by check: sgstore check STORE …",
+                "run it with check: sgstore check STORE …",
             )
         elif isinstance(statement, s.UnionClause):
             session.refuse(
-                "a UNION joins the answers of several queries, and one is asked for here",
+                "a UNION combines several queries; expected one query here",
                 statement.span,
-                "ask of each part by itself",
+                "run each part separately",
             )
         elif found is not None:
-            session.refuse("one MATCH at a time", statement.span, "answers are joined by UNION")
+            session.refuse("expected only one MATCH", statement.span, "answers are joined by UNION")
         else:
             found = statement
     if found is None:
@@ -189,7 +189,7 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.MatchC
             d.name for d in session.predicates.values() if isinstance(d.body, s.SequenceClause)
         ]
         hint = f"add MATCH {names[0]}()" if names else "add MATCH …"
-        session.refuse("nothing is asked", TextSpan(0, len(session.text)), hint)
+        session.refuse("the text contains no query", TextSpan(0, len(session.text)), hint)
     return found
 
 
@@ -208,7 +208,7 @@ def define(statement: s.Define, session: Session) -> None:
     if name in session.predicates:
         session.refuse(f"'{statement.name}' is defined twice", statement.name_span)
     if name in {normalize_name(function) for function in FUNCTIONS}:
-        session.refuse(f"'{statement.name}' is a function already", statement.name_span)
+        session.refuse(f"'{statement.name}' is the name of a function", statement.name_span)
     session.predicates[name] = statement
 
 
@@ -249,7 +249,7 @@ def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) ->
             asked(value, setting.span, session)
         elif name == "abstraction":
             if catalog.under(value) is None:
-                hint = None if catalog.sets else "the store has none yet: sgstore derive makes them"
+                hint = None if catalog.sets else "the store has none; run sgstore derive"
                 session.unknown("abstraction", value, setting.span, [*catalog.sets], hint)
         else:
             session.unknown("setting", setting.name, setting.span, SETTINGS)
@@ -294,7 +294,7 @@ def _metres(value: str, setting: s.Setting, session: Session) -> float:
         metres = -1.0
     if not 0 <= metres < math.inf:
         session.refuse(
-            f"USING RANGE {value} is no distance", setting.span, "metres: USING RANGE 200"
+            f"USING RANGE {value} is not a distance", setting.span, "metres: USING RANGE 200"
         )
     return metres
 
@@ -309,9 +309,9 @@ def refuse_unused(session: Session) -> None:
     """Raise an error if the caller passes a query parameter that the query does not use."""
     unused = sorted(set(session.parameters) - session.used)
     if unused:
-        name, hint = unused[0], f"it would be written ${unused[0]}"
+        name, hint = unused[0], f"write a parameter as ${unused[0]}"
         if name == "limit":
-            hint = "for fewer rows write LIMIT into the query, or call .limit(n) on its matches"
+            hint = "for fewer rows write LIMIT in the query, or call .limit(n) on its matches"
         raise QueryError(f"the query has no parameter '{name}'", hint=hint)
 
 

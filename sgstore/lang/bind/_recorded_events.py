@@ -32,12 +32,12 @@ def happens(e: s.HappensExpression, names: SymbolTable) -> b.Happened:
         session.unknown("event", e.kind, e.kind_span, (*EVENT_KINDS, *session.tables), _no_event(e))
     nodes = tuple(_to_whom(e, argument, names) for argument in e.arguments)
     if len(set(nodes)) < len(nodes):
-        session.refuse("what happens between two happens to two nodes", e.span)
+        session.refuse("an event between two nodes needs two different nodes", e.span)
     if table is not None:
         return b.Happened(table.name, nodes, _columns_of(table, e, names))
     assert kind is not None  # noqa: S101 - it was refused above
     if len(nodes) > EVENT_KINDS[kind]:
-        most = {0: "to nobody: it is of the frame", 1: "to one node", 2: "to two nodes at most"}
+        most = {0: "to no node, only the frame", 1: "to one node", 2: "to two nodes at most"}
         session.refuse(
             f"{kind} happens {most[EVENT_KINDS[kind]]}, found {len(nodes)}",
             e.span,
@@ -54,7 +54,7 @@ def _no_event(e: s.HappensExpression) -> str | None:
         how = (
             f"EXISTS {{(a)-[:{e.kind}]->(b)}}" if relation_named(e.kind) else f"{e.kind}({called})"
         )
-        return f"it is no event that is recorded, but a condition: {how}"
+        return f"it is not a recorded event, but a condition: {how}"
     return None
 
 
@@ -63,14 +63,14 @@ def _to_whom(e: s.HappensExpression, argument: s.Expression, names: SymbolTable)
     found = names.bind(argument)
     if not isinstance(found, b.NodeValue):
         names.session.refuse(
-            f"{e.kind} happens to nodes, and this is a {found.type.value}",
+            f"{e.kind} happens to nodes, but this is a {found.type.value}",
             argument.span,
             f"write HAPPENS {e.kind}(v)",
         )
     kinds = names.scope.kinds(found.node).every
     if not kinds & entity_kinds():
         names.session.refuse(
-            f"{e.kind} happens to entities, and this is a {' or '.join(sorted(kinds))}",
+            f"{e.kind} happens to entities, but this is a {' or '.join(sorted(kinds))}",
             argument.span,
         )
     return found.node
@@ -87,7 +87,7 @@ def _columns_of(table: TableFacts, e: s.HappensExpression, names: SymbolTable) -
     """
     if not table.joins:
         names.session.refuse(
-            f"the rows of {table.name} belong to no frames",
+            f"the rows of {table.name} do not refer to frames",
             e.kind_span,
             "it needs frame_id, or trace and one of seq, time_ns, t",
         )
@@ -99,8 +99,8 @@ def _columns_of(table: TableFacts, e: s.HappensExpression, names: SymbolTable) -
         if all(name in there for name in chosen):
             return tuple(there[name] for name in chosen) or ("",)
     return names.session.refuse(
-        f"{table.name} does not say to whom: it has no column"
+        f"{table.name} does not name the nodes: it lacks the column"
         f" {' or '.join(' and '.join(known[: len(e.arguments)]) for known in _WHOM)}",
         e.span,
-        f"of the frame it says: HAPPENS {e.kind}()",
+        f"for the frame write HAPPENS {e.kind}()",
     )

@@ -43,7 +43,7 @@ def values_given(
         if isinstance(given.value, s.Variable):
             default = parameters[given.name]
             session.refuse(
-                f"'{given.name}' is a parameter of {step.name}, and takes a value",
+                f"'{given.name}' is a parameter of {step.name} and takes a value",
                 given.span,
                 f"such as {given.name} = {default}" if default else None,
             )
@@ -90,13 +90,13 @@ def own_names(
             session.unknown(f"parameter or variable of {step.name}", given.name, given.span, known)
         if not isinstance(given.value, s.Variable):
             session.refuse(
-                f"'{given.name}' is a variable of {step.name}, and takes the name of one of yours",
+                f"'{given.name}' is a variable of {step.name} and takes the name of a variable of the query",
                 given.span,
                 f"such as {given.name} = a",
             )
         new = given.value.name
         if new in names.values():
-            session.refuse(f"'{new}' is given for two variables of {step.name}", given.span)
+            session.refuse(f"'{new}' renames two variables of {step.name}", given.span)
         names[given.name] = new
     for given in step.given:
         new = names.get(given.name)
@@ -104,7 +104,7 @@ def own_names(
             session.refuse(
                 f"'{new}' is a variable of {step.name} itself",
                 given.span,
-                f"give that one another name, too: {new} = …",
+                f"rename that variable, too: {new} = …",
             )
     strange = taken.union(names.values()).difference(variables)
     return names | {name: f"{name}~" for name in strange}

@@ -56,7 +56,7 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
     """Return the item ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS`` of a ``RETURN`` clause, or None."""
     special = [item for item in returns.items if item.form not in {"value", "all"}]
     if len(special) > 1:
-        session.refuse("one of FRAMES, INTERVALS, SUBGRAPHS and CLIPS at a time", special[1].span)
+        session.refuse("write one of FRAMES, INTERVALS, SUBGRAPHS or CLIPS", special[1].span)
     return special[0] if special else None
 
 
@@ -105,9 +105,9 @@ def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
     """Raise an error for an expression that mixes an aggregate with a value of a single match."""
     if b.is_counted(value) and _of_each(value):
         session.refuse(
-            "a value of each match cannot stand beside one of all matches",
+            "a value of each match cannot be returned with a value of all matches",
             span,
-            "return both by themselves: x.speed, AVG(x.speed)",
+            "return them separately: x.speed, AVG(x.speed)",
         )
 
 
@@ -131,9 +131,9 @@ def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) 
         found = settled(replace(names, aliases=own).condition(written), session)
         if b.is_counted(found) or _of_each(found):
             session.refuse(
-                f"behind HAVING, {result.form} have their ends and no other values",
+                f"after HAVING, {result.form} have only their ends as values",
                 written.span,
-                f"name one of: {', '.join(own)}; what a match must be stands behind WHERE",
+                f"name one of: {', '.join(own)}; write conditions on matches after WHERE",
             )
         return found
     own = {column.name: column.value for column in result.columns}
@@ -141,15 +141,15 @@ def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) 
     found = _of_groups(found, _group_keys(result.columns))
     if not b.is_counted(found) and not result.aggregated:
         session.refuse(
-            "HAVING chooses among groups of matches, and nothing is counted here",
+            "HAVING chooses among groups of matches, but this query has no aggregate",
             written.span,
-            "what a match must be stands behind WHERE, before RETURN",
+            "write conditions on matches after WHERE, before RETURN",
         )
     if _of_each(found):
         session.refuse(
-            "behind HAVING stand values of groups: what is counted, and what is returned beside it",
+            "HAVING can use only aggregates and returned values",
             written.span,
-            "what a match must be stands behind WHERE, before RETURN",
+            "write conditions on matches after WHERE, before RETURN",
         )
     return found
 
@@ -168,10 +168,10 @@ def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound |
         found = _of_groups(found, _group_keys(result.columns))
     _refuse_mixed(found, value.span, names.session)
     if found.type is Type.list:
-        names.session.refuse("a list puts nothing in an order", value.span)
+        names.session.refuse("a list cannot define an order", value.span)
     if isinstance(found, b.Value):
         hint = f"name a value, or one of: {', '.join(known)}"
-        names.session.refuse("a constant puts nothing in an order", value.span, hint)
+        names.session.refuse("a constant cannot define an order", value.span, hint)
     same = next((column.name for column in result.columns if column.value == found), None)
     if result.form in {"intervals", "clips"} and found == _TRACE_NAME:
         same = "trace"
@@ -182,7 +182,7 @@ def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound |
     listed = result.form in {"rows", "subgraphs"}
     if not listed or not (result.aggregated if counted else one_each):
         names.session.refuse(
-            "only by what is returned can these results be ordered or sampled",
+            "these results can be ordered or sampled only by a returned value",
             value.span,
             f"name one of: {', '.join(known)}",
         )
@@ -193,8 +193,8 @@ def _sampling(sample: s.Sample | None, result: b.Result, names: SymbolTable) -> 
     if sample is None:
         return None
     if result.aggregated or (result.distinct and not (result.whole or result.framed)):
-        reason = "SAMPLE chooses among matches, and these are not listed"
-        names.session.refuse(reason, sample.span, "LIMIT n gives the first ones, by ORDER BY")
+        reason = "SAMPLE chooses among matches, but this query does not list them"
+        names.session.refuse(reason, sample.span, "write LIMIT n for the first rows")
     return b.Sampling(sample.number, sample.per and _key(sample.per, result, names))
 
 
@@ -209,7 +209,7 @@ def _top(top: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampli
     rows = result.form == "rows" and not (result.whole or result.framed)
     if not isinstance(per, str) and rows and (result.aggregated or result.distinct):
         names.session.refuse(
-            "LIMIT n PER takes what is returned, where it is counted or DISTINCT",
+            "with DISTINCT or an aggregate, LIMIT n PER needs a returned value",
             top.per.span,
             f"name one of: {', '.join(column.name for column in result.columns)}",
         )
@@ -220,10 +220,10 @@ def _check_result(result: b.Result, returns: s.Returns, session: Session) -> Non
     names = [*result.names, *(column.name for column in result.columns)]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        session.refuse(f"two results are called '{twice}'", returns.span, "name them with AS")
+        session.refuse(f"two results have the name '{twice}'", returns.span, "name them with AS")
     listed = result.form != "rows" or result.whole or result.framed
     if result.aggregated and listed:
-        hint = "a number for each row is COUNT {(a)-[:near]->(b)} AS n"
+        hint = "write COUNT {(a)-[:near]->(b)} AS n for a number in each row"
         if result.form in {"intervals", "clips"}:
-            hint = "frames says how many each has; a value over each is MIN(…) OVER match"
+            hint = "frames is the number of frames of each; write MIN(…) OVER match for a value over each"
         session.refuse("matches are either counted or listed, not both", returns.span, hint)

@@ -248,8 +248,8 @@ def _ways(
         else:
             found = _ways_on(one, found, session)
         if len(found) > MAX_WAYS:
-            reason = f"these steps stand for more than {MAX_WAYS} sequences"
-            session.refuse(reason, span, "repeat fewer of them, or less often")
+            reason = f"these steps expand to more than {MAX_WAYS} sequences"
+            session.refuse(reason, span, "repeat fewer steps, or each step less often")
     if any(len(steps) > MAX_STEPS for steps, _ in found):
         session.refuse(f"a sequence has at most {MAX_STEPS} steps", span)
     return found
@@ -287,7 +287,7 @@ def _bind_steps(
         if isinstance(one, _Written):
             if again and one.step.name is not None:
                 found.session.refuse(
-                    f"'{one.step.name}' would be several steps: it is repeated",
+                    f"'{one.step.name}' names a repeated step",
                     one.step.span,
                     "name a step before or after the brackets, or write the repetitions one by one",
                 )
@@ -479,9 +479,9 @@ def _check_absent(
         before = links[number - 1][0] if number else None
         if before is None:
             session.refuse(
-                "a sequence begins with something that happens",
+                "a sequence cannot begin with NOT MATCH",
                 written.step.span,
-                "a frame in which something is not: MATCH … WHERE NOT EXISTS {…}",
+                "write MATCH … WHERE NOT EXISTS {…} for a frame without a pattern",
             )
         after = links[number][0] if number < len(links) else None
         last = after is None
@@ -489,14 +489,14 @@ def _check_absent(
             session.refuse("before NOT MATCH stands THEN alone", before.span, "… THEN NOT MATCH …")
         if last and (before.within is None or before.after is not None):
             session.refuse(
-                "a sequence that ends with NOT MATCH says for how long",
+                "a sequence that ends with NOT MATCH needs a duration",
                 written.step.span,
                 "write THEN WITHIN 5s NOT MATCH …",
             )
         if after is not None and after.kind != "then":
             session.refuse("after NOT MATCH stands THEN", after.span)
         if after is not None and steps[number + 1].step.absent:
-            session.refuse("between two steps one NOT MATCH", steps[number + 1].step.span)
+            session.refuse("write one NOT MATCH between two steps", steps[number + 1].step.span)
 
 
 def _bind_step(
@@ -505,9 +505,9 @@ def _bind_step(
     session, step = found.session, written.step
     for name in sorted(found.partial & names_written(s.SequenceClause((step,), (), step.span))):
         session.refuse(
-            f"'{name}' is bound in some of the sequences only that the steps before stand for",
+            f"'{name}' is bound only in some alternatives of the steps before",
             written.called or step.span,
-            "bind it in all of them, or before",
+            "bind it in all alternatives, or before them",
         )
     scope = StepScope(session, known=dict(found.known))
     names = SymbolTable(session, scope, dict(found.meanings))
@@ -552,9 +552,9 @@ def _link(link: s.LinkClause, values: Mapping[str, Any] | None, session: Session
         within = length(link.within, names) if link.within else None
     if after and within:
         if after.frames != within.frames:
-            session.refuse("a bound is either in time or in frames", link.span)
+            session.refuse("a bound must be in time or in frames, not both", link.span)
         if within.amount < after.amount:
-            session.refuse("the bound ends before it begins", link.span)
+            session.refuse("the end of the bound is before its start", link.span)
     return b.StepLink(link.kind, after, within)
 
 

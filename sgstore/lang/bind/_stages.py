@@ -142,9 +142,9 @@ class StageBinder:
         lengths = {edge.key: edge.high - edge.low + 1 for edge in scope.edges}
         if math.prod(lengths[key] for path in paths for key, _ in path.edges) > MOST_WAYS:
             self._session.refuse(
-                f"the edges of these paths may be repeated in more than {MOST_WAYS} ways",
+                f"the repeated edges of these paths have more than {MOST_WAYS} combinations",
                 self._span,
-                "bound them closer: -[:travelsTo*1..3]->",
+                "lower the bounds: -[:travelsTo*1..3]->",
             )
 
     def _checked(self, value: b.Bound) -> b.Bound:
@@ -157,13 +157,13 @@ class StageBinder:
             self._session.refuse(
                 "OPTIONAL MATCH and WITH are about one frame, and this query looks at others",
                 self._span,
-                "ask for values of other frames in a query of its own",
+                "write a separate query for values of other frames",
             )
         if any(b.is_passed_on(part) for part in _in_blocks([found])):
             self._session.refuse(
-                "what stands in braces does not know the values of WITH",
+                "a block in braces cannot use the values of WITH",
                 self._span,
-                "compare them outside: WHERE COUNT {…} > n; or write a MATCH behind WITH",
+                "compare them outside: WHERE COUNT {…} > n; or write a MATCH after WITH",
             )
         return found
 
@@ -212,7 +212,7 @@ class StageBinder:
     def _key(self, value: s.Expression, names: SymbolTable) -> b.Bound:
         found = self._checked(names.bind(value))
         if found.type is Type.list:
-            self._session.refuse("a list puts nothing in an order", value.span)
+            self._session.refuse("a list cannot define an order", value.span)
         return found
 
     def _passed(
@@ -227,7 +227,7 @@ class StageBinder:
             )
             for name, symbol in found.items():
                 if name in symbols:
-                    self._session.refuse(f"two results are called '{name}'", item.span)
+                    self._session.refuse(f"two results have the name '{name}'", item.span)
                 symbols[name] = symbol
         columns = {column.name: column.value for column in self._bind_columns(written, names)}
         values: list[b.ReturnColumn] = []
@@ -256,9 +256,7 @@ class StageBinder:
                 return {item.name or value.name: symbol}
             item = replace(item, name=item.name or value.name)
         if item.name is None:
-            self._session.refuse(
-                "a value that WITH passes on needs a name", item.span, "WITH …, COUNT(*) AS n"
-            )
+            self._session.refuse("a value in WITH needs a name", item.span, "WITH …, COUNT(*) AS n")
         written.append(item)
         return {item.name: Symbol()}
 
@@ -352,7 +350,7 @@ def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTab
     assert span is not None  # noqa: S101 - a name has a place
     if names.paths is None:
         hint = "MATCH p = (a)-[:near*1..2]->(b) RETURN nodes(p)"
-        session.refuse("a path has a name in a pattern of one frame, outside of braces", span, hint)
+        session.refuse("name a path only in a pattern of one frame, outside braces", span, hint)
     if path.name in RESERVED or path.name == THE_EGO or names.meaning(path.name) is not None:
         session.refuse(f"'{path.name}' is bound already", span)
     place = _place(path.name, None, session)

@@ -217,7 +217,7 @@ class ScopeBuilder:
         for a, other in sorted(pairs):
             if not self.kinds(a).other and not self.kinds(other).other:
                 self.session.refuse(
-                    "two nodes are both the ego, and different nodes of a pattern are never the same",
+                    "two nodes are the ego, but different nodes of a pattern cannot be equal",
                     self.nodes[a].span,
                     "a frame has one ego: use one variable, or USING NODES any",
                 )
@@ -299,7 +299,7 @@ class SymbolTable:
             self.session.unknown("variable", name, span, known, hint)
         elif meaning.node is None:
             way = meaning.value is not None and meaning.value.type is Type.list
-            hint = f"of a path there are length({name}) and nodes({name})" if way else None
+            hint = f"use length({name}) or nodes({name}) for a path" if way else None
             self.session.refuse(f"'{name}' is not a node", span, hint)
         else:
             key = meaning.node
@@ -309,7 +309,7 @@ class SymbolTable:
     def _hint(self, name: str) -> str | None:
         """Return a hint for a name that is unknown at this place of the query, or None."""
         if self.session.calls:
-            return f"{self.session.calls[-1]}() knows its parameters and ego only"
+            return f"{self.session.calls[-1]}() can use only its parameters and ego"
         if name in self.session.dropped:
             return f"WITH does not pass it on: WITH …, {name}"
         elsewhere = name.lower() in self.session.keys
@@ -374,5 +374,5 @@ def call_hint(name: str) -> str | None:
     word = normalize_name(name)
     if (found := predicates().get(word)) is not None:
         formals = ", ".join(formal.name for formal in found.parameters)
-        return f"it is a predicate: {found.name}({formals})"
+        return f"write the predicate as {found.name}({formals})"
     return f"it is a function: {PAIR_NAMES[word]}(a, b)" if word in PAIR_NAMES else None

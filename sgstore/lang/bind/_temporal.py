@@ -50,9 +50,9 @@ def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
         return b.Tense(e.word, operands, low.amount, None, low.frames)
     high = length(e.bound[1], names)
     if low.frames != high.frames and low.amount:
-        names.session.refuse("a bound is either in time or in frames", e.bound[1].span)
+        names.session.refuse("a bound must be in time or in frames, not both", e.bound[1].span)
     if high.amount < low.amount:
-        names.session.refuse("the bound ends before it begins", e.bound[1].span)
+        names.session.refuse("the end of the bound is before its start", e.bound[1].span)
     return b.Tense(e.word, operands, low.amount, high.amount, high.frames)
 
 
@@ -84,9 +84,9 @@ def _given(e: s.Parameter, names: SymbolTable) -> tuple[float, str]:
     found = _LENGTH.fullmatch(value.strip()) if isinstance(value, str) else None
     if found is None:
         names.session.refuse(
-            f"the parameter '{e.name}' is no length of time",
+            f"the parameter '{e.name}' is not a duration",
             e.span,
-            "give it a number of seconds, or a text such as '2s' or '10frames'",
+            "set it to a number of seconds, or a text such as '2s' or '10frames'",
         )
     return min(float(found[1]), s.LONGEST), found[2].lower()
 
@@ -112,7 +112,7 @@ def course(e: s.Call, names: SymbolTable) -> b.Bound:
     if len(e.arguments) != wanted:
         found = len(e.arguments)
         reason = f"{e.name}() takes {wanted} argument{'s' * (wanted > 1)}, found {found}"
-        hint = f"say how long the window is: {e.name}(x, 2s)" if word in _WINDOWS else None
+        hint = f"add the length of the window: {e.name}(x, 2s)" if word in _WINDOWS else None
         names.session.refuse(reason, e.span, hint)
     return COURSES[word](e, names)
 
@@ -136,7 +136,7 @@ def _how_far(e: s.Call, names: SymbolTable) -> b.Length:
     """Return the bound duration in the second argument of a function over time, such as ``delta(x, 2s)``."""
     back = e.arguments[1]
     if not isinstance(back, s.Duration | s.Parameter):
-        names.session.refuse("expected a length of time such as 2s", back.span)
+        names.session.refuse("expected a duration such as 2s", back.span)
     return length(back, names)
 
 
@@ -148,15 +148,15 @@ def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
     by = _how_far(e, names)
     if by.frames and not by.amount:
         names.session.refuse(
-            f"{word}() of no frame has no value",
+            f"{word}() needs at least one frame",
             e.arguments[1].span,
-            "1frames is the frame itself, 10frames are the last ten",
+            "write 1frames for the frame itself, 10frames for the last ten",
         )
     if word == "avg_over" and b.is_angle(value):
         names.session.refuse(
-            "angles have no average: they come round after 360 degrees",
+            "angles have no average, because they repeat after 360 degrees",
             e.arguments[0].span,
-            "that of directions is atan2(avg_over(sin(radians(x)), 2s), avg_over(cos(radians(x)), 2s))",
+            "average directions with atan2(avg_over(sin(radians(x)), 2s), avg_over(cos(radians(x)), 2s))",
         )
     return b.SignalCall(word, value, by.amount, by.frames)
 
@@ -230,7 +230,7 @@ COURSES: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
 def _refuse_in_block(word: str, span: TextSpan, names: SymbolTable) -> None:
     if names.scope.parent is not None:
         names.session.refuse(
-            f"{word} looks at other frames, and inside braces there is but one",
+            f"{word} needs other frames, but a block in braces has only one",
             span,
             "name the node outside: MATCH (v:Vehicle) WHERE …, or FORALL (v:Vehicle) in a CHECK",
         )

@@ -49,7 +49,7 @@ def regex(text: str) -> re.Pattern[str]:
             return re.compile(text)
         except FutureWarning:
             raise re.error(
-                "a set in a set; write a backslash before [, -, &, | or ~ in a set"
+                "a set contains a set; write a backslash before [, -, &, | or ~ in a set"
             ) from None
 
 
@@ -63,7 +63,7 @@ def _check_regex(pattern: b.Bound, span: TextSpan, names: SymbolTable) -> None:
         names.session.refuse(f"not a regular expression: {error}", span)
     if _NOT_RE2.search(text):
         names.session.refuse(
-            "not a regular expression that can be searched for",
+            "this regular expression is not supported",
             span,
-            "no look-around, no back-references",
+            "remove look-around and back-references",
         )

@@ -103,18 +103,18 @@ def translated(text: str) -> str:
     try:
         tree = ast.parse(text)
     except SyntaxError as error:
-        reason = f"this is no Python: {error.msg}"
+        reason = f"invalid Python: {error.msg}"
         raise QueryError(reason, text=text, span=_place(text, error)) from None
     except (ValueError, RecursionError, MemoryError) as error:
-        raise QueryError(f"this is no Python: {error}") from None
+        raise QueryError(f"invalid Python: {error}") from None
     try:
         found = _Translation(text).all(tree)
     except RecursionError:
-        raise QueryError("too much stands in one another, perhaps by way of names") from None
+        raise QueryError("the expressions are nested too deeply, perhaps through names") from None
     _check(found)
     if not found.strip():
         hint = "Property('name', 'G(~a)', [('a', P.gt(P.size(…), 0))])"
-        raise QueryError("no property is in it, and no truth value", hint=hint)
+        raise QueryError("it contains neither a property nor a truth value", hint=hint)
     return found
 
 
@@ -125,7 +125,7 @@ def _check(found: str) -> None:
     try:
         parse(found)
     except QueryError as error:
-        reason = f"what this means cannot be said in the query language: {error.reason}"
+        reason = f"the query language cannot express this: {error.reason}"
         raise QueryError(reason, text=found, span=error.span, hint=error.hint) from None
 
 
@@ -208,7 +208,7 @@ class _Translation:
 
     def _define(self, name: str, value: ast.expr) -> None:
         if not name.isidentifier():
-            raise self._refused(f"{name!r} is no name", value)
+            raise self._refused(f"{name!r} is not a name", value)
         text = self.truth(value)
         if self._defined.setdefault(name, text) != text:
             raise self._refused(f"{name} is defined twice, and differently", value)
@@ -258,7 +258,7 @@ class _Translation:
         if isinstance(number, bool) or not isinstance(number, int | float):
             raise self._refused("expected a number", at)
         if not abs(number) <= MAX_NUMBER:
-            raise self._refused("too large a number", at)
+            raise self._refused("the number is too large", at)
         return repr(float(number)) if abs(number) >= 2**63 else repr(number)
 
     # Sets of nodes
@@ -333,7 +333,7 @@ class _Translation:
         try:
             wanted = regex(str(test.value))
         except re.error as error:
-            raise self._refused(f"no regular expression: {error}", test) from None
+            raise self._refused(f"invalid regular expression: {error}", test) from None
         if name in {"name", "base_class"}:
             words = {kind: (kind, *_OTHER_NAMES.get(kind, ())) for kind in KINDS}
             kinds = [kind for kind in KINDS if any(wanted.search(word) for word in words[kind])]
@@ -350,7 +350,7 @@ class _Translation:
 
     def _among(self, what: str, words: list[str], test: ast.Constant) -> str:
         if not words:
-            raise self._refused(f"nothing is called like '{test.value}'", test)
+            raise self._refused(f"no name matches '{test.value}'", test)
         return f"{what} IN [{', '.join(repr(word) for word in words)}]"
 
     def _intersection(self, node: str, one: ast.expr, other: ast.expr) -> _Found:
@@ -406,7 +406,7 @@ class _Translation:
             raise self._refused("expected a call", value)
         self._calls += 1
         if self._calls > MAX_CALLS:
-            raise self._refused(f"more than {MAX_CALLS} calls, by way of names", value)
+            raise self._refused(f"more than {MAX_CALLS} calls through names", value)
         name, arguments = _function(value), [*value.args, *(k.value for k in value.keywords)]
         if name == "partial" and arguments:
             name, arguments = _last_name(arguments[0]), arguments[1:]

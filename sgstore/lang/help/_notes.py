@@ -130,7 +130,7 @@ def _there(name: str, text: str, ask: Ask) -> bool:
 
 
 def _note(name: str, text: str, ask: Ask) -> str:
-    said = f"nothing in the store has the {name} {text!r}"
+    said = f"the store has no {name} {text!r}"
     for other in _TEXTS_OF:
         alike = other.startswith("trace.") == name.startswith("trace.") and other != name
         if alike and other != "type" and _there(other, text, ask):
@@ -139,7 +139,7 @@ def _note(name: str, text: str, ask: Ask) -> str:
     near = 'levenshtein(lower("v"."value"), lower($1)), levenshtein("v"."value", $1), "v"."value"'
     nearest = Select(['"v"."value"'], [nested(_all_values(name), "v")], order=[near], limit=1)
     rows = ask(nearest.text(), [text])
-    return f"{said}; the nearest is {rows[0][0]!r}" if rows else f"{said}, or any"
+    return f"{said}; the nearest is {rows[0][0]!r}" if rows else f"{said}, nor any {name}"
 
 
 def _all_values(name: str) -> str:

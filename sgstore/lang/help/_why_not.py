@@ -151,7 +151,7 @@ class WhyNotSteps:
             lines += [f"step {number} of {len(self.steps)}: {text}"]
             lines += [f"  {line}" for line in str(step).splitlines()]
         return "\n".join(
-            [*lines, "what looks at other frames (FOR, THEN, EVENTUALLY …) is not asked"]
+            [*lines, "parts that need other frames (FOR, THEN, EVENTUALLY …) are not tested"]
         )
 
 

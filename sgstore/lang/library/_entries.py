@@ -235,8 +235,8 @@ def pattern_named(name: str) -> NamedPattern:
     if like:
         raise QueryNameError(f"'{name}' may be {' or '.join(like)}", hint="write one of them")
     near = next(iter(get_close_matches(name, found, 1)), suggestion(name, found))
-    hint = f"did you mean '{near}'?" if near else "'sgstore patterns list' names them all"
-    raise QueryNameError(f"no pattern is called '{name}'", hint=hint)
+    hint = f"did you mean '{near}'?" if near else "list all names with 'sgstore patterns list'"
+    raise QueryNameError(f"unknown pattern '{name}'", hint=hint)
 
 
 @cache
@@ -323,8 +323,8 @@ class _LibraryEntry:
         places = {found[1] for found in _PLACE.finditer(query) if found[1]}
         strange = places ^ set(self.parameters)
         if not query or strange or "source" not in self.head:
-            wrong = f"parameter '{min(strange)}' is not both told and used" if strange else ""
-            wrong = wrong or ("it has no text" if not query else "it has no source")
+            wrong = f"parameter '{min(strange)}' is not both declared and used" if strange else ""
+            wrong = wrong or ("the text is missing" if not query else "the source is missing")
             raise QueryError(f"{library}.sgql: '{self.name}': {wrong}")
         parameters = MappingProxyType(self.parameters)
         sentence, source = self.head["sentence"], self.head["source"]

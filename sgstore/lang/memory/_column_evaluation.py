@@ -164,4 +164,4 @@ def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:
 
 
 def _no_blocks(block: b.BlockValue) -> Any:
-    raise TypeError(f"{block} is no number of a node")
+    raise TypeError(f"{block} is not the number of a node")

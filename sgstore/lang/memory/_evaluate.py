@@ -99,7 +99,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
         case (
             b.Aggregate() | b.GroupKey() | b.Tense() | b.SignalCall() | b.StepTime() | b.OverMatch()
         ):
-            raise TypeError(f"{expression} has no value of its own")
+            raise TypeError(f"{expression} has no value")
 
 
 def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a case each

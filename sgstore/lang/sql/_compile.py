@@ -96,7 +96,7 @@ class Compiled:
             return {}
         wanted = self.query.relations
         missing = {trace.name: sorted(wanted - trace.answers) for trace in self.chosen}
-        return {n: f"it knows nothing of {', '.join(some)}" for n, some in missing.items() if some}
+        return {n: f"it does not contain {', '.join(some)}" for n, some in missing.items() if some}
 
     @property
     def left_out(self) -> tuple[str, ...]:

@@ -85,7 +85,7 @@ def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: Boun
         case NodeAttribute(attribute=attribute) if attribute.values:
             return f"CAST({leaf(expression)} AS VARCHAR)"
         case Choices() | LabelTest() | Tense() | SignalCall() | StepTime() | OverMatch():
-            raise TypeError(f"{expression} is no column")
+            raise TypeError(f"{expression} is not a column")
         case _:
             return leaf(expression)
 

@@ -97,12 +97,12 @@ def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
     defined = [one for one in statements if isinstance(one, s.Define)]
     other = next((one for one in statements if one is not union and one not in defined), None)
     if other is not None:
-        hint = "a CHECK is asked by check" if isinstance(other, s.CheckClause) else None
+        hint = "run a CHECK with check" if isinstance(other, s.CheckClause) else None
         raise QueryError("a UNION stands alone", text=text, span=other.span, hint=hint)
     named = [_parameters_of(part, defined) for part in union.parts]
     unused = sorted(set(values).difference(*named))
     if unused:
-        hint = f"it would be written ${unused[0]}"
+        hint = f"write a parameter as ${unused[0]}"
         raise QueryError(f"the query has no parameter '{unused[0]}'", hint=hint)
     parts: list[UnionPart] = []
     for part, names in zip(union.parts, named, strict=True):

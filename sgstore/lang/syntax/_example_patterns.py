@@ -56,7 +56,7 @@ def pattern_of(graph: SceneGraph, ignored: Sequence[str] = ()) -> str:
         The frame has no ego, or an ignored name is unknown.
     """
     if graph.ego is None or graph.ego not in graph.nodes:
-        raise QueryError("the frame has no ego, so nothing is around it")
+        raise QueryError("the frame has no ego, so the pattern around it is empty")
     around = _Around(graph, graph.ego, *_left(ignored))
     facts = list(around.of_ego())
     groups = Counter(text for text in map(around.block, around.others()) if text)
@@ -74,7 +74,7 @@ def _left(ignored: Sequence[str]) -> tuple[frozenset[str], frozenset[str]]:
         if relation is None and several is None:
             like = suggestion(name, [*RELATIONS, *ENTITY_KINDS])
             hint = f"did you mean '{like}'?" if like else "expected a kind or a relation"
-            raise QueryError(f"nothing to ignore is called '{name}'", hint=hint)
+            raise QueryError(f"unknown kind or relation '{name}' to ignore", hint=hint)
         relations -= {relation}
         kinds -= set(several or ())
     return frozenset(relations), frozenset(kinds)

@@ -150,13 +150,13 @@ def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) ->
 def _character(found: str, at: frozenset[str]) -> str | None:
     """Return a hint for a character of the query that is not allowed, or not allowed at this place; or None."""
     if found in {"'", '"'}:
-        return "the text in quotes has no end"
+        return "the text in quotes is not closed"
     if found[:1] in {"'", '"'}:
         what = "a label" if "label" in at else "a name" if "name" in at else ""
         word = found[1:-1]
-        return f"{what} stands without quotes: {word}" if what and word.isidentifier() else None
+        return f"write {what} without quotes: {word}" if what and word.isidentifier() else None
     if found == "`":
-        return "a name stands without quotes, a text in '…'"
+        return "write a name without quotes, a text in '…'"
     if found in _ODD:
         return f"write {_ODD[found]} instead of {found}"
     return _unknown_letter(found, at)
@@ -164,9 +164,9 @@ def _character(found: str, at: frozenset[str]) -> str | None:
 
 def _unknown_letter(found: str, at: frozenset[str]) -> str | None:
     if found[:1].isalpha() and not found[0].isascii() and "name" in at:
-        return "a name begins with one of a to z, or _"
+        return "begin a name with a letter from a to z, or with _"
     if found and unicodedata.category(found[0]).startswith("C"):
-        return "it cannot be seen: delete it"
+        return "the character is invisible; delete it"
     return None
 
 
@@ -184,10 +184,10 @@ def _joined(found: str, before: str, at: frozenset[str]) -> str | None:
     if last and (like := _like(last[1], _PREFIXES)):
         return f"did you mean {like}?"
     if relation_named(found):
-        return f"a relation stands in a pattern: EXISTS {{(a)-[:{found}]->(b)}}"
+        return f"write a relation in a pattern: EXISTS {{(a)-[:{found}]->(b)}}"
     if "comma" in at:
-        return "values are separated by commas"
-    return "conditions are joined by AND, and texts stand in quotes"
+        return "separate values with commas"
+    return "join conditions with AND, and write texts in quotes"
 
 
 _WORDS: Final = frozenset(
@@ -239,7 +239,7 @@ def bracket_hint(text: str, position: int, found: str) -> str | None:
         elif len(part[0]) == 1:
             opened.append(part.start())
     if found in _CLOSES and _CLOSES[found] not in {text[place] for place in opened}:
-        return f"there is no '{_CLOSES[found]}' that it closes"
+        return f"the opening '{_CLOSES[found]}' is missing"
     if found or not opened:
         return None
     after = text[opened[-1] + 1 :].strip()
@@ -268,20 +268,20 @@ def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | N
         True if another part of the query binds this name.
     """
     if elsewhere:
-        return "what a block, or one of several steps, binds is known there only: bind it in MATCH"
+        return "a block or an alternative step binds it; bind it in MATCH to use it here"
     word = normalize_name(name)
     if (said := said_of("variables", name)) is not None:
         return said.format(name=name)
     if relation_named(name):
         return (
-            f"a relation stands in a pattern, EXISTS {{(a)-[:{name}]->(b)}}, or is a text: '{name}'"
+            f"write a relation in a pattern, EXISTS {{(a)-[:{name}]->(b)}}, or as a text: '{name}'"
         )
     if (said := said_of("attributes", name)) is not None:
         return said
     if word in NODE_ATTRIBUTES and len(word) > 1:
         owner = next(iter(sorted(set(visible) - {"ego"})), "ego")
-        return f"an attribute stands behind a variable: {owner}.{NODE_ATTRIBUTES[word].name}"
-    return f"a text stands in quotes: '{name}'" if word in _WORDS else None
+        return f"write an attribute after a variable: {owner}.{NODE_ATTRIBUTES[word].name}"
+    return f"write a text in quotes: '{name}'" if word in _WORDS else None
 
 
 def condition_hint(found: Type, written: str) -> str | None:
@@ -301,7 +301,7 @@ def condition_hint(found: Type, written: str) -> str | None:
     if found is Type.text:
         return f"compare it: {written} = 'a'"
     if found is Type.node:
-        return f"ask for something of it: {written}.speed > 3, stopped({written}), EXISTS {{…}}"
+        return f"write a condition on it: {written}.speed > 3, stopped({written}), EXISTS {{…}}"
     return None
 
 
@@ -318,23 +318,23 @@ def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | N
     if types == {Type.number, Type.text}:
         return next(filter(None, map(_number_hint, texts)), None)
     if Type.boolean in types:
-        return "it is true or false: write it by itself, or after NOT"
+        return "it is true or false; write it alone, or after NOT"
     if types == {Type.node, Type.number}:
         return "the id of a node e is e.id"
     if types == {Type.node, Type.text}:
-        return "the name of a node e is e.name, what it is e.kind"
+        return "the name of a node e is e.name, its kind is e.kind"
     return None
 
 
 def _number_hint(value: object) -> str | None:
     """Return a hint for a quoted number, a number with a unit, or a text without quotes; otherwise None."""
     if isinstance(value, int | float):
-        return f"a text stands in quotes: '{value}'"
+        return f"write a text in quotes: '{value}'"
     found = re.fullmatch(r"\s*([-+]?\d+(?:\.\d+)?)\s*([a-z°/²%]*)\s*", str(value), re.IGNORECASE)
     if found is None:
         return None
     if not found[2]:
-        return f"a number has no quotes: {found[1]}"
+        return f"write a number without quotes: {found[1]}"
     units = {"m/s": "speeds are in m/s", "km/h": "speeds are in m/s", "mph": "speeds are in m/s"}
     said = units.get(found[2].lower(), "m, m/s, degrees, s")
-    return f"a number has no unit: {said}"
+    return f"write a number without a unit; {said}"

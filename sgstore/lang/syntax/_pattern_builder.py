@@ -228,14 +228,14 @@ class Pattern:
 
 def _checked(text: str, form: re.Pattern[str], what: str) -> str:
     if not form.fullmatch(text):
-        raise QueryError(f"{text!r} is not {what} that can stand in a pattern")
+        raise QueryError(f"{text!r} is not {what} that a pattern can use")
     return text
 
 
 def _label(label: str) -> str:
     depths = list(accumulate((c == "(") - (c == ")") for c in label))
     if depths and (min(depths) < 0 or depths[-1]):
-        raise QueryError(f"{label!r} is not a label that can stand in a pattern")
+        raise QueryError(f"{label!r} is not a label that a pattern can use")
     return f":{_checked(label, _LABEL, 'a label')}" if label else ""
 
 

@@ -114,8 +114,8 @@ class _Arguments:
             self.at += 1
             values.append(self._named())
         if self._sign() != ")":
-            hint = "a quote within the text is doubled: 'x.name = ''bus'''; or write $$MATCH …$$"
-            self._refuse("expected ',' or ')' behind the query", self.at, hint)
+            hint = "double a quote within the text: 'x.name = ''bus'''; or write $$MATCH …$$"
+            self._refuse("expected ',' or ')' after the query", self.at, hint)
         self.at += 1
         return text, tuple(values)
 
@@ -131,7 +131,7 @@ class _Arguments:
         name = _NAME.match(self.sql, self._next())
         if name is None:
             self._refuse(
-                "a value of a query has the name of a parameter",
+                "expected the name of a parameter before the value",
                 self.at,
                 "sgql('… WHERE e.speed > $least', least := 10)",
             )

@@ -42,7 +42,7 @@ def _number(span: TextSpan, children: Children) -> s.Constant:
     text: str = children[0].text
     value = int(text) if text.isdigit() else float(text)
     if abs(value) > 1e300:
-        raise BuildError("too large a number")
+        raise BuildError("the number is too large")
     if isinstance(value, int) and value >= 2**63:
         value = float(value)
     return s.Constant(value, span)
@@ -52,7 +52,7 @@ def _whole(token: Any) -> int:
     if not token.text.isdigit():
         raise BuildError("expected a whole number", token.span)
     if len(token.text) > 9:
-        raise BuildError("too large a number", token.span, "at most 9 digits")
+        raise BuildError("the number is too large", token.span, "at most 9 digits")
     return int(token.text)
 
 
@@ -96,11 +96,11 @@ def _attribute(span: TextSpan, children: Children) -> s.AttributeOf:
     owner, name = children
     if not isinstance(owner, s.Variable):
         inner = owner.name if isinstance(owner, s.AttributeOf) else ""
-        hint = said_of("attributes", inner) or "what is of a value is a function: abs(x), lower(x)"
+        hint = said_of("attributes", inner) or "call a function for a value: abs(x), lower(x)"
         if isinstance(owner, s.Call):
-            hint = f"the attribute stands in the brackets: {owner.name}(x.{name.text})"
+            hint = f"write the attribute in the parentheses: {owner.name}(x.{name.text})"
         raise BuildError(
-            f"only variables have attributes, so '.{name.text}' has no meaning here", hint=hint
+            f"only variables have attributes; '.{name.text}' is not allowed here", hint=hint
         )
     return s.AttributeOf(owner, name.text, span)
 
@@ -109,10 +109,8 @@ def _attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
     """Return the syntax tree of ``frame.class('E')``, which means ``frame.class_E``."""
     owner, name, value = children
     if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
-        hint = said_of("methods", name.text) or f"what is called stands first: {name.text}(x)"
-        raise BuildError(
-            f"'.{name.text}' takes nothing in parentheses; only frame.class does", hint=hint
-        )
+        hint = said_of("methods", name.text) or f"write the function first: {name.text}(x)"
+        raise BuildError(f"'.{name.text}' takes no arguments; only frame.class does", hint=hint)
     return s.AttributeOf(owner, f"class_{_unquoted(value.text)}", span)
 
 
@@ -328,7 +326,7 @@ def _range(low: int, high: int, span: TextSpan) -> tuple[int, int]:
     if not 1 <= low <= high:
         raise BuildError(f"an edge cannot be repeated {low} to {high} times", span, "write *1..3")
     if high > MAX_EDGES:
-        raise BuildError(f"a repeated edge stands for at most {MAX_EDGES} edges", span)
+        raise BuildError(f"a repeated edge has at most {MAX_EDGES} edges", span)
     return low, high
 
 
@@ -377,7 +375,7 @@ def _holds_step(span: TextSpan, children: Children) -> s.StepClause:
 def _absent_step(span: TextSpan, children: Children) -> s.StepClause:
     (step,) = children
     if step.hold or step.name:
-        raise BuildError("what must not happen has no duration and no name", step.span)
+        raise BuildError("NOT MATCH cannot have a duration or a name", step.span)
     return s.StepClause(step.block, absent=True, hold=None, name=None, span=span)
 
 
@@ -393,7 +391,7 @@ def _often(span: TextSpan, children: Children) -> tuple[int, int]:
     most = least if high is None else _whole(high)
     if not 1 <= least <= most:
         reason = f"steps cannot be repeated {least} to {most} times"
-        raise BuildError(reason, span, "write {2}, or {1,3}")
+        raise BuildError(reason, span, "write {2} or {1,3}")
     return least, most
 
 
@@ -402,7 +400,7 @@ def _scenario_step(span: TextSpan, children: Children) -> s.ScenarioStep:
     values = tuple(value for value in given if value is not None)
     named = [normalize_name(value.name) for value in values]
     if len(set(named)) < len(named):
-        raise BuildError("a parameter is given twice", span)
+        raise BuildError("a parameter has two values", span)
     return s.ScenarioStep(name.text, values, name.span, span)
 
 
@@ -420,7 +418,7 @@ def _hold(span: TextSpan, children: Children) -> s.HoldClause:
     *comparison, duration, inclusive = children
     word = comparison[0].text if comparison else "="
     if word in {"<>", "!="}:
-        raise BuildError("a step lasts for >=, >, =, < or <= a time", span)
+        raise BuildError("expected >=, >, =, < or <= before the duration of a step", span)
     return s.HoldClause(word, duration, inclusive is not None, span)
 
 
@@ -471,7 +469,7 @@ def _union(span: TextSpan, children: Children) -> s.UnionClause:
     words = {" ".join(word.text.upper().split()): word for word in children[1::2]}
     if len(words) > 1:
         last = [*words.values()][-1]
-        raise BuildError("one of UNION and UNION ALL in a query", last.span)
+        raise BuildError("a query cannot contain both UNION and UNION ALL", last.span)
     return s.UnionClause(tuple(children[::2]), "UNION" in words, span)
 
 
@@ -481,7 +479,7 @@ def _check(span: TextSpan, children: Children) -> s.CheckClause:
     distinct, items, having, at = returns or (False, (), None, span)
     if distinct or having:
         word = "DISTINCT" if distinct else "HAVING"
-        raise BuildError(f"violations are told one by one, so {word} has no meaning", at)
+        raise BuildError(f"violations are listed one by one; remove {word}", at)
     if any(item.form != "value" for item in items):
         reason = "a CHECK returns values of its violations"
         raise BuildError(reason, at, "RETURN MIN(gap(ego, v)) OVER match AS closest")
@@ -516,7 +514,7 @@ def _define(span: TextSpan, children: Children) -> s.Define:
     formals: tuple[s.Formal, ...] = parameters or ()
     named = [normalize_name(formal.name) for formal in formals]
     if len(set(named)) < len(named):
-        raise BuildError("two parameters have one name", span)
+        raise BuildError("two parameters have the same name", span)
     if not isinstance(body, s.SequenceClause) and any(formal.default for formal in formals):
         raise BuildError("the parameters of a predicate are names, without a value", span)
     return s.Define(name.text, formals, body, name.span, span)

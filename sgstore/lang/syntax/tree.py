@@ -23,7 +23,7 @@ class Constant:
 
 LONGEST: Final = 1e18
 """Largest amount of a :class:`Duration`. No trace is this long in any unit."""
-TOO_LONG: Final = "no length of time that a trace may have"
+TOO_LONG: Final = "this duration is longer than any trace can be"
 """Message for a duration above the limit."""
 
 

@@ -151,7 +151,7 @@ class Lock:
         """
         path = Path(path)
         if path.suffix != ENDING:
-            raise ExportError(f"{path}: the name of a lock ends in {ENDING}, such as tests{ENDING}")
+            raise ExportError(f"{path}: a lock name must end in {ENDING}, such as tests{ENDING}")
         try:
             data = self.text().encode()
         except UnicodeEncodeError as error:
