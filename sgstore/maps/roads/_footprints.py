@@ -250,13 +250,13 @@ class LaneIndex:
 
     def _touching(self, shapes: _Shapes) -> tuple[Ints, Ints, Bools, Floats]:
         """Return touching pairs of a footprint and a lane piece, with overlap area and centre mask."""
-        from sgstore.maps.roads import _loops
+        from sgstore.maps.roads import _footprint_loops
 
         grid, quads = self._grid, self._quads
-        rows, *cells = self._cells(shapes)
-        return _loops.touching(
+        rows, first, last = self._cells(shapes)
+        return _footprint_loops.touching(
             rows,
-            (cells[0], cells[1]),
+            (first, last),
             (shapes.x, shapes.y, shapes.cos, shapes.sin, shapes.a, shapes.b),
             (grid.keys, grid.begin, grid.quad, int(grid.shape[1, 0]), grid.first),
             (quads.middle_x, quads.middle_y, quads.radius),
@@ -311,10 +311,10 @@ class LaneIndex:
             yield row[close], quad[close]
 
     def _gathered(
-        self, shapes: _Shapes, row: Ints, quad: Ints, inside: Bools, numbers: Floats
+        self, shapes: _Shapes, row: Ints, quad: Ints, inside: Bools, measures: Floats
     ) -> Touches:
         quads = self._quads
-        share, distance, area = numbers
+        share, distance, area = measures
         z = quads.z[:, quad]
         level = z[0] + (z[1] - z[0]) * np.clip(share, 0.0, 1.0)
         apart = np.abs(level - shapes.z[row]) > self._storey

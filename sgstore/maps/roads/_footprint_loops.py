@@ -1,4 +1,7 @@
-"""Compiled loops (numba) for footprints on lane surfaces. ``_footprints`` has the same in numpy."""
+"""Compiled loops (numba) for footprints on lane surfaces.
+
+``_footprints`` has the same in numpy, with explanations. Both must round equally: change both together.
+"""
 
 # ruff: noqa: PLR0913, PLR0917
 
@@ -41,82 +44,94 @@ def touching(
         Keys of cells, ascending; start of the quadrangles of each cell; these quadrangles; cells
         per column; and the first cell (2, Q) of each quadrangle.
     circles : tuple of (Q,) float64
-        Around quadrangles.
+        Around quadrangles: centre x, centre y, radius.
     corners : (Q, 8) float64
+        Corners of quadrangles: x, then y.
     turn : (Q,) float64
+        +1 for a quadrangle with counter-clockwise corners, else -1.
     touch : float
-        m.
+        Distance at which a footprint still touches a lane; m.
+
+    Returns
+    -------
+    footprint, quad : (P,) int64
+    inside : (P,) bool
+        True if the centre of the footprint is in the quadrangle.
+    measures : (3, P) float64
+        Relative position along the quadrangle, squared distance from its centre line, common area.
     """
     x, y, _, _, a, b = shapes
-    keys, begin, held, high, quad_first = grid
-    found = np.empty((max(8 * len(rows), 8), 2), np.int64)
-    inside, numbers = np.empty(len(found), np.bool_), np.empty((len(found), 3))
-    at_x, at_y = np.empty(4), np.empty(4)
+    keys, begin, quads, cells_per_column, quad_first = grid
+    pairs = np.empty((max(8 * len(rows), 8), 2), np.int64)
+    inside, measures = np.empty(len(pairs), np.bool_), np.empty((len(pairs), 3))
+    corner_x, corner_y = np.empty(4), np.empty(4)
     count = 0
     for i in range(len(rows)):
         row = rows[i]
         size = float(a[row]), float(b[row])
-        around = np.hypot(size[0], size[1]) + touch
+        radius = np.hypot(size[0], size[1]) + touch
         for cell_x in range(cells[0][0, i], cells[1][0, i] + 1):
             for cell_y in range(cells[0][1, i], cells[1][1, i] + 1):
-                key = cell_x * high + cell_y
-                place = np.searchsorted(keys, key)
-                if place == len(keys) or keys[place] != key:
+                key = cell_x * cells_per_column + cell_y
+                cell = np.searchsorted(keys, key)
+                if cell == len(keys) or keys[cell] != key:
                     continue
-                for quad in held[begin[place] : begin[place + 1]]:
-                    if not _counts(cell_x, cell_y, cells[0][:, i], quad_first[:, quad]):
+                for quad in quads[begin[cell] : begin[cell + 1]]:
+                    if not _counts_here(cell_x, cell_y, cells[0][:, i], quad_first[:, quad]):
                         continue
                     away_x, away_y = circles[0][quad] - x[row], circles[1][quad] - y[row]
-                    if away_x**2 + away_y**2 > (circles[2][quad] + around) ** 2:
+                    if away_x**2 + away_y**2 > (circles[2][quad] + radius) ** 2:
                         continue
-                    _place(corners[quad], shapes, row, at_x, at_y)
-                    meets, within = _meets(at_x, at_y, size, float(turn[quad]), touch)
-                    if not meets:
+                    _to_footprint_axes(corners[quad], shapes, row, corner_x, corner_y)
+                    touches, is_inside = _meet(corner_x, corner_y, size, float(turn[quad]), touch)
+                    if not touches:
                         continue
-                    if count == len(found):
-                        found, inside, numbers = _doubled(found, inside, numbers)
-                    found[count, 0], found[count, 1], inside[count] = row, quad, within
-                    numbers[count, 0], numbers[count, 1] = _beside(at_x, at_y)
-                    numbers[count, 2] = _common_area(at_x, at_y, size)
+                    if count == len(pairs):
+                        pairs, inside, measures = _doubled(pairs, inside, measures)
+                    pairs[count, 0], pairs[count, 1], inside[count] = row, quad, is_inside
+                    measures[count, 0], measures[count, 1] = _along_middle(corner_x, corner_y)
+                    measures[count, 2] = _common_area(corner_x, corner_y, size)
                     count += 1
     return (
-        found[:count, 0].copy(),
-        found[:count, 1].copy(),
+        pairs[:count, 0].copy(),
+        pairs[:count, 1].copy(),
         inside[:count],
-        numbers[:count].T.copy(),
+        measures[:count].T.copy(),
     )
 
 
 @compiled
-def _counts(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
-    """Return True if a lane piece counts in a grid cell, so that each lane piece is found only once."""
+def _counts_here(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
+    """Return True if a pair counts in a grid cell: the first cell that both share."""
     if cell_x > first[0] and quad_first[0] != cell_x:
         return False
     return cell_y == first[1] or quad_first[1] == cell_y
 
 
 @compiled
-def _doubled(found: Ints, inside: Bools, numbers: Floats) -> tuple[Ints, Bools, Floats]:
+def _doubled(pairs: Ints, inside: Bools, measures: Floats) -> tuple[Ints, Bools, Floats]:
     """Return copies of the result arrays with twice the size."""
     return (
-        np.concatenate((found, np.empty_like(found))),
+        np.concatenate((pairs, np.empty_like(pairs))),
         np.concatenate((inside, np.empty_like(inside))),
-        np.concatenate((numbers, np.empty_like(numbers))),
+        np.concatenate((measures, np.empty_like(measures))),
     )
 
 
 @compiled
-def _place(corners: Floats, shapes: Shapes, row: int, at_x: Floats, at_y: Floats) -> None:
-    """Convert the corners of a lane piece into the axes of an object footprint."""
+def _to_footprint_axes(
+    corners: Floats, shapes: Shapes, row: int, corner_x: Floats, corner_y: Floats
+) -> None:
+    """Write the corners of a lane piece in the axes of an object footprint into two arrays."""
     x, y, cos, sin, _, _ = shapes
     for corner in range(4):
         dx, dy = corners[corner] - x[row], corners[4 + corner] - y[row]
-        at_x[corner] = dx * cos[row] + dy * sin[row]
-        at_y[corner] = dy * cos[row] - dx * sin[row]
+        corner_x[corner] = dx * cos[row] + dy * sin[row]
+        corner_y[corner] = dy * cos[row] - dx * sin[row]
 
 
 @compiled
-def _meets(
+def _meet(
     x: Floats, y: Floats, size: tuple[float, float], turn: float, touch: float
 ) -> tuple[bool, bool]:
     """Return two flags: footprint and lane piece touch; the footprint's centre is in the piece."""
@@ -135,7 +150,7 @@ def _meets(
 
 
 @compiled
-def _beside(x: Floats, y: Floats) -> tuple[float, float]:
+def _along_middle(x: Floats, y: Floats) -> tuple[float, float]:
     """Return the relative position of a footprint along the lane piece, and the squared distance."""
     from_x, from_y = (x[0] + x[3]) / 2, (y[0] + y[3]) / 2
     along_x, along_y = (x[1] + x[2]) / 2 - from_x, (y[1] + y[2]) / 2 - from_y
