@@ -499,7 +499,7 @@ def test_a_query_and_a_name_are_not_asked_at_once(
     code, _, err = sgstore(verb[0], store, *verb[1:], "MATCH (e:Ego)", "-p", "jaywalking")
 
     assert code == 2
-    assert "give one of" in err
+    assert "expected one of" in err
 
 
 def test_a_table_in_a_pipe_is_whole_however_late_a_long_value_comes(

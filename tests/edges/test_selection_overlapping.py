@@ -328,7 +328,7 @@ def test_each_case_of_a_lock_is_exported_as_a_clip_of_its_own(
     assert sorted(of_clips.values()) == sorted(case.frames for case in lock.cases)
     assert {row["frame_id"] for row in frames} == frames_of(found)
     assert run([*asked, "MATCH (e:Ego)", "--to", str(tmp_path / "more")]) == 2
-    assert "give one of" in capsys.readouterr().err
+    assert "expected one of" in capsys.readouterr().err
 
 
 def test_parts_count_frames_once_and_share_no_recording(store: Store) -> None:
