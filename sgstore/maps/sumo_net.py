@@ -43,9 +43,10 @@ if TYPE_CHECKING:
 
 MAX_ELEMENTS: Final = 8_000_000
 WIDTH: Final = 3.2
-"""Default width of a lane; m. (SUMO's default.)"""
+"""SUMO's default width of a lane; m."""
 CROSSING_WIDTH: Final = 4.0
-_ALONE: Final = (
+"""SUMO's default width of a crossing; m."""
+_LANE_TYPES: Final = (
     ({"pedestrian", "wheelchair"}, "sidewalk"),
     ({"bicycle", "scooter"}, "biking"),
     ({"tram"}, "tram"),
@@ -53,9 +54,9 @@ _ALONE: Final = (
     ({"bus", "coach", "taxi", "emergency", "authority"}, "bus"),
 )
 """Classes of vehicles, and the lane type for these and all previous classes only."""
-_NONE: Final = "all"
-_LOOKED_AT: Final = 1 << 16
-_APART: Final = 1.0
+_HEAD: Final = 1 << 16
+"""Characters at the start of a text that decide whether it is a SUMO network."""
+_MAX_GAP: Final = 1.0
 """Greatest gap between neighbouring lanes, in addition to their widths; m."""
 
 
@@ -70,43 +71,44 @@ class _SumoEdge:
 
 @dataclass(slots=True)
 class _SumoNet:
-    """Contents of a SUMO network file: edges, connections, junction positions, traffic light phases."""
+    """Contents of a SUMO network file: edges, connections, traffic light phases."""
 
     edges: list[_SumoEdge] = field(default_factory=list[_SumoEdge])
     connections: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
-    junctions: dict[str, tuple[str, str]] = field(default_factory=dict[str, tuple[str, str]])
     phases: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     """States of the links of each traffic light, in all phases of all programs."""
     roundabouts: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
     beside: dict[str, str] = field(default_factory=dict[str, str])
     """Lane → its left neighbour with the opposite direction."""
     depth: int = 0
+    """Depth of the present XML element."""
     logic: str = ""
+    """Traffic light of the present phases."""
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         """Handle the start tag of an XML element."""
         self.depth += 1
         if self.depth == 1 and tag != "net":
             raise MapError(f"the root element is <{tag[:80]}>, expected <net>")
-        if self.depth == 2 and tag == "edge":
-            told = (attributes.get(key, "") for key in ("id", "function", "from", "to"))
-            ident, function, source, target = told
-            self.edges.append(_SumoEdge(ident, function, source, target))
-        elif self.depth == 2 and tag == "connection":
-            self.connections.append(attributes)
-        elif self.depth == 2 and tag == "roundabout":
-            self.roundabouts.append(attributes)
-        elif self.depth == 2 and tag == "junction":
-            place = attributes.get("x", ""), attributes.get("y", "")
-            self.junctions[attributes.get("id", "")] = place
-        elif self.depth == 2 and tag == "tlLogic":
-            self.logic = attributes.get("id", "")
-        elif self.depth == 3 and tag == "phase":
-            self.phases.setdefault(self.logic, []).append(attributes.get("state", ""))
-        elif self.depth == 3 and tag == "lane" and self.edges:
-            self.edges[-1].lanes.append(attributes)
-        elif self.depth == 4 and tag == "neigh" and self.edges and self.edges[-1].lanes:
-            self.beside[self.edges[-1].lanes[-1].get("id", "")] = attributes.get("lane", "")
+        match self.depth, tag:
+            case 2, "edge":
+                names = (attributes.get(key, "") for key in ("id", "function", "from", "to"))
+                ident, function, source, target = names
+                self.edges.append(_SumoEdge(ident, function, source, target))
+            case 2, "connection":
+                self.connections.append(attributes)
+            case 2, "roundabout":
+                self.roundabouts.append(attributes)
+            case 2, "tlLogic":
+                self.logic = attributes.get("id", "")
+            case 3, "phase":
+                self.phases.setdefault(self.logic, []).append(attributes.get("state", ""))
+            case 3, "lane" if self.edges:
+                self.edges[-1].lanes.append(attributes)
+            case 4, "neigh" if self.edges and self.edges[-1].lanes:
+                self.beside[self.edges[-1].lanes[-1].get("id", "")] = attributes.get("lane", "")
+            case _:
+                pass
 
     def end(self, _tag: str) -> None:
         """Handle the end tag of an XML element."""
@@ -115,7 +117,7 @@ class _SumoNet:
 
 def is_sumo_net(text: str) -> bool:
     """Return True if a text is a SUMO network, by its first XML elements."""
-    start = text[:_LOOKED_AT]
+    start = text[:_HEAD]
     return "<net " in start and ("<location " in start or "<edge " in start)
 
 
@@ -134,6 +136,7 @@ def sumo_net_text(text: str) -> str:
         raise MapError(str(error), element=error.element or None) from error
     broken: list[str] = []
     lines, crosswalks = _lines(net, broken)
+    _add_opposites(net, lines)
     if not lines:
         raise MapError("a network of SUMO without lanes", element="net")
     lanes, warnings = plain_lanes(_joined(net, lines))
@@ -148,55 +151,66 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
     lines: dict[str, LaneLine] = {}
     crosswalks: list[PlainCrosswalk] = []
     points = 0
-    around = _around(net)
+    roundabouts = _roundabouts(net)
     for edge in net.edges:
         if edge.function in {"walkingarea", "connector"}:
             continue
-        inside = edge.ident.startswith(":")
+        is_crossing = edge.function == "crossing"
         for lane in edge.lanes:
-            ident = lane.get("id", "")
-            crossing = edge.function == "crossing"
-            centre = _shape(lane.get("shape", ""))
+            ident, centre = lane.get("id", ""), _centre_line(lane.get("shape", ""))
             points += len(centre)
             if points > MAX_POINTS:
                 raise MapError(f"lanes of more than {MAX_POINTS:,} points", element="lane")
-            width = _number(lane.get("width", ""), CROSSING_WIDTH if crossing else WIDTH)
+            width = _number(lane.get("width", ""), CROSSING_WIDTH if is_crossing else WIDTH)
             if not ident or len(ident) > MAX_NAME or len(centre) < 2 or not 0 < width < 1000:
                 broken.append(ident or edge.ident)
                 continue
             sections, _ = Sections.across(centre, [], [], width / 2)
-            if crossing:
+            if is_crossing:
                 crosswalks.append(_crosswalk(ident, sections))
-                continue
-            index = int(_number(lane.get("index", ""), 0.0))
-            junction = edge.ident[1:].rpartition("_")[0] if inside else ""
-            lines[ident] = LaneLine(
-                ident,
-                _type(lane),
-                centre,
-                sections=sections,
-                lefts=(_side(sections, left=True),),
-                rights=(_side(sections, left=False),),
-                road=edge.ident,
-                number=index + 1,
-                junction=junction,
-                speed_limit=_speed(lane),
-                roundabout=around.get(("node", junction) if inside else ("edge", edge.ident), ""),
-            )
-        _set_beside(net, edge, lines)
+            else:
+                lines[ident] = _lane_line(edge, lane, centre, sections, roundabouts)
+        _add_neighbours(net, edge, lines)
     if len(lines) > MAX_LANES:
         raise MapError(f"{len(lines):,} lanes; a map may have {MAX_LANES:,}", element="lane")
-    return _with_opposites(net, lines), crosswalks
+    return lines, crosswalks
 
 
-def _around(net: _SumoNet) -> dict[tuple[str, str], str]:
+def _lane_line(
+    edge: _SumoEdge,
+    lane: dict[str, str],
+    centre: Floats,
+    sections: Sections,
+    roundabouts: dict[tuple[str, str], str],
+) -> LaneLine:
+    """Return a SUMO lane without neighbours and links."""
+    in_junction = edge.ident.startswith(":")
+    junction = edge.ident[1:].rpartition("_")[0] if in_junction else ""
+    return LaneLine(
+        lane["id"],
+        _lane_type(lane),
+        centre,
+        sections=sections,
+        lefts=(_side(sections, left=True),),
+        rights=(_side(sections, left=False),),
+        road=edge.ident,
+        number=int(_number(lane.get("index", ""), 0.0)) + 1,
+        junction=junction,
+        speed_limit=_speed(lane),
+        roundabout=roundabouts.get(("node", junction) if in_junction else ("edge", edge.ident), ""),
+    )
+
+
+def _roundabouts(net: _SumoNet) -> dict[tuple[str, str], str]:
     """Return the name of the roundabout for each SUMO node and edge in a roundabout."""
-    found: dict[tuple[str, str], str] = {}
-    for one in net.roundabouts:
-        nodes = one.get("nodes", "").split()
-        for what, names in (("node", nodes), ("edge", one.get("edges", "").split())):
-            found |= {(what, name): nodes[0][:MAX_NAME] for name in names if nodes}
-    return found
+    names: dict[tuple[str, str], str] = {}
+    for roundabout in net.roundabouts:
+        nodes = roundabout.get("nodes", "").split()
+        if nodes:
+            name = nodes[0][:MAX_NAME]
+            names |= {("node", node): name for node in nodes}
+            names |= {("edge", edge): name for edge in roundabout.get("edges", "").split()}
+    return names
 
 
 def _crosswalk(ident: str, sections: Sections) -> PlainCrosswalk:
@@ -210,8 +224,8 @@ def _side(sections: Sections, *, left: bool) -> Border:
     return Border(np.column_stack((line, sections.z)), to_left=True, to_right=True)
 
 
-def _set_beside(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> None:
-    """Record the lanes of a SUMO edge as neighbours. The lane with the next index is on the left."""
+def _add_neighbours(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> None:
+    """Add the neighbours of the lanes of a SUMO edge. The lane with the next index is on the left."""
     idents = [lane.get("id", "") for lane in edge.lanes]
     for right, left in pairwise(idents):
         if right in lines and left in lines:
@@ -222,37 +236,36 @@ def _set_beside(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> N
             lines[ident] = replace(lines[ident], left_beside=(*lines[ident].left_beside, other))
 
 
-def _with_opposites(net: _SumoNet, lines: dict[str, LaneLine]) -> dict[str, LaneLine]:
-    """Record the leftmost lanes of opposite SUMO edges as neighbours, if they touch."""
-    back: dict[tuple[str, str], list[_SumoEdge]] = defaultdict(list)
+def _add_opposites(net: _SumoNet, lines: dict[str, LaneLine]) -> None:
+    """Add the leftmost lanes of opposite SUMO edges as neighbours, if they touch."""
+    edges_between: dict[tuple[str, str], list[_SumoEdge]] = defaultdict(list)
     for edge in net.edges:
         if not edge.function and edge.lanes:
-            back[edge.source, edge.target].append(edge)
-    for (source, target), edges in back.items():
-        others = back.get((target, source), []) if source < target else []
-        if len(edges) != 1 or len(others) != 1:
+            edges_between[edge.source, edge.target].append(edge)
+    for (source, target), edges in edges_between.items():
+        opposites = edges_between.get((target, source), []) if source < target else []
+        if len(edges) != 1 or len(opposites) != 1:
             continue
-        one, other = (e[0].lanes[-1].get("id", "") for e in (edges, others))
-        if one in lines and other in lines and _side_by_side(lines[one], lines[other]):
-            beside = (*lines[one].left_beside, other)
-            lines[one] = replace(lines[one], left_beside=tuple(dict.fromkeys(beside)))
-    return lines
+        left, opposite = (pair[0].lanes[-1].get("id", "") for pair in (edges, opposites))
+        if left in lines and opposite in lines and _side_by_side(lines[left], lines[opposite]):
+            beside = dict.fromkeys((*lines[left].left_beside, opposite))
+            lines[left] = replace(lines[left], left_beside=tuple(beside))
 
 
 def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
     if one.sections is None or other.sections is None:
         return False
     gaps = one.sections.left[[0, -1]] - other.sections.left[[-1, 0]]
-    return bool((np.hypot(*gaps.T) < _APART).all())
+    return bool((np.hypot(*gaps.T) < _MAX_GAP).all())
 
 
 def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
     """Return SUMO lanes with predecessors and successors, also through junctions with inner lanes."""
     after: dict[str, list[Joint]] = defaultdict(list)
     before: dict[str, list[Joint]] = defaultdict(list)
-    for told in net.connections:
-        src = f"{told.get('from')}_{told.get('fromLane')}"
-        via, end = told.get("via", ""), f"{told.get('to')}_{told.get('toLane')}"
+    for connection in net.connections:
+        src = _from_lane(connection)
+        via, end = connection.get("via", ""), f"{connection.get('to')}_{connection.get('toLane')}"
         dst = via if via in lines else end
         if src in lines and dst in lines:
             after[src].append(Joint(dst, Joint.START))
@@ -263,41 +276,45 @@ def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
     ]
 
 
+def _from_lane(connection: dict[str, str]) -> str:
+    return f"{connection.get('from')}_{connection.get('fromLane')}"
+
+
 def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -> list[PlainSignal]:
     """Return the traffic lights of a SUMO network: one for all lanes of a junction with equal states."""
     links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
-    for told in net.connections:
-        name, number = told.get("tl", ""), told.get("linkIndex", "0")
-        through = told.get("via") or f"{told.get('from')}_{told.get('fromLane')}"
-        if name and len(name) <= MAX_NAME and through in row_of and number.isdecimal():
+    for connection in net.connections:
+        name, number = connection.get("tl", ""), connection.get("linkIndex", "0")
+        lane = connection.get("via") or _from_lane(connection)
+        if name and len(name) <= MAX_NAME and lane in row_of and number.isdecimal():
             link = int(number)
-            shown = tuple(state[link : link + 1] for state in net.phases.get(name, ()))
-            links[name].setdefault(shown, {})[link] = through
+            states = tuple(state[link : link + 1] for state in net.phases.get(name, ()))
+            links[name].setdefault(states, {})[link] = lane
     signals: list[PlainSignal] = []
     for name, groups in links.items():
         for lanes in groups.values():
-            begins = np.array([lines[lane].centre[0] for lane in lanes.values()])
-            x, y, z = begins.mean(axis=0).tolist()
-            own = name if len(groups) == 1 else f"{name}/{min(lanes)}"
+            starts = np.array([lines[lane].centre[0] for lane in lanes.values()])
+            x, y, z = starts.mean(axis=0).tolist()
+            signal = name if len(groups) == 1 else f"{name}/{min(lanes)}"
             rows = tuple(sorted({row_of[lane] for lane in lanes.values()}))
-            signals.append(PlainSignal(own, "traffic_light", x, y, z, lanes=rows))
+            signals.append(PlainSignal(signal, "traffic_light", x, y, z, lanes=rows))
     return signals
 
 
-def _type(lane: dict[str, str]) -> str:
+def _lane_type(lane: dict[str, str]) -> str:
     """Return the lane type from the vehicle classes that a SUMO lane permits."""
     allowed = {*lane.get("allow", "").split()}
-    if not allowed and _NONE in lane.get("disallow", "").split():
+    if not allowed and "all" in lane.get("disallow", "").split():
         return "none"
-    seen: set[str] = set()
-    for classes, kind in _ALONE:
-        seen |= classes
-        if allowed and allowed <= seen:
-            return kind
+    classes: set[str] = set()
+    for more_classes, lane_type in _LANE_TYPES:
+        classes |= more_classes
+        if allowed and allowed <= classes:
+            return lane_type
     return "entry" if lane.get("acceleration") in {"1", "true"} else "driving"
 
 
-def _shape(text: str) -> Floats:
+def _centre_line(text: str) -> Floats:
     """Parse the points (n, 3) of a SUMO line; empty for an invalid line."""
     try:
         points = [[float(number) for number in point.split(",")] for point in text.split()]
