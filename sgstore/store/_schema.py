@@ -163,7 +163,7 @@ def check(connection: DuckDBPyConnection, database: str, path: Path) -> None:
 _REMEDY: Final = "'sgstore rebuild' makes it anew from its recordings"
 
 
-def looked_at(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tuple[str, ...]]:
+def schema_faults(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tuple[str, ...]]:
     """Return all faults of a store's schema, and the names of user tables and views.
 
     Raises

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import sgstore.store._schema as shape
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.config import from_dict
 from sgstore.model.world import BUCKET_FRAMES
@@ -21,6 +20,7 @@ from sgstore.store._engine_errors import translated
 from sgstore.store._locking import Access
 from sgstore.store._packing import LONGEST_STEP
 from sgstore.store._publish import SHARED, checksum_of, owned
+from sgstore.store._schema import schema_faults
 from sgstore.store._traces import stored_traces
 
 if TYPE_CHECKING:
@@ -285,25 +285,21 @@ def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
     place = Path(path)
     access = Access(place, checked=False)
     with access.reading() as connection:
-        wrong, others = shape.looked_at(connection, place)
-    if wrong:
-        return Verification(faults=[Fault("", "schema", one) for one in wrong], others=others)
-    found = verify_store(Access(place, diagnose=damage), recordings=recordings)
-    found.others = others
-    return found
+        altered, others = schema_faults(connection, place)
+    if altered:
+        return Verification(faults=[Fault("", "schema", text) for text in altered], others=others)
+    result = verify_store(Access(place, diagnose=damage), recordings=recordings)
+    result.others = others
+    return result
 
 
 def verify_store(access: Access, *, recordings: bool = False) -> Verification:
     """Verify the content of an open store, and return the faults."""
-    from sgstore.mcap import digest_of
-
     with access.reading() as connection:
-        found = verify(connection, access.path)
+        result = verify(connection, access.path)
         if recordings:
-            again = verify_recordings(connection, digest_of, access.path, access.root)
-            found.recordings = again.recordings
-            found.faults += again.faults
-    return found
+            _verify_recordings(connection, access, result)
+    return result
 
 
 def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
@@ -324,30 +320,30 @@ def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
         except StoreError as error:
             return [Fault("", "rows", str(error))]
 
-    found = Verification()
+    result = Verification()
     traces = {trace.trace_id: trace for trace in stored_traces(connection)}
-    found.traces = len(traces)
+    result.traces = len(traces)
     published = _published(connection)
-    found.faults += attempt(partial(_odd, connection))
+    result.faults += attempt(partial(_content_faults, connection))
     for trace in traces.values():
-        found.faults += attempt(partial(_rows, connection, trace, published, found))
-    found.faults += attempt(partial(_shared, connection, published, found))
+        result.faults += attempt(partial(_trace_faults, connection, trace, published, result))
+    result.faults += attempt(partial(_shared_faults, connection, published, result))
     names = {trace_id: trace.name for trace_id, trace in traces.items()}
     for rule in _RULES:
-        found.faults += attempt(partial(_broken, connection, names, *rule))
-    return found
+        result.faults += attempt(partial(_rule_faults, connection, names, *rule))
+    return result
 
 
 def damage(connection: DuckDBPyConnection, path: Path) -> str:
     """Return the first fault of a store as text; empty without a fault."""
     try:
-        found = verify(connection, path)
+        faults = verify(connection, path).faults
     except SgstoreError as error:
         return str(error)
-    return f"{found.faults[0].trace} {found.faults[0].detail}".strip() if found.faults else ""
+    return f"{faults[0].trace} {faults[0].detail}".strip() if faults else ""
 
 
-def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
+def _content_faults(connection: DuckDBPyConnection) -> Iterator[Fault]:
     """Yield faults of a store: unreadable settings, duplicate names or ids, and a wrong table of mask bits."""
     for number, text in connection.execute("SELECT config_id, settings FROM config").fetchall():
         try:
@@ -367,30 +363,26 @@ def _odd(connection: DuckDBPyConnection) -> Iterator[Fault]:
         yield Fault("", "rows", "table bits does not hold the bits of a mask")
 
 
-def verify_recordings(
-    connection: DuckDBPyConnection,
-    digest_of: Callable[[Path], str],
-    store: Path | None = None,
-    root: str | Path | None = None,
-) -> Verification:
-    """Compare the recording files of all traces with the stored hashes. Return the faults."""
-    found = Verification()
-    known: dict[Path, str | SgstoreError] = {}
-    traces = stored_traces(connection, store, root)
-    for trace in traces:
-        if trace.path not in known:
+def _verify_recordings(
+    connection: DuckDBPyConnection, access: Access, result: Verification
+) -> None:
+    """Compare the recording files of all traces with the stored hashes, and add the faults."""
+    from sgstore.mcap import digest_of
+
+    digests: dict[Path, str | SgstoreError] = {}
+    for trace in stored_traces(connection, access.path, access.root):
+        if trace.path not in digests:
             try:
-                known[trace.path] = digest_of(trace.path)
+                digests[trace.path] = digest_of(trace.path)
             except SgstoreError as error:
-                known[trace.path] = error
-        digest = known[trace.path]
+                digests[trace.path] = error
+        digest = digests[trace.path]
         if isinstance(digest, SgstoreError):
-            found.faults.append(Fault(trace.name, "payloads", str(digest)))
+            result.faults.append(Fault(trace.name, "payloads", str(digest)))
         elif digest != trace.digest:
             reason = f"{trace.path}: not the file that was ingested; ingest it anew"
-            found.faults.append(Fault(trace.name, "payloads", reason))
-    found.traces, found.recordings = len(traces), len(known)
-    return found
+            result.faults.append(Fault(trace.name, "payloads", reason))
+    result.recordings = len(digests)
 
 
 _Published = dict[tuple[str, int], dict[str, Checksum]]
@@ -405,19 +397,19 @@ def _published(connection: DuckDBPyConnection) -> _Published:
     return published
 
 
-def _rows(
-    connection: DuckDBPyConnection, trace: StoredTrace, published: _Published, found: Verification
+def _trace_faults(
+    connection: DuckDBPyConnection, trace: StoredTrace, published: _Published, result: Verification
 ) -> Iterator[Fault]:
     """Yield faults of a trace: tables whose rows differ from the published rows."""
     manifest = published.get(("trace", trace.trace_id), {})
     if not manifest:
         yield Fault(trace.name, "rows", "nothing is noted of what was published of it")
-    tables = {table for (whose, _), of in published.items() if whose == "trace" for table in of}
+    tables = {table for (owner, _), of in published.items() if owner == "trace" for table in of}
     database = _database(connection)
     for table, _ in list(owned(connection, database)):
         if table in tables:
             checksum = checksum_of(connection, database, table, trace.trace_id, trace.frames)
-            found.rows += checksum.rows
+            result.rows += checksum.rows
             if checksum != manifest.get(table, Checksum()):
                 yield Fault(trace.name, "rows", _difference(table, checksum, manifest.get(table)))
 
@@ -429,16 +421,16 @@ def _difference(table: str, now: Checksum, then: Checksum | None) -> str:
     return f"table {table} holds other values than were published"
 
 
-_NAMED: Final = {"recording": "uri", "config": "config_id", "map": "name"}
+_NAME_COLUMNS: Final = {"recording": "uri", "config": "config_id", "map": "name"}
 
 
-def _shared(
-    connection: DuckDBPyConnection, published: _Published, found: Verification
+def _shared_faults(
+    connection: DuckDBPyConnection, published: _Published, result: Verification
 ) -> Iterator[Fault]:
     """Yield faults of a store: recordings, settings and road maps that differ from the published ones."""
     database = _database(connection)
     for owner, tables in SHARED.items():
-        sql = f"SELECT {owner}_id, {_NAMED[owner]} FROM {owner}"
+        sql = f"SELECT {owner}_id, {_NAME_COLUMNS[owner]} FROM {owner}"
         for number, name in connection.execute(sql).fetchall():
             manifest = published.get((owner, number), {})
             for table in tables:
@@ -446,20 +438,21 @@ def _shared(
                 select = expressions(connection, table, database)
                 sql = f"SELECT {select} FROM {table} WHERE {owner}_id = ?"
                 checksum.add(connection.execute(sql, [number]).fetchnumpy())
-                found.rows += checksum.rows
+                result.rows += checksum.rows
                 if checksum != manifest.get(table, Checksum()):
                     difference = _difference(table, checksum, manifest.get(table))
                     check = "map" if owner == "map" else "rows"
                     yield Fault("", check, f"{owner} {name!r}: {difference}")
 
 
-def _broken(
-    connection: DuckDBPyConnection, names: dict[int, str], check: str, wrong: str, sql: str
+def _rule_faults(
+    connection: DuckDBPyConnection, names: dict[int, str], check: str, detail: str, sql: str
 ) -> Iterator[Fault]:
+    """Yield one fault for each trace with rows that break a rule."""
     grouped = f"SELECT trace_id, count(*) FROM ({sql}) AS found(trace_id) GROUP BY ALL ORDER BY ALL"
     for trace_id, count in connection.execute(grouped).fetchall():
         name = "" if trace_id is None else names.get(trace_id, str(trace_id))
-        yield Fault(name, check, f"{wrong} ({count} times)")
+        yield Fault(name, check, f"{detail} ({count} times)")
 
 
 def _database(connection: DuckDBPyConnection) -> str:
