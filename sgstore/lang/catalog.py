@@ -790,6 +790,9 @@ class Catalog:
         Kinds in table ``state``, kinds of static entities in ``entity``, and kinds in ``map_node``.
     ego_signals : frozenset of str
         Kinds of lights and signs that are an ego; empty in nearly every store.
+    lacking : mapping of str to frozenset of str
+        For attributes such as ``heading``: the kinds of nodes that have no value in some frame. Attributes
+        that are not listed may be missing everywhere.
     traces : tuple of TraceFacts
     classed : tuple of str
         Abstractions whose frame classes are in the store.
@@ -838,6 +841,7 @@ class Catalog:
     fixed: frozenset[str] = frozenset()
     mapped: frozenset[str] = frozenset(MAP_KINDS)
     ego_signals: frozenset[str] = frozenset(SIGNALS)
+    lacking: Mapping[str, frozenset[str]] = field(default_factory=dict[str, frozenset[str]])
     traces: tuple[TraceFacts, ...] = ()
     classed: tuple[str, ...] = ()
     name: str = ""

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.base.quoting import literal
 from sgstore.graphs.abstractions import SUBSETS
 from sgstore.lang.catalog import (
+    NODE_ATTRIBUTES,
     Catalog,
+    Home,
     RelationScope,
     TraceFacts,
     Type,
@@ -53,12 +55,16 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
         "SELECT trace_id, min(bucket), max(bucket) - min(bucket) + 1 FROM bucket GROUP BY trace_id"
     ).fetchall()
     extents = {trace: (first, buckets) for trace, first, buckets in rows}
+    moving, fixed, mapped = (
+        kinds(of) for of in ("entity WHERE NOT is_static", "entity WHERE is_static", "map_node")
+    )
     whole = Catalog(
         edges=_counted(connection, "edge"),
         map_edges=_counted(connection, "map_edge"),
-        moving=kinds("entity WHERE NOT is_static"),
-        fixed=kinds("entity WHERE is_static"),
-        mapped=kinds("map_node"),
+        moving=moving,
+        fixed=fixed,
+        mapped=mapped,
+        lacking=_lacking(connection, {Home.scenery: fixed, Home.map: mapped}),
         ego_signals=kinds(f"state WHERE is_ego AND kind IN ({_words(SIGNALS)})"),
         traces=tuple(
             TraceFacts(
@@ -169,6 +175,39 @@ def _type_of(traces: list[tuple[Type, bool, bool]]) -> Type:
     numbers = [flags for one, *flags in traces if one is Type.number]
     exact = all(whole for whole, _ in numbers) and any(large for _, large in numbers)
     return Type.whole if kind is Type.number and exact else kind
+
+
+_STATED: Final = ("heading", "length", "width", "height", "speed")
+"""Attributes whose missing values are looked up in the states."""
+
+_HOLDERS: Final = {
+    Home.state: ("state", "world_state"),
+    Home.scenery: ("(SELECT * FROM entity WHERE is_static)",),
+    Home.map: ("map_node",),
+}
+"""Tables with the values of moving nodes, static entities and map parts."""
+
+
+def _lacking(
+    connection: DuckDBPyConnection, held: Mapping[Home, frozenset[str]]
+) -> dict[str, frozenset[str]]:
+    """Return the kinds of nodes that lack an attribute in some frame: attribute → kinds.
+
+    DuckDB skips row groups without missing values. ``held``: kinds in tables that may not have the column.
+    """
+    found: dict[str, frozenset[str]] = {}
+    parts: list[str] = []
+    for name in _STATED:
+        columns = NODE_ATTRIBUTES[name].columns
+        found[name] = frozenset().union(*(of for home, of in held.items() if home not in columns))
+        parts += [
+            f"SELECT DISTINCT {literal(name)} AS name, kind FROM {table} AS t WHERE {columns[home]} IS NULL"
+            for home in _HOLDERS.keys() & columns.keys()
+            for table in _HOLDERS[home]
+        ]
+    for name, kind in connection.execute(" UNION ALL ".join(parts)).fetchall():
+        found[name] |= {kind}
+    return found
 
 
 def _counted(connection: DuckDBPyConnection, table: str) -> dict[Triple, int]:

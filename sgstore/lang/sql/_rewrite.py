@@ -47,6 +47,7 @@ from sgstore.lang.ir import (
     Stage,
     TraceAttribute,
     Value,
+    all_of,
     any_kinds,
     conjuncts,
     ego_kinds,
@@ -58,7 +59,7 @@ from sgstore.lang.ir import (
 from sgstore.lang.operators import MIRRORED
 from sgstore.lang.sql._expressions import is_constant, leaves
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
-from sgstore.model.vocabulary import KINDS
+from sgstore.model.vocabulary import KINDS, SIGNALS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
 
 
 FALSE: Final = Value(value=False, type=Type.boolean)
+TRUE: Final = Value(value=True, type=Type.boolean)
 _OPPOSITE: Final = {"=": "<>", "<>": "=", "<": ">=", ">=": "<", ">": "<=", "<=": ">"} | {
     "IS NULL": "IS NOT NULL",
     "IS NOT NULL": "IS NULL",
@@ -76,7 +78,10 @@ _OPPOSITE: Final = {"=": "<>", "<>": "=", "<": ">=", ">=": "<", ">": "<=", "<=":
 def rewritten(query: Query, catalog: Catalog) -> Query:
     """Return an equivalent query that is faster to evaluate, after all rewriting rules."""
     if query.stages:
-        return _staged(query, catalog)
+        return _staged(
+            query, catalog
+        )  # a node of OPTIONAL MATCH lacks every value where it is absent
+    query = _in_scopes(values_lacking, query, catalog)
     query = _ruled(query, catalog)
     query = replace(query, result=query.result.changed(_attributes))
     return count_by_buckets(query, catalog)
@@ -232,6 +237,72 @@ def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
         return with_operands(value, known)
 
     return replace(scope, where=tuple(map(known, scope.where)))
+
+
+def values_lacking(scope: Scope, catalog: Catalog) -> Scope:
+    """Replace ``v.heading IS NULL`` by a test of the kinds of ``v`` that lack a heading somewhere in the store.
+
+    Such conditions come from checks, which ask whether a value is unknown. Most recordings have all values.
+    """
+    egos = catalog.moving - (frozenset(SIGNALS) - catalog.ego_signals)
+
+    def told(value: Bound) -> Bound:
+        match value:
+            case Operation("IS NULL", (NodeAttribute(node=node, attribute=attribute),)) if (
+                attribute.name in catalog.lacking
+            ):
+                if node not in scope.nodes and node not in scope.outer:
+                    return value
+                kinds, lacking = scope.kinds(node), catalog.lacking[attribute.name]
+                every = (kinds.ego & egos) | kinds.other
+                if not every & lacking:
+                    return FALSE
+                if every <= lacking:
+                    return value
+                return all_of(LabelTest(node, any_kinds().only(lacking)), value)
+            case _:
+                return _folded(with_operands(value, told))
+
+    where = tuple(map(told, scope.where))
+    return replace(scope, where=(FALSE,) if FALSE in where else where)
+
+
+def _folded(value: Bound) -> Bound:
+    """Return an equal condition without constants among the operands of AND, OR and NOT."""
+    match value:
+        case Operation("NOT", (operand,)) if operand == FALSE:
+            return TRUE
+        case Operation("AND" | "OR" as word, operands):
+            return _joined(word, operands)
+        case BlockValue(word="EXISTS", scope=Scope(where=(first,))) if first == FALSE:
+            return FALSE
+        case _:
+            return value
+
+
+def _joined(word: str, operands: tuple[Bound, ...]) -> Bound:
+    """Join conditions by AND or OR, without constants. A label that all parts of an OR share is put first."""
+    neutral, strong = (TRUE, FALSE) if word == "AND" else (FALSE, TRUE)
+    rest = tuple(one for one in operands if one != neutral)
+    if strong in rest or not rest:
+        return strong if rest else neutral
+    joined = Operation(word, rest, Type.boolean) if len(rest) > 1 else rest[0]
+    label = _common_label(rest) if word == "OR" and len(rest) > 1 else None
+    return joined if label is None else all_of(label, joined)
+
+
+def _common_label(ways: tuple[Bound, ...]) -> LabelTest | None:
+    """Return the label that follows from each of several conditions on the same node, or None."""
+    labels: list[LabelTest] = []
+    for way in ways:
+        label = way.operands[0] if isinstance(way, Operation) and way.word == "AND" else way
+        if not isinstance(label, LabelTest) or (labels and label.node != labels[0].node):
+            return None
+        labels.append(label)
+    kinds = labels[0].kinds
+    for label in labels[1:]:
+        kinds |= label.kinds
+    return LabelTest(labels[0].node, kinds)
 
 
 def push_negations(scope: Scope, _: Catalog) -> Scope:
