@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
@@ -68,9 +69,15 @@ def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
     ]
 
 
+_IN_BRACES: Final = re.compile(r"\{[^{}]*\}")
+
+
 def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
     """Return the text "condition is unknown of entities in frame" for an unknown verdict."""
     written = value_text(condition).removeprefix("(").removesuffix(")")
+    while (shorter := _IN_BRACES.sub("\0", written)) != written:
+        written = shorter
+    written = written.replace("\0", "{…}")  # one pattern takes many lines
     return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
 
 
