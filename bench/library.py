@@ -47,12 +47,13 @@ PROGRAM = (
 class Answer(NamedTuple):
     """Processor time (s) and greatest memory (MB) of an entry over a store, and the number of its answers.
 
-    The time is infinite where the process was ended.
+    The time is infinite where the process was ended, or failed with ``error``.
     """
 
     seconds: float
     memory: float
     count: int
+    error: str = ""
 
 
 def answered(path: str, name: str) -> str:
@@ -86,7 +87,7 @@ def asked(path: Path, name: str) -> Answer:
     if run.returncode < 0:
         return Answer(math.inf, 0.0, 0)
     if run.returncode:
-        raise RuntimeError(f"{name}: {run.stderr.strip().splitlines()[-1]}")
+        return Answer(math.inf, 0.0, 0, run.stderr.strip().splitlines()[-1][:160])
     return Answer(*json.loads(run.stdout))
 
 
@@ -121,7 +122,9 @@ def measured(name: str, sized: list[tuple[Path, int]]) -> Measure:
         parts.append(f"exponent {slope:.2f}")
     parts += [f"above {limit} s"] * (scaled > limit)
     parts += [f"above {PEAK_MB} MB"] * (max(one.memory for one in answers) > PEAK_MB)
-    parts += [f"ended after {MOST_S} s over {sized[last][1]:,} frames"] * math.isinf(scaled)
+    if math.isinf(scaled):
+        reason = answers[last].error or f"ended after {MOST_S} s"
+        parts.append(f"over {sized[last][1]:,} frames: {reason}")
     return Measure(name, scaled, "s", "  ".join(parts))
 
 
