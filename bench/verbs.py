@@ -57,7 +57,7 @@ VERBS = (
     Verb("patterns run STORE cut_in"),
     Verb("check STORE -p rss_distance"),
     Verb("check STORE -p phi1 -p phi7"),
-    Verb("check STORE|-e|CHECK ROBUSTNESS: ALWAYS FORALL (v:Vehicle) dist(ego, v) > 2"),
+    Verb("check STORE|-e|CHECK FORALL (v:Vehicle) ALWAYS dist(ego, v) > 2 ROBUSTNESS"),
     Verb("timeline STORE -p cut_in -o FOLDER/timeline.png"),
     Verb("criticality STORE -m pet", 10.0),
     Verb("criticality STORE -m ttc_recorded", 10.0),
