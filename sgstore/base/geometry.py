@@ -89,8 +89,8 @@ def is_simple(corners: Sequence[Corner]) -> bool:
     """Return True if a polygon does not cross or touch itself."""
     sides = list(zip(corners, (*corners[1:], corners[0]), strict=True))
     folded_back = any(
-        _turn(*one, other[1]) == 0 and not _between(*one, other[1], ahead=True)
-        for one, other in zip(sides, (*sides[1:], sides[0]), strict=True)
+        _turn(*side, following[1]) == 0 and not _is_ahead(*side, following[1])
+        for side, following in zip(sides, (*sides[1:], sides[0]), strict=True)
     )
     crossing = any(
         _meet(sides[i], sides[j])
@@ -106,15 +106,19 @@ def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
     turns = [_turn(*three) for three in ends]
     if turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0:
         return True
-    return any(turn == 0 and _between(*e) for turn, e in zip(turns, ends, strict=True))
+    return any(turn == 0 and _is_between(*three) for turn, three in zip(turns, ends, strict=True))
 
 
-def _between(a: Corner, b: Corner, c: Corner, *, ahead: bool = False) -> bool:
-    """Return True if point c lies between points a and b on their line; with ``ahead``, if c lies beyond b."""
-    if ahead:
-        return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
+def _is_between(a: Corner, b: Corner, c: Corner) -> bool:
+    """Return True if point c, on the line through a and b, lies between them."""
     return all(min(p, q) <= r <= max(p, q) for p, q, r in zip(a, b, c, strict=True))
 
 
+def _is_ahead(a: Corner, b: Corner, c: Corner) -> bool:
+    """Return True if the way from b to c continues the way from a to b."""
+    return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
+
+
 def _turn(a: Corner, b: Corner, c: Corner) -> float:
+    """Return twice the signed area of a triangle; positive for a turn to the left at b."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

@@ -81,14 +81,13 @@ class MarkupParser:
     def _begins(self, tag: str, attributes: dict[str, str]) -> None:
         self._depth += 1
         self._elements += 1
-        most = self._most
         if self._depth > MAX_DEPTH:
             raise MarkupError(f"nested more than {MAX_DEPTH} levels deep", tag[:80])
         if len(attributes) > MAX_ATTRIBUTES:
             reason = f"{len(attributes)} attributes; an element may have {MAX_ATTRIBUTES}"
             raise MarkupError(reason, tag[:80])
-        if most is not None and self._elements > most:
-            raise MarkupError(f"more than {most:,} elements", tag[:80])
+        if self._most is not None and self._elements > self._most:
+            raise MarkupError(f"more than {self._most:,} elements", tag[:80])
         self._start(tag, attributes)
 
     def _ends(self, tag: str) -> None:

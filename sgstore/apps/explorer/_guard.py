@@ -27,13 +27,14 @@ POLICY: Final = (
 """Content policy of the page; the editor's styles have the nonce, and the browser itself writes
 some attributes."""
 
-_ALWAYS: Final = {
+_HEADERS: Final = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cross-origin-opener-policy": "same-origin",
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
+"""Headers of all responses, unless the application sets them."""
 
 
 class Guard:
@@ -60,43 +61,43 @@ class Guard:
         nonce = secrets.token_urlsafe(16)
         scope.setdefault("state", {})["nonce"] = nonce
 
-        async def sent(message: Message) -> None:
+        async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 headers["content-security-policy"] = POLICY.format(nonce=nonce)
-                for name, value in _ALWAYS.items():
+                for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
             await send(message)
 
         answer = self._refusal(scope) if scope["type"] == "http" else Response(status_code=403)
-        await (answer or self._app)(scope, receive, sent)
+        await (answer or self._app)(scope, receive, send_with_headers)
 
     def _refusal(self, scope: Scope) -> Response | None:
         """Return the response that rejects a request or sets the login cookie.
 
         ``None`` means that the request may pass.
         """
-        asked = HTTPConnection(scope)
-        headers = asked.headers
+        connection = HTTPConnection(scope)
+        headers = connection.headers
         host = headers.get("host", "")
         name, port = scope.get("server") or ("", 0)
         if host not in {*self._hosts, host_of(name, port)}:
             return PlainTextResponse("wrong host", 403)
         if headers.get("origin", f"http://{host}") != f"http://{host}":
             return PlainTextResponse("wrong origin", 403)
-        plain = scope["method"] == "GET" and scope["path"] == "/"
+        is_first_page = scope["method"] == "GET" and scope["path"] == "/"
         site = headers.get("sec-fetch-site")
-        if site not in {None, "same-origin"} and not plain:
+        if site not in {None, "same-origin"} and not is_first_page:
             return PlainTextResponse("wrong site", 403)
-        if plain and scope["query_string"]:
-            token = asked.query_params.get("token", "")
-            return self._let_in() if self._is_token(token) else _no_token()
-        return None if self._is_token(asked.cookies.get(self._cookie, "")) else _no_token()
+        if is_first_page and scope["query_string"]:
+            token = connection.query_params.get("token", "")
+            return self._log_in() if self._is_token(token) else _no_token()
+        return None if self._is_token(connection.cookies.get(self._cookie, "")) else _no_token()
 
-    def _is_token(self, told: str) -> bool:
-        return secrets.compare_digest(told.encode(), self._token.encode())
+    def _is_token(self, text: str) -> bool:
+        return secrets.compare_digest(text.encode(), self._token.encode())
 
-    def _let_in(self) -> Response:
+    def _log_in(self) -> Response:
         response = RedirectResponse("/", 303)
         response.set_cookie(
             self._cookie, self._token, max_age=30 * 86_400, httponly=True, samesite="strict"

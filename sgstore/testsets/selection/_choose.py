@@ -28,7 +28,7 @@ from sgstore.testsets.locks import lock_of
 from sgstore.testsets.selection._bounds import has_solver
 from sgstore.testsets.selection._bundles import UnitsWished, cheapest_units
 from sgstore.testsets.selection._cover import affordable, cheapest, minimal, within
-from sgstore.testsets.selection._unit_values import is_check, least_of_check, least_values
+from sgstore.testsets.selection._unit_values import is_check, least_margins, least_values
 from sgstore.testsets.selection._units import (
     Budget,
     Measure,
@@ -520,7 +520,7 @@ def _allotted(
 
 def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
     """Select clips in ascending order of their lowest value, within the budget. Unknown values are last."""
-    value = least_of_check(units, spec.by) if is_check(spec.by) else least_values(units, spec.by)
+    value = least_margins(units, spec.by) if is_check(spec.by) else least_values(units, spec.by)
     order = np.lexsort((rank, np.where(np.isnan(value), np.inf, value)))
     if spec.budget is not None:
         order = BudgetTracker.of(units, spec.budget.measure, spec.budget.most).fitting(order)

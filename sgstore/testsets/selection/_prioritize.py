@@ -44,7 +44,7 @@ from sgstore.testsets.selection._situations import (
     frames_in_parts,
     situations,
 )
-from sgstore.testsets.selection._unit_values import numbers_of_frames
+from sgstore.testsets.selection._unit_values import frame_values
 from sgstore.testsets.selection._units import Budget, SelectionUnit, units_of
 
 if TYPE_CHECKING:
@@ -504,9 +504,9 @@ def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, Wor
 
 
 def _worst_of_expression(units: Units, text: str) -> WorstValues:
-    asked, value = numbers_of_frames(units, text)
+    rows, numbers = frame_values(units, text)
     frames = np.full(len(units.frame_id), np.inf)
-    frames[asked] = np.where(np.isnan(value), np.inf, value)
+    frames[rows] = np.where(np.isnan(numbers), np.inf, numbers)
     return _worst_of(units, text, frames, np.full(len(frames), -1))
 
 

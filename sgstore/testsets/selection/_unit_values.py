@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats, Ints
 
 
-def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
+def frame_values(units: Units, text: str) -> tuple[Ints, Floats]:
     """Return the ids of frames and the value of an expression (a number) in each frame.
 
     Parameters
@@ -43,48 +43,48 @@ def numbers_of_frames(units: Units, text: str) -> tuple[Ints, Floats]:
 
     rows = np.flatnonzero(units.asked)
 
-    def asked(expression: str) -> list[Any]:
+    def values_of(expression: str) -> list[Any]:
         labels = Labels.asked(units.chosen.store, {"measure": expression}, units.frame_id[rows])
         return labels.of(units.frame_id[rows])["measure"]
 
-    found, condition = asked(text), _condition_in(text)
-    if any(isinstance(one, bool) for one in found):
-        found, condition = asked(f"robustness({text})"), text
-    wrong = next((v for v in found if not isinstance(v, int | float | None)), None)
+    values, condition = values_of(text), _condition_in(text)
+    if any(isinstance(value, bool) for value in values):
+        values, condition = values_of(f"robustness({text})"), text
+    wrong = next((v for v in values if not isinstance(v, int | float | None)), None)
     if wrong is not None:
         raise ConfigError(f"the measure {text} is {wrong!r}; expected a number, or a condition")
-    value = np.array([np.nan if one is None else float(one) for one in found], np.float64)
-    if condition is not None and np.isinf(value).any():
+    numbers = np.array([np.nan if v is None else float(v) for v in values], np.float64)
+    if condition is not None and np.isinf(numbers).any():
         # An unknown condition has a margin of minus infinity, too, and must not come first.
         margin = _margins(units, f"CHECK ALWAYS ({condition}) ROBUSTNESS")[rows]
-        value[np.isinf(value) & np.isnan(margin)] = np.nan
-    return rows, value
+        numbers[np.isinf(numbers) & np.isnan(margin)] = np.nan
+    return rows, numbers
 
 
 def _condition_in(text: str) -> str | None:
     """Return the condition of an expression ``robustness(…)``; ``None`` for any other expression."""
-    begun = "MATCH () RETURN "
+    prefix = "MATCH () RETURN "
     try:
-        match = parse(begun + text)[-1]
+        match = parse(prefix + text)[-1]
     except QueryError:
-        return None  # a complete query
+        return None  # the text is a complete query
     items = match.returns.items if isinstance(match, MatchClause) and match.returns else ()
     call = items[0].value if len(items) == 1 else None
     if not isinstance(call, Call) or call.name.lower() != "robustness" or not call.arguments:
         return None
     span = call.arguments[0].span
-    return (begun + text)[span.start : span.end]
+    return (prefix + text)[span.start : span.end]
 
 
 def least_values(units: Units, text: str) -> Floats:
     """Return the lowest value of an expression in each test case, (U,); NaN if unknown."""
-    rows, value = numbers_of_frames(units, text)
+    rows, numbers = frame_values(units, text)
     frames = np.full(len(units.frame_id), np.nan)
-    frames[rows] = value
-    return _least(units, frames)
+    frames[rows] = numbers
+    return _least_by_unit(units, frames)
 
 
-def _least(units: Units, frames: Floats) -> Floats:
+def _least_by_unit(units: Units, frames: Floats) -> Floats:
     """Return the lowest of the given frame values in each test case, (U,); NaN if unknown."""
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
     return np.fmin.reduceat(np.append(frames, np.nan), ranges)[::2]
@@ -98,7 +98,7 @@ def is_check(text: str) -> bool:
     return bool(_CHECK.match(text))
 
 
-def least_of_check(units: Units, text: str) -> Floats:
+def least_margins(units: Units, text: str) -> Floats:
     """Return the lowest robustness margin of a check in each test case, (U,); NaN if unknown.
 
     Raises
@@ -109,7 +109,7 @@ def least_of_check(units: Units, text: str) -> Floats:
     QueryError
         The check is invalid.
     """
-    return _least(units, _margins(units, text))
+    return _least_by_unit(units, _margins(units, text))
 
 
 def _margins(units: Units, text: str) -> Floats:
@@ -126,8 +126,8 @@ def _margins(units: Units, text: str) -> Floats:
         )
     frames = np.full(len(units.frame_id), np.nan)
     for frame_id, margins in run.margins():
-        place = np.searchsorted(units.frame_id, frame_id)
-        there = np.append(units.frame_id, -1)[place] == frame_id
-        frames[place[there]] = np.broadcast_to(margins, len(frame_id))[there]
+        row = np.searchsorted(units.frame_id, frame_id)
+        in_units = np.append(units.frame_id, -1)[row] == frame_id
+        frames[row[in_units]] = np.broadcast_to(margins, len(frame_id))[in_units]
     frames[~units.asked] = np.nan
     return frames
