@@ -32,7 +32,7 @@ FILE_PREFIX: Final = ".sgstore-held-"
 
 _DESCRIPTOR: Final = re.compile(r"/dev/fd/(\d+)|/proc/self/fd/(\d+)")
 
-_NOT_THERE: Final = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV}
+_NOT_REPLACEABLE: Final = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV}
 """Errors of a place in which a file is writable but not replaceable."""
 
 _CONTROLS: Final = {
@@ -156,7 +156,7 @@ class OutputFile:
         self._to = Path(to)
         self._stack = ExitStack()
         self._stream: io.BufferedWriter | None = None
-        with _told(self._to):
+        with _export_errors(self._to):
             self._target = _target(self._to)
             self._in_place = self._target is None
             self._path = None if self._target is None else self._folder(self._target) / "output"
@@ -167,7 +167,7 @@ class OutputFile:
         try:
             return self._stack.enter_context(HeldFolder(target.parent, FILE_PREFIX)).path
         except OSError as error:
-            if error.errno not in _NOT_THERE or not target.exists():
+            if error.errno not in _NOT_REPLACEABLE or not target.exists():
                 raise
             self._in_place = True
             return self._stack.enter_context(working_folder("output"))
@@ -175,7 +175,7 @@ class OutputFile:
     def path(self) -> Path:
         """Return a temporary path for the content. :meth:`keep` moves this file to its final path."""
         if self._path is None:
-            with _told(self._to):
+            with _export_errors(self._to):
                 self._path = self._stack.enter_context(working_folder("output")) / "output"
         return self._path
 
@@ -184,7 +184,7 @@ class OutputFile:
 
         It closes with the output; use it instead of :meth:`path`.
         """
-        with _told(self._to):
+        with _export_errors(self._to):
             if self._path is None:
                 descriptor = _descriptor(self._to)
             else:
@@ -204,24 +204,24 @@ class OutputFile:
             if self._stream is not None:
                 self._stream.close()
             if self._path is not None:
-                with _told(self._to):
-                    self._put(self._path)
+                with _export_errors(self._to):
+                    self._move(self._path)
         finally:
             self.discard()
 
-    def _put(self, place: Path) -> None:
+    def _move(self, content: Path) -> None:
         target = self._target
         if target is None or self._in_place:
-            _copy(place, target or self._to, str(self._to))
+            _copy(content, target or self._to, str(self._to))
             return
         if target.exists():
-            _as_before(place, target)
+            _keep_owner_and_mode(content, target)
         try:
-            place.replace(target)
+            content.replace(target)
         except OSError as error:
-            if error.errno not in _NOT_THERE or not target.exists():
+            if error.errno not in _NOT_REPLACEABLE or not target.exists():
                 raise
-            _copy(place, target, str(self._to))
+            _copy(content, target, str(self._to))
 
     def discard(self) -> None:
         """Discard the new output file. An older file at the final path stays unchanged."""
@@ -278,7 +278,7 @@ def written_at(to: str | Path) -> Generator[Path]:
     ExportError
         The file is not writable; the previous file does not change.
     """
-    with _complete(to) as output, _told(Path(to)):
+    with _complete(to) as output, _export_errors(Path(to)):
         yield output.path()
 
 
@@ -295,7 +295,8 @@ def write_bytes(to: str | Path, data: bytes) -> None:
 
 
 @contextmanager
-def _told(to: Path) -> Generator[None]:
+def _export_errors(to: Path) -> Generator[None]:
+    """Context manager that raises errors of the operating system as :class:`ExportError`."""
     try:
         yield
     except OSError as error:
@@ -333,31 +334,31 @@ def _open_here(to: Path, about: os.stat_result) -> int | None:
 
 def _descriptor(to: Path) -> int:
     """Open an existing pipe, device or stream for writing, and return the file descriptor."""
-    mine = _open_here(to, to.stat())
-    if mine is None:
+    descriptor = _open_here(to, to.stat())
+    if descriptor is None:
         return os.open(to, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):  # keeps the order of outputs
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()
-    return os.dup(mine)
+    return os.dup(descriptor)
 
 
-def _copy(place: Path, to: Path, name: str) -> None:
+def _copy(content: Path, to: Path, name: str) -> None:
     """Copy a file into an existing file or stream that cannot be replaced."""
     about = to.stat()
     plain = stat.S_ISREG(about.st_mode) and _open_here(to, about) is None
     descriptor = os.open(to, os.O_WRONLY | os.O_TRUNC) if plain else _descriptor(to)
-    with place.open("rb") as source, io.BufferedWriter(Stream(descriptor, name)) as sink:
+    with content.open("rb") as source, io.BufferedWriter(Stream(descriptor, name)) as sink:
         shutil.copyfileobj(source, sink)
 
 
-def _as_before(place: Path, target: Path) -> None:
+def _keep_owner_and_mode(content: Path, target: Path) -> None:
     """Give a new file the owner and mode of the old file, and flush it to disk."""
     about = target.stat()
     with suppress(OSError):
-        os.chown(place, about.st_uid, about.st_gid)
-    place.chmod(stat.S_IMODE(about.st_mode))
-    descriptor = os.open(place, os.O_RDONLY)
+        os.chown(content, about.st_uid, about.st_gid)
+    content.chmod(stat.S_IMODE(about.st_mode))
+    descriptor = os.open(content, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

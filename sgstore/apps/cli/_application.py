@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-import sgstore.apps.cli._process as ending
 from sgstore.apps.cli import (
     _checks,
     _collections,
@@ -18,6 +17,7 @@ from sgstore.apps.cli import (
     _exports,
     _monitor,
     _prioritize,
+    _process,
     _queries,
     _recordings,
     _serve,
@@ -25,10 +25,9 @@ from sgstore.apps.cli import (
     _testsets,
     _timeline,
 )
+from sgstore.apps.cli._collection_options import forget_collections, report_missing
 from sgstore.apps.cli._options import ERROR, USAGE, Quiet, Verbose, Verbs
-from sgstore.apps.cli._output import complain, talk, talk_as_usual, write_error
-from sgstore.apps.cli._places import forget_asked, with_missing
-from sgstore.apps.cli._process import take_streams
+from sgstore.apps.cli._output import complain, reset_verbosity, set_verbosity, write_error
 from sgstore.base.output_files import ReaderGoneError
 from sgstore.errors import ConfigError, QueryError, SgstoreError, SqlError, is_interruption
 
@@ -54,7 +53,7 @@ def sgstore(
     Recordings go in (ingest), frames are found by what happens in them (find, sql), looked at (show), and
     exported as clips (export). SGSTORE_STORE names the store of verbs that are given none.
     """
-    talk(quiet=quiet, verbose=verbose)
+    set_verbosity(quiet=quiet, verbose=verbose)
     if version:
         from importlib.metadata import version as version_of
 
@@ -87,7 +86,7 @@ for _group, _panel in (
 
 def _verb_in(arguments: Sequence[str]) -> Sequence[str]:
     """Return a list with the verb of a command line, without global options; an empty list without a verb."""
-    return [one for one in arguments if one not in {"--quiet", "--verbose"}][:1]
+    return [text for text in arguments if text not in {"--quiet", "--verbose"}][:1]
 
 
 _PUBLISHING: Final = ("ingest", "import", "derive")
@@ -106,15 +105,15 @@ def main() -> None:
     # Imported objects are never garbage: a search for garbage during imports takes a tenth of a
     # short run.
     gc.set_threshold(50_000)
-    take_streams()
+    _process.take_streams()
     try:
-        ending.heed_signals()
+        _process.heed_signals()
         code = run(sys.argv[1:])
-        ending.ignore_signals()
+        _process.ignore_signals()
     except KeyboardInterrupt:  # before the run began, or after its end
-        ending.ignore_signals()
-        complain(ending.word())
-        code = ending.exit_code()
+        _process.ignore_signals()
+        complain(_process.word())
+        code = _process.exit_code()
     sys.exit(code)
 
 
@@ -134,9 +133,9 @@ def run(arguments: list[str]) -> int:
         The exit code, as listed in :mod:`sgstore.apps.cli`.
     """
     try:
-        code = _ran(arguments)
+        code = _exit_code(arguments)
     except SgstoreError as error:
-        return 0 if isinstance(error, ReaderGoneError) else _refused(error, arguments)
+        return 0 if isinstance(error, ReaderGoneError) else _report_error(error, arguments)
     except BrokenPipeError:
         # The reader of our output has exited (`| head`): there is nothing to report or flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -150,41 +149,41 @@ def run(arguments: list[str]) -> int:
         show()
         return USAGE
     finally:
-        ending.clear_deadline()
-        talk_as_usual()
-        forget_asked()
-    if code == ending.INTERRUPTED:  # typer also converts Ctrl-C to this code
-        more = (
+        _process.clear_deadline()
+        reset_verbosity()
+        forget_collections()
+    if code == _process.INTERRUPTED:  # typer also converts Ctrl-C to this code
+        note = (
             "; the store has all finished work" if {*_verb_in(arguments)} & {*_PUBLISHING} else ""
         )
-        complain(f"{ending.word()}{more}")
-        return ending.exit_code()
+        complain(f"{_process.word()}{note}")
+        return _process.exit_code()
     return code
 
 
-def _ran(arguments: list[str]) -> int:
+def _exit_code(arguments: list[str]) -> int:
     """Run one command line of ``sgstore``, and return its exit code.
 
     A signal or deadline counts even if Python lost its exception.
     """
     try:
         code = int(app(args=arguments, prog_name="sgstore", standalone_mode=False) or 0)
-        code = with_missing(code)
-        if code != ending.INTERRUPTED:
+        code = report_missing(code)
+        if code != _process.INTERRUPTED:
             sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
-        ended = isinstance(error, typer.Abort) or ending.was_ended()
+        ended = isinstance(error, typer.Abort) or _process.was_ended()
         if not (ended or is_interruption(error)):
             raise
-        code = ending.INTERRUPTED
-    if ending.was_ended():  # an interruption can appear as the error of one recording
-        code = ending.INTERRUPTED
-    if code == ending.INTERRUPTED:
-        ending.refuse_late()
+        code = _process.INTERRUPTED
+    if _process.was_ended():  # an interruption can appear as the error of one recording
+        code = _process.INTERRUPTED
+    if code == _process.INTERRUPTED:
+        _process.refuse_late()
     return code
 
 
-def _refused(error: SgstoreError, arguments: list[str]) -> int:
+def _report_error(error: SgstoreError, arguments: list[str]) -> int:
     """Print an error of the library, as text or JSON, and return the exit code for it."""
     if _wants_json(arguments):
         write_error(error.as_dict())

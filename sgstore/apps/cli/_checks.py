@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer import Argument, Option
 
+from sgstore.apps.cli._collection_options import CollectionOptions, url_of
 from sgstore.apps.cli._junit import write_junit
 from sgstore.apps.cli._options import (
     NO_MATCH,
@@ -23,7 +24,6 @@ from sgstore.apps.cli._options import (
     say_unknown,
 )
 from sgstore.apps.cli._output import say
-from sgstore.apps.cli._places import CollectionOptions, url_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

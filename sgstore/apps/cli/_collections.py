@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from typer import Argument, Option
 
+from sgstore.apps.cli._collection_options import url_of
 from sgstore.apps.cli._options import (
     ERROR,
     Jobs,
@@ -18,7 +19,6 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import count_bar, number_of, say
-from sgstore.apps.cli._places import url_of
 from sgstore.errors import place_named
 
 if TYPE_CHECKING:
@@ -31,18 +31,22 @@ Place = Annotated[
 ]
 
 
-def _say(url: Path, told: str) -> None:
-    say(f"{place_named(url)}: {told}")
+def _place_of(url: Path) -> str | Path:
+    return url_of(url) or url
 
 
-def _statuses(done: Commit) -> list[tuple[str, str]]:
+def _say_of(url: Path, text: str) -> None:
+    say(f"{place_named(url)}: {text}")
+
+
+def _trace_rows(done: Commit) -> list[tuple[str, str]]:
     from sgstore.model.vocabulary import natural
 
     present = sorted(done.present, key=natural)
     return [(name, "added") for name in done.added] + [(name, "present") for name in present]
 
 
-def _new_in(done: Commit) -> str:
+def _summary(done: Commit) -> str:
     if not done.added:
         return f"no new traces; the last snapshot is {done.number}"
     told = f"{number_of(len(done.added), 'trace')} in {number_of(len(done.bundles), 'bundle')}"
@@ -71,13 +75,11 @@ def pack(
     from sgstore.collection import pack as pack_store
 
     with count_bar("packing", "bundles") as on_bundle:
-        done = pack_store(
-            store, url_of(url) or url, bundle_traces=bundle_traces, on_bundle=on_bundle
-        )
-    out.write(("trace", "status"), _statuses(done))
+        done = pack_store(store, _place_of(url), bundle_traces=bundle_traces, on_bundle=on_bundle)
+    out.write(("trace", "status"), _trace_rows(done))
     for old, new in done.renamed.items():
         say(f"{old}: the collection has another trace of this name; renamed to {new!r}")
-    _say(url, _new_in(done))
+    _say_of(url, _summary(done))
     return 0
 
 
@@ -86,11 +88,11 @@ def commit(url: Place, *, out: PrintedRows) -> int:
     """Commit the traces of 'ingest URL … --shard' to a collection: new bundles, and a new snapshot."""
     from sgstore.collection import commit as commit_landed
 
-    done = commit_landed(url_of(url) or url)
-    out.write(("trace", "status"), _statuses(done))
+    done = commit_landed(_place_of(url))
+    out.write(("trace", "status"), _trace_rows(done))
     for reason in done.refused:
         say(f"not committed: {reason}")
-    _say(url, _new_in(done))
+    _say_of(url, _summary(done))
     return ERROR if done.refused else 0
 
 
@@ -102,7 +104,7 @@ def unpack(
     """Copy all traces of a collection into one new store."""
     from sgstore.collection import unpack as unpack_all
 
-    names = unpack_all(url_of(url) or url, store)
+    names = unpack_all(_place_of(url), store)
     say(f"{store}: {number_of(len(names), 'trace')}")
     return 0
 
@@ -112,11 +114,11 @@ def verify(url: Place, *, out: PrintedRows) -> int:
     """Verify the bundles and the catalogue of a collection; list every fault."""
     from sgstore.collection import verify as verify_all
 
-    found = verify_all(url_of(url) or url)
+    found = verify_all(_place_of(url))
     out.write(("what", "check", "detail"), found.faults)
     wrong = number_of(len(found.faults), "fault") if found.faults else "no fault"
     held = f"{number_of(found.bundles, 'bundle')}, {number_of(found.traces, 'trace')}"
-    _say(url, f"snapshot {found.number}, {held}: {wrong}")
+    _say_of(url, f"snapshot {found.number}, {held}: {wrong}")
     return ERROR if found.faults else 0
 
 
@@ -136,14 +138,14 @@ def rebuild(
 
     with count_bar("rebuilding", "bundles") as on_bundle:
         made = make_anew(
-            url_of(url) or url,
+            _place_of(url),
             look_in=look_in or (),
             jobs=jobs_of(jobs),
             everything=everything,
             on_bundle=on_bundle,
         )
     out.write(("bundle", "is now"), made.items())
-    _say(url, f"{number_of(len(made), 'bundle')} rebuilt")
+    _say_of(url, f"{number_of(len(made), 'bundle')} rebuilt")
     return 0
 
 
@@ -163,9 +165,9 @@ def gc(
     from sgstore.collection import gc as collect
 
     seconds = seconds_of(older, "--older")
-    found = collect(url_of(url) or url, keep=keep, older_s=seconds, dry_run=dry_run)
+    found = collect(_place_of(url), keep=keep, older_s=seconds, dry_run=dry_run)
     out.write(("file",), [(name,) for name in found.names])
     verb = "would be removed" if dry_run else "removed"
     files = number_of(len(found.names), "file")
-    _say(url, f"{files}, {found.size} bytes {verb}; {found.young} too young")
+    _say_of(url, f"{files}, {found.size} bytes {verb}; {found.young} too young")
     return 0

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 from typer import Argument, Option
 
+from sgstore.apps.cli._collection_options import CollectionOptions, note_collection
 from sgstore.apps.cli._options import (
     Abstraction,
     AskOptions,
@@ -20,7 +21,6 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import say
-from sgstore.apps.cli._places import CollectionOptions, note_asked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -99,7 +99,7 @@ class FrameAskOptions(CollectionOptions, AskOptions):
         spill = self.spill()
         for text in texts:
             chosen = selection_of(text, max_spill=spill, engine=self.engine, partial=self.partial)
-            note_asked(chosen.store)
+            note_collection(chosen.store)
             yield chosen
 
 

@@ -81,7 +81,7 @@ def monitor(
 
     asked, values = statements.asked(files)
     settings = reading.settings() or Config()
-    tell = _as_json if as_json else _for_people
+    write = _write_json if as_json else _write_text
     longest = seconds_of(duration, "--duration") if duration else None
     cameras = _sensors(sensors, shown=serve and trace.startswith("carla://"))
     with opened(trace, settings, road_map=reading.road_map, ego=ego, sensors=cameras) as source:
@@ -92,19 +92,19 @@ def monitor(
             settings,
             parameters=values,
             trace=source.name,
-            called=_called(asked),
+            called=_pattern_names(asked),
             sgsm_compat=statements.sgsm_compat,
         )
         if serve:
-            watched, verdicts = _watched_on_a_page(watch, source, tell, longest, port)
+            watched, verdicts = _run_with_page(watch, source, write, longest, port)
         else:
-            watched = watch(on_event=tell)
+            watched = watch(on_event=write)
             verdicts = watched.run(source.frames, duration_s=longest)
     losses = [*source.losses, *(loss.reason for loss in watched.generator.losses)]
     for warning in [*source.warnings, *losses]:
         say(warning)
     for verdict in verdicts:
-        _tell_verdict(verdict, as_json=as_json)
+        _write_verdict(verdict, as_json=as_json)
     if require and any(verdict.violated for verdict in verdicts):
         return NO_MATCH
     return LOSS if losses else 0
@@ -120,10 +120,10 @@ def _sensors(file: Path | None, *, shown: bool) -> list[Sensor]:
     return [] if file is None else load_sensors(file)
 
 
-def _watched_on_a_page(
+def _run_with_page(
     watch: Callable[..., Monitor],
     source: FrameSource,
-    tell: Callable[[MonitorEvent], None],
+    write: Callable[[MonitorEvent], None],
     longest: float | None,
     port: int,
 ) -> tuple[Monitor, tuple[Verdict, ...]]:
@@ -133,11 +133,11 @@ def _watched_on_a_page(
 
     page = LiveRun(source.name, source.road_map, source.cameras)
 
-    def told(event: MonitorEvent) -> None:
-        tell(event)
+    def on_event(event: MonitorEvent) -> None:
+        write(event)
         page.event(event)
 
-    watched = watch(on_event=told, on_step=page.step)
+    watched = watch(on_event=on_event, on_step=page.step)
     page.follow(watched)
     with serve_live(page, port=port, on_start=say):
         frames = source.frames if source.live else paced(source.frames)
@@ -150,7 +150,7 @@ def _watched_on_a_page(
     return watched, verdicts
 
 
-def _called(asked: Mapping[str, list[str]]) -> list[str]:
+def _pattern_names(asked: Mapping[str, list[str]]) -> list[str]:
     """Return the names of the patterns as they occur in monitor events, in the order of the queries."""
     from sgstore.lang.sql import each_match
     from sgstore.lang.syntax import parse
@@ -164,8 +164,8 @@ def _called(asked: Mapping[str, list[str]]) -> list[str]:
     return every
 
 
-def _for_people(event: MonitorEvent) -> None:
-    who = ", ".join(f"{variable} = {name}" for variable, name in event.names.items())
+def _write_text(event: MonitorEvent) -> None:
+    binding = ", ".join(f"{variable} = {name}" for variable, name in event.names.items())
     about = f"from {event.start.t:.3f} s" if event.start != event.told else ""
     if event.kind == "kept again":
         about = f"after {event.end.t - event.start.t:.3f} s"
@@ -174,18 +174,18 @@ def _for_people(event: MonitorEvent) -> None:
     from sgstore.temporal import cell_of
 
     values = ", ".join(f"{name} = {cell_of(value)}" for name, value in event.values.items())
-    parts = (f"{event.told.t:9.3f} s", event.kind.ljust(10), event.name, who, about, values)
+    parts = (f"{event.told.t:9.3f} s", event.kind.ljust(10), event.name, binding, about, values)
     _line("  ".join(part for part in parts if part))
 
 
-def _as_json(event: MonitorEvent) -> None:
+def _write_json(event: MonitorEvent) -> None:
     about = asdict(event)
     if not event.values:
         del about["values"]
     _line(json_text({"event": about.pop("kind"), **about}))
 
 
-def _tell_verdict(verdict: Verdict, *, as_json: bool) -> None:
+def _write_verdict(verdict: Verdict, *, as_json: bool) -> None:
     if as_json:
         about: dict[str, Any] = {
             "event": "verdict",

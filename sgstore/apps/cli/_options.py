@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 import sgstore.apps.cli._completion as completion
 from sgstore.apps.cli._completion import STORE
-from sgstore.apps.cli._output import LONG_TABLE, Format, say, say_json, talk, write_rows
+from sgstore.apps.cli._output import LONG_TABLE, Format, say, say_json, set_verbosity, write_rows
 from sgstore.apps.cli._process import set_deadline
 from sgstore.errors import ConfigError, url_named
 
@@ -204,12 +204,12 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
 
     parameters += (
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=about)
-        for name, about in _TALK.items()
+        for name, about in _VERBOSITY.items()
     )
 
     @wraps(function)
     def verb(**values: Any) -> Any:
-        talk(**{name: values.pop(name) for name in _TALK})
+        set_verbosity(**{name: values.pop(name) for name in _VERBOSITY})
         for name, bundle in bundles.items():
             values[name] = bundle(**{one.name: values.pop(one.name) for one in fields(bundle)})
         return function(**values)
@@ -327,7 +327,7 @@ Verbose = Annotated[
     bool,
     Option("--verbose", help="Also log steps and times on stderr.", rich_help_panel=MESSAGES),
 ]
-_TALK: Final = {"quiet": Quiet, "verbose": Verbose}
+_VERBOSITY: Final = {"quiet": Quiet, "verbose": Verbose}
 """Options of every verb."""
 AsJson = Annotated[bool, Option("--json", help="Short for --format json.", rich_help_panel=ROWS)]
 Output = Annotated[

@@ -178,17 +178,17 @@ def write_document(values: dict[str, Any], form: Format) -> None:
 
 
 @dataclass(slots=True)
-class _Manner:
+class _Verbosity:
     """Current values of the options ``--quiet`` and ``--verbose``."""
 
     quiet: bool = False
     handler: Any = None
 
 
-_manner = _Manner()
+_verbosity = _Verbosity()
 
 
-def talk(*, quiet: bool, verbose: bool) -> None:
+def set_verbosity(*, quiet: bool, verbose: bool) -> None:
     """Switch the messages on stderr off (``--quiet``) or to more detail (``--verbose``).
 
     Options before and after a command are combined.
@@ -200,20 +200,20 @@ def talk(*, quiet: bool, verbose: bool) -> None:
     verbose : bool
         True to print the library's log on stderr, with the time since the process start.
     """
-    _manner.quiet |= quiet
-    if verbose and _manner.handler is None:
+    _verbosity.quiet |= quiet
+    if verbose and _verbosity.handler is None:
         import logging
 
-        _manner.handler = logging.StreamHandler()
+        _verbosity.handler = logging.StreamHandler()
         form = "sgstore: %(relativeCreated)6d ms  %(name)s: %(message)s"
-        _manner.handler.setFormatter(logging.Formatter(form))
-        logging.getLogger("sgstore").addHandler(_manner.handler)
+        _verbosity.handler.setFormatter(logging.Formatter(form))
+        logging.getLogger("sgstore").addHandler(_verbosity.handler)
         logging.getLogger("sgstore").setLevel(logging.DEBUG)
 
 
-def talk_as_usual() -> None:
+def reset_verbosity() -> None:
     """Reset the messages on stderr to normal: neither quiet nor verbose."""
-    handler, _manner.handler, _manner.quiet = _manner.handler, None, False
+    handler, _verbosity.handler, _verbosity.quiet = _verbosity.handler, None, False
     if handler is not None:
         import logging
 
@@ -228,13 +228,13 @@ def number_of(number: int, what: str, more: str = "s") -> str:
 
 def say(message: str) -> None:
     """Print a message on stderr that is neither a result nor an error."""
-    if not _manner.quiet:
+    if not _verbosity.quiet:
         complain(message)
 
 
 def say_json(found: Mapping[str, Any]) -> None:
     """Print a message for programs on stderr, as one line of JSON."""
-    if not _manner.quiet:
+    if not _verbosity.quiet:
         sys.stderr.write(f"{json.dumps(found, ensure_ascii=False)}\n")
 
 
@@ -245,7 +245,7 @@ def complain(message: str) -> None:
 
 def quiet() -> bool:
     """True if only results and errors are printed, because of ``--quiet``."""
-    return _manner.quiet
+    return _verbosity.quiet
 
 
 def write_error(about: dict[str, Any]) -> None:

@@ -11,6 +11,7 @@ import typer
 from typer import Argument, Option
 
 from sgstore.apps.cli import _completion as completion
+from sgstore.apps.cli._collection_options import COLLECTIONS, CollectionOptions, url_of
 from sgstore.apps.cli._options import (
     NO_MATCH,
     Abstraction,
@@ -45,7 +46,6 @@ from sgstore.apps.cli._output import (
     write_document,
     write_text,
 )
-from sgstore.apps.cli._places import COLLECTIONS, CollectionOptions, url_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping

@@ -13,6 +13,7 @@ import typer
 from typer import Argument, Option
 
 from sgstore.apps.cli import _completion as completion
+from sgstore.apps.cli._collection_options import note_collection, url_of
 from sgstore.apps.cli._options import (
     ERROR,
     LOSS,
@@ -29,7 +30,6 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import Format, complain, quiet, say, write_document, write_report
-from sgstore.apps.cli._places import note_asked, url_of
 from sgstore.errors import StoreError, place_named
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def ingest(
     from sgstore.ingest import ingest as ingest_traces
     from sgstore.ingest import recordings
 
-    how: dict[str, Any] = {
+    options: dict[str, Any] = {
         "road_map": reading.road_map,
         "config": reading.settings(),
         "egos": ego or (),
@@ -103,7 +103,7 @@ def ingest(
         "rate": rate,
     }
     if shard is not None or url_of(store) is not None:
-        outcomes = _landed(store, recordings(_names(traces)), shard, how, alone=force or dry_run)
+        outcomes = _land(store, recordings(_names(traces)), shard, options, alone=force or dry_run)
     else:
         with ingest_bar() as on_progress:
             outcomes = ingest_traces(
@@ -112,17 +112,17 @@ def ingest(
                 force=force,
                 dry_run=dry_run,
                 on_progress=on_progress,
-                **how,
+                **options,
             )
-    return _told(outcomes, out)
+    return _report_outcomes(outcomes, out)
 
 
-def _told(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
+def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     """Print the result of an ingest for each recording, and return the exit code."""
     from sgstore.model.scope import scope_of
 
     for outcome in outcomes:
-        _say_what_was_odd(outcome)
+        _say_warnings(outcome)
     reports = [{"scope": outcome.scope} if outcome.scope else {} for outcome in outcomes]
     say_scope(scope_of(reports, world=None), out.chosen)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
@@ -147,8 +147,8 @@ def _with_scopes(
     return (*columns, "scope"), ((*row, its) for row, its in zip(rows, scopes, strict=True))
 
 
-def _landed(
-    store: Path, paths: list[Path], shard: str | None, how: dict[str, Any], *, alone: bool
+def _land(
+    store: Path, paths: list[Path], shard: str | None, options: dict[str, Any], *, alone: bool
 ) -> list[TraceOutcome]:
     """Ingest a share of recordings as segment files into a collection, and return the results.
 
@@ -161,7 +161,7 @@ def _landed(
     number, stroke, of = (shard or "1/1").partition("/")
     if not (stroke and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
         raise typer.BadParameter(f"--shard {shard}: expected I/N, such as 3/16; I is 1 to N")
-    outcomes = land(url_of(store) or store, paths, shard=(int(number), int(of)), **how)
+    outcomes = land(url_of(store) or store, paths, shard=(int(number), int(of)), **options)
     if not outcomes:
         say(f"share {shard} of {len(paths)} recordings is empty")
     return outcomes
@@ -171,7 +171,7 @@ def _names(traces: list[str]) -> list[str]:
     return [name for one in traces for name in (lines_of(Path("-")) if one == "-" else [one])]
 
 
-def _say_what_was_odd(outcome: TraceOutcome) -> None:
+def _say_warnings(outcome: TraceOutcome) -> None:
     if outcome.error:
         complain(str(outcome.error))
     for name, number in outcome.unknown_types.items():
@@ -222,13 +222,13 @@ def info(
     from sgstore.model.scope import scope_of
 
     if (url := url_of(store)) is not None:
-        _tell_of_collection(url, traces or [], out)
+        _list_collection(url, traces or [], out)
         return 0
     from sgstore.store import StoreFile
 
     file = StoreFile(store)
     if traces:
-        _tell_all_of(file, traces, out)
+        _describe_traces(file, traces, out)
         return 0
     columns = ("trace", "frames", "seconds", "ego", "map", "flavour", "losses", "trace_id", "file")
     stored = file.traces()
@@ -251,12 +251,12 @@ def info(
     return 0
 
 
-def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
+def _list_collection(url: str, names: list[str], out: PrintedRows) -> None:
     """Print the catalogue entries of the named traces of a collection, or of all traces."""
     from sgstore.collection import Collection
 
     whole = Collection(url)
-    note_asked(whole)
+    note_collection(whole)
     found = whole.traces()
     known = {row["name"] for row in found}
     for name in names:
@@ -275,7 +275,7 @@ def _tell_of_collection(url: str, names: list[str], out: PrintedRows) -> None:
     out.write(columns, rows, totals={"frames": "frames", "seconds": "s"})
 
 
-def _tell_all_of(file: StoreFile, names: list[str], out: PrintedRows) -> None:
+def _describe_traces(file: StoreFile, names: list[str], out: PrintedRows) -> None:
     """Print all data about traces: a document for one trace, rows for several."""
     with file.snapshot():
         found = [file.trace(name) for name in names]
@@ -300,24 +300,24 @@ def doctor(traces: Recordings, reading: ReadingOptions, out: PrintedRows) -> int
     from sgstore.pipeline.doctor import Examination, examine
 
     settings = reading.settings()
-    found = (
+    examinations = (
         examine(path, config=settings, road_map=reading.road_map)
         for path in recordings(_names(traces))
     )
     codes: set[int] = set()
 
-    def seen() -> Iterator[dict[str, Any]]:
-        for one in found:
-            codes.add(ERROR if one.error else LOSS if one.losses else 0)
-            yield one.as_dict()
+    def examined() -> Iterator[dict[str, Any]]:
+        for examination in examinations:
+            codes.add(ERROR if examination.error else LOSS if examination.losses else 0)
+            yield examination.as_dict()
 
     if out.for_people:
-        for number, values in enumerate(seen()):
+        for number, values in enumerate(examined()):
             sys.stdout.write("\n" if number else "")
             write_report(values)
     else:
         columns = [column.name for column in fields(Examination)]
-        out.write(columns, (tuple(values.values()) for values in seen()))
+        out.write(columns, (tuple(values.values()) for values in examined()))
     return ERROR if ERROR in codes else max(codes, default=0)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
+from sgstore.apps.cli._collection_options import CollectionOptions  # noqa: TC001  typer looks its type up
 from sgstore.apps.cli._coverage import (
     PANEL,
     FrameAskOptions,
@@ -39,7 +40,6 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import count_bar, say
-from sgstore.apps.cli._places import CollectionOptions  # noqa: TC001  typer looks its type up
 
 if TYPE_CHECKING:
     from sgstore.collection import Collection

@@ -70,7 +70,7 @@ class CollectionOptions:
         bounds.spill()
         how: dict[str, Any] = {"engine": self.engine, "partial": self.partial}
         with Collection(url, tables=tables_of(tables), **how) as whole:
-            note_asked(whole)
+            note_collection(whole)
             yield whole
 
     def opened_at(self, place: Path, bounds: QueryLimits) -> Store | Collection:
@@ -81,14 +81,14 @@ class CollectionOptions:
             return whole
 
 
-_asked: Final[list[Any]] = []  # Collection
+_collections: Final[list[Any]] = []  # Collection
 
 
-def note_asked(store: Store | Collection) -> None:
+def note_collection(store: Store | Collection) -> None:
     """Remember the collection of the current command, to report its missing bundles at the end."""
     if hasattr(store, "missing"):
         whole: Any = store
-        _asked.append(whole)
+        _collections.append(whole)
         if not whole.snapshot.bundles:
             say(
                 f"{whole.place.url}: the collection has no committed bundle;"
@@ -96,14 +96,14 @@ def note_asked(store: Store | Collection) -> None:
             )
 
 
-def with_missing(code: int) -> int:
+def report_missing(code: int) -> int:
     """Report the bundles of a collection without a result, and return the final exit code."""
-    missing = {name: why for whole in _asked for name, why in whole.missing.items()}
+    missing = {name: why for whole in _collections for name, why in whole.missing.items()}
     for bundle, why in missing.items():
         say(f"bundle {bundle[:12]}… failed: {why}")
     return LOSS if missing else code
 
 
-def forget_asked() -> None:
+def forget_collections() -> None:
     """Clear the list of collections that the last command used."""
-    _asked.clear()
+    _collections.clear()
