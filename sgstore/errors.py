@@ -209,11 +209,11 @@ class StoreError(SgstoreError):
     --------
     >>> sgstore.open("none.sgstore")
     Traceback (most recent call last):
-    sgstore.errors.StoreError: none.sgstore: no such store; 'sgstore ingest' makes one
+    sgstore.errors.StoreError: none.sgstore: store not found; create it with 'sgstore ingest'
     """
 
 
-def one_store_needed(collection: str | Path, why: str = "this asks one store") -> StoreError:
+def one_store_needed(collection: str | Path, why: str = "this reads one store") -> StoreError:
     """Return the error for a collection in a place that needs a single store."""
     place = place_named(collection)
     return StoreError(

@@ -75,7 +75,7 @@ def _meant(path: Path) -> Iterator[Path]:
     elif has_magic(str(path)) and not path.exists():
         fitting = sorted(glob(str(path), recursive=True))  # noqa: PTH207  absolute patterns, too
         if not fitting:
-            raise StoreError(f"{path}: no file fits this pattern")
+            raise StoreError(f"{path}: no file matches this pattern")
         for name in fitting:
             yield from _meant(Path(name))
     else:
@@ -109,7 +109,7 @@ def _meant_by(url: str) -> list[str]:
         found = [name for name in found if _fits(name, url)]
     if not found:
         why = (
-            "nothing fits this pattern"
+            "no file matches this pattern"
             if pattern
             else f"no recording ({', '.join(ENDINGS)}) below it"
         )
@@ -199,7 +199,7 @@ def read_in_processes(
 def _lost(path: Path, code: int) -> TraceOutcome:
     """Return the outcome of a recording whose process died."""
     how = f"was killed by signal {-code}; is there too little memory?"
-    how = how if code < 0 else f"ended with code {code}; what it said of that is on stderr"
+    how = how if code < 0 else f"ended with code {code}; see its output on stderr"
     return TraceOutcome(path, error=TraceError(f"the process that read it {how}", path=path))
 
 

@@ -298,7 +298,7 @@ class Matches(Tabular):
         Examples
         --------
         >>> store.find("MATCH (v:Vehicle {name: 'car 7'})").notes
-        ("nothing in the store has the name 'car 7'; the nearest is 'car 0'",)
+        ("the store has no name 'car 7'; the nearest is 'car 0'",)
         """
         from sgstore.lang.help import compared_in_query
 
@@ -610,7 +610,7 @@ class Matches(Tabular):
             raise QueryError(
                 "a table has values, and SUBGRAPHS are graphs",
                 text=self._text,
-                hint="RETURN what the statement needs of them: v.id, dist(e, v)",
+                hint="RETURN the values that the statement needs: v.id, dist(e, v)",
             )
         with self._compiled() as compiled:
             asked = self._asked((compiled.told_apart() if apart else compiled).rows())
@@ -737,7 +737,7 @@ class UnionMatches(Matches):
                 reason = (
                     f"the parts of a UNION return the same, and this one {', '.join(other.columns)}"
                 )
-                raise QueryError(reason, text=text, span=part.span, hint=f"{hint}; AS gives a name")
+                raise QueryError(reason, text=text, span=part.span, hint=f"{hint}; add AS NAME")
             for column, one, kind in zip(self._results[0].columns, types[0], kinds, strict=True):
                 if one is not kind and "NULL" not in {one, kind}:
                     reason = f"'{column.name}' is a {one} in the first part of the UNION, and a {kind} here"

@@ -332,7 +332,7 @@ class Store:
         files = recordings(names)
         for file in files:
             if url_named(file) is None and not file.exists():
-                raise StoreError(f"{file}: no such file; name a recording, or a folder of some")
+                raise StoreError(f"{file}: file not found; expected a recording or a folder")
         return ingest(self.file.path, files, **options)
 
     def catalog(self) -> Catalog:
@@ -727,7 +727,7 @@ class Store:
             topics = [one.topic for one in known if "PointCloud" in one.schema]
             if not topics:
                 told = ", ".join(one.topic for one in known) or "none"
-                raise StoreError(f"no channel carries points; the channels: {told}")
+                raise StoreError(f"no channel has points; channels: {told}")
             channel = min(topics)
         return cloud_of(self.file, _ref(frame), channel)
 

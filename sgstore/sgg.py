@@ -664,7 +664,7 @@ class SceneGraphGenerator:
     def _seen(self, number: int) -> GraphColumns:
         """Return a graph of the last step in the column form that abstractions need."""
         if self._online is None or self._online.last is None:
-            raise ValueError("there was no step yet")
+            raise ValueError("call step() first")
         graphs, kinds = self._online.last
         if self._grounds is None and self._road_map is not None:
             shown = map_of_graphs(self._road_map, self._config)

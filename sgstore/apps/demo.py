@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 QUESTIONS: Final = (
     (
         "crossing-at-red",
-        "Does anybody cross in front of the ego, in its own lane, while the light is red?",
+        "Does a person cross in the lane of the ego, ahead of it, while the light is red?",
         """\
 MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(p:Person),
       (light:TrafficLight {light_state: 'red'})-[:controlsTrafficOf]->(lane)
@@ -32,7 +32,7 @@ WHERE abs(bearing(e, p)) < 45""",
     ),
     (
         "cut-in",
-        "Does anybody come over from the lane beside, closely before the ego?",
+        "Does a vehicle cut in from the next lane, closely ahead of the ego?",
         """\
 MATCH (e:Ego)-[:isIn]->(lane:Lane)<-[:isIn]-(v:Vehicle)-[:isIn]->(beside:Lane),
       (beside)-[:laneChange]->(lane)
@@ -40,7 +40,7 @@ WHERE abs(bearing(e, v)) < 45 AND gap(e, v) < 12 AND v.speed > 1""",
     ),
     (
         "jaywalking",
-        "Does anybody walk on a driving lane, near the ego and on no crosswalk?",
+        "Does a person walk on a driving lane, near the ego and off the crosswalks?",
         """\
 MATCH (e:Ego), (p:Person)-[at:isIn]->(lane:Lane {lane_type: 'driving'})
 WHERE dist(e, p) < 25 AND at.overlap > 0.5 AND NOT EXISTS {(p)-[:isIn]->(:Crosswalk)}""",
@@ -90,7 +90,7 @@ def run_demo(folder: str | Path, say: Say, recording: str | Path | None = None) 
     folder, recording = Path(folder), Path(recording or bundled())
     if not recording.is_file():
         raise TraceError(
-            "no such recording; without --recording it is the package's", path=recording
+            "file not found; leave out --recording to use the packaged recording", path=recording
         )
     _prepare(folder)
     _ingest(folder / STORE, recording, say)
@@ -190,7 +190,7 @@ def _export(store: Store, folder: Path, say: Say) -> Path:
 def _say_what_next(folder: Path, clip: Path, pictures: list[Path | None], say: Say) -> None:
     store = folder / STORE
     say("")
-    say("What to type next:")
+    say("Next commands:")
     say("")
     called = Path(sys.argv[0])
     if called.name == "sgstore" and not shutil.which("sgstore"):

@@ -276,7 +276,7 @@ def _scenes(config: pytest.Config, folder: Path, mark: pytest.Mark) -> list[Clip
     wrong = sorted(told.keys() - _KNOWN)
     if mark.args or wrong or sum(source in told for source in _SOURCES) != 1:
         problem = (
-            f"unknown: {', '.join(wrong)}" if wrong else "give a query, a lock or a check, by name"
+            f"unknown: {', '.join(wrong)}" if wrong else "pass a query, lock or check by keyword"
         )
         raise ValueError(f"{problem}; {_EXPLAINED}")
     key = f"{folder}\0{sorted(told.items(), key=str)}"
@@ -286,7 +286,7 @@ def _scenes(config: pytest.Config, folder: Path, mark: pytest.Mark) -> list[Clip
     if not known[key] and not told.get("allow_empty", False):
         source = next(told[source] for source in _SOURCES if source in told)
         raise ValueError(
-            f"no scene was found, so nothing would be tested; say allow_empty=True if that is right: {source}"
+            f"no scene matches, so no test would run; set allow_empty=True to accept this: {source}"
         )
     return known[key]
 
@@ -302,7 +302,7 @@ def _store(config: pytest.Config, folder: Path, told: Mapping[str, Any]) -> Stor
     if kept:
         return Store(config.rootpath / str(kept))
     raise ValueError(
-        f"which store? Say store=PATH, --scenes-store PATH, or {OPTION} in the settings"
+        f"no store is set; set store=PATH, --scenes-store PATH, or {OPTION} in the settings"
     )
 
 
@@ -333,7 +333,7 @@ def scenes_of(path: Path, store: Store) -> list[ClipScene]:
     def differences(case: LockedCase, messages: bool) -> list[str]:  # noqa: FBT001 - called by place
         found = verify_case(lock, case, store, graphs=not messages, payloads=messages)
         others = [f"  {one.where}: {one.what} {one.detail}" for one in found if one.matters]
-        return [f"{path}: {case.id} is not what the lock says:", *others] if others else []
+        return [f"{path}: {case.id} differs from the lock:", *others] if others else []
 
     clips = [Clip(trace, start, end) for trace, start, end, _ in cases_of(lock, store)]
     return [

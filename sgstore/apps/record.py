@@ -113,7 +113,7 @@ def record(  # noqa: PLR0913  as many options as a recording has
         if attached is not None:
             run.drain(attached, LAST_S)
     if recorder.written is None or not recorder.written.frames:
-        raise ExportError(f"{to}: no frame came, so there is no recording")
+        raise ExportError(f"{to}: no frame arrived; the recording was not written")
     return Recorded(
         written=recorder.written,
         ego=run.ego,
@@ -180,7 +180,7 @@ def _snapshots(world: Any, step_s: float | None) -> Generator[Any]:
             try:
                 yield world.wait_for_tick(TICK_TIMEOUT_S)
             except RuntimeError as error:
-                reason = f"the world stood still for {TICK_TIMEOUT_S:g} s; does anybody drive it?"
+                reason = f"the world did not advance for {TICK_TIMEOUT_S:g} s; start a client that ticks it"
                 raise TraceError(f"{reason} (--step drives it): {error}") from error
     settings = world.get_settings()
     before = (settings.synchronous_mode, settings.fixed_delta_seconds)

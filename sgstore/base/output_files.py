@@ -133,7 +133,7 @@ class Stream(io.RawIOBase):
     def _fail(self, error: OSError) -> None:
         self.lost = True
         if isinstance(error, BrokenPipeError):
-            raise ReaderGoneError(f"{self._name}: nobody reads it any more") from error
+            raise ReaderGoneError(f"{self._name}: the reader closed the pipe") from error
         if not self._quiet:
             raise ExportError(f"{self._name}: {error.strerror or error}") from error
 

@@ -140,12 +140,12 @@ def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_L
             done.present.append(row["name"])
         elif len(of) > 1:
             done.refused.append(
-                f"the id {trace_id} is that of several traces by chance: {' and '.join(whose)};"
+                f"the id {trace_id} belongs to several traces by chance: {' and '.join(whose)};"
                 " put one of them into a collection of its own"
             )
         elif len(whose) > 1:
             done.refused.append(
-                f"one trace was read in several ways (settings, map, part or place): {' and '.join(whose)};"
+                f"one trace was ingested with different settings, map, part or place: {' and '.join(whose)};"
                 " a collection has it once"
             )
         else:

@@ -140,7 +140,7 @@ class _Processes:
                         waiting.appendleft(index)
                         continue
                     how = f"signal {-outcome}" if outcome < 0 else f"code {outcome}"
-                    reason = f"the process that asked it ended with {how}, {tries[index]} times"
+                    reason = f"the process of this bundle ended with {how}, {tries[index]} times"
                     outcome = {"bundle": tasks[index]["bundle"], "error": reason}
                 left -= 1
                 yield outcome

@@ -254,7 +254,7 @@ def unpack(url: str | Path, store: str | Path) -> list[str]:
     if to.exists():
         raise StoreError(f"{to}: exists already; name a store that is to be made")
     if not to.parent.is_dir():
-        raise StoreError(f"{to}: there is no folder {to.parent}")
+        raise StoreError(f"{to}: the folder {to.parent} does not exist")
     snapshot = catalogue.latest(place)
     names = {row["trace_id"]: row["name"] for row in snapshot.traces}
     maps = {row["map_digest"]: row["map"] for row in snapshot.traces if row["map_digest"]}

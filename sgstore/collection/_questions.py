@@ -304,7 +304,7 @@ class Collection:
         """
         if not each:
             raise SqlError(
-                "a statement in SQL cannot be split over bundles: say --each (each=True) to run it in"
+                "a statement in SQL cannot be split over bundles: add --each (each=True) to run it in"
                 " every bundle, with a column 'bundle'; or 'sgstore collection unpack' makes one store of all"
             )
         return PartedRows(self, text)
@@ -458,13 +458,13 @@ class Collection:
         told = [f"{name[:12]}…: {why}" for name, why in failed.items()]
         more = [f"… and {len(told) - _SHOWN} more"] if len(told) > _SHOWN else []
         more += (
-            ["what was asked before was answered by all: ask all of it again"]
+            ["all bundles answered the other queries; run all queries again"]
             if lost and self._partial
             else []
         )
         listed = "\n  ".join([*told[:_SHOWN], *more])
         raise PartialAnswerError(
-            f"{self.place.url}: not all of {asked} bundles could be asked:\n  {listed}", failed
+            f"{self.place.url}: not all of {asked} bundles answered:\n  {listed}", failed
         )
 
     def _task(self, question: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -956,7 +956,7 @@ class PartedRows(Tabular):
                 found = whole.find(one.text, **dict(one.values))
                 if found.of_all:
                     raise QueryError(
-                        "in sgql(...) a pattern is asked of each bundle, and classes are counted in all",
+                        "sgql(...) runs a pattern in each bundle, but classes need all bundles",
                         hint="ask the pattern alone: sgstore find URL 'MATCH …'",
                     )
                 self.reasons |= found.reasons

@@ -121,7 +121,7 @@ class _Folder:
         try:
             yield
         except FileNotFoundError as error:
-            raise MissingObjectError(f"{self.root / name}: there is no such file") from error
+            raise MissingObjectError(f"{self.root / name}: file not found") from error
         except OSError as error:
             if self.root.is_file():
                 raise StoreError(f"{self.root}: a file, and a collection is a folder") from error

@@ -157,7 +157,7 @@ def parts_timeline(
     steps = len(found.steps) > 1
     for lane in found.lanes:
         name = f"{lane.part.step}. {lane.part.text}" if steps else lane.part.text
-        reason = f"nothing is known of {', '.join(lane.unknown)}" if lane.unknown else ""
+        reason = ", ".join(lane.unknown)
         verdict = "unknown" if lane.unknown else ""
         whole.lanes.append(Lane(name, "", verdict, spans(lane.spans), reason))
     for step in found.steps:
@@ -362,7 +362,7 @@ def _draw(page: Page, timeline: Timeline, lanes: int, top: float, longest: float
         across = (row - _BAR / _LANE / 2, _BAR / _LANE)
         axes.broken_barh([(0, seconds)], across, color=GROUND, linewidth=0, zorder=0.4)
         if not lane.spans and lane.verdict == "unknown":
-            said = f"cannot be told: {lane.reason}" if lane.reason else "cannot be told"
+            said = f"unknown: {lane.reason}" if lane.reason else "unknown"
             page.write(
                 axes, longest / 120, row, _cut(said, _REASON), va="center_baseline", color=FAINT_INK
             )

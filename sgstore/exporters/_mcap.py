@@ -63,7 +63,7 @@ _COMPRESSION: Final = {
 _FIXED: Final = 8 + 8 + 4 + 4 + 8 + 4
 """Bytes of an attachment without its texts and its data."""
 _MALFORMED: Final = "an attachment is malformed and was left out"
-_DAMAGED: Final = "an attachment has another checksum than it says"
+_DAMAGED: Final = "the checksum of an attachment does not match"
 
 
 def write(export: Export, folder: Path) -> list[WrittenClip]:
@@ -73,7 +73,7 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
     :mod:`sgstore.exporters._mcap_graphs`. With graphs there is also a viewer layout.
     """
     if export.mounts and not export.with_graph:
-        raise ExportError("--mount is told in clips with graphs: add --with-graph")
+        raise ExportError("--mount needs clips with graphs; add --with-graph")
     added = Added(export) if export.with_graph or export.labels is not None else None
     written: dict[int, WrittenClip] = {}
     ego = ""
@@ -402,7 +402,7 @@ def _validate(file: Path, expected: Counter[int]) -> None:
             found = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
             by_index = Counter(channel.id for _, channel, _ in found)
     except (McapError, struct.error, ValueError, LookupError, RuntimeError) as error:
-        reason = f"{file.name}: what was written cannot be read back: {error!r}"
+        reason = f"{file.name}: the written file cannot be read back: {error!r}"
         raise ExportError(reason) from error
     if not in_order == by_index == expected:
         raise ExportError(

@@ -344,5 +344,5 @@ def _test(folder: Path, columns: _TensorColumns) -> None:
     data = GraphData(folder)
     found = len(data), len(data.columns["node_type"]), len(data.columns["edge_type"])
     if found != (sum(last - first for first, last in columns.clips), columns.nodes, columns.edges):
-        raise ExportError(f"{FOLDER}: what was written cannot be read back")
+        raise ExportError(f"{FOLDER}: the written file cannot be read back")
     data.check()

@@ -95,7 +95,7 @@ class Recorder:
         if to.suffix.lower() != ".mcap":
             raise ExportError(f"cannot record into {to.name!r}: end the name in .mcap")
         if to.exists():
-            raise ExportError(f"{to}: there is a file already; nothing is overwritten")
+            raise ExportError(f"{to}: the file exists and is not overwritten; choose another name")
         self._to = to
         self._aside = to.with_name(f"{to.name}.part")
         try:

@@ -248,7 +248,7 @@ class RerunClip:
             if not self._write_message(frame_id, topic):
                 odd[topic] = odd.get(topic, 0) + 1
         for topic, count in odd.items():
-            reason = f"{topic}: {count} pictures or clouds have no form that is written for Rerun"
+            reason = f"{topic}: {count} images or point clouds have no format for Rerun"
             self.losses.append(Loss(reason, 0, 0))
 
     def _write_message(self, frame_id: int, topic: str) -> bool:

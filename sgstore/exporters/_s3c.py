@@ -47,7 +47,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
                 for number, edge in enumerate(edges):
                     writer.writerow((trace, f"{trace}#{seq}", 1, number, *edge))
                 rows += len(edges)
-    reason = f"{alone} nodes without an edge stand in no row"
+    reason = f"{alone} nodes without an edge are in no row"
     losses = [Loss(reason, 0, 0)] if alone else []
     _test(folder / GRAPHS, rows)
     written = [WrittenFile.of(folder / GRAPHS, "rows", rows, losses)]

@@ -135,7 +135,7 @@ def _of_record(record: Record) -> Sensed | None:
         if "fields" in record and ("point_step" in record or "point_stride" in record):
             return Sensed("cloud", "", _points(data, record))
     except (ValueError, TypeError, LookupError, OverflowError) as error:
-        raise TraceError(f"not what it says: {error}") from error
+        raise TraceError(f"does not match its encoding: {error}") from error
     return None
 
 

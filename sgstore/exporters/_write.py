@@ -156,7 +156,7 @@ def _check(export: Export, exporter: Exporter) -> None:
             continue
         if getattr(export, name) != option.default:
             told = f"--{OPTIONS[name]}"
-            raise ExportError(f"{told} is not for the format '{exporter.name}'")
+            raise ExportError(f"{told} cannot be used with the format '{exporter.name}'")
     for clip in export.clips:
         if clip.start_ns > clip.end_ns:
             raise ExportError(

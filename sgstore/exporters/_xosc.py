@@ -148,7 +148,7 @@ def _write_map(export: Export, folder: Path, trace: str) -> Path | None:
             return file
         if file.read_bytes() == data:
             return file
-    raise AssertionError("there are no more maps than clips")
+    raise AssertionError("more maps than clips")
 
 
 class Scenario:
@@ -203,10 +203,10 @@ class Scenario:
             reason = f"the size of {_some(self._unsized)} is not known: a usual one is written"
             told.append(Loss(reason, 0, 0))
         if self._unmapped:
-            reason = f"{_some(self._unmapped)}: no signal of the map, so what it shows is left out"
+            reason = f"{_some(self._unmapped)}: not a signal of the map; its state is left out"
             told.append(Loss(reason, 0, 0))
         if not self._map:
-            told.append(Loss("the trace has no OpenDRIVE map: the scenario names none", 0, 0))
+            told.append(Loss("the trace has no OpenDRIVE map; the scenario has none", 0, 0))
         return told
 
     def write(self, file: Path) -> None:

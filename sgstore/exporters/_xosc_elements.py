@@ -250,6 +250,6 @@ def test(file: Path, vertices: int) -> None:
             found += element.tag == "Vertex"
             element.clear()
     except ET.ParseError as error:
-        raise ExportError(f"{file.name}: what was written cannot be read back: {error}") from error
+        raise ExportError(f"{file.name}: the written file cannot be read back: {error}") from error
     if found != vertices:
         raise ExportError(f"{file.name}: {vertices} vertices were written, {found} are read back")

@@ -141,7 +141,7 @@ def sumo_net_text(text: str) -> str:
         raise MapError("a network of SUMO without lanes", element="net")
     lanes, warnings = plain_lanes(_joined(net, lines))
     if broken:
-        warnings.insert(0, about_lanes(broken, "its shape is no line: left out"))
+        warnings.insert(0, about_lanes(broken, "left out, because its shape is not a line"))
     row_of = {lane.name: row for row, lane in enumerate(lanes)}
     return lane_text(lanes, warnings, _lights(net, lines, row_of), crosswalks)
 

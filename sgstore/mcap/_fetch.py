@@ -122,7 +122,7 @@ def parts_of(folder: Path) -> tuple[BagPart, ...]:
         parts.append(BagPart(path, base, size))
         base += max(size, 0)
     if all(part.size < 0 for part in parts):
-        reason = f"none of the {len(parts)} files that its {METADATA} lists is there"
+        reason = f"none of the {len(parts)} files that its {METADATA} lists exists"
         raise TraceError(reason, path=folder)
     return tuple(parts)
 
@@ -354,7 +354,7 @@ def check_name(path: Path) -> None:
             name.encode()
         except UnicodeEncodeError:
             shown = repr(os.fsencode(name))[2:-1]
-            reason = f"a store keeps names as UTF-8, and '{shown}' is none: rename it"
+            reason = f"a store needs names in UTF-8; '{shown}' is not; rename it"
             raise TraceError(reason, path=path) from None
 
 
@@ -449,7 +449,7 @@ def _part_of(path: Path, parts: tuple[BagPart, ...], place: int) -> tuple[Path, 
     """Return the file of a bag that contains a byte position, and the file's first position."""
     part = part_at(parts, place)
     if part is None:
-        raise TraceError("no file of the bag is there: it was replaced", path=path, offset=place)
+        raise TraceError("the bag was replaced; its files are missing", path=path, offset=place)
     return part.path, part.base
 
 
@@ -473,7 +473,7 @@ def open_regular(path: Path) -> BufferedReader:
             raise TraceError("not a regular file; expected an MCAP recording", path=path)
         return path.open("rb")
     except FileNotFoundError as error:
-        there = "no such file" if url_named(path) is None else f"{error.strerror}"
+        there = "file not found" if url_named(path) is None else f"{error.strerror}"
         raise TraceError(there, path=path) from error
     except (OSError, ValueError) as error:
         raise TraceError(f"cannot be opened: {error}", path=path) from error

@@ -547,7 +547,7 @@ class McapFile:
             messages = 1 if opcode == Opcode.MESSAGE else 0
             walk.report.lose(Loss(reason, messages, stop - start, offset=start))
         elif opcode == 0 or opcode > Opcode.DATA_END:
-            reason = f"the bytes from here to the end are no MCAP records (opcode {opcode})"
+            reason = f"the bytes from here to the end are not MCAP records (opcode {opcode})"
             walk.report.lose(Loss(reason, bytes=stop - start, offset=start))
 
     def _cut_chunk(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
@@ -596,12 +596,12 @@ class McapFile:
         if not walk.closed:
             if 0 < left < HEAD.size:
                 walk.report.lose(Loss("the file ends inside the head of a record", bytes=left))
-            warn("the recording was not closed: it has no end of data")
+            warn("the recording was not closed; its end of data is missing")
         elif self._summary_fault:
             warn(self._summary_fault)
         told = sum(self.counts.values()) if self.counts else 0
         if told > walk.messages and not walk.report.losses and walk.wanted is None:
-            reason = f"the file's statistics tell of {told} messages, {walk.messages} were found"
+            reason = f"the file's statistics count {told} messages, {walk.messages} were found"
             walk.report.lose(Loss(reason, told - walk.messages))
         if walk.chunks and walk.unverified == walk.chunks:
             warn("no chunk has a checksum: damage that leaves a chunk readable cannot be noticed")
@@ -739,7 +739,7 @@ class McapBag(McapFile):
         """
         name = part.path.name
         if part.size < 0:
-            self._faults.append(Loss(f"{name}: {METADATA} lists it, but there is no such file"))
+            self._faults.append(Loss(f"{name}: {METADATA} lists it, but the file is missing"))
             return
         try:
             file = McapFile(part.path, self._spool)
@@ -796,7 +796,7 @@ class McapBag(McapFile):
         """Read a group of messages of one file of the bag again."""
         part = part_at(self._parts, place)
         if part is None or part.base not in self._files:
-            raise TraceError("no file of the bag is there", path=self.path, offset=place)
+            raise TraceError("the bag's files are missing", path=self.path, offset=place)
         file, base = self._files[part.base], part.base
         self._use(file)
         messages = self._placed(file, file._again(place - base, count), base)  # noqa: SLF001  (its own class)
@@ -821,7 +821,7 @@ class McapBag(McapFile):
         """Yield the bytes of a record of the bag in pieces."""
         part = part_at(self._parts, place.offset)
         if part is None or part.base not in self._files:
-            raise TraceError("no file of the bag is there", path=self.path, offset=place.offset)
+            raise TraceError("the bag's files are missing", path=self.path, offset=place.offset)
         file = self._files[part.base]
         file.reopen()
         try:

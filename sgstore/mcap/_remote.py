@@ -78,7 +78,7 @@ def reason_of_object_store(error: BaseException) -> tuple[str, bool]:
     """Return a one-line reason for an object store error. The second value is True for a missing object."""
     wrong = object_stores().exceptions
     if isinstance(error, FileNotFoundError | wrong.NotFoundError):
-        return "no such object, or no such bucket", True
+        return "object or bucket not found", True
     refused = PermissionError, wrong.PermissionDeniedError, wrong.UnauthenticatedError
     if isinstance(error, refused):
         return "access is refused: look at the credentials", False
@@ -297,7 +297,7 @@ class RemoteFile(io.RawIOBase):
             except wrong.PreconditionError as error:
                 raise TraceError("it was replaced while it was read", path=self.name) from error
             except wrong.NotSupportedError as error:
-                raise NoRangesError("its server knows no ranges", path=self.name) from error
+                raise NoRangesError("its server lacks range support", path=self.name) from error
 
         return whole(self.name, stop - start, ask)
 

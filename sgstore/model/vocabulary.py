@@ -293,7 +293,7 @@ def _refuse_like_own(enum: str, name: str) -> None:
     elif enum != "light_state" and (folded == "ego" or folded in _OWN_LABELS_FOLDED):
         like = f"the label {name!r}"
     if like:
-        raise ValueError(f"{name!r} would be taken for {like}")
+        raise ValueError(f"{name!r} could be confused with {like}")
 
 
 @contextmanager

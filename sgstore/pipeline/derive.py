@@ -116,7 +116,7 @@ def derive(
         if old is not None and not replace_old:
             raise AbstractionError(
                 f"{trace.name!r} has a set {old.name!r} already, with other settings;"
-                " say --force to replace it, or choose another name"
+                " add --force to replace it, or choose another name"
             )
         results.append(_derived(file, trace, settings, of_name))
     return results
@@ -218,7 +218,7 @@ def _settings(trace: StoredTrace, wanted: Config) -> Config:
     """
     if "imported" in trace.report:
         raise ConfigError(
-            f"{trace.name!r} was imported as graphs: there is no geometry to derive others from"
+            f"{trace.name!r} was imported as graphs; graphs cannot be derived without geometry"
         )
     old = from_dict(trace.settings)
     new = replace(wanted, **{name: getattr(old, name) for name in _NOT_RELATIONS})

@@ -115,8 +115,8 @@ def rebuild(
     _check_settings(path, old.traces)
     if old.others:
         raise StoreError(
-            f"{path}: cannot be made anew: what is none of sgstore's would be lost: {', '.join(old.others)};"
-            " move it to a file of its own first"
+            f"{path}: not rebuilt, because tables of other programs would be lost: {', '.join(old.others)};"
+            " move them to another file first"
         )
     fresh = path.with_name(f"{path.name}.rebuild")
     with _alone(fresh):
@@ -201,8 +201,8 @@ def _found(
         more = [f"… and {len(lost) - _SHOWN} more"] if len(lost) > _SHOWN else []
         listed = "\n  ".join([*lost[:_SHOWN], *more])
         raise StoreError(
-            f"{path}: left as it is: {len(lost)} of {len(known)} recordings cannot be read again:\n  {listed}\n"
-            "  say --look-in FOLDER where they are, or --leave-out TRACE: the new store is not to have it"
+            f"{path}: left as it is: {len(lost)} of {len(known)} recordings cannot be read:\n  {listed}\n"
+            "  add --look-in FOLDER to find them, or --leave-out TRACE to drop a trace"
         )
     places = {one.trace_id: known[one.path, one.digest] for one in traces}
     return {trace_id: place for trace_id, place in places.items() if isinstance(place, Path)}
@@ -265,7 +265,7 @@ def _check_settings(path: Path, traces: Sequence[OldTrace]) -> None:
         for one in traces:
             _settings(one)
     except ConfigError as error:
-        raise StoreError(f"{path}: left as it is: what a trace was read with: {error}") from error
+        raise StoreError(f"{path}: not changed: settings of a trace: {error}") from error
 
 
 def _settings(trace: OldTrace) -> Config:
@@ -356,14 +356,14 @@ def _import(fresh: Path, trace: OldTrace, path: Path, maps: dict[int, OldMap]) -
     except (TypeError, ValueError) as error:
         raise StoreError(_stopped(fresh, [f"{path}: {error}"])) from error
     reason = str(done.error or "")
-    unknown = f"import it again afterwards, and say --leave-out {trace.name!r} now"
+    unknown = f"import it again afterwards, and add --leave-out {trace.name!r} now"
     if reason and "words" not in (trace.imported or {}):
         reason += f" (an older version did not keep how it was imported: {unknown})"
     if not reason and trace.map_id is not None:
         now = {one.digest for one in Remains.of(fresh).maps.values()}
         if maps[trace.map_id].digest not in now:
             StoreFile(fresh).remove(trace.trace_id)
-            reason = f"{path}: the store does not know how it was imported (--kind, --relation, …): {unknown}"
+            reason = f"{path}: it lacks its import options (--kind, --relation, …): {unknown}"
     if reason:
         raise StoreError(_stopped(fresh, [reason]))
 

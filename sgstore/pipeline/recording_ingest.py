@@ -534,7 +534,7 @@ class SegmentReader:
         for one, segment in zip(group, segments, strict=True):
             outcome = one.outcome
             if self._job.config.egos and not one.met:
-                reason = f"the ego {one.info.ego!r} is in none of the frames that were read"
+                reason = f"the ego {one.info.ego!r} is missing from all frames"
                 outcome.error = TraceError(reason, path=one.info.path)
                 continue
             outcome.frames = tally.frames

@@ -469,7 +469,7 @@ class MessageTrace:
         decoder.settle()
         if not report.frames:
             topic = next(c.topic for c in self.info.channels if c.role == "ground_truth")
-            reason = report.losses[0].reason if report.losses else "it has no messages"
+            reason = report.losses[0].reason if report.losses else "it contains no messages"
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
 
     def _first_steps(self) -> list[int]:
@@ -823,7 +823,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         The state of the decoder does not change.
         """
         if not isinstance(frame, Frame):
-            raise TypeError(f"{type(frame).__name__} is no Frame")
+            raise TypeError(f"{type(frame).__name__} is not a Frame")
         if abs(frame.time_ns) >= _LATEST:
             raise ValueError(f"no time: {frame.time_ns} ns")
         check_entities(frame, self._is_static)

@@ -534,7 +534,7 @@ def assemble(
     lives.settle()
     decoder.roster.settle()
     if between.dropped:
-        words = f"{between.dropped} sensor messages stand far from any frame, and no frame refers to them"
+        words = f"{between.dropped} sensor messages are far from all frames and were not linked"
         decoder.roster.report.warnings.append(words)
     if last is not None:
         yield last
@@ -714,7 +714,7 @@ class LifetimeTracker:
         if self._gaps:
             longest = max(self._gaps) / 1e9
             warnings.append(
-                f"{len(self._gaps)} gaps of more than three periods, the longest of {longest:g} s:"
+                f"{len(self._gaps)} gaps longer than three periods, the longest {longest:g} s:"
                 " nothing is derived across them"
             )
 

@@ -229,7 +229,7 @@ _LOOKS: Final = (
 _TELLS_OBJECTS: Final = re.compile(
     r"object|track|detect|obstacle|truth|actor|entit|marker|scene", re.IGNORECASE
 )
-_HELP: Final = "docs/flavours.md says how a flavour of your own reads them, in one file"
+_HELP: Final = "see docs/flavours.md to add a reader for them"
 
 
 def _no_reader(recording: Recording) -> str:

@@ -170,7 +170,7 @@ def parse_definition(name: str, text: bytes) -> Struct:
         texts = _texts(short_name(name), text.decode())
         return _Parser(texts).struct(short_name(name))
     except UnicodeDecodeError as error:
-        raise TraceError(f"schema {name}: its definition is no UTF-8 text: {error}") from error
+        raise TraceError(f"schema {name}: its definition is not UTF-8 text: {error}") from error
     except TraceError as error:
         raise TraceError(f"schema {name}: {error.reason}") from error
 
@@ -426,7 +426,7 @@ class _MessageReader:
         head = bytes(data[:HEAD])
         kind = int.from_bytes(head[:2], "big")
         if len(head) < HEAD:
-            raise TraceError(f"a message of {len(head)} bytes, which is no CDR")
+            raise TraceError(f"a message of {len(head)} bytes is not CDR")
         if kind not in _ORDERS:
             raise TraceError(
                 f"a message in encoding 0x{kind:04x}; expected plain CDR, 0x0000 or 0x0001"

@@ -25,7 +25,7 @@ OTHER_CLOCK: Final = 86_400_000_000_000
 """Minimum distance of stamps of two different clocks; ns."""
 MOST_RUNS: Final = 100_000
 """Maximum number of stored runs of messages without a stamp. Messages of further runs are losses."""
-NO_TIME: Final = "a message has no time, and none can be derived"
+NO_TIME: Final = "a message has no time, and it cannot be derived"
 """Reason of the loss of such a message."""
 _STEPS: Final = 99
 """Number of steps of a clock; their median is its period."""

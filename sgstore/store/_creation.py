@@ -36,7 +36,7 @@ def create(path: Path) -> None:
     """
     refuse_odd_name(path)
     if not path.parent.is_dir():
-        raise StoreError(f"{path}: there is no folder {path.parent}")
+        raise StoreError(f"{path}: the folder {path.parent} does not exist")
     with Folder(path) as beside:
         place = beside.path / "store"
         write_empty(place)

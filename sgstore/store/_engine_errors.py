@@ -95,7 +95,7 @@ def _reason(message: str) -> str:
     if any(phrase in message for phrase in phrases):
         return "not a store; expected a file that 'sgstore ingest' made"
     if "database does not exist" in message:
-        return "no such store; 'sgstore ingest' makes one"
+        return "store not found; create it with 'sgstore ingest'"
     if "database file with version number" in message:
         return "made by a newer DuckDB than is installed here; upgrade the package duckdb"
     return message

@@ -271,7 +271,7 @@ def _reading(connection: DuckDBPyConnection, name: str, given: object) -> str:
         return "SELECT * FROM given"
     path = Path(given)
     if not path.is_file():
-        raise StoreError(f"table {name}: {path}: no such file")
+        raise StoreError(f"table {name}: {path}: file not found")
     if path.stat().st_size == 0:
         raise StoreError(f"table {name}: {path}: an empty file")
     reader = _READERS.get(path.suffix.lower())

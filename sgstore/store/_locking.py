@@ -241,8 +241,8 @@ class Access:
         except _SURPRISES as error:
             if self._checked and (reason := self._damage(connection, error)):
                 raise StoreError(
-                    f"{self.path}: not as it was published: {reason}; 'sgstore verify' says all,"
-                    " 'sgstore rebuild' makes it anew from its recordings"
+                    f"{self.path}: differs from its published state: {reason}; 'sgstore verify' lists faults,"
+                    " 'sgstore rebuild' makes it again from its recordings"
                 ) from error
             raise
         finally:

@@ -185,7 +185,7 @@ def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Rem
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise StoreError(
-            f"{path}: what it says of its traces cannot be read ({error});"
+            f"{path}: its list of traces cannot be read ({error});"
             " ingest its recordings into a new store"
         ) from error
 
@@ -351,7 +351,7 @@ def refuse_others(path: Path, access: Access) -> None:
     if others:
         raise StoreError(
             f"{path}: cannot be written anew: what is none of sgstore's would be lost:"
-            f" {', '.join(others)}; move them to a file of their own first"
+            f" {', '.join(others)}; move them to another file first"
         )
 
 

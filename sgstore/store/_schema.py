@@ -51,7 +51,7 @@ def schema_version() -> str:
     """Return the version number in the header of ``schema.sql``."""
     found = _HEAD.match(schema_sql())
     if found is None:
-        raise ValueError("the head of schema.sql says no version")
+        raise ValueError("the head of schema.sql contains no version")
     return found[1]
 
 
@@ -155,12 +155,12 @@ def check(connection: DuckDBPyConnection, database: str, path: Path) -> None:
     if faults:
         more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
         raise StoreError(
-            f"{path}: not as sgstore made it, so nothing of it is read: {faults[0]}{more};"
-            f" 'sgstore verify' says all; {_REMEDY}"
+            f"{path}: differs from the schema of sgstore and is not read: {faults[0]}{more};"
+            f" 'sgstore verify' lists faults; {_REMEDY}"
         )
 
 
-_REMEDY: Final = "'sgstore rebuild' makes it anew from its recordings"
+_REMEDY: Final = "'sgstore rebuild' makes it again from its recordings"
 
 
 def schema_faults(connection: DuckDBPyConnection, path: Path) -> tuple[list[str], tuple[str, ...]]:
@@ -449,7 +449,7 @@ def _differing(
             gone = f"a {'view' if what == 'table' else 'table'}" if name in instead else "missing"
             yield f"{what} {name!r} is {gone}"
         elif found != words:
-            yield f"{what} {name!r} is not the one that sgstore makes"
+            yield f"{what} {name!r} differs from that of sgstore"
 
 
 def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:

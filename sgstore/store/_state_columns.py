@@ -65,9 +65,7 @@ def states_between(connection: DuckDBPyConnection, trace_id: int, first: int, la
         The range has more than :data:`MOST_FRAMES` frames.
     """
     if last - first >= MOST_FRAMES:
-        raise StoreError(
-            f"{last - first + 1} frames are asked for; {MOST_FRAMES} are given at once"
-        )
+        raise StoreError(f"{last - first + 1} frames requested; at most {MOST_FRAMES} at once")
     low, high = _ids(trace_id, first, last)
     found = connection.execute(
         f"SELECT frame_id, {_OF_STATE} FROM state WHERE frame_id BETWEEN ? AND ?"
@@ -80,7 +78,7 @@ def states_between(connection: DuckDBPyConnection, trace_id: int, first: int, la
 def states_at(connection: DuckDBPyConnection, frames: Sequence[tuple[int, int]]) -> Columns:
     """Return object states in given frames. Column ``at`` is the index of the frame in the input."""
     if len(frames) > MOST_FRAMES:
-        raise StoreError(f"{len(frames)} frames are asked for; {MOST_FRAMES} are given at once")
+        raise StoreError(f"{len(frames)} frames requested; at most {MOST_FRAMES} at once")
     ids = [int(frame_ids(trace, np.array([seq]))[0]) for trace, seq in frames]
     found = connection.execute(
         f"SELECT a.at AS at, {_OF_STATE} FROM"

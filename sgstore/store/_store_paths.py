@@ -49,10 +49,10 @@ def refuse_special(path: Path) -> None:
             what = _KINDS.get(stat.S_IFMT(mode), "no file")
             whose = "" if file == path else f"{file.name} beside it is "
             raise StoreError(
-                f"{path}: {whose}{what}: not a store; expected a file that 'sgstore ingest' made"
+                f"{path}: {whose}{what}: not a store; expected a file written by 'sgstore ingest'"
             )
     if not path.exists():
-        raise StoreError(f"{path}: no such store; 'sgstore ingest' makes one")
+        raise StoreError(f"{path}: store not found; create it with 'sgstore ingest'")
 
 
 _NAME: Final = ".segment-"
@@ -116,6 +116,4 @@ def refuse_odd_name(store: Path) -> None:
     except UnicodeEncodeError:
         pass
     shown = str(store).encode(errors="backslashreplace").decode().replace("\0", "\\x00")
-    raise StoreError(
-        f"{shown}: the name of a store and of its folders is UTF-8; rename what is not"
-    )
+    raise StoreError(f"{shown}: the names of a store and its folders must be UTF-8; rename them")

@@ -161,7 +161,7 @@ class TableFile:
         """Return one column for a range of rows in a row group (block of rows) of the file."""
         about, end = piece.columns[name], piece.rows if end is None else end
         if about["type"] not in _PLAIN:
-            raise self._wrong("is none of ours")
+            raise self._wrong("is not a file of sgstore")
         kind = np.dtype(about["type"])
         if "value" in about:
             value = np.nan if about["value"] is None else about["value"]
@@ -214,7 +214,7 @@ class TableFile:
         while at < self._size:
             length = int.from_bytes(self._bytes(at, _HEAD), "little")
             if length > self._size:
-                raise self._wrong("is none of ours")
+                raise self._wrong("is not a file of sgstore")
             said = json.loads(self._bytes(at + _HEAD, length))
             at += _HEAD + length
             self._pieces.append(Piece(said["table"], said["rows"], said["columns"], at))

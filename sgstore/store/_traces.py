@@ -329,7 +329,7 @@ def stored_traces(
             row["report"] = _object(row["report"])
             row["settings"] = settings[row.pop("config_id")]
     except (ValueError, TypeError) as error:
-        raise StoreError(f"what the store says of its traces cannot be read: {error}") from error
+        raise StoreError(f"the list of traces of the store cannot be read: {error}") from error
     return tuple(sorted((StoredTrace(**row) for row in found), key=lambda one: natural(one.name)))
 
 
@@ -397,7 +397,7 @@ def already_stored(
     for how, holds in same.items():
         if not holds:
             raise StoreError(
-                f"already in the store as {name!r}, read {how}; to read it anew, remove it first or say --force"
+                f"already in the store as {name!r}, read {how}; remove it, or add --force to ingest it again"
             )
     return name
 

@@ -97,7 +97,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "masks",
-        "a bucket does not have the frames that it says, or joins others than follow one another",
+        "the frames of a bucket differ from its number of frames, or are not consecutive",
         f"""
         SELECT coalesce(b.trace_id, f.trace_id)
         FROM bucket b FULL JOIN (
@@ -112,7 +112,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "frames",
-        "the frames are not as many as the trace says, or are not numbered from 0 without gaps",
+        "the number of frames differs from that of the trace, or the numbers do not run from 0 without gaps",
         """
         SELECT t.trace_id FROM trace t LEFT JOIN (
           SELECT trace_id, count(*) AS frames, count(DISTINCT seq) AS seqs, min(seq) AS first,
@@ -158,7 +158,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "references",
-        "an ego is no entity of the trace",
+        "an ego is not an entity of the trace",
         "SELECT f.trace_id FROM frame f WHERE f.ego IS NOT NULL AND NOT EXISTS"
         " (SELECT 1 FROM entity e WHERE e.trace_id = f.trace_id AND e.node_id = f.ego)",
     ),
@@ -181,7 +181,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "references",
-        "an entity lies in a lane that its map does not have, or is none of the trace",
+        "an entity lies in a lane missing from its map, or is not an entity of the trace",
         """
         SELECT l.bucket >> 18
         FROM (SELECT bucket, node_id, kind, lane FROM lane_single UNION ALL
@@ -196,7 +196,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     *(
         (
             "references",
-            f"an edge {way} what is no entity of the trace or no part of its map, or of another kind",
+            f"an edge {way} a node that is not in the trace or its map, or its kind differs",
             f"""
             SELECT e.bucket >> 18
             FROM (SELECT DISTINCT bucket, {end} AS node, {end}_kind AS kind
@@ -210,7 +210,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "references",
-        "a static node is no entity of the trace and no part of its map, or of another kind",
+        "a static node is neither an entity of the trace nor a part of its map, or its kind differs",
         """
         SELECT k.bucket >> 18 FROM (SELECT * FROM node UNION ALL SELECT * FROM world_node) k
         LEFT JOIN trace t ON t.trace_id = k.bucket >> 18
@@ -229,7 +229,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "map",
-        "an edge of a map leads to what is no part of it",
+        "an edge of a map leads to a node outside the map",
         """
         SELECT NULL FROM map_edge e
         LEFT JOIN map_node a ON a.map_id = e.map_id AND a.node_id = e.src
@@ -238,7 +238,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "map",
-        "a way along lanes of a map leads to what is no lane of it",
+        "a way along lanes of a map leads to a node that is not a lane of it",
         """
         SELECT NULL FROM map_reach r
         LEFT JOIN map_node a ON a.map_id = r.map_id AND a.node_id = r.src
@@ -247,7 +247,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "map",
-        "a place along lanes of a map is of what is no part of it, or on what is no lane",
+        "a place along lanes of a map belongs to a node outside the map, or lies on a node that is not a lane",
         """
         SELECT NULL FROM map_place p
         LEFT JOIN map_node a ON a.map_id = p.map_id AND a.node_id = p.node_id
@@ -256,7 +256,7 @@ _RULES: Final[tuple[tuple[str, str, str], ...]] = (
     ),
     (
         "map",
-        "a course of a lane of a map is of what is no lane",
+        "a course of a lane of a map belongs to a node that is not a lane",
         """
         SELECT NULL FROM map_course c
         LEFT JOIN map_node n ON n.map_id = c.map_id AND n.node_id = c.lane
@@ -403,7 +403,7 @@ def _trace_faults(
     """Yield faults of a trace: tables whose rows differ from the published rows."""
     manifest = published.get(("trace", trace.trace_id), {})
     if not manifest:
-        yield Fault(trace.name, "rows", "nothing is noted of what was published of it")
+        yield Fault(trace.name, "rows", "its record of publication is missing")
     tables = {table for (owner, _), of in published.items() if owner == "trace" for table in of}
     database = _database(connection)
     for table, _ in list(owned(connection, database)):

@@ -154,13 +154,13 @@ class CheckMonitor:
         self._variables = plan.bound
         if check.gaps == "unknown":
             raise QueryError(
-                f"USING GAPS unknown of {check.name} is a question about what was recorded",
+                f"USING GAPS unknown of {check.name} needs a complete recording",
                 hint="a monitor sees every frame that there is; leave it out, or ask a store",
             )
         if reset is not None and looks_ahead(reset):
             raise QueryError(
                 f"RESET WHEN of {check.name} looks ahead",
-                hint="a monitor begins anew in the next frame, so what resets it must be known by then",
+                hint="a monitor restarts in the next frame, so the reset condition must be known by then",
             )
         self._guards: dict[BoundQuantifier, int] = {
             check.quantifiers[number]: 1 << place for place, number in enumerate(guards)

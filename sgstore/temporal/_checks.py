@@ -220,7 +220,7 @@ class CheckRun:
         Examples
         --------
         >>> store.check("CHECK none: FORALL (v:Vehicle) ALWAYS NOT v.name = 'car 7'").notes
-        ("nothing in the store has the name 'car 7'; the nearest is 'car 0'",)
+        ("the store has no name 'car 7'; the nearest is 'car 0'",)
         """
         with self._file.snapshot():
             compared = [pair for one in self._checks for pair in compared_in_check(one.check)]
@@ -546,7 +546,7 @@ class StoreCheck:
             return "it is unknown whether a quantifier is about an entity"
         row = int(rows[0])
         if judged.in_gap[row]:
-            return "it depends on what happened in a gap"
+            return "it depends on a gap in the recording"
         binding = innermost(levels)[row : row + 1]
         found = self._decisive_doubt(trace, binding)
         if found is None:

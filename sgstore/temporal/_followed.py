@@ -102,7 +102,7 @@ class FollowedMatch:
         The format is that of :meth:`sgstore.Store.parts`.
         """
         lanes = (
-            TruthLane(part, (), ("what is asked of other frames",))
+            TruthLane(part, (), ("values of other frames",))
             if search is None
             else TruthLane(part, tuple(one for one in spans if one[1] >= first))
             for part, search, spans in zip(self._parts, self._search, self._spans, strict=True)

@@ -96,7 +96,7 @@ def short_range(needed: Horizon, known: float) -> ShortRange:
         if metres <= known:
             return ""
         far = "everything" if metres == math.inf else f"{math.ceil(metres)} m"
-        return f"it depends on {far} around the ego, and the trace knows {known:g} m"
+        return f"it depends on {far} around the ego, but the trace covers {known:g} m"
 
     return ShortRange(reason(needed.true), reason(needed.false))
 

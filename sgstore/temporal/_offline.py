@@ -164,7 +164,7 @@ def refuse_many(bindings: int, told: str) -> None:
     if bindings > MOST_BINDINGS:
         raise QueryError(
             f"{told}: {bindings:,} combinations of nodes in one trace, expected at most {MOST_BINDINGS:,}",
-            hint="say more of these nodes: a label, an edge between them, a condition",
+            hint="restrict these nodes: add a label, an edge between them, or a condition",
         )
 
 
@@ -569,7 +569,7 @@ def arrays_of(
         raise TooMuchError(
             f"{ask_text(ask)} holds for more than {most:,} combinations of nodes and frames of"
             f" {', '.join(held)}, more than memory may take",
-            hint="say more of its nodes: a label, an edge between them, a condition; or allow more memory",
+            hint="restrict its nodes: add a label, an edge between them, or a condition; or allow more memory",
         )
     columns = [np.ma.getdata(arrays[key]).astype(np.int64, copy=False) for key in ask.variables]
     columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]

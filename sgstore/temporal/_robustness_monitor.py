@@ -214,7 +214,7 @@ class MarginStream:
             raise QueryError(
                 f"the robustness of {self._open} operators that look ahead without a bound,"
                 f" expected at most {MOST_OPEN}",
-                hint="give some of them one: EVENTUALLY[0s, 5s] …; or ask a store",
+                hint="bound some of them: EVENTUALLY[0s, 5s] …; or use a store",
             )
         self._vertices = np.arange(1 << self._open)
         self._names = sorted(propositions(formula))

@@ -324,7 +324,7 @@ class Finder:
             if sum(len(one[0]) for one in parts) > MOST_MATCHES:
                 raise TooMuchError(
                     f"{name} has more than {MOST_MATCHES:,} matches, more than memory may take",
-                    hint="say more of its nodes: a label, an edge between them, a condition",
+                    hint="restrict its nodes: add a label, an edge between them, or a condition",
                 )
         first = [frame for part in parts for frame in part[0].tolist()]
         last = [frame for part in parts for frame in part[1].tolist()]

@@ -71,7 +71,7 @@ class SignalState:
             for part in b.walk(test.expression):
                 if isinstance(part, b.Tense) and part.word in FUTURE:
                     raise QueryError(
-                        f"{part.word} stands where its value must be known at once, and it looks ahead",
+                        f"{part.word} looks ahead, but its value is needed at once",
                         hint="join conditions by AND, OR, NOT, IMPLIES",
                     )
             for course in _courses(test.expression):

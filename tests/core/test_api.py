@@ -50,7 +50,7 @@ def test_importing_the_package_loads_none_of_its_rooms() -> None:
 
 def test_a_store_is_created_and_filled_where_there_is_none(tmp_path: Path) -> None:
     path = tmp_path / "new.sgstore"
-    with pytest.raises(sgstore.StoreError, match="no such store"):
+    with pytest.raises(sgstore.StoreError, match="store not found"):
         sgstore.open(path)
 
     with sgstore.open(path, create=True) as store:

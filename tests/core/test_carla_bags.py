@@ -195,7 +195,7 @@ def test_a_file_that_is_missing_is_named_and_the_others_are_read(
     _, _, report = read(bag)
 
     assert whole / 2 < report.frames < whole
-    assert "drive_2.mcap: metadata.yaml lists it, but there is no such file" in reasons(report)
+    assert "drive_2.mcap: metadata.yaml lists it, but the file is missing" in reasons(report)
 
 
 def test_a_file_that_is_hurt_is_named_and_the_others_are_read(tmp_path: Path, path: Path) -> None:
@@ -275,7 +275,7 @@ def test_in_a_folder_a_bag_is_one_recording(
 
     assert code == 3, err
     assert (row["trace"], row["status"]) == ("bag", "added")
-    assert "drive_1.mcap: metadata.yaml lists it, but there is no such file" in err
+    assert "drive_1.mcap: metadata.yaml lists it, but the file is missing" in err
     opened = sgstore.open(store)
     picture = opened.payload("bag#0", "/carla/hero/rgb_front/image/compressed")
     last = opened.payload(f"bag#{row['frames'] - 1}", "/carla/objects")

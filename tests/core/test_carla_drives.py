@@ -312,7 +312,7 @@ def test_without_an_ego_it_is_said_that_there_is_none(path: Path) -> None:
 
     assert info.ego == ""
     assert blocks[0].ego.tolist() == [-1]
-    assert any("none unless one is named" in warning for warning in report.warnings)
+    assert any("name one as the ego" in warning for warning in report.warnings)
 
 
 @pytest.mark.parametrize("delay", [-0.001, 0.004], ids=["before", "behind"])

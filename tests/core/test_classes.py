@@ -300,7 +300,7 @@ def test_an_edge_to_nowhere_is_a_defect_that_is_told() -> None:
     one = np.zeros(1, np.int64)
     graph = Labelled.assembled(1, [(one, one, one)], [(one, one, one, one + 7)], "a")
 
-    with pytest.raises(ValueError, match="no node of its frame"):
+    with pytest.raises(ValueError, match="a node outside its frame"):
         classes_of(graph)
 
 

@@ -73,7 +73,7 @@ def test_the_demo_says_that_a_recording_is_not_there(tmp_path: Path, sgstore: An
     code, _, err = sgstore("demo", tmp_path / "demo", "--recording", tmp_path / "town.mcap")
 
     assert code == 1
-    assert "no such recording" in err
+    assert "file not found" in err
     assert not (tmp_path / "demo").exists()
 
 

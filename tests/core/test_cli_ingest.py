@@ -141,7 +141,7 @@ def test_what_was_read_otherwise_is_refused_and_replaced_by_force(tmp_path) -> N
     forced = sgstore("ingest", tmp_path / "s.db", path, "--rate", 1, "--force", "--json")
 
     assert refused.returncode == 1
-    assert "read with other settings; to read it anew, remove it first or say --force" in (
+    assert "read with other settings; remove it, or add --force to ingest it again" in (
         refused.stderr.decode()
     )
     assert (forced.returncode, statuses(forced)) == (0, {"d.mcap": "replaced"})
@@ -150,10 +150,10 @@ def test_what_was_read_otherwise_is_refused_and_replaced_by_force(tmp_path) -> N
 @pytest.mark.parametrize(
     ("arguments", "code", "reason"),
     [
-        (("nothing/*.mcap",), 1, "no file fits this pattern"),
+        (("nothing/*.mcap",), 1, "no file matches this pattern"),
         (("d.mcap", "--since", "soon"), 2, "expected a time"),
         (("d.mcap", "--jobs", "-1"), 2, "Invalid value"),
-        (("none.mcap",), 1, "no such file"),
+        (("none.mcap",), 1, "file not found"),
     ],
 )
 def test_wrong_use_of_ingest_is_told(tmp_path, arguments, code, reason) -> None:
@@ -303,5 +303,5 @@ def test_graphs_in_a_file_whose_name_is_no_utf_8_are_refused(tmp_path: Path) -> 
     run = started("import", tmp_path / "s.db", file, "--format", "csv")
 
     assert run.returncode == 1
-    assert r"'g\xff.csv' is none: rename it" in run.stderr.decode()
+    assert r"'g\xff.csv' is not; rename it" in run.stderr.decode()
     assert not (tmp_path / "s.db").exists()

@@ -196,7 +196,10 @@ def test_a_name_of_a_store_that_is_no_utf8_is_refused_by_every_verb(
             continue
         there = dict.fromkeys(("store", "copy", "short", "new"), odd)
         words = [*verb.split(), *(part.format(**(files | there)) for part in line)]
-        codes[verb] = run(words), "is UTF-8; rename" in " ".join(capsys.readouterr().err.split())
+        codes[verb] = (
+            run(words),
+            "must be UTF-8; rename" in " ".join(capsys.readouterr().err.split()),
+        )
 
     assert len(codes) > 25
     assert {verb: code for verb, code in codes.items() if code != (1, True)} == {}

@@ -116,7 +116,10 @@ def test_a_config_survives_json_and_toml(tmp_path: Path, config: Config) -> None
             "[proximity]\nnames = ['very near']",
             "setting 'proximity.names': 'very near' is not a name",
         ),
-        ("[proximity]\nnames = ['Near']", "setting 'proximity.names': 'Near' would be taken for"),
+        (
+            "[proximity]\nnames = ['Near']",
+            "setting 'proximity.names': 'Near' could be confused with",
+        ),
         ("[proximity]\nupper = [1]", "expected 6 bounds for 6 names"),
         ("[proximity]\nupper = [1,2,3,4,4,5]", "expected ascending bounds above 0"),
         ("[proximity]\nupper = [0,1,2,3,4,5]", "expected ascending bounds above 0"),

@@ -251,6 +251,6 @@ def test_a_name_that_is_all_but_a_built_in_one_is_noted(tmp_path: Path) -> None:
 
     assert outcome.error is None
     assert [note for note in outcome.warnings if "proximity" in note] == [
-        "setting 'proximity.names': 'near_col' is a relation of your own; did you mean 'near_coll'?"
+        "setting 'proximity.names': 'near_col' would be a new relation; did you mean 'near_coll'?"
     ]
     assert Config().notes == []

@@ -224,7 +224,7 @@ def test_a_crowded_frame_has_what_bodies_are_to_the_ego_and_other_frames_have_al
 
     assert [loss.reason for loss in outcome.losses] == [
         "frame 1 has 60 bodies, of which more than 200 pairs are within 25 m of one another"
-        " ('pairs.within'): how near and where bodies are is told of the ego alone, and 1 more frames like it"
+        " ('pairs.within'): proximity and direction are computed for the ego only, and 1 more frames like it"
     ]
     store, ego_only = (sgstore.open(tmp_path / name) for name in ("s.sgstore", "ego.sgstore"))
     between = [store.sql(BETWEEN_OTHERS.format(seq, "'overlaps'")).values[0][0] for seq in range(4)]

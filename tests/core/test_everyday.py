@@ -64,7 +64,7 @@ def test_a_name_that_duckdb_cannot_open_is_refused_before_work_begins(
 def test_a_missing_recording_is_an_error(path: Path) -> None:
     with (
         sgstore.open(path) as store,
-        pytest.raises(StoreError, match=r"missing\.mcap: no such file"),
+        pytest.raises(StoreError, match=r"missing\.mcap: file not found"),
     ):
         store.ingest("missing.mcap")
 

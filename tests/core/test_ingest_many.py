@@ -374,7 +374,7 @@ def test_an_ego_that_comes_only_after_the_part_is_told(crowd: Any, tmp_path: Pat
     outcomes = ingest(tmp_path / "s.db", [crowd], egos=["1", "5"], until=2.0)
 
     assert [(o.status, o.frames) for o in outcomes] == [("added", 21), ("failed", 0)]
-    assert "the ego '5' is in none of the frames that were read" in str(outcomes[1].error)
+    assert "the ego '5' is missing from all frames" in str(outcomes[1].error)
 
 
 # Which files
@@ -411,7 +411,7 @@ def test_files_folders_and_patterns_are_meant_each_once(tmp_path: Path) -> None:
 def test_a_folder_or_pattern_that_means_nothing_is_told(tmp_path: Path, name: Any) -> None:
     (tmp_path / "empty").mkdir()
 
-    with pytest.raises(StoreError, match=r"no recording \(\.mcap|no file fits this pattern"):
+    with pytest.raises(StoreError, match=r"no recording \(\.mcap|no file matches this pattern"):
         recordings([tmp_path / name])
 
 

@@ -80,9 +80,9 @@ def test_safe_distance_grows_with_greatest_speed() -> None:
 def test_reason_names_needed_and_known_range() -> None:
     assert short_range(Horizon(120, 0), 50).of(holds=False) == ""
     reason = short_range(Horizon(119.2, 0), 50).of(holds=True)
-    assert reason == "it depends on 120 m around the ego, and the trace knows 50 m"
+    assert reason == "it depends on 120 m around the ego, but the trace covers 50 m"
     reason = short_range(Horizon(0, math.inf), 50).of(holds=False)
-    assert reason == "it depends on everything around the ego, and the trace knows 50 m"
+    assert reason == "it depends on everything around the ego, but the trace covers 50 m"
 
 
 @pytest.mark.parametrize(

@@ -485,7 +485,7 @@ def test_verdict_is_unknown_beyond_known_range(
     for text, expected in ((APART, apart), (SLOW, slow)):
         (found,) = store.check(text)
         assert found.verdict == watched[found.check].verdict == expected
-        assert ("around the ego, and the trace knows" in found.reason) is (expected == "unknown")
+        assert ("around the ego, but the trace covers" in found.reason) is (expected == "unknown")
         assert found.reason == watched[found.check].reason
         (found,) = store.check(f"USING SCOPE graph {text}")
         assert found.verdict == ("false" if radius > 300 and text is SLOW else "true")

@@ -211,7 +211,7 @@ def test_what_is_no_recording_is_named_for_what_it_is(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
 
     for name, words in (
-        ("nothing", "no such file"),
+        ("nothing", "file not found"),
         ("empty", "the file is empty"),
         ("text", "not an MCAP file"),
         ("cut", "the header of this MCAP file"),

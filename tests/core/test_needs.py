@@ -281,7 +281,7 @@ def test_whatever_tells_verdicts_says_why_they_are_unknown(
         assert f"c is unknown of {traces}: {reason}" in lines
         assert f"c is unknown of {traces}: {reason}" in drawn
         assert re.search(rf"^{trace}  0 … .*\n  c  ·+  unknown$", lanes, re.MULTILINE)
-        assert f"cannot be told: {reason}" in picture.read_text(encoding="utf-8")
+        assert f"unknown: {reason}" in picture.read_text(encoding="utf-8")
 
 
 def test_swim_lanes_tell_what_a_trace_cannot_answer_from_what_is_not_found(

@@ -323,10 +323,10 @@ def test_a_type_of_a_recording_is_of_a_kind_that_the_settings_name(tmp_path: Pat
             '[types]\nx = { kind = "trcuk" }',
             "'truck', perhaps; new_kinds names those of your own",
         ),
-        ('new_kinds = ["Vehicle"]', "would be taken for the label"),
-        ('new_kinds = ["near"]', "would be taken for the relation 'near'"),
+        ('new_kinds = ["Vehicle"]', "could be confused with the label"),
+        ('new_kinds = ["near"]', "could be confused with the relation 'near'"),
         ('new_kinds = ["a b"]', "is not a name"),
-        ('new_kinds = ["ego"]', "would be taken for the label"),
+        ('new_kinds = ["ego"]', "could be confused with the label"),
     ],
 )
 def test_a_kind_that_cannot_be_is_told(tmp_path: Path, text: str, told: str) -> None:

@@ -92,7 +92,11 @@ BROKEN_ROADS = {
         "'length'",
         "geometry",
     ),
-    "NaN for a place": (a_road("bad", line(9.0, x=float("nan"))), "'x' is no finite", "geometry"),
+    "NaN for a place": (
+        a_road("bad", line(9.0, x=float("nan"))),
+        "'x' is not a finite",
+        "geometry",
+    ),
     "infinity for a heading": (a_road("bad", line(9.0, hdg=float("inf"))), "'hdg'", "geometry"),
     "an unknown curve": (
         a_road("bad", geometry(9.0, "<bezier/>")),
@@ -251,7 +255,7 @@ def test_one_width_that_is_not_finite_costs_a_town_nothing_else(data: Path) -> N
 
     assert found.nodes.name == plain.nodes.name
     assert len(found.warnings) == len(plain.warnings) + 1
-    assert "width>: attribute 'a' is no finite number" in " ".join(found.warnings)
+    assert "width>: attribute 'a' is not a finite number" in " ".join(found.warnings)
 
 
 def test_links_that_lead_nowhere_cost_no_road_and_are_said() -> None:

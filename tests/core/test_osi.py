@@ -1088,10 +1088,10 @@ def test_an_object_is_called_as_the_scenario_calls_it_if_nothing_else_is(tmp_pat
     ("host", "names", "ego", "word"),
     [
         (0, {0: "", 1: "Ego"}, "0", ""),
-        (None, {0: "Other", 1: "Ego"}, "Ego", "host vehicle told: none"),
-        (77, {0: "Other", 1: "hero"}, "hero", "host vehicle 77 is no moving object"),
-        (77, {0: "Other", 1: "Rival"}, "", "no host vehicle is among the moving objects"),
-        (None, {0: "Ego", 1: "Hero"}, "", "no host vehicle is among the moving objects"),
+        (None, {0: "Other", 1: "Ego"}, "Ego", "host vehicle in the file: none"),
+        (77, {0: "Other", 1: "hero"}, "hero", "host vehicle 77: no moving object"),
+        (77, {0: "Other", 1: "Rival"}, "", "the moving objects contain no host vehicle"),
+        (None, {0: "Ego", 1: "Hero"}, "", "the moving objects contain no host vehicle"),
         ((1 << 64) - 1, {(1 << 64) - 1: "", 1: "Ego"}, str((1 << 64) - 1), ""),
     ],
 )
@@ -1111,9 +1111,7 @@ def test_a_host_that_changes_is_said_and_the_first_is_the_ego(tmp_path: Path) ->
     info, _, report = read(record(tmp_path / "a.mcap", frames))
 
     assert info.ego == "1"
-    assert report.warnings == [
-        "several host vehicles are told (ids 1, 2); the first one is the ego"
-    ]
+    assert report.warnings == ["several host vehicles (ids 1, 2); the first one is the ego"]
 
 
 def test_a_truth_split_over_messages_of_one_time_is_one_frame(tmp_path: Path) -> None:
@@ -1173,7 +1171,7 @@ def test_what_another_channel_tells_between_frames_is_not_lost_in_silence(tmp_pa
 
     assert idents(blocks) == ["1"]
     (loss,) = report.losses
-    assert "moving object 2 is told only between the frames" in loss.reason
+    assert "moving object 2 appears only between the frames" in loss.reason
 
 
 def test_the_gear_is_that_of_the_egos_gearbox_and_osi_has_no_hand_brake(tmp_path: Path) -> None:
@@ -1291,10 +1289,7 @@ def test_of_messages_without_end_between_two_frames_those_near_them_are_referred
         assert ns(near / 10) in times
     assert ns(20.0) not in times
     dropped = 303 - len(times)
-    assert (
-        f"{dropped} sensor messages stand far from any frame, and no frame refers to them"
-        in warnings
-    )
+    assert f"{dropped} sensor messages are far from all frames and were not linked" in warnings
 
 
 def test_weather_and_light_are_events_when_they_begin_and_change(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_a_store_made_before_holds_a_relation_of_another_package(
 
     installed(monkeypatch)
     asked = "MATCH (a)-[:abreast_of]->(b) RETURN COUNT(*) AS n"
-    assert list(Store(path).find(asked)) == [(0,)]  # nothing is known of it there
+    assert list(Store(path).find(asked)) == [(0,)]  # unknown: it there
     ingest(path, [RECORDING], until=4.0, force=True)
 
     abreast = Store(path).sql(ABREAST).values

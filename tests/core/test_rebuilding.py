@@ -220,7 +220,7 @@ def test_a_store_that_was_made_before_says_what_it_was_made_of(
     before = Remains.of(small)
     change(small, *MADE_BEFORE[how])
 
-    with pytest.raises(StoreError, match="'sgstore rebuild' makes it anew"):
+    with pytest.raises(StoreError, match="'sgstore rebuild' makes it again"):
         StoreFile(small).traces()
     assert Remains.of(small) == before
     assert {one.name for one in before.traces} == set(few.content["order"])
@@ -238,10 +238,10 @@ def test_what_an_older_version_did_not_keep_is_left_out_when_that_is_said(
     before = small.read_bytes()
 
     assert run(["remove", str(small), "elves"]) == 1
-    assert "'sgstore rebuild' makes it anew" in capsys.readouterr().err
+    assert "'sgstore rebuild' makes it again" in capsys.readouterr().err
     assert run(["rebuild", str(small)]) == 1
     told = capsys.readouterr().err
-    assert "'elf' is of no kind that is known" in told
+    assert "'elf' is an unknown kind" in told
     assert "an older version did not keep how it was imported" in told
     assert "--leave-out 'elves'" in told
     assert small.read_bytes() == before
@@ -291,7 +291,7 @@ def test_recordings_that_are_gone_or_changed_are_named_and_nothing_is_touched(
         said = capsys.readouterr().err
 
         assert code == 1
-        assert "2 of 4 recordings cannot be read again" in said
+        assert "2 of 4 recordings cannot be read" in said
         assert f"{moved}: gone" in said
         assert f"{changed}: changed since it was ingested" in said
         assert small.read_bytes() == before

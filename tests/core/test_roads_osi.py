@@ -491,7 +491,7 @@ def test_lanes_that_make_no_map_are_said_and_cost_nothing(
     with open_trace(path) as trace:
         assert trace.info.map_text == ""
         assert sum(map(len, trace.blocks())) == 1
-        assert [w for w in trace.report.warnings if "make no road map" in w and "6 lanes" in w]
+        assert [w for w in trace.report.warnings if "make no map" in w and "6 lanes" in w]
 
 
 def both(path: Path) -> tuple[RoadMap, RoadMap]:

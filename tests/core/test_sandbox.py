@@ -177,7 +177,7 @@ def test_an_answer_that_is_too_long_is_stopped(path: Path) -> None:
 def test_what_is_no_store_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
 
-    with pytest.raises(StoreError, match="no such store"):
+    with pytest.raises(StoreError, match="store not found"):
         Sandbox(tmp_path / "none.sgstore")
     with pytest.raises(StoreError, match="not a store"):
         Sandbox(tmp_path / "notes.txt")

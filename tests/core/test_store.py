@@ -65,7 +65,7 @@ def test_create_opens_what_is_a_store_already(tmp_path: Path) -> None:
 
 
 def test_what_is_not_there_is_not_opened_nor_made(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="no such store; 'sgstore ingest' makes one"):
+    with pytest.raises(StoreError, match="store not found; create it with 'sgstore ingest'"):
         StoreFile(tmp_path / "none.db")
 
     assert list(tmp_path.iterdir()) == []
@@ -117,7 +117,7 @@ def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_not_there_cannot_hold_a_store(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="there is no folder"):
+    with pytest.raises(StoreError, match="does not exist"):
         StoreFile.create(tmp_path / "x" / "s.db")
 
 

@@ -257,7 +257,7 @@ def test_the_same_trace_read_otherwise_is_refused(
     publish(store, trace)
 
     with pytest.raises(
-        StoreError, match=f"already in the store as 'drive', read {what}; to read it anew, remove"
+        StoreError, match=f"already in the store as 'drive', read {what}; remove it"
     ):
         store.stored(trace.info, config, roads)
 

@@ -235,7 +235,7 @@ def test_recordings_are_hashed_again_where_that_is_asked_for(tmp_path: Path) -> 
     assert found.recordings == 3
     assert [(f.trace, f.check) for f in found.faults] == [("a", "payloads"), ("b", "payloads")]
     assert "not the file that was ingested" in found.faults[0].detail
-    assert "no such file" in found.faults[1].detail
+    assert "file not found" in found.faults[1].detail
 
 
 # Checksums

@@ -143,7 +143,10 @@ def test_nodes_of_several_traces_are_not_mixed_up(store: Store) -> None:
             "MATCH (v:Car) UNION MATCH (v:Car) UNION ALL MATCH (v:Car)",
             "a query cannot contain both UNION and UNION ALL",
         ),
-        ("MATCH (v:Car) UNION MATCH (v:Car); MATCH (v)", "a UNION stands alone"),
+        (
+            "MATCH (v:Car) UNION MATCH (v:Car); MATCH (v)",
+            "expected only the UNION",
+        ),
         ("MATCH (v:Car) UNION", "expected MATCH or USING, but the text ends"),
     ],
 )

@@ -157,7 +157,7 @@ def test_several_rows_for_a_frame_are_no_attribute_of_it(path, frames, table) ->
 @pytest.mark.parametrize(
     ("name", "text", "reason"),
     [
-        ("labels.csv", None, "no such file"),
+        ("labels.csv", None, "file not found"),
         ("labels.xlsx", "x", "cannot be read; expected a file that ends in .parquet"),
         (
             "labels.parquet",
@@ -354,5 +354,5 @@ def test_a_table_is_read_in_the_process_of_the_sandbox(path, frames, table) -> N
 
 
 def test_a_table_that_is_none_is_told_by_the_sandbox(path, tmp_path) -> None:
-    with pytest.raises(StoreError, match="no such file"):
+    with pytest.raises(StoreError, match="file not found"):
         Sandbox(path, tables={"labels": tmp_path / "labels.csv"})

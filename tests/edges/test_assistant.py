@@ -427,7 +427,7 @@ def test_an_answer_tells_that_there_is_more_and_what_cannot_answer(tools: StoreT
     assert "the first 2 rows; there are more" in few.text
     assert noted.text.startswith("nothing\n(note: ")
     assert len(wide.text) < 32_000
-    assert re.search(r"\(\d+ of 500 rows: more have no room", wide.text)
+    assert re.search(r"\(\d+ of 500 rows: the answer is full", wide.text)
 
 
 def test_a_name_of_the_library_is_taken_where_it_fits(tools: StoreTools) -> None:
@@ -498,13 +498,13 @@ def test_clips_are_cut_into_the_folder_and_nowhere_else(
     assert tools.export_clips("MATCH (e:Ego) WHERE e.speed > 300", "none").text == "nothing"
     with (
         StoreTools(town_store) as reading,
-        pytest.raises(ExportError, match="without --write-to"),
+        pytest.raises(ExportError, match="with --write-to"),
     ):
         reading.export_clips(query, "z")
 
 
 def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="no such store"):
+    with pytest.raises(StoreError, match="store not found"):
         StoreTools(tmp_path / "none.sgstore")
 
 

@@ -206,9 +206,9 @@ def test_the_store_may_be_named_by_the_environment(
     assert answer("why-not", "town#3", FAST)[0] == 0
     assert answer("info")[1] == answer("info", store)[1]
     assert answer("check", "-e", RULE)[1] == answer("check", store, "-e", RULE)[1]
-    assert "no such store" in answer("info", str(tmp_path / "none"))[2]
-    assert "no such store" in answer("find", str(tmp_path / "none.sgstore"), FAST)[2]
-    assert "no such store" in answer("why-not", "none", "town#3", FAST)[2]
+    assert "store not found" in answer("info", str(tmp_path / "none"))[2]
+    assert "store not found" in answer("find", str(tmp_path / "none.sgstore"), FAST)[2]
+    assert "store not found" in answer("why-not", "none", "town#3", FAST)[2]
     assert answer("ingest", str(tmp_path / "none.mcap"))[0] == 1
     assert not (tmp_path / "none").exists()
 

@@ -417,7 +417,7 @@ def test_sql_is_asked_of_each_bundle_or_refused(whole: Collection, path: Path) -
 
     with pytest.raises(SqlError, match="--each"):
         whole.sql(text)
-    with pytest.raises(QueryError, match="classes are counted in all"):
+    with pytest.raises(QueryError, match="classes need all bundles"):
         whole.sql("SELECT * FROM sgql('MATCH (a:Car) RETURN class_count()')", each=True)
     with pytest.raises(QueryError, match="neer"):
         whole.sql("SELECT * FROM sgql('MATCH (a:Car)-[:neer]->(b)')", each=True)

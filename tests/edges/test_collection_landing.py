@@ -228,7 +228,7 @@ def test_one_trace_read_in_two_ways_is_in_a_collection_once(
     land(place, drives[:1], until=2)
 
     (reason,) = commit(place).refused
-    assert "several ways" in reason
+    assert "different settings" in reason
 
 
 def test_what_came_from_a_store_and_lands_too_is_there_already(
@@ -243,7 +243,7 @@ def test_what_came_from_a_store_and_lands_too_is_there_already(
     assert (done.refused, sorted(done.present), done.added) == ([], ["a", "b"], ["c"])
     land(place, drives[1:2], since=1)
     (reason,) = commit(place).refused
-    assert "several ways" in reason
+    assert "different settings" in reason
 
 
 def test_a_share_that_is_none_is_refused(tmp_path: Path) -> None:

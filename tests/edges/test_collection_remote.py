@@ -369,7 +369,7 @@ def test_a_recording_that_does_not_come_at_once_is_asked_for_again(
     [
         ("403", "drives/day1.mcap", "credentials"),
         *([("cut", "drives/day1.mcap", "not read in 4 tries")] if LONG else []),
-        ("", "drives/day2.mcap", "no such object"),
+        ("", "drives/day2.mcap", "object or bucket not found"),
     ],
 )
 def test_a_recording_that_cannot_be_read_is_one_clear_line(

@@ -336,12 +336,12 @@ def test_what_is_unsound_is_left_out_and_named(tmp_path: Path) -> None:
 
     assert [loss.reason for loss in report.losses] == [
         "dynamicObstacle 1: there are two states at step 1; the first one counts",
-        "dynamicObstacle 1: time 'nan' is no number",
+        "dynamicObstacle 1: time 'nan' is not a number",
         "dynamicObstacle 1: there are two of this id; the first one counts",
         "dynamicObstacle 2: length -1.0 m of a shape",
         "dynamicObstacle 3: an unknown shape, cone",
         "dynamicObstacle 4: it has a set of places where it may be, and no trajectory: its first state counts",
-        "lanelet 9: it has no borders of two points at least",
+        "lanelet 9: its borders need at least two points each",
     ]
     assert sorted(states(blocks)) == [("1", 0), ("1", 100_000_000), ("4", 0)]
 

@@ -170,7 +170,7 @@ def test_deriving_needs_no_recording_and_goes_on_where_it_was(tmp_path: Path) ->
 
 def test_a_name_that_is_taken_is_replaced_on_demand_only(town: Any) -> None:
     derive(town.file.path, OTHERS["smaller"], "once")
-    with pytest.raises(AbstractionError, match="already, with other settings; say --force"):
+    with pytest.raises(AbstractionError, match="already, with other settings; add --force"):
         derive(town.file.path, OTHERS["vehicles"], "once")
     derive(town.file.path, OTHERS["vehicles"], "once", replace_old=True)
     relations = town.sql(

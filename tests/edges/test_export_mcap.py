@@ -433,7 +433,7 @@ def test_what_cannot_be_exported_is_named(tmp_path: Path) -> None:
         write_clips([Clip("drive", 0, 5)], known, tmp_path / "out")
 
     path.unlink()
-    with pytest.raises(TraceError, match="no such file"):
+    with pytest.raises(TraceError, match="file not found"):
         write_clips([Clip("drive", 0, 5)], known, tmp_path / "out")
 
 

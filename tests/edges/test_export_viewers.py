@@ -249,7 +249,7 @@ def test_mounts_want_graphs(store: sgstore.Store, tmp_path: Path) -> None:
 
     with pytest.raises(ExportError, match="add --with-graph"):
         write_export(export, tmp_path / "out")
-    with pytest.raises(ExportError, match="--mount is not for the format 'parquet'"):
+    with pytest.raises(ExportError, match="--mount cannot be used with the format 'parquet'"):
         write_export(replace(export, mounts=export.mounts), tmp_path / "out", "parquet")
 
 

@@ -245,7 +245,7 @@ def test_options_that_a_format_does_not_mind_are_refused(
     }
     minded = exporter_named(form).options
     for option in ways.keys() - minded:
-        with pytest.raises(ExportError, match=f"is not for the format '{form}'"):
+        with pytest.raises(ExportError, match=f"cannot be used with the format '{form}'"):
             write_export(replace(export, **{option: ways[option]}), tmp_path / "out", form)
     assert minded <= ways.keys()
     assert not (tmp_path / "out").exists()
@@ -664,7 +664,7 @@ def test_networkx_reads_the_graphs_of_the_store(
 
 def test_graphml_is_written_where_it_is_asked_for(written: Callable[..., Path]) -> None:
     assert not [*written("nx").rglob("*.graphml")]
-    with pytest.raises(ExportError, match="--graphml is not for the format 'parquet'"):
+    with pytest.raises(ExportError, match="--graphml cannot be used with the format 'parquet'"):
         written("parquet", graphml=True)
 
 

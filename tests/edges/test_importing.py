@@ -216,7 +216,11 @@ WRONG = [
     ("s3c", "", "empty; expected a header"),
     ("s3c", HEADER + "d,a,1,0,ego,isIn\n", "row 2: 6 columns, expected 7"),
     ("s3c", HEADER + "d,a,x,0,ego,isIn,Ego Lane\n", "row 2, column n_img: expected a number"),
-    ("s3c", HEADER + "d,a,1,0,ego,isIn,dragon_3\n", "row 2, column node2: 'dragon' is of no kind"),
+    (
+        "s3c",
+        HEADER + "d,a,1,0,ego,isIn,dragon_3\n",
+        "row 2, column node2: 'dragon' is an unknown kind",
+    ),
     ("s3c", HEADER + "d,a,1,0,ego,nearr,car_1\n", r"row 2, column edge: .*did you mean 'near'"),
     ("s3c", HEADER + "d,,1,0,ego,near,car_1\n", "row 2, column sg: expected the name of a graph"),
     ("s3c", HEADER + "d,a,1,0,ego,near,\n", "row 2, column node2: expected the name of a node"),
@@ -260,7 +264,7 @@ WRONG = [
     (
         "nodelink",
         '{"nodes": [{"id": "ego"}, {"id": "car_1"}], "edges": [{"source": "ego", "target": "car_1"}]}',
-        "line 1, edge 0: says no relation",
+        "line 1, edge 0: names no relation",
     ),
     (
         "nodelink",
@@ -602,7 +606,7 @@ def test_the_verb_imports_and_its_exit_code_says_what_was_lost(
     assert codes == [0, 1, 3, 2]
     assert json.loads(out[: out.index("]") + 1])[0]["frames"] == 2
     assert "relation guards: 1 times, cannot be kept" in err
-    assert "'elf' is of no kind that is known" in err
+    assert "'elf' is an unknown kind" in err
 
 
 # Values keep their types ------------------------------------------------------------------------------

@@ -104,7 +104,7 @@ def test_areas_stand_beside_the_lanes_or_are_counted() -> None:
     assert (nodes.length[at], nodes.width[at]) == (4, 2)
     assert abs(np.sin(nodes.heading[at])) < 1e-9
     assert road_map.outlines()[at].area == 8
-    assert any("areas are left out: 1 parking" in text for text in road_map.warnings)
+    assert any("areas left out: 1 parking" in text for text in road_map.warnings)
     assert any("an outer border that closes" in text for text in road_map.warnings)
 
 

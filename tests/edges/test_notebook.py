@@ -225,7 +225,7 @@ def test_the_cell_finds_its_store(names: dict[str, Any], town_store: Path) -> No
         ("store --as 1x", "SELECT 1", "expected a name"),
         ("store --rows 3", "SELECT 1", "not understood"),
         ("store 'x", "SELECT 1", "usage"),
-        ("nowhere.sgstore", "SELECT 1", "no such store"),
+        ("nowhere.sgstore", "SELECT 1", "store not found"),
         ("store", "CHECK slow ALWAYS", "a colon"),
     ],
 )

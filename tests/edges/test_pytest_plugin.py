@@ -138,7 +138,9 @@ def test_the_store_may_stand_beside_the_test_or_be_told_to_pytest(
 
     assert told == ini
     assert told["passed"] > 1
-    here.runpytest(*PLUGIN).stdout.fnmatch_lines(["*which store? Say store=PATH, --scenes-store*"])
+    here.runpytest(*PLUGIN).stdout.fnmatch_lines(
+        ["*no store is set; set store=PATH, --scenes-store*"]
+    )
 
 
 @pytest.fixture
@@ -363,15 +365,15 @@ def test_a_wrong_mark_hides_no_other_test(here: pytest.Pytester) -> None:
 @pytest.mark.parametrize(
     ("mark", "says"),
     [
-        ('store="town.sgstore"', "*give a query, a lock or a check*"),
-        ('store="town.sgstore", query="MATCH (e)", lock="x"', "*give a query, a lock or a check*"),
-        ('store="town.sgstore", query="MATCH (e)", check="x"', "*give a query, a lock or a check*"),
+        ('store="town.sgstore"', "*pass a query, lock or check*"),
+        ('store="town.sgstore", query="MATCH (e)", lock="x"', "*pass a query, lock or check*"),
+        ('store="town.sgstore", query="MATCH (e)", check="x"', "*pass a query, lock or check*"),
         ('store="town.sgstore", query="MATCH (e)", bfore=1', "*unknown: bfore*"),
         ('store="town.sgstore", query="MATCH (e:Egg)"', "*did you mean 'Ego'*"),
-        ('store="nowhere.sgstore", query="MATCH (e)"', "*nowhere.sgstore*no such store*"),
+        ('store="nowhere.sgstore", query="MATCH (e)"', "*nowhere.sgstore*store not found*"),
         (
             'store="town.sgstore", query="MATCH (e) WHERE frame.seq > 9999"',
-            "*no scene was found, so nothing would be tested*",
+            "*no scene matches, so no test would run*",
         ),
     ],
 )

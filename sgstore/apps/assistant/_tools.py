@@ -229,7 +229,7 @@ class StoreTools:
         if len(found) > limit:
             lines.append(f"({len(found) - limit} more; raise limit, or add words)")
         return ToolAnswer(
-            "\n".join(lines) or "nothing in the library has these words", {"patterns": listed}
+            "\n".join(lines) or "no library entry matches these words", {"patterns": listed}
         )
 
     def find(
@@ -303,11 +303,11 @@ class StoreTools:
     def show(
         self,
         frame: FrameName,
-        query: Annotated[str, Field(description="marks what it matches there")] = "",
+        query: Annotated[str, Field(description="query; its matches are marked")] = "",
         relations: Annotated[
             Literal["ego", "all", "none"], Field(description="which edges are drawn")
         ] = "ego",
-        camera: Annotated[bool, Field(description="beside it what a camera saw")] = True,  # noqa: FBT002
+        camera: Annotated[bool, Field(description="add the camera image")] = True,  # noqa: FBT002
         graph: Annotated[bool, Field(description="beside it the graph instead")] = False,  # noqa: FBT002
         radius: Annotated[float | None, Field(gt=0, description="half the side; m")] = None,
     ) -> ToolAnswer:
@@ -367,7 +367,7 @@ class StoreTools:
         self,
         frames: Annotated[str, Field(description="MATCH … that chooses frames; empty: all")] = "",
         reference: Annotated[
-            str, Field(description="MATCH … that chooses what to compare with; empty: all frames")
+            str, Field(description="MATCH … of the frames to compare with; empty: all frames")
         ] = "",
         cells: Annotated[
             str, Field(description="MATCH … RETURN a, b: each combination of values is a cell")
@@ -413,7 +413,7 @@ class StoreTools:
         from sgstore.model.world import Clip
 
         if self._write_to is None:
-            raise ExportError("nothing may be written: the server was started without --write-to")
+            raise ExportError("writing is disabled; start the server with --write-to")
         if not _NAME.fullmatch(name):
             raise ExportError(f"{name!r} is not a folder name; expected such as 'cut-ins_1'")
         exporter_named(form)  # before the search starts
@@ -468,7 +468,7 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
     told = lines if rows else ["nothing"]
     if shown < len(rows):
         told.append(
-            f"({shown} of {len(rows)} rows: more have no room in an answer; return less of each)"
+            f"({shown} of {len(rows)} rows: the answer is full; return fewer values per row)"
         )
     elif reply["truncated"]:
         told.append(

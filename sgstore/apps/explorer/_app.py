@@ -303,7 +303,7 @@ class Explorer:
             question["to"] = str(self.target(question.pop("name")))
         else:
             if "b" not in self.stores:
-                told = "there is no second store; start 'sgstore serve STORE' with --compare OTHER"
+                told = "the server has no second store; start 'sgstore serve STORE' with --compare OTHER"
                 raise RequestError(told, 404)
             question["other"] = str(self.stores["b"].file.path.absolute())
         path = self.stores["a"].file.path

@@ -67,7 +67,7 @@ async def fields_of(request: Request) -> dict[str, Any]:
     try:
         found = json.loads(body, parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise RequestError(f"the body is no JSON: {error}") from None
+        raise RequestError(f"invalid JSON in the body: {error}") from None
     if not isinstance(found, dict):
         raise RequestError("expected an object of JSON")
     return found
@@ -107,7 +107,7 @@ def _parameters(value: Any, _: str) -> dict[str, Any]:
     for name, one in found.items():
         items = one if isinstance(one, list) else [one]
         if len(items) > MOST_ITEMS or not name.isidentifier() or not all(map(_plain, items)):
-            raise RequestError(f"parameters: {name!r} is no value that a query can have")
+            raise RequestError(f"parameters: {name!r} is not a value for a query parameter")
     return found
 
 
@@ -154,7 +154,7 @@ def _whole(value: object, name: str, least: int = 0) -> int:
 
 
 def _refuse_constant(word: str) -> float:
-    raise ValueError(f"{word} is no number of JSON")
+    raise ValueError(f"{word} is not a JSON number")
 
 
 _node: Final = partial(_whole, least=LEAST_NODE)

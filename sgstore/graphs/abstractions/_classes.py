@@ -351,7 +351,7 @@ class _Block:
         ends = np.concatenate([graphs.src, graphs.dst])
         rows = found(graphs.node_frame, graphs.node, np.tile(graphs.frame, 2), ends)
         if rows.min(initial=0) < 0:
-            raise ValueError("an edge of an abstraction ends at what is no node of its frame")
+            raise ValueError("an edge of an abstraction ends at a node outside its frame")
         src, dst = rows.reshape(2, -1)
         key = src * len(graphs.node) + dst
         order = ascending(key)

@@ -147,9 +147,9 @@ class Crowds:
         for what, (count, seq, bodies, span) in self._found.items():
             if what == NEAR:
                 of = f"are within {config.pairs.within:g} m of one another ('pairs.within')"
-                told = "how near and where bodies are is told of the ego alone"
+                told = "proximity and direction are computed for the ego only"
             else:
-                of, told = "touch one another", "what touches is told of the ego alone"
+                of, told = "touch one another", "contact is computed for the ego only"
             more = f", and {count - 1} more frames like it" if count > 1 else ""
             reason = (
                 f"frame {seq} has {bodies:,} bodies, of which more than {MOST_PAIRS:,} pairs {of}:"

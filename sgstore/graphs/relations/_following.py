@@ -188,7 +188,7 @@ def gaps(bodies: Bodies, ground: MapContext | None) -> LaneGaps:
 def _edges(scene: BlockScene) -> Edges:
     ground = scene.ground
     if ground is None:
-        raise ValueError("who follows whom needs a map")
+        raise ValueError("leads and follows need a map")
     a, b, _ = ground.following
     return Edges.chained(
         [edges_between(scene, "leads", b, a), edges_between(scene, "follows", a, b)]

@@ -98,7 +98,7 @@ def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
     other = next((one for one in statements if one is not union and one not in defined), None)
     if other is not None:
         hint = "run a CHECK with check" if isinstance(other, s.CheckClause) else None
-        raise QueryError("a UNION stands alone", text=text, span=other.span, hint=hint)
+        raise QueryError("expected only the UNION", text=text, span=other.span, hint=hint)
     named = [_parameters_of(part, defined) for part in union.parts]
     unused = sorted(set(values).difference(*named))
     if unused:

@@ -172,8 +172,8 @@ def _refuse_strange(result: Result) -> None:
     for one in fields(result):
         if one.name not in MERGED and getattr(result, one.name) != one.default:
             raise QueryError(
-                f"a collection cannot say what '{one.name}' of a query is over all its bundles",
-                hint="'sgstore collection unpack' makes one store of all, which can be asked",
+                f"a collection cannot compute the value of '{one.name}' in a query over all its bundles",
+                hint="'sgstore collection unpack' combines them into one store, which can answer this",
             )
 
 
@@ -478,8 +478,8 @@ class _Grouping:
             return f"coalesce({found}, [])" if number.word == "collect" else found
         if number.word not in SUMMED:
             raise QueryError(
-                f"a collection cannot say what {number.word}() is over all its bundles",
-                hint="'sgstore collection unpack' makes one store of all, which can be asked",
+                f"a collection cannot compute {number.word}() over all its bundles",
+                hint="'sgstore collection unpack' combines them into one store, which can answer this",
             )
         if number.word == "avg":
             total = self._part(replace(number, word="sum"))

@@ -56,7 +56,7 @@ def pattern_of(graph: SceneGraph, ignored: Sequence[str] = ()) -> str:
         The frame has no ego, or an ignored name is unknown.
     """
     if graph.ego is None or graph.ego not in graph.nodes:
-        raise QueryError("the frame has no ego, so the pattern around it is empty")
+        raise QueryError("the frame has no ego; choose a frame with an ego")
     around = _Around(graph, graph.ego, *_left(ignored))
     facts = list(around.of_ego())
     groups = Counter(text for text in map(around.block, around.others()) if text)

@@ -238,7 +238,7 @@ def with_joints(
     for gate, joints in at.items():
         if len(joints) > _MOST_BESIDE:
             what = f"more than {_MOST_BESIDE} lanelets meet between nodes {' and '.join(gate)}"
-            document.warnings.append(f"{what}: none of them goes on there")
+            document.warnings.append(f"{what}: no lanelet continues there")
             joints.clear()
 
     def touching(line: LaneLine, gate: tuple[str, str]) -> tuple[Joint, ...]:

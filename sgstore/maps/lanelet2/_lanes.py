@@ -107,7 +107,7 @@ def _areas(document: OsmDocument) -> list[PlainObject]:
             found.append(PlainObject(ident, ring[:, :2], z, _AREAS[subtype]))
     if left:
         told = ", ".join(f"{many} {what}" for what, many in sorted(left.items()))
-        document.warnings.append(f"areas are left out: {told}")
+        document.warnings.append(f"areas left out: {told}")
     if broken:
         named = ", ".join(broken[:8]) + (f" and {len(broken) - 8} more" if broken[8:] else "")
         document.warnings.append(f"areas {named}: expected an outer border that closes; left out")

@@ -149,7 +149,7 @@ def read_projector_info(text: str) -> Projection:
             origin = float(told["latitude"]), float(told["longitude"])
         scale = float(told.get("scale_factor", _UTM_SCALE))
     except ValueError as error:
-        raise MapError(f"its origin or scale is no number: {error}") from error
+        raise MapError(f"its origin or scale is not a number: {error}") from error
     grid = told.get("mgrs_grid", "") if name == "MGRS" else ""
     return Projection(name, origin if name != "MGRS" else None, grid, scale)
 

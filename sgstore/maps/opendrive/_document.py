@@ -181,7 +181,7 @@ class Document:
         wild = ~(np.abs(values) <= MAX_MAGNITUDE)
         if default is not None and math.isnan(default):
             wild &= np.array([name in a for a in table.attributes], bool)
-        self.accuse(kind, wild, f"attribute {name!r} is no finite number")
+        self.accuse(kind, wild, f"attribute {name!r} is not a finite number")
         values[wild] = 0.0 if default is None else default
         if default is None:
             absent = np.array([name not in a for a in table.attributes], bool)
@@ -195,7 +195,7 @@ class Document:
         """
         values = self.numbers(kind, name, default)
         broken = (values != np.floor(values)) | (np.abs(values) > 1e9)
-        self.accuse(kind, broken, f"attribute {name!r} is no whole number")
+        self.accuse(kind, broken, f"attribute {name!r} is not a whole number")
         values[broken] = 0 if default is None else default
         return values.astype(np.int64)
 

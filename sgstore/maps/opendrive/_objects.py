@@ -177,7 +177,7 @@ def read_objects(
         row: space for row in np.flatnonzero(parks).tolist() if (space := _space(objects, row))
     }
     flat = [nodes.name[row] for row in np.flatnonzero(parks).tolist() if row not in spaces]
-    warnings.extend(f"parking space {name!r} has no extent and is left out" for name in flat)
+    warnings.extend(f"parking space {name!r} left out: it has no extent" for name in flat)
     return (
         objects.take(np.flatnonzero(crosswalk)),
         objects.take(np.flatnonzero(~crosswalk & ~parks)),

@@ -47,7 +47,7 @@ def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> 
         placed &= np.isfinite(document.rough_numbers(kind, name))
     warnings.extend(
         f"road {document.road_ids[table.road[row]]!r}, <{table.element}>"
-        f" {table.attributes[row].get('id', '')!r}: its place is no number, left out"
+        f" {table.attributes[row].get('id', '')!r}: left out, because its position is not a number"
         for row in rows[~placed[rows]].tolist()
     )
     return rows[placed[rows]]

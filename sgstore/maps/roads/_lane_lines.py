@@ -377,7 +377,7 @@ def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
                 number += 1
                 _add_way(network, area.ident, number, (lanes[0], lanes[1]))
     _tell(network, list(dict.fromkeys(missing)), "a way through it leads to a missing lane")
-    _tell(network, astray, "told to be a way through, but not by the lanes at its ends: it is none")
+    _tell(network, astray, "left out as a connection: the lanes at its ends do not confirm it")
 
 
 def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
@@ -442,7 +442,7 @@ def _joints(network: _Network) -> set[_Joined]:
                     far.append(f"{line.ident} to {joint.lane}")
                 else:
                     joints |= {(row, own, other, contact), (other, contact, row, own)}
-    _tell(network, far, f"told to touch, but their ends are more than {GAP} m apart: they do not")
+    _tell(network, far, f"not joined as declared: their ends are more than {GAP} m apart")
     return joints
 
 

@@ -127,7 +127,7 @@ def _dumps(value: Any) -> str:
 
 
 def _no_number(text: str) -> None:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number")
 
 
 def _fields(lane: PlainLane) -> dict[str, Any]:
@@ -174,13 +174,13 @@ def _text_rows(document: dict[str, Any], what: str, most: int, lanes: int) -> li
         raise MapError(f"expected a list of at most {most:,} {what}s", element=f"{what}s")
     for number, row in enumerate(rows):
         if not isinstance(row, dict):
-            raise MapError(f"{what} {number} is no object", element=f"{what}s")
+            raise MapError(f"{what} {number} is not an object", element=f"{what}s")
     return [_TextRow(row, number, lanes, what) for number, row in enumerate(rows)]
 
 
 def _lane(row: Any, number: int, lanes: int) -> PlainLane:
     if not isinstance(row, dict):
-        raise MapError(f"lane {number} is no object", element="lanes")
+        raise MapError(f"lane {number} is not an object", element="lanes")
     fields: dict[str, Any] = row
     return _TextRow(fields, number, lanes).lane()
 

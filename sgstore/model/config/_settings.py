@@ -77,7 +77,7 @@ class RangeSettings:
     length: float = setting(100.0, "shape 'corridor': how far along the lanes, through forks; m")
     by: str = setting(
         "footprint",
-        "what of an entity must be in range: 'footprint': any part of it; 'centre': its centre",
+        "part of an entity that must be in range: 'footprint': any part of it; 'centre': its centre",
     )
     static_by: str = setting(
         "footprint", "likewise for entities that never move; parts of a map count by their shape"
@@ -88,7 +88,8 @@ class RangeSettings:
         "the road, may be (storeys); signals may hang up to 6 m above it; m. Empty: at any height",
     )
     grade: float = setting(
-        0.0, "with height: what rises or falls by less than this for each metre away counts too"
+        0.0,
+        "with height: entities that rise or fall by less than this per metre of distance also count",
     )
     height_of_entities: bool = setting(
         default=True, comment="whether height holds for entities, too, or only for parts of the map"
@@ -248,9 +249,7 @@ class PairSettings:
         default=False,
         comment="entities that never move with one another too, up to the same distance",
     )
-    ego_within: float = setting(
-        0.0, "up to which distance from the ego; m. 0: whatever the distance"
-    )
+    ego_within: float = setting(0.0, "maximum distance from the ego; m. 0: no limit")
     kinds: tuple[tuple[str, ...], ...] = setting(
         (),
         "only pairs of these labels, in either order: [['Ego', 'Vehicle'], ['Person', 'Car']]; empty: all",
@@ -312,15 +311,15 @@ class Config:
     pairs: PairSettings = field(default_factory=PairSettings)
     lanes: LaneSettings = field(default_factory=LaneSettings)
     payloads: Payloads = field(default_factory=Payloads)
-    ego: str = setting("", "the simulator's id, role or name of the ego; empty: as the trace says")
+    ego: str = setting("", "the simulator's id, role or name of the ego; empty: that of the trace")
     mapping: str = setting(
         "",
-        "what the boxes of a Foxglove scene are: a mapping that is shipped ('nuscenes2mcap') or the path of a "
-        "TOML file; empty: the shipped one that fits. Other recordings need none",
+        "mapping of the boxes of a Foxglove scene to kinds: a shipped mapping ('nuscenes2mcap') or the path of "
+        "a TOML file; empty: the shipped one that fits. Other recordings need none",
     )
     sees: bool = setting(
         default=True,
-        comment="whether it is computed what the ego sees; otherwise nothing is known of it",
+        comment="whether visibility from the ego is computed; if not, it is unknown",
     )
     egos: tuple[str, ...] = setting(
         (),
@@ -343,7 +342,7 @@ class Config:
     )
     without: tuple[str, ...] = setting(
         (),
-        "relations that are not computed, so that nothing is known of them: ['overlaps', 'follows']",
+        "relations that are not computed and stay unknown: ['overlaps', 'follows']",
     )
     orientation: str = setting(
         "asam",
@@ -409,10 +408,10 @@ class Config:
         --------
         >>> from sgstore.model.config import from_dict
         >>> from_dict({"proximity": {"names": ["nearr"], "upper": [10.0]}}).notes
-        ["setting 'proximity.names': 'nearr' is a relation of your own; did you mean 'near'?"]
+        ["setting 'proximity.names': 'nearr' would be a new relation; did you mean 'near'?"]
         """
         return [
-            f"setting '{table}.names': {name!r} is a relation of your own; did you mean {like!r}?"
+            f"setting '{table}.names': {name!r} would be a new relation; did you mean {like!r}?"
             for table, known in (("proximity", PROXIMITY), ("direction", DIRECTIONS))
             for name in getattr(self, table).names
             if name not in known and (like := suggestion(name, known, alike=0.8))

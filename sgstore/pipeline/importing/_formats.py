@@ -501,7 +501,7 @@ def _add_edge(path: Path, graph: GivenGraph, at: tuple[str, int], edge: Any) -> 
     told = next((key for key in (*_RELATIONS, "key") if isinstance(edge.get(key), str)), None)
     if told is None:
         raise wrong(
-            path, where, f"says no relation; expected one of {', '.join(_RELATIONS)}, or a key"
+            path, where, f"names no relation; expected one of {', '.join(_RELATIONS)}, or a key"
         )
     skipped = {"source", "target", "key", *_RELATIONS}
     attributes = {key: value for key, value in edge.items() if key not in skipped}

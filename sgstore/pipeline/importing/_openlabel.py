@@ -231,7 +231,7 @@ class _Labels:
                     at = (f"{where}, relation {{}}", row)
                     graph.edges.append(GivenEdge(src, relation, dst, *at, NO_ATTRIBUTES))
                 else:
-                    what = f"relation {relation[:80]} of what is not in the frame"
+                    what = f"relation {relation[:80]} of a node that is not in the frame"
                     graph.lost[what] = graph.lost.get(what, 0) + 1
             check_size(self._path, where, graph)
             yield graph

@@ -270,7 +270,7 @@ class Words:
             if relation_named(relation) is None:
                 like = suggestion(relation, RELATIONS)
                 hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(RELATIONS)}"
-                raise ConfigError(f"--relation {name}={relation}: no such relation; {hint}")
+                raise ConfigError(f"--relation {name}={relation}: unknown relation; {hint}")
         if self.unknown_as and self._fallback not in ENTITY_KINDS:
             raise ConfigError(_no_kind(f"--unknown-as {self.unknown_as}", self.unknown_as))
 
@@ -321,7 +321,7 @@ class Words:
         if several:
             hint = f" (it can be any of {', '.join(several)})"
         return (
-            f"{text!r} is of no kind that is known{hint}; say what it is with --kind {text!r}=KIND,"
+            f"{text!r} is an unknown kind{hint}; map it with --kind {text!r}=KIND,"
             " --unknown-as own if its name is a kind of its own, or --unknown-as other for all such"
         )
 
@@ -330,8 +330,8 @@ class Words:
         like = suggestion(name, RELATIONS)
         hint = f" (did you mean {like!r}?)" if like else ""
         return (
-            f"{name!r} is no relation that is known{hint}; say what it is with --relation {name!r}=RELATION,"
-            " --unknown-as own to take it as it is, or --unknown-as other to leave such edges out"
+            f"{name!r} is an unknown relation{hint}; map it with --relation {name!r}=RELATION,"
+            " --unknown-as own to keep its name, or --unknown-as other to leave such edges out"
         )
 
     def as_dict(self) -> dict[str, object]:
@@ -397,7 +397,7 @@ def _simulators(text: str) -> LabelMeaning | None:
 def _no_kind(what: str, kind: str) -> str:
     like = suggestion(kind, KINDS)
     hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(KINDS)}"
-    return f"{what}: no such kind; {hint}; --new-kind {kind} makes it one"
+    return f"{what}: unknown kind; {hint}; --new-kind {kind} adds it as a kind"
 
 
 # Attributes of nodes and edges in files, converted into columns with internal units.

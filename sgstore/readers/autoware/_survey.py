@@ -191,7 +191,7 @@ class AutowareSurvey(Survey[ObjectLead]):
             raise TraceError(f"no object has the id {self.wanted!r}; the vehicle itself is {EGO!r}")
         if not there and not self.wanted:
             self.about_ego.append(
-                "neither a pose of the vehicle nor a transform of base_link: there is no ego"
+                "the ego is missing: no pose of the vehicle and no transform of base_link"
             )
         return self.wanted or (EGO if there else "")
 

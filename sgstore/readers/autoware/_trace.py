@@ -242,9 +242,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
                 " show is in no graph"
             )
         if self._followed:
-            warn(
-                "detected objects have no ids: they were followed from list to list by place and class"
-            )
+            warn("detected objects have no ids; they were tracked by position and class")
 
     def _is_predicted(self) -> bool:
         return "Predicted" in self._survey.structures[self._survey.leading].name
@@ -288,7 +286,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         name = "pose" if "pose" in told else "pose_with_covariance"
         pose = _pose_at(told, f"{name}.pose.position", f"{name}.pose.orientation")
         if pose is None:
-            raise TraceError("its pose is none")
+            raise TraceError("its pose is invalid")
         stamp = self._stamp(told, "header.stamp", log_time)
         self._axes.tell(self._survey.ego_axes, self._survey.world, stamp, pose)
         twist = f"{name.replace('pose', 'twist')}.twist"

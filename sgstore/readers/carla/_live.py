@@ -130,7 +130,7 @@ def connect(host: str = "localhost", port: int = 2000, timeout_s: float = TIMEOU
         reason = (
             f"the CARLA server at {host}:{port} is version {server}, the installed package {own}"
         )
-        raise TraceError(f"{reason}; install the one that belongs to the server")
+        raise TraceError(f"{reason}; install the version of the server")
     return client
 
 

@@ -154,7 +154,7 @@ class Egos:
         }
         found = list(dict.fromkeys(candidates.values()))
         if not found:
-            return None, ["no vehicle has the role of an ego: there is none unless one is named"]
+            return None, ["no vehicle has the role of an ego; name one as the ego"]
         if len(found) == 1:
             return found[0], []
         names = ", ".join(f"{role!r} ({ident})" for role, ident in candidates.items())

@@ -210,9 +210,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._report.warnings += self._lights.warnings
         super().settle()
         if not self._survey.egos.actors:
-            warn(
-                "no list of actors: what a vehicle is, is what the bridge guesses, and mostly a car"
-            )
+            warn("no list of actors; kinds of vehicles are guesses of the bridge, mostly car")
 
     def _raw(self, log_time: int, data: memoryview) -> CarlaRawFrame:
         head, objects = self._table.read(data)

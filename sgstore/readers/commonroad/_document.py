@@ -270,7 +270,7 @@ class _Reader:
 
 def _begin(scenario: TrafficScenario, root: _Node) -> None:
     if root.tag != ROOT:
-        raise TraceError(f"<{root.tag[:40]}> is no CommonRoad scenario; expected <{ROOT}>")
+        raise TraceError(f"<{root.tag[:40]}> is not a CommonRoad scenario; expected <{ROOT}>")
     version = root.attributes.get("commonRoadVersion", "")
     if version not in VERSIONS:
         known = " and ".join(VERSIONS)
@@ -283,7 +283,7 @@ def _begin(scenario: TrafficScenario, root: _Node) -> None:
         scenario.step = math.nan
     if not 1e-6 <= scenario.step <= 100:
         told = root.attributes.get("timeStepSize", "")[:40]
-        raise TraceError(f"timeStepSize {told!r}: expected the seconds from one step to the next")
+        raise TraceError(f"timeStepSize {told!r}: expected the seconds between two steps")
 
 
 def _take(scenario: TrafficScenario, node: _Node) -> None:
@@ -309,14 +309,14 @@ def _float(text: str, what: str) -> float:
     except ValueError:
         value = math.nan
     if not abs(value) < _FAR:
-        raise ValueError(f"{what} {text[:40]!r} is no number")
+        raise ValueError(f"{what} {text[:40]!r} is not a number")
     return value
 
 
 def _whole(text: str, what: str) -> int:
     value = _float(text, what)
     if value != int(value) or abs(value) > MAX_STEP:
-        raise ValueError(f"{what} {text[:40]!r} is no number of steps")
+        raise ValueError(f"{what} {text[:40]!r} is not a number of steps")
     return int(value)
 
 
@@ -521,7 +521,7 @@ def _lanelet(scenario: TrafficScenario, node: _Node) -> None:
         tuple(_point(point) for point in side.all("point")) if side else () for side in sides
     )
     if len(left) < 2 or len(right) < 2:
-        raise ValueError("it has no borders of two points at least")
+        raise ValueError("its borders need at least two points each")
     limit = node.word("speedLimit")
     stop_line = node.get("stopLine")
     beside = [node.refs(tag) for tag in ("adjacentLeft", "adjacentRight")]

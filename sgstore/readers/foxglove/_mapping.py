@@ -237,7 +237,7 @@ def mapping_for(given: str | Path, topics: Iterable[str]) -> Mapping:
         content = path.read_bytes()
     except (OSError, ValueError) as error:
         names = ", ".join(shipped())
-        reason = f"no mapping {str(given)!r}: neither a file that can be read nor one of: {names}"
+        reason = f"no mapping {str(given)!r}: expected a readable file or one of: {names}"
         raise TraceError(reason) from error
     return _read(str(path), content)
 
@@ -293,7 +293,7 @@ def _value(name: str, kind: str, value: Any) -> Any:
 
 def _types(values: Any) -> dict[str, TypeMeaning]:
     if not isinstance(values, dict):
-        raise TypeError("'types' is no table")
+        raise TypeError("'types' is not a table")
     meanings: dict[str, TypeMeaning] = {}
     for name, told in values.items():
         parts = {"kind": told} if isinstance(told, str) else told

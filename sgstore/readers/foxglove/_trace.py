@@ -148,7 +148,7 @@ class FoxgloveSurvey(Survey[Lead]):
         axes = next((axes for axes in EGO_AXES if axes in self._transforms), "")
         if axes:
             self.about_ego.append(
-                f"the ego is the axes {axes!r}, a box without a size: a mapping can tell one"
+                f"the ego is the axes {axes!r}, a box without a size; set the size in a mapping"
             )
         return "", axes
 
@@ -324,10 +324,10 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
         self._report.losses += self._left_out.losses()
         warn = self._report.warnings.append
         if self._bodiless:
-            warn(f"{self._bodiless} entities are lines, texts or arrows only: they are no objects")
+            warn(f"{self._bodiless} entities left out: they have only lines, texts or arrows")
         if self._odd_axes:
             warn(
-                f"{self._odd_axes} transforms contradict others or have no usable pose: they were left out"
+                f"{self._odd_axes} transforms left out: they contradict others or have no usable pose"
             )
         if self._ego < 0:
             self._warn_of_egos(NO_EGO)

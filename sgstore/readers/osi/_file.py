@@ -304,10 +304,10 @@ class OsiFile(MessageFile):
         best = max(likeness, key=lambda name: likeness[name])
         if likeness[best] > 0:
             return best
-        reason = f"its messages are neither {GROUND_TRUTH} nor {SENSOR_VIEW} with anything in them"
+        reason = f"its messages are neither {GROUND_TRUTH} nor {SENSOR_VIEW} with content"
         if not tried:
             told = report.losses[0].reason if report.losses else "the file is empty"
-            reason = f"no message of ASAM OSI: {told}"
+            reason = f"not an ASAM OSI message: {told}"
         raise TraceError(reason, path=self.path)
 
     def _messages(self, report: Findings) -> Iterator[tuple[int, int, bytes]]:

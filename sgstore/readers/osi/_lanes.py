@@ -223,7 +223,7 @@ class OsiLanes:
             things = getattr(truth, name, ())
             if self._lacks[name]:
                 number = len(things)
-                warning = f"the schema of {name} lacks the field {self._lacks[name][0]}: none of it is used"
+                warning = f"{name} left out: its schema lacks the field {self._lacks[name][0]}"
                 if number and warning not in self.warnings:
                     self.warnings.append(warning)
                 continue
@@ -314,7 +314,7 @@ class OsiLanes:
         if self._points > MAX_POINTS:
             raise MapError(f"lanes of more than {MAX_POINTS:,} points", element="lane")
         if not (np.abs(line) < _FAR).all():
-            raise ValueError("a point of it is no place")
+            raise ValueError("a point of it is not a position")
         return line
 
 
@@ -368,7 +368,7 @@ class _LaneBoundaries:
                 line = self.place(p.position for p in boundary.boundary_line)
                 s = np.array([p.s_position for p in boundary.boundary_line], np.float64)
                 if not (np.abs(s) < _FAR).all():
-                    raise ValueError("the s of a point of its boundary is no number")
+                    raise ValueError("the s of a point of its boundary is not a number")
                 self._logical[ident] = line, s
             line, s = self._logical[ident]
             lines.append(line)
@@ -481,7 +481,7 @@ def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
     start = max(start, lane.start_s) if lane.HasField("start_s") else start
     end = min(end, lane.end_s) if lane.HasField("end_s") else end
     if not abs(lane.start_s) + abs(lane.end_s) < _FAR or not end > start:
-        raise ValueError("there is no s at which it has a boundary on each side")
+        raise ValueError("its boundaries on the two sides share no value of s")
     cuts = np.concatenate(([start], left_s, right_s, [end]))
     cuts = np.unique(cuts[(cuts >= start) & (cuts <= end)])
     before, after = (

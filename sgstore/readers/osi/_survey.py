@@ -193,7 +193,7 @@ class Cast:
         hosts = [host for host in self.hosts if host in self.names]
         if len(hosts) > 1:
             told = ", ".join(str(host) for host in hosts[:LISTED])
-            notes.append(f"several host vehicles are told (ids {told}); the first one is the ego")
+            notes.append(f"several host vehicles (ids {told}); the first one is the ego")
         if hosts:
             return hosts[0]
         named = [
@@ -202,10 +202,8 @@ class Cast:
         if len(named) != 1:
             return None
         called = self.idents()[named[0]]
-        told = (
-            f"host vehicle {next(iter(self.hosts))} is no moving object" if self.hosts else "none"
-        )
-        notes.append(f"the ego is {called!r}, by its name (host vehicle told: {told})")
+        told = f"host vehicle {next(iter(self.hosts))}: no moving object" if self.hosts else "none"
+        notes.append(f"the ego is {called!r}, chosen by name (host vehicle in the file: {told})")
         return named[0]
 
     def _named(self, wanted: str) -> int:
@@ -490,4 +488,4 @@ class OsiSurvey(Survey[OsiLead]):
                 if self.map_text:
                     self.map_name = told or f"{self.recording.path.stem}{OF_LANES}"
                     return
-            self.notes += [f"its lanes make no road map: {what}" for what in lead.lanes.warnings]
+            self.notes += [f"its lanes make no map: {what}" for what in lead.lanes.warnings]

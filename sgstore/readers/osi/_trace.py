@@ -149,7 +149,7 @@ def _class(message: Any, field: str) -> str:
 #
 # Source: open-simulation-interface 3.8.0 (osi_object.proto, osi_hostvehicledata.proto).
 
-NO_EGO: Final = "no host vehicle is among the moving objects: there is no ego unless one is named"
+NO_EGO: Final = "the moving objects contain no host vehicle; name one as the ego"
 """Warning in a report without an ego."""
 
 _VEHICLE: Final = 2
@@ -274,7 +274,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         super().settle()
         never = {ident: count for ident, count in self._aside.items() if ident not in self._nodes}
         for ident, count in list(never.items())[: LossTally.MOST]:
-            reason = f"moving object {ident} is told only between the frames of the leading channel"
+            reason = f"moving object {ident} appears only between the frames of the leading channel"
             self._report.losses.append(Loss(f"{reason}: {count} states were left out", 0, 0))
         if self._ego is None:
             self._warn_of_egos(NO_EGO)

@@ -142,6 +142,4 @@ def of_unknown(unknown: int, text: str) -> list[str]:
     """Return a list with a note about the frames without a known class; empty without such frames."""
     if not unknown:
         return []
-    return [
-        f"{unknown} frames of {text} are too symmetric for a class to be told; they count nowhere"
-    ]
+    return [f"{unknown} frames of {text} are too symmetric for a class; they are not counted"]

@@ -73,7 +73,7 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
     columns = matches.columns[len(_FRAME) :]
     if not columns or not _RETURN.search(query):
         raise QueryError(
-            "a specification returns values, each combination of which is a cell",
+            "a specification must return values; each combination is a cell",
             text=query,
             hint="such as: MATCH (v:Vehicle)-[d:near|visible]->(:Ego) RETURN v.kind, type(d)",
         )
@@ -95,7 +95,7 @@ def _with_frames(query: str) -> str:
         chosen = (returns.limit, returns.sample, returns.top, returns.skip or None, returns.having)
         if any(one is not None for one in chosen):
             raise QueryError(
-                "a specification counts all matches, and has no LIMIT, SKIP, SAMPLE or HAVING",
+                "a specification counts all matches; remove LIMIT, SKIP, SAMPLE or HAVING",
                 text=query,
                 span=returns.span,
             )
@@ -318,7 +318,7 @@ def _specification(path: Path, given: Any, name: str) -> Specification:
     for one in impossible if isinstance(impossible, list) else [impossible]:
         for key, value in one.items() if isinstance(one, dict) else [(one, None)]:
             if value not in domains.get(str(key), ()):
-                raise ConfigError(f"{path}: impossible: {key} = {value!r}: no such slot or value")
+                raise ConfigError(f"{path}: impossible: {key} = {value!r}: unknown slot or value")
     named = str(given.get("name", name))
     return Specification(named, where, made, tuple(impossible), _tables(path, given))
 
@@ -333,7 +333,7 @@ def _tables(path: Path, given: Mapping[str, Any]) -> dict[str, Path]:
     return {name: path.parent / file for name, file in tables.items()}
 
 
-_EXPECTED: Final = "expected a pattern, MATCH … WHERE … and nothing else"
+_EXPECTED: Final = "expected a pattern, MATCH … WHERE … only"
 
 
 def _slot(path: Path, given: Any) -> Slot:

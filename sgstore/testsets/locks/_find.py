@@ -67,7 +67,7 @@ def _same(trace: LockedTrace, store: Store) -> StoredTrace:
             )
     if (mine.since, mine.until) != (trace.since, trace.until):
         raise StoreError(
-            f"{store.file.path}: another part of {found.name!r} was read than the lock says"
+            f"{store.file.path}: another part of {found.name!r} was read than the lock records"
         )
     return found
 

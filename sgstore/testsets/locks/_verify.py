@@ -207,7 +207,7 @@ def _payloads(
                 if channel not in now:
                     yield Difference(case.id, "payload", f"{channel}: no message any more")
                 elif channel not in was:
-                    yield Difference(case.id, "payload", f"{channel}: there was no message")
+                    yield Difference(case.id, "payload", f"{channel}: message missing")
                 elif was[channel] != now[channel]:
                     yield Difference(case.id, "payload", f"{channel}: other messages")
     except TraceError as error:

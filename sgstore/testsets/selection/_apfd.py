@@ -69,7 +69,7 @@ def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
     where = np.flatnonzero(failed)
     if not len(where):
         raise ConfigError(
-            f"none of {len(failed):,} cases failed: there is nothing to be found early"
+            f"none of {len(failed):,} cases failed; early detection cannot be measured"
         )
     left = 1 - (where + 0.5) / len(failed)
     rng = np.random.Generator(np.random.PCG64(seed))

@@ -208,9 +208,11 @@ class SelectionSpec:
                 " to have each class several times, leave out --stride"
             )
         if self.sequences and self.combos:
-            raise ConfigError("give one of --combos and --sequences: what is to be kept")
+            raise ConfigError(
+                "use only one of --combos and --sequences to define the items to keep"
+            )
         if self.sequences and self.unit is SelectionUnit.frame:
-            raise ConfigError("a sequence is in no single frame: say --unit clip or --unit trace")
+            raise ConfigError("a sequence needs several frames; add --unit clip or --unit trace")
         if (self.manoeuvres or self.within_s != WITHIN_S) and not self.sequences:
             raise ConfigError(
                 "manoeuvres, and a time within which they happen, belong to --sequences"
@@ -378,7 +380,7 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
         + (f", each in {each} {units.unit}s or in all that have it" if each > 1 else ""),
         f"{spec.objective}: {_number(cover.cost)}; lower bound {_number(bound)}, so "
         + (
-            "there is none smaller"
+            "no smaller set exists"
             if cover.exact
             else f"at most {_above(cover.cost, bound)} too many"
         )

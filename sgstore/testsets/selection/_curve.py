@@ -75,7 +75,7 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
             0,
         )
     if held is None:
-        raise ConfigError("a curve shows what is kept: say --minimal, --per-class or --rarest")
+        raise ConfigError("a curve needs --minimal, --per-class or --rarest")
     elements, total, pairs = held.total, len(units), held.pairs
     so_far = kept(pairs, held.weight, selection.picked, total)
     often = np.bincount(pairs[1], minlength=len(held.weight))

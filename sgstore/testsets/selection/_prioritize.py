@@ -123,7 +123,7 @@ class PrioritySpec:
             name for name in self.measures if name not in RANKED | LATER and name.isidentifier()
         ]
         if wrong or not self.measures:
-            said = f"no measure of criticality: {wrong[0]!r}" if wrong else "no measure is given"
+            said = f"no measure of criticality: {wrong[0]!r}" if wrong else "a measure is missing"
             known = ", ".join(RANKED | LATER)
             raise ConfigError(
                 f"{said}; expected some of {known}, or an expression such as -ego.speed"
@@ -269,7 +269,7 @@ class Prioritized:
                     ]
                 )
             said = [
-                "; ".join(one if all(one) else filter(None, one)) or "nothing is known of it"
+                "; ".join(one if all(one) else filter(None, one)) or "no value is known"
                 for one in zip(*told, strict=True)
             ]
             names = units[start : start + _TOLD]

@@ -116,9 +116,9 @@ def _margins(units: Units, text: str) -> Floats:
     """Return the robustness margin of a check in each frame, (N,); NaN if unknown."""
     run = units.chosen.store.check(text)
     if len(run.names) > 1:
-        raise ConfigError("several checks have no order together: give one of them")
+        raise ConfigError("several checks cannot define one order; choose one of them")
     if not run.quantitative:
-        raise ConfigError("the check asks for no margin: write CHECK … ROBUSTNESS")
+        raise ConfigError("the check has no margin; write CHECK … ROBUSTNESS")
     if not run.lasting and units.unit is not SelectionUnit.trace:
         raise ConfigError(
             f"this CHECK has one margin for a whole trace, and these are {units.unit}s: take --unit trace,"
