@@ -34,9 +34,9 @@ AROUND: Final = 7.0
 LIGHTS: Final = {"red": "R", "yellow": "Y", "green": "G"}
 ARROWS: Final = "→↑←↓"
 LEGEND: Final = (
-    "In the drawings `e` is the ego; an arrow is where somebody goes, who has none stands; `R`, `Y`, `G` are "
-    "traffic lights, `S` stop signs, `^` cones. `·` is a lane, `:` parking or a sidewalk, `=` a crosswalk, "
-    "`+` a junction. A letter is 1.75 m wide and 3.5 m high."
+    "In the drawings `e` is the ego; an arrow shows the direction of motion; entities without an arrow stand; "
+    "`R`, `Y`, `G` are traffic lights, `S` stop signs, `^` cones. `·` is a lane, `:` parking or a sidewalk, "
+    "`=` a crosswalk, `+` a junction. A letter is 1.75 m wide and 3.5 m high."
 )
 
 
