@@ -180,7 +180,7 @@ class OutcomeOptions:
 def prioritize(
     store: StorePath,
     order: OrderOptions,
-    given: OutcomeOptions,
+    results: OutcomeOptions,
     query: QueryText = None,
     parameters: Parameters = None,
     output: Annotated[
@@ -205,25 +205,25 @@ def prioritize(
     spec = order.spec()
     if output is not None and output.suffix != ENDING:  # before the search starts
         raise typer.BadParameter(f"--output {output}: the name of a lock must end in {ENDING}")
-    given.check(order.by)
-    known = None if given.outcomes is None else read_outcomes(given.outcomes)
-    lessons = known if given.learn_outcomes is None else read_outcomes(given.learn_outcomes)
-    others = None
-    if given.learn_from is not None:
-        others = ChosenFrames(str(given.learn_from), bounds.opened(given.learn_from))
+    results.check(order.by)
+    known = None if results.outcomes is None else read_outcomes(results.outcomes)
+    training = known if results.learn_outcomes is None else read_outcomes(results.learn_outcomes)
+    training_frames = None
+    if results.learn_from is not None:
+        training_frames = ChosenFrames(str(results.learn_from), bounds.opened(results.learn_from))
     chosen = chosen_frames(bounds.opened(store), str(store), query, parameters)
     say_scope(chosen.scope(world=True), out.chosen)
-    found = put_in_order(chosen, spec, lessons, others)
-    for text in found.said:
+    ordered = put_in_order(chosen, spec, training, training_frames)
+    for text in ordered.said:
         say(text)
     if known is not None:
-        _fault_detection(found, known, given.picture)
-    rows = found.rows()  # the store is read before the lock is made
+        _fault_detection(ordered, known, results.picture)
+    rows = ordered.rows()  # the store is read before the lock is made
     if output is not None:
         values = parameters_of(parameters)
         with count_bar(output.name, "cases") as progress:
             made = locked_order(
-                found,
+                ordered,
                 query or "",
                 parameters=values,
                 payloads=not no_payloads,
@@ -231,7 +231,7 @@ def prioritize(
             )
         say_made(made, output)
     # Last, so that the lock exists even if the reader stops after the first rows.
-    out.write(found.columns, rows, found.types)
+    out.write(ordered.columns, rows, ordered.types)
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:
