@@ -284,8 +284,10 @@ def _joined(word: str, operands: tuple[Bound, ...]) -> Bound:
     """Join conditions by AND or OR, without constants. A label that all parts of an OR share is put first."""
     neutral, strong = (TRUE, FALSE) if word == "AND" else (FALSE, TRUE)
     rest = tuple(one for one in operands if one != neutral)
-    if strong in rest or not rest:
-        return strong if rest else neutral
+    if not rest:
+        return neutral
+    if strong in rest:
+        return strong
     joined = Operation(word, rest, Type.boolean) if len(rest) > 1 else rest[0]
     label = _common_label(rest) if word == "OR" and len(rest) > 1 else None
     return joined if label is None else all_of(label, joined)
