@@ -67,10 +67,16 @@ MOST_CHANGE: Final = 24
 # Pillow's quantisers, only this one keeps rare colours; the k-means step keeps the colours of areas.
 
 
+LEARNED: Final = 2_000_000
+"""Most pixels that the colours of a palette are chosen from; the time grows faster than their number."""
+
+
 def quantized(picture: Image.Image) -> Image.Image:
-    """Convert an RGB picture to an indexed one of at most 256 colours."""
-    how = Image.Quantize.MAXCOVERAGE
-    return picture.quantize(256, how, kmeans=100_000, dither=Image.Dither.NONE)
+    """Convert an RGB picture to an indexed one of at most 256 colours, chosen from rows of a large picture."""
+    plain, every = Image.Dither.NONE, -(-picture.width * picture.height // LEARNED)
+    sample = Image.fromarray(np.asarray(picture)[::every]) if every > 1 else picture
+    made = sample.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=100_000, dither=plain)
+    return picture.quantize(palette=made, dither=plain) if every > 1 else made
 
 
 def greatest_change(made: Image.Image, picture: Image.Image) -> int:

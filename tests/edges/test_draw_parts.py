@@ -341,6 +341,20 @@ def test_too_many_colours_for_a_palette() -> None:
     assert greatest_change(quantized(photograph), photograph) > MOST_CHANGE
 
 
+def test_a_large_picture_has_the_colours_of_its_parts() -> None:
+    """Its palette is chosen from some of its rows."""
+    part = np.random.default_rng(2).integers(0, 256, (100, 3))[np.arange(1300) // 13]
+    rows = np.repeat(part[None], 40, axis=0)
+    rows[10:20] = 255 - rows[10:20]
+    picture = Image.fromarray(np.tile(rows, (60, 1, 1)).astype(np.uint8))
+
+    made = quantized(picture)
+
+    assert picture.width * picture.height > layers.LEARNED
+    assert made.mode == "P"
+    assert greatest_change(made, picture) <= MOST_CHANGE
+
+
 def test_the_ego_is_not_related_to_itself() -> None:
     nodes = {0: entity("car", 0, 0, is_ego=True), 1: entity("car", 5, 0)}
 
