@@ -13,6 +13,7 @@ import re
 import threading
 from collections import OrderedDict
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from itertools import count
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,7 +21,15 @@ import duckdb
 from duckdb.func import FunctionNullHandling
 
 from sgstore.errors import ConfigError
-from sgstore.model.criticality import FIXED_KINDS, KNOWN, RECORDED, TRACKS, tracks_of
+from sgstore.model.criticality import (
+    FIXED_KINDS,
+    KNOWN,
+    OF_AREAS,
+    RECORDED,
+    TRACKS,
+    tracks_of,
+)
+from sgstore.store._conflict_areas import BoundedCache, ConflictAreas
 from sgstore.store._interrupts import interrupted
 from sgstore.store._lease import stamp_of
 from sgstore.store._schema_text import INSIDE
@@ -34,25 +43,35 @@ if TYPE_CHECKING:
     from sgstore.model.criticality import Track
     from sgstore.store._lease import Stamp
 
-MOST_STATES: Final = 1 << 20
-"""Largest number of cached track states. For a longer trace, only the states of the pair are read."""
-MOST_PAIRS: Final = 1 << 20
-"""Number of pairs with cached measures."""
+MOST_BYTES: Final = 64 << 20
+"""Largest size of the cached object tracks. For a longer trace, only the states of the pair are read."""
+_STATE_BYTES: Final = 11 * 8
+"""Size of a state in a track: its time, and the columns of ``TRACKS``."""
+_MOST_PAIRS: Final = 1 << 18
+"""Number of pairs with cached measures, about 64 MiB."""
+_MOST_CALLS: Final = 1 << 16
+"""Number of calls whose values are returned without a look-up: a pair is measured again in each frame."""
 _FILES: Final = 4
 """Number of files with cached measures."""
 
 _WANTED: Final = re.compile(r"\b(recorded|encounters)\b", re.IGNORECASE)
 _FUNCTION: Final = "sgstore_recorded"
+# The rows are in the order of traces, so that the states of a trace are read once.
 _VIEW: Final = f"""
 CREATE TEMP VIEW IF NOT EXISTS encounters AS
-SELECT e.trace_id, t.name AS trace, e.node_id AS src, o.node_id AS dst, o.kind,
-  {", ".join(f"recorded('{KNOWN}{name}', e.trace_id, e.node_id, o.node_id) AS {name}" for name in RECORDED)}
-FROM (SELECT DISTINCT frame_id >> 24 AS trace_id, node_id FROM {INSIDE}.state WHERE is_ego) e
-JOIN (
-  SELECT trace_id, node_id, kind FROM {INSIDE}.entity
-  WHERE is_static OR (trace_id, node_id) IN (SELECT DISTINCT frame_id >> 24, node_id FROM {INSIDE}.known_state)
-) o ON o.trace_id = e.trace_id AND o.node_id <> e.node_id AND o.kind NOT IN {FIXED_KINDS}
-JOIN {INSIDE}.trace t ON t.trace_id = e.trace_id
+SELECT trace_id, trace, src, dst, kind,
+  {", ".join(f"recorded('{KNOWN}{name}', trace_id, src, dst) AS {name}" for name in RECORDED)}
+FROM (
+  SELECT e.trace_id, t.name AS trace, e.node_id AS src, o.node_id AS dst, o.kind
+  FROM (SELECT DISTINCT frame_id >> 24 AS trace_id, node_id FROM {INSIDE}.state WHERE is_ego) e
+  JOIN (
+    SELECT trace_id, node_id, kind FROM {INSIDE}.entity
+    WHERE is_static
+      OR (trace_id, node_id) IN (SELECT DISTINCT frame_id >> 24, node_id FROM {INSIDE}.known_state)
+  ) o ON o.trace_id = e.trace_id AND o.node_id <> e.node_id AND o.kind NOT IN {FIXED_KINDS}
+  JOIN {INSIDE}.trace t ON t.trace_id = e.trace_id
+  ORDER BY e.trace_id, e.node_id, o.node_id
+)
 """
 
 
@@ -61,21 +80,9 @@ class _Known:
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
-        self.tracks: OrderedDict[tuple[str, int, int], Track | None] = OrderedDict()
-        self.states = 0
-        self.whole: set[tuple[str, int]] = set()
-        self.values: dict[tuple[str, int, int, int], float | None] = {}
-
-    def keep(self, key: tuple[str, int, int], track: Track | None) -> None:
-        self.tracks[key] = track
-        self.states += 0 if track is None else len(track)
-
-    def forget(self) -> None:
-        """Clear the cached object tracks if they have too many states in total."""
-        if self.states > MOST_STATES:
-            self.tracks.clear()
-            self.whole.clear()
-            self.states = 0
+        self.tracks: BoundedCache[dict[int, Track]] = BoundedCache(MOST_BYTES)
+        self.values: OrderedDict[tuple[str, int, int, int], float | None] = OrderedDict()
+        self.areas = ConflictAreas()
 
 
 class _MeasuredQuestion:
@@ -99,16 +106,24 @@ class _MeasuredQuestion:
         """Return a criticality measure of an object pair in a trace. ``None`` means unknown or undefined."""
         if measure.removeprefix(KNOWN) not in RECORDED:
             raise ConfigError(f"no recorded measure: {measure!r}; expected {', '.join(RECORDED)}")
-        key = measure, trace, src, dst
-        known = self._known
-        with known.lock:
-            if key not in known.values:
+        with self._known.lock:
+            if measure.removeprefix(KNOWN) in OF_AREAS:
+                return self._of_area(measure, trace, src, dst)
+            key, values = (measure, trace, src, dst), self._known.values
+            if key not in values:
                 if id(self.asking) in interrupted:
                     return None
-                if len(known.values) >= MOST_PAIRS:
-                    known.values.clear()
-                known.values[key] = self._worked_out(measure, trace, src, dst)
-            return known.values[key]
+                if len(values) >= _MOST_PAIRS:
+                    values.popitem(last=False)
+                values[key] = self._worked_out(measure, trace, src, dst)
+            return values[key]
+
+    def _of_area(self, measure: str, trace: int, src: int, dst: int) -> float | None:
+        """Return a measure of a conflict area. Those of all pairs of the first object are computed together."""
+        scope, areas = "known_" if measure.startswith(KNOWN) else "", self._known.areas
+        if id(self.asking) in interrupted and not areas.known(scope, trace, src):
+            return None
+        return areas.value(self._reader, scope, measure.removeprefix(KNOWN), (trace, src, dst))
 
     def _worked_out(self, measure: str, trace: int, src: int, dst: int) -> float | None:
         if src == dst:
@@ -123,23 +138,23 @@ class _MeasuredQuestion:
         return None if math.isnan(value) else value
 
     def _track(self, nodes: str, trace: int, node: int) -> Track | None:
-        known = self._known
-        key = nodes, trace, node
-        if key not in known.tracks and (nodes, trace) not in known.whole:
-            known.forget()
-            first, last = trace << 24, ((trace + 1) << 24) - 1
-            sql = "SELECT count(*) FROM known_state WHERE frame_id BETWEEN ? AND ?"
-            ((many,),) = self._reader.execute(sql, [first, last]).fetchall()
-            tracks = TRACKS.format(nodes=nodes)
-            if many <= MOST_STATES:
-                known.whole.add((nodes, trace))
-                found = self._reader.execute(tracks, [trace])
-            else:
-                found = self._reader.execute(f"{tracks} AND n.node_id = $2", [trace, node])
-                known.keep(key, None)
-            for other, _, _, track in tracks_of(found.fetchnumpy()):
-                known.keep((nodes, trace, other), track)
-        return known.tracks.get(key)
+        known = self._known.tracks
+        for key in ((nodes, trace), (nodes, trace, node)):
+            if key in known:
+                known.move_to_end(key)
+                return known[key].get(node)
+        first, last = trace << 24, ((trace + 1) << 24) - 1
+        sql = "SELECT count(*) FROM known_state WHERE frame_id BETWEEN ? AND ?"
+        ((many,),) = self._reader.execute(sql, [first, last]).fetchall()
+        tracks = TRACKS.format(nodes=nodes)
+        if many * _STATE_BYTES <= MOST_BYTES:
+            key, found = (nodes, trace), self._reader.execute(tracks, [trace])
+        else:
+            key = nodes, trace, node
+            found = self._reader.execute(f"{tracks} AND n.node_id = $2", [trace, node])
+        read = {other: track for other, _, _, track in tracks_of(found.fetchnumpy())}
+        known.keep(key, read, sum(map(len, read.values())) * _STATE_BYTES)
+        return read.get(node)
 
     def close(self) -> None:
         self._reader.close()
@@ -151,6 +166,7 @@ _paths: Final[dict[int, Path]] = {}
 _known: Final[OrderedDict[tuple[Path, Stamp], _Known]] = OrderedDict()
 
 
+@lru_cache(_MOST_CALLS)
 def _recorded(token: int, measure: Any, trace: Any, src: Any, dst: Any) -> float | None:
     asked = _questions.get(token)
     if asked is None or measure is None or trace is None or src is None or dst is None:

@@ -437,13 +437,11 @@ def test_no_pair_is_worked_out_that_the_rest_of_a_question_excludes(
     copied: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Encounter] = []
-    monkeypatch.setattr(
-        sgstore.model.criticality, "et_recorded", lambda of: asked.append(of) or 1.5
-    )
+    monkeypatch.setattr(sgstore.model.criticality, "tet", lambda of: asked.append(of) or 1.5)
     query = "MATCH (e:Ego), (v:Vehicle) WHERE {} dist(e, v) < 8 RETURN DISTINCT v.id"
     near = copied.find(query.format("")).rows()
 
-    found = copied.find(query.format("et_recorded(e, v) < 2 AND")).rows()
+    found = copied.find(query.format("tet(e, v) < 2 AND")).rows()
 
     assert {*found} == {*near}
     assert 0 < len(asked) == len(near) < len(recorded(copied, ["dce_recorded"]).values)
@@ -452,7 +450,8 @@ def test_no_pair_is_worked_out_that_the_rest_of_a_question_excludes(
 def test_a_long_trace_is_read_pair_by_pair(
     copied: Store, open_town: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sgstore.store._encounters.MOST_STATES", 100)
+    monkeypatch.setattr("sgstore.store._encounters.MOST_BYTES", 100)
+    monkeypatch.setattr("sgstore.store._conflict_areas.MOST_STATES", 1000)
     monkeypatch.setattr("sgstore.model.criticality._encounter._CIRCLES", 3)
 
     assert recorded(copied).values == recorded(open_town).values

@@ -9,8 +9,15 @@ frames.
 from sgstore.model.criticality._closest import dce_recorded, ttce_recorded
 from sgstore.model.criticality._collision import ttc_recorded
 from sgstore.model.criticality._encounter import Encounter, Track
-from sgstore.model.criticality._encroachment import Encroachment, encroachment, et_recorded, pet
+from sgstore.model.criticality._encroachment import (
+    OF_AREAS,
+    Encroachment,
+    encroachment,
+    et_recorded,
+    pet,
+)
 from sgstore.model.criticality._exposure import tet, tit
+from sgstore.model.criticality._footprints import crossings_of
 from sgstore.model.criticality._headway import headway_recorded
 from sgstore.model.criticality._potential import cpi, crash_probability
 from sgstore.model.criticality._recorded import (
@@ -27,6 +34,7 @@ from sgstore.model.criticality._recorded import (
 __all__ = [
     "FIXED_KINDS",
     "KNOWN",
+    "OF_AREAS",
     "RECORDED",
     "TRACKS",
     "Encounter",
@@ -35,6 +43,7 @@ __all__ = [
     "Track",
     "cpi",
     "crash_probability",
+    "crossings_of",
     "dce_recorded",
     "encounters",
     "encroachment",

@@ -11,15 +11,18 @@ first such frame, and leaves with the first frame after the last one.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.model.criticality._footprints import FOOTPRINT, Footprints
+
 if TYPE_CHECKING:
-    from sgstore.model.criticality._encounter import Encounter, Track
-    from sgstore.model.world import Bools
+    from collections.abc import Callable
+
+    from sgstore.model.criticality._encounter import Encounter
+    from sgstore.model.world import Floats
 
 
 @dataclass(frozen=True)
@@ -42,22 +45,32 @@ def encroachment(of: Encounter) -> Encroachment:
 
     An entry is unknown if the first frame is in the area, and an exit if the last frame is.
     """
-    inside = [np.zeros(len(one), np.bool_) for one in (of.a, of.b)]
-    for rows in of.crossings():
-        for on, found in zip(inside, rows, strict=True):
-            on[found] = True
-    enters_a, leaves_a = _span(of.a, inside[0])
-    enters_b, leaves_b = _span(of.b, inside[1])
-    return Encroachment(enters_a, leaves_a, enters_b, leaves_b)
+    return Encroachment(*_when(of)[0].tolist())
 
 
-def _span(track: Track, inside: Bools) -> tuple[float, float]:
-    rows = np.flatnonzero(inside)
-    if not len(rows):
-        return math.nan, math.nan
-    first, last = int(rows[0]), int(rows[-1])
-    enters = float(track.times[first]) if first > 0 else math.nan
-    return enters, float(track.times[last + 1]) if last + 1 < len(track) else math.nan
+def _when(of: Encounter) -> Floats:
+    """Return entry and exit times of two objects in their conflict area, (1, 4); s."""
+    objects = np.repeat([0, 1], [len(of.a), len(of.b)])
+    states = np.concatenate([of.a.states, of.b.states])
+    footprints = Footprints(objects, states[:, FOOTPRINT].T)
+    times = np.concatenate([of.a.times, of.b.times, [np.nan]])  # -1 is the last one
+    if len(footprints.objects) < 2:  # one has no states
+        return np.full((1, 4), np.nan)
+    return times[footprints.crossed(np.array([0]), np.array([1]))]
+
+
+def _pet(when: Floats) -> Floats:
+    enters_a, leaves_a, enters_b, leaves_b = when.T
+    second_a = np.where(leaves_b <= enters_a, enters_a - leaves_b, np.nan)
+    return np.where(leaves_a <= enters_b, enters_b - leaves_a, second_a)
+
+
+def _et(when: Floats) -> Floats:
+    return when[:, 1] - when[:, 0]
+
+
+OF_AREAS: Final[dict[str, Callable[[Floats], Floats]]] = {"pet": _pet, "et_recorded": _et}
+"""Measures of pairs, (P,), from the entry and exit times of both objects, (P, 4)."""
 
 
 def pet(of: Encounter) -> float:
@@ -66,15 +79,9 @@ def pet(of: Encounter) -> float:
     NaN without a conflict area, if both were in it at once, or if the recording begins or ends in
     it.
     """
-    when = encroachment(of)
-    if when.leaves_a <= when.enters_b:
-        return when.enters_b - when.leaves_a
-    if when.leaves_b <= when.enters_a:
-        return when.enters_a - when.leaves_b
-    return math.nan
+    return float(_pet(_when(of))[0])
 
 
 def et_recorded(of: Encounter) -> float:
     """Return the encroachment time: how long object a is in the conflict area; s. NaN if unknown."""
-    when = encroachment(of)
-    return when.leaves_a - when.enters_a
+    return float(_et(_when(of))[0])

@@ -1,0 +1,315 @@
+"""Footprints of many objects over time, and the frames in which pairs of them cover a common area.
+
+Notes
+-----
+Frames in which an object stands still are one row, because only the first and last frames in an area
+count. Bounding boxes of eight rows each form a tree. A pair of boxes is skipped if the boxes are apart, or
+if both lie between rows that are already known to be in the area. The memory depends on the number of
+rows, not on the number of pairs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.model.pair_numbers import COLUMNS, PairNumbers
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from sgstore.model.world import Bools, Floats, Ints
+
+_FAN: Final = 8
+"""Number of rows in a bounding box, and of boxes in a larger one."""
+_TOGETHER: Final = 1 << 13
+"""Pairs of bounding boxes that are divided together."""
+FOOTPRINT: Final = [COLUMNS.index(name) for name in ("x", "y", "heading", "length", "width")]
+"""Columns of a state that form the footprint of an object."""
+_MARGIN: Final = 1e-6
+"""Enlargement of bounding boxes, more than their rounding errors; m."""
+_FRAME_BITS: Final = 24
+"""Lower bits of a frame id, which number the frames of a trace."""
+_NODES: Final = 1 << 31
+"""Number of negative node ids."""
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Bounding boxes of one level of the tree: sides, first row and first box of the level below."""
+
+    sides: Floats
+    rows: Ints
+    below: Ints
+
+
+class Footprints:
+    """Footprints of objects: one row for each frame in which an object has another footprint than before.
+
+    Parameters
+    ----------
+    objects : (K,) int64
+        Object of each state; the states of an object are consecutive.
+    boxes : (5, K) float64
+        ``x, y, heading, length, width`` of each state, in order of time; m, m, rad, m, m.
+
+    Attributes
+    ----------
+    objects : (n,) int64
+        The different objects, in the order of their states.
+    begins : (n + 1,) int64
+        First row of each object.
+    states : (R,) int64
+        First state of each row.
+    boxes : (5, R) float64
+    """
+
+    def __init__(self, objects: Ints, boxes: Floats) -> None:
+        starts = np.ones(len(objects), np.bool_)
+        starts[1:] = objects[1:] != objects[:-1]
+        rows = starts.copy()
+        for one in boxes:
+            rows[1:] |= one[1:] != one[:-1]  # True for NaN
+        self.states: Ints = np.flatnonzero(rows)
+        self.boxes: Floats = boxes[:, self.states]
+        first = np.flatnonzero(starts[self.states])
+        self.begins: Ints = np.append(first, len(self.states))
+        self.objects: Ints = objects[self.states[first]]
+
+    @cached_property
+    def known(self) -> Bools:
+        """Mask of the objects whose position and size are known in every frame, (n,)."""
+        if not len(self.objects):
+            return np.zeros(0, np.bool_)
+        unknown = np.isnan(self.boxes).any(axis=0)
+        return ~np.logical_or.reduceat(unknown, self.begins[:-1])
+
+    @cached_property
+    def reach(self) -> Floats:
+        """Radius of the circle around each footprint, (R,); m."""
+        return np.hypot(self.boxes[3], self.boxes[4]) / 2
+
+    @cached_property
+    def directions(self) -> tuple[Floats, Floats]:
+        """Cosine and sine of each heading, (R,)."""
+        return np.cos(self.boxes[2]), np.sin(self.boxes[2])
+
+    @cached_property
+    def levels(self) -> list[_Level]:
+        """Tree of bounding boxes: the rows first, and finally one box for each object."""
+        x, y = self.boxes[0], self.boxes[1]
+        wide = self.reach * (1 + 1e-9) + _MARGIN
+        sides = np.stack([x - wide, y - wide, -x - wide, -y - wide])
+        rows = np.arange(len(x) + 1)
+        levels = [_Level(sides, rows, rows)]
+        begins = self.begins
+        while len(levels[-1].rows) > len(self.begins):
+            count = -(-np.diff(begins) // _FAN)
+            above = np.append(0, np.cumsum(count))
+            of = np.repeat(np.arange(len(count)), count)
+            first = begins[of] + (np.arange(above[-1]) - above[of]) * _FAN
+            below = np.append(first, begins[-1])
+            sides = np.minimum.reduceat(levels[-1].sides, first, axis=1)
+            levels.append(_Level(sides, levels[-1].rows[below], below))
+            begins = above
+        return levels
+
+    def common(self, a: Ints, b: Ints) -> Ints:
+        """Return the first and last rows in the common area of each pair of objects, (P, 4).
+
+        Parameters
+        ----------
+        a, b : (P,) int64
+            Indices of the objects in ``objects``.
+
+        Returns
+        -------
+        (P, 4) int64
+            First and last row of a, first and last row of b. The first is greater than the last if the
+            objects never cover a common area.
+        """
+        search = _Search(self, len(a))
+        known = np.flatnonzero(self.known[a] & self.known[b])
+        search.run(known, a[known], b[known])
+        return np.stack([search.first[0], search.last[0], search.first[1], search.last[1]], axis=1)
+
+    def crossed(self, a: Ints, b: Ints) -> Ints:
+        """Return the states in which pairs of objects enter and leave their common area, (P, 4).
+
+        Parameters
+        ----------
+        a, b : (P,) int64
+            Indices of the objects in ``objects``.
+
+        Returns
+        -------
+        (P, 4) int64
+            State in which a enters, first state after a has left, and the same of b. -1 means unknown or
+            no common area: the first state of the object is in the area, or its last one.
+        """
+        found = self.common(a, b)
+        crossed = np.full_like(found, -1)
+        for one, objects in enumerate((a, b)):
+            enters, leaves = found[:, 2 * one], found[:, 2 * one + 1] + 1
+            begins = np.flatnonzero((enters > self.begins[objects]) & (leaves > 0))
+            ends = np.flatnonzero((leaves < self.begins[objects + 1]) & (leaves > 0))
+            crossed[begins, 2 * one] = self.states[enters[begins]]
+            crossed[ends, 2 * one + 1] = self.states[leaves[ends]]
+        return crossed
+
+
+class _Search:
+    """Search for the first and last rows of pairs of objects in their common areas."""
+
+    def __init__(self, of: Footprints, pairs: int) -> None:
+        self._of = of
+        self._inner = np.minimum(of.boxes[3], of.boxes[4]) / 2
+        self.first = np.full((2, pairs), len(of.states))
+        self.last = np.full((2, pairs), -1)
+
+    def run(self, pair: Ints, a: Ints, b: Ints) -> None:
+        """Search pairs of objects, from large bounding boxes to small ones."""
+        waiting = [(len(self._of.levels) - 1, pair, a, b)]
+        while waiting:
+            level, pair, a, b = waiting.pop()
+            most = _TOGETHER if level else _TOGETHER * _FAN
+            if len(pair) > most:
+                waiting.append((level, pair[most:], a[most:], b[most:]))
+                pair, a, b = pair[:most], a[:most], b[:most]
+            if not level:
+                self._rows(pair, a, b)
+                continue
+            pair, a, b = self._near(level, pair, a, b)
+            if len(pair):
+                below = self._of.levels[level].below
+                waiting.append((level - 1, *_divided(below, pair, a, b)))
+
+    def _near(self, level: int, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:
+        """Return the pairs of bounding boxes that overlap, and may have a new first or last row."""
+        boxes = self._of.levels[level]
+        low_x, low_y, high_x, high_y = boxes.sides  # the high sides are negative
+        on = (low_x[a] <= -high_x[b]) & (low_x[b] <= -high_x[a])
+        on &= (low_y[a] <= -high_y[b]) & (low_y[b] <= -high_y[a])
+        pair, a, b = pair[on], a[on], b[on]
+        middle_a, middle_b = ((boxes.rows[one] + boxes.rows[one + 1]) // 2 for one in (a, b))
+        sure = self._apart(middle_a, middle_b) < self._sure(middle_a, middle_b)
+        self._found(pair[sure], middle_a[sure], middle_b[sure])
+        ends_a, ends_b = (boxes.rows[one + 1] - 1 for one in (a, b))
+        new = self._new(pair, (boxes.rows[a], boxes.rows[b]), (ends_a, ends_b))
+        return pair[new], a[new], b[new]
+
+    def _rows(self, pair: Ints, a: Ints, b: Ints) -> None:
+        """Compare the footprints of pairs of rows."""
+        apart, of = self._apart(a, b), self._of
+        sure = apart < self._sure(a, b)
+        self._found(pair[sure], a[sure], b[sure])
+        near = np.flatnonzero(~sure & (apart <= ((of.reach[a] + of.reach[b]) * (1 + 1e-9)) ** 2))
+        near = near[self._new(pair[near], (a[near], b[near]), (a[near], b[near]))]
+        on = near[self._overlap(a[near], b[near])]
+        self._found(pair[on], a[on], b[on])
+
+    def _overlap(self, a: Ints, b: Ints) -> Bools:
+        """Return a mask of the pairs of rows whose footprints touch or overlap, (K,)."""
+        of, (cosine, sine) = self._of, self._of.directions
+        states = np.zeros((2, len(COLUMNS), len(a)))
+        for one, rows in zip(states, (a, b), strict=True):
+            one[FOOTPRINT] = of.boxes[:, rows]
+        numbers = PairNumbers(states[0].T, states[1].T)
+        level = np.zeros(len(a))  # without heights, all pairs are on one level
+        numbers.update(level=level, solid=level)
+        numbers.update(ca=cosine[a], sa=sine[a], cb=cosine[b], sb=sine[b])
+        beyond = np.maximum.reduce([numbers[f"out{axis}"] for axis in (1, 2, 3, 4)])
+        found: Bools = beyond <= 0
+        return found
+
+    def _apart(self, a: Ints, b: Ints) -> Floats:
+        """Return squared distances of the centres of footprints; m²."""
+        x, y = self._of.boxes[0], self._of.boxes[1]
+        away_x, away_y = x[a] - x[b], y[a] - y[b]
+        return away_x * away_x + away_y * away_y
+
+    def _sure(self, a: Ints, b: Ints) -> Floats:
+        """Return squared distances below which the circles inside two footprints overlap; m²."""
+        return ((self._inner[a] + self._inner[b]) * (1 - 1e-9)) ** 2
+
+    def _new(self, pair: Ints, first: tuple[Ints, Ints], last: tuple[Ints, Ints]) -> Bools:
+        """Return a mask of the ranges of rows that are not between known rows of their pair."""
+        new = np.zeros(len(pair), np.bool_)
+        for one in (0, 1):
+            new |= (first[one] < self.first[one, pair]) | (last[one] > self.last[one, pair])
+        return new
+
+    def _found(self, pair: Ints, a: Ints, b: Ints) -> None:
+        for one, rows in enumerate((a, b)):
+            np.minimum.at(self.first[one], pair, rows)
+            np.maximum.at(self.last[one], pair, rows)
+
+
+def _divided(below: Ints, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return all pairs of the parts of two bounding boxes, for many pairs of boxes."""
+    count_a, count_b = below[a + 1] - below[a], below[b + 1] - below[b]
+    count = count_a * count_b
+    of = np.repeat(np.arange(len(pair)), count)
+    place = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    part_a, part_b = np.divmod(place, count_b[of])
+    return pair[of], below[a][of] + part_a, below[b][of] + part_b
+
+
+def crossings_of(
+    frames: Ints, nodes: Ints, boxes: Sequence[Floats], sources: Mapping[int, int]
+) -> tuple[Ints, Ints, Ints]:
+    """Return the frames in which an object of each trace and the others cross their common areas.
+
+    Parameters
+    ----------
+    frames, nodes : (K,) int64
+        Frame id and node id of each state, in any order. The upper bits of a frame id are the trace id.
+    boxes : sequence of (K,) float64
+        ``x, y, heading, length, width``; m, m, rad, m, m.
+    sources : mapping of int to int
+        Node id of the object by trace id; at most 64 traces, all that occur.
+
+    Returns
+    -------
+    traces, nodes : (P,) int64
+        Other objects that come near the object of their trace.
+    crossed : (P, 4) int64
+        Frame in which the object enters, first frame after it has left, and the same of the other
+        object. -1 means unknown or no common area.
+    """
+    traces = np.array(sorted(sources))
+    rank = traces.searchsorted(frames >> _FRAME_BITS)
+    objects = (rank << 32) + nodes + _NODES
+    order = np.argsort(objects << _FRAME_BITS | frames & (1 << _FRAME_BITS) - 1, kind="stable")
+    wanted = (np.arange(len(traces)) << 32) + np.array([sources[one] for one in traces]) + _NODES
+    objects = objects[order]
+    x, y, _, length, width = boxes
+    near = np.flatnonzero(_near(objects, x[order], y[order], (length + width)[order], wanted))
+    order = order[near]
+    footprints = Footprints(objects[near], np.stack([one[order] for one in boxes]))
+    objects = footprints.objects
+    source = objects.searchsorted(wanted)[objects >> 32]
+    others = np.flatnonzero(objects != wanted[objects >> 32])
+    crossed = footprints.crossed(source[others], others)
+    rows = np.append(frames[order], -1)  # -1 is the last one
+    found = objects[others]
+    return traces[found >> 32], (found & (1 << 32) - 1) - _NODES, rows[crossed]
+
+
+def _near(objects: Ints, x: Floats, y: Floats, size: Floats, wanted: Ints) -> Bools:
+    """Return a mask of the states of objects whose surroundings overlap those of their trace's object, (K,)."""
+    if not len(objects):
+        return np.zeros(0, np.bool_)
+    starts = np.flatnonzero(np.append(True, objects[1:] != objects[:-1]))
+    of = objects[starts]
+    reach = np.maximum.reduceat(size, starts) / 2 + _MARGIN
+    place = np.minimum(of.searchsorted(wanted), len(of) - 1)
+    on, own = (of[place] == wanted)[of >> 32], place[of >> 32]
+    for one in (x, y):
+        low = np.minimum.reduceat(one, starts) - reach
+        high = np.maximum.reduceat(one, starts) + reach
+        on &= (low <= high[own]) & (low[own] <= high)
+    return np.repeat(on, np.diff(np.append(starts, len(objects))))
