@@ -91,7 +91,7 @@ def test_pictures_are_the_same_for_the_same_numbers_and_are_drawn_as_svg_too(
         (["classes", "drives.sgstore:MATCH (x:Dragon)"], 2, "Dragon"),
         (["classes", "drives.sgstore", "--abstraction", "XYZ"], 1, "no abstraction 'XYZ'"),
         (["spec", "drives.sgstore"], 2, ""),
-        (["spec", "drives.sgstore", "MATCH (v)", "--cells", "3"], 2, "returns values"),
+        (["spec", "drives.sgstore", "MATCH (v)", "--cells", "3"], 2, "return values"),
         (["combos", "drives.sgstore", "--slots", "none.toml"], 2, "No such file"),
         (["combos", "drives.sgstore", "--k", "30"], 2, "can be gone through"),
         (["classes", "drives.sgstore", "--picture", "x.bmp"], 1, "a picture is .png or .svg"),

@@ -286,6 +286,6 @@ def test_who_comes_and_goes_and_what_is_not_known(tmp_path: Path) -> None:
     assert np.allclose(by_name["Ego"].middle(0.55), [11, 0, 0.75], atol=0.01)
     assert np.allclose(by_name["50"].middle(0.3)[:2], [30, 0], atol=1e-3)
     assert "no OpenDRIVE map" in reasons
-    assert "no signal of the map" in reasons
+    assert "not a signal of the map" in reasons
     assert "the size of" in reasons
     assert faults([one.file]) == []

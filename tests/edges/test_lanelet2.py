@@ -251,7 +251,7 @@ def test_the_projector_info_beside_a_map_says_how_it_is_projected(tmp_path: Path
         ("projector_type: Mercator", "known: UTM"),
         ("projector_type: LocalCartesian", "without an origin"),
         ("projector_type: MGRS\nmgrs_grid: 5400", "expected a zone and a square"),
-        ("projector_type: UTM\nmap_origin:\n latitude: x\n longitude: 1", "no number"),
+        ("projector_type: UTM\nmap_origin:\n latitude: x\n longitude: 1", "not a number"),
     ],
 )
 def test_a_projector_info_that_tells_no_projection_is_refused(text: str, reason: str) -> None:

@@ -106,7 +106,7 @@ def test_a_lock_is_read_as_it_was_written(lock: Lock, tmp_path: Path) -> None:
 
     assert read_lock(tmp_path / "a.lock") == lock
     assert len(lock.text().splitlines()) > len(lock.cases) + len(lock.traces)
-    with pytest.raises(ExportError, match=r"ends in \.lock"):
+    with pytest.raises(ExportError, match=r"must end in \.lock"):
         lock.write(tmp_path / "a.txt")
 
 

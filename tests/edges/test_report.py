@@ -173,6 +173,6 @@ def test_the_verb_writes_it(
     )
     told = capsys.readouterr()
     assert told.out.strip() == str(to)
-    assert "the first 3 are in the page" in told.err
+    assert "the page has only the first 3 matches" in told.err
     assert kept_in(to)["parameters"] == {"least": 1}
     assert run(["report", str(town_store), "-o", str(to)]) == 2
