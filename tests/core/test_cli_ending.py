@@ -644,7 +644,7 @@ def test_the_exit_code_is_kept_wherever_the_interruption_came_from() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 143
 
 
-@pytest.mark.parametrize("place", ["ending._hear_of_lost", "run", "ending.clear_deadline"])
+@pytest.mark.parametrize("place", ["_process._hear_of_lost", "run", "_process.clear_deadline"])
 def test_a_signal_at_the_edge_of_a_run_ends_it_like_any_other(place: str) -> None:
     code = (
         "import signal, sys; from sgstore.apps.cli import _application as cli\n"

@@ -78,7 +78,10 @@ def test_a_missing_recording_is_an_error(path: Path) -> None:
     ],
 )
 def test_two_checks_without_a_semicolon_get_a_hint(path: Path, text: str) -> None:
-    with sgstore.open(path) as store, pytest.raises(QueryError, match="separated by a semicolon"):
+    with (
+        sgstore.open(path) as store,
+        pytest.raises(QueryError, match="separate statements with a semicolon"),
+    ):
         store.check(text)
 
 

@@ -433,7 +433,7 @@ with open_trace(sys.argv[1], mapping=sys.argv[2]) as trace:
         ('[types]\nx = { kind = "cart" }', "did you mean 'car'"),
         ('[types]\nx = { kind = "car", special = "taxy" }', "did you mean 'taxi'"),
         ("[types]\nx = 3", "expected { kind"),
-        ("types = 3", "no table"),
+        ("types = 3", "is not a table"),
         ("scene = 3", r"expected a table \[scene\]"),
         ("[types]\nx = { colour = 'red' }", "types.x.colour"),
     ],

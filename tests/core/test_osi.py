@@ -797,7 +797,7 @@ def test_a_host_that_is_not_there_means_no_ego_and_is_said(
 
     assert info.ego == ""
     assert blocks[0].ego.tolist() == [-1]
-    assert any("no ego" in warning for warning in report.warnings)
+    assert any("no host vehicle" in warning for warning in report.warnings)
 
 
 def test_the_host_of_a_sensor_view_comes_before_that_of_the_truth_in_it(tmp_path: Path) -> None:

@@ -341,7 +341,7 @@ def test_tables_of_others_are_not_lost(store: Path) -> None:
     change(store, "CREATE TABLE labels AS SELECT 1 AS label")
     before = store.read_bytes()
 
-    with pytest.raises(StoreError, match="none of sgstore's would be lost: labels"):
+    with pytest.raises(StoreError, match="tables of other programs would be lost: labels"):
         rebuild(store)
     assert store.read_bytes() == before
 

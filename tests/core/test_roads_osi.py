@@ -420,7 +420,11 @@ def test_lanes_of_a_schema_that_lacks_what_they_need_are_said() -> None:
     lanes.take(ground.SerializeToString())
 
     assert lanes.text() == ("", "")
-    assert [w for w in lanes.warnings if "lane lacks the field classification.type" in w]
+    assert [
+        w
+        for w in lanes.warnings
+        if "lane left out: its schema lacks the field classification.type" in w
+    ]
 
 
 def test_too_many_points_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
