@@ -62,7 +62,7 @@ from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.model.vocabulary import KINDS, SIGNALS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from sgstore.lang.sql._expressions import Leaf
 
@@ -283,17 +283,17 @@ def _folded(value: Bound) -> Bound:
 def _joined(word: str, operands: tuple[Bound, ...]) -> Bound:
     """Join conditions by AND or OR, without constants. A label that all parts of an OR share is put first."""
     neutral, strong = (TRUE, FALSE) if word == "AND" else (FALSE, TRUE)
-    rest = tuple(one for one in operands if one != neutral)
+    rest = [one for one in operands if one != neutral]
     if not rest:
         return neutral
     if strong in rest:
         return strong
-    joined = Operation(word, rest, Type.boolean) if len(rest) > 1 else rest[0]
+    joined = Operation(word, tuple(rest), Type.boolean) if len(rest) > 1 else rest[0]
     label = _common_label(rest) if word == "OR" and len(rest) > 1 else None
     return joined if label is None else all_of(label, joined)
 
 
-def _common_label(ways: tuple[Bound, ...]) -> LabelTest | None:
+def _common_label(ways: Sequence[Bound]) -> LabelTest | None:
     """Return the label that follows from each of several conditions on the same node, or None."""
     labels: list[LabelTest] = []
     for way in ways:
