@@ -645,7 +645,7 @@ def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str
     kinds = [Kinds(one.ego - never, one.other) for one in kinds]
     ends = WayEnd(nodes[0], kinds[0]), WayEnd(nodes[1], kinds[1])
     of_ego = any(one.one_a_frame for one in kinds)
-    if not (of_ego and is_between_entities(leaf, ends, sql.catalog)):
+    if not (of_ego and is_between_entities(leaf.function, ends, sql.catalog)):
         return way_text(leaf.function, join.frame, ends, sql.catalog)
     alias = f":ways {leaf.a} {leaf.b}"
     if alias not in join.lanes:

@@ -54,23 +54,23 @@ def way_text(function: str, frame: str, ends: tuple[WayEnd, WayEnd], catalog: Ca
         return _next_text(frame, ends[0], NEXT_PARTS[function], catalog)
     if function in COURSES:
         return _course_text(frame, ends[0], function, catalog)
-    if function == LANE_DIST and not _has_signals(ends, catalog):
+    if is_between_entities(function, ends, catalog):
         return _between_entities(frame, ends, catalog)
     return _between(frame, ends, catalog, parts=function == PART_DIST)
 
 
 _AHEAD: Final = """min(CASE WHEN "way" >= 0 THEN "way" END)"""
 _BEHIND: Final = """max(CASE WHEN "way" < 0 THEN "way" END)"""
+_SHORTER: Final = (
+    f"CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END"
+)
+"""Shorter one of the ways ahead and behind, with its sign."""
 
 
-def is_between_entities(value: PairNumber, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> bool:
+def is_between_entities(function: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> bool:
     """Return True for the lane distance between two entities that are neither lights nor signs."""
-    return value.function == LANE_DIST and not _has_signals(ends, catalog)
-
-
-def _has_signals(ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> bool:
     signals = _SIGNALS & (catalog.moving | catalog.fixed | catalog.mapped)
-    return any(end.kinds.every & signals for end in ends)
+    return function == LANE_DIST and not any(end.kinds.every & signals for end in ends)
 
 
 def lane_distances(ends: tuple[WayEnd, WayEnd], catalog: Catalog, within: list[str]) -> str:
@@ -78,15 +78,12 @@ def lane_distances(ends: tuple[WayEnd, WayEnd], catalog: Catalog, within: list[s
 
     ``within`` has conditions on the frame ids of ``":a"``.
     """
-    more = [
-        condition
-        for alias, end in zip((":a", ":b"), ends, strict=True)
-        for condition in _kinds_of(end, alias, catalog)
-    ]
+    a, b = ends
+    more = _kinds_of(a, ":a", catalog) + _kinds_of(b, ":b", catalog)
     where = " AND ".join(['":a"."is_own"', '":b"."is_own"', *more, *within])
     return f"""
     SELECT "frame_id", "src", "dst",
-      CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END AS "value"
+      {_SHORTER} AS "value"
     FROM (
       SELECT ":a"."frame_id", ":a"."node_id" AS "src", ":b"."node_id" AS "dst",
         ":r"."start" + (CAST(":b"."along" AS DOUBLE) - CAST(":a"."along" AS DOUBLE)) AS "way"
@@ -103,16 +100,12 @@ def lane_distances(ends: tuple[WayEnd, WayEnd], catalog: Catalog, within: list[s
 
 def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
     """Return the SQL of the lane distance between two entities. Each entity is a point on its lane."""
-    conditions = [
-        condition
-        for alias, end in zip((":a", ":b"), ends, strict=True)
-        for condition in _kinds_of(end, alias, catalog)
-    ]
     a, b = (end.node for end in ends)
+    conditions = _kinds_of(ends[0], ":a", catalog) + _kinds_of(ends[1], ":b", catalog)
     # Each row is joined to the given frame, not to other rows. So DuckDB starts with the frame.
     more = "".join(f"\n        AND {condition}" for condition in conditions)
     return f"""(
-    SELECT CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END
+    SELECT {_SHORTER}
     FROM (
       SELECT ":r"."start" + (CAST(":b"."along" AS DOUBLE) - CAST(":a"."along" AS DOUBLE)) AS "way"
       FROM "lane_state" AS ":a", "lane_state" AS ":b", "frame" AS ":f", "map_reach" AS ":r"
@@ -133,7 +126,7 @@ def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts
     near = '":r"."start" + (":b"."first" - ":a"."last")'
     far = '":r"."start" + (":b"."last" - ":a"."first")'
     return f"""(
-    SELECT CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END
+    SELECT {_SHORTER}
     FROM (
       SELECT CASE WHEN {near} >= 0 THEN {near} WHEN {far} < 0 THEN {far} ELSE 0 END AS "way"
       FROM ({one}) AS ":a", ({other}) AS ":b", "frame" AS ":f", "map_reach" AS ":r"

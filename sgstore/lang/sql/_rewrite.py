@@ -78,9 +78,8 @@ _OPPOSITE: Final = {"=": "<>", "<>": "=", "<": ">=", ">=": "<", ">": "<=", "<=":
 def rewritten(query: Query, catalog: Catalog) -> Query:
     """Return an equivalent query that is faster to evaluate, after all rewriting rules."""
     if query.stages:
-        return _staged(
-            query, catalog
-        )  # a node of OPTIONAL MATCH lacks every value where it is absent
+        return _staged(query, catalog)
+    # Not for stages: a node of OPTIONAL MATCH lacks every value where it is absent.
     query = _in_scopes(values_lacking, query, catalog)
     query = _ruled(query, catalog)
     query = replace(query, result=query.result.changed(_attributes))
