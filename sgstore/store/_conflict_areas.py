@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 import numpy as np
 
 from sgstore.model.criticality import FIXED_KINDS, OF_AREAS, crossings_of
+from sgstore.model.frame_ids import SEQ_BITS, trace_of
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterator, Mapping
@@ -189,7 +190,7 @@ class ConflictAreas:
         key = scope, *sources, *part
         if len(sources) == 1 and key in self._columns:
             return self._columns[key]
-        ends = [min(sources) << 24, ((max(sources) + 1) << 24) - 1]
+        ends = [min(sources) << SEQ_BITS, ((max(sources) + 1) << SEQ_BITS) - 1]
         source = next(iter(sources.values()))
         found = [
             reader.execute(sql.format(scope=scope), [*ends, *part, source]).fetchnumpy()
@@ -199,7 +200,7 @@ class ConflictAreas:
             np.concatenate([_filled(one[name]) for one in found]) for name in found[0]
         )
         moving = slice(0, len(found[0]["frame_id"]))
-        trace = self._traces["trace_id"].searchsorted(frame[moving] >> 24)
+        trace = self._traces["trace_id"].searchsorted(trace_of(frame[moving]))
         for i, name in enumerate(("origin_x", "origin_y")):
             boxes[i][moving] += self._traces[name][trace]
         boxes[2][moving] = np.radians(np.degrees(boxes[2][moving]))  # as in the view of all states

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.pair_numbers import COLUMNS, PairNumbers
 
 if TYPE_CHECKING:
@@ -31,8 +32,6 @@ FOOTPRINT: Final = [COLUMNS.index(name) for name in ("x", "y", "heading", "lengt
 """Columns of a state that form the footprint of an object."""
 _MARGIN: Final = 1e-6
 """Enlargement of bounding boxes, more than their rounding errors; m."""
-_FRAME_BITS: Final = 24
-"""Lower bits of a frame id, which number the frames of a trace."""
 _NODES: Final = 1 << 31
 """Number of negative node ids."""
 
@@ -117,25 +116,6 @@ class Footprints:
             begins = above
         return levels
 
-    def common(self, a: Ints, b: Ints) -> Ints:
-        """Return the first and last rows in the common area of each pair of objects, (P, 4).
-
-        Parameters
-        ----------
-        a, b : (P,) int64
-            Indices of the objects in ``objects``.
-
-        Returns
-        -------
-        (P, 4) int64
-            First and last row of a, first and last row of b. The first is greater than the last if the
-            objects never cover a common area.
-        """
-        search = _Search(self, len(a))
-        known = np.flatnonzero(self.known[a] & self.known[b])
-        search.run(known, a[known], b[known])
-        return np.stack([search.first[0], search.last[0], search.first[1], search.last[1]], axis=1)
-
     def crossed(self, a: Ints, b: Ints) -> Ints:
         """Return the states in which pairs of objects enter and leave their common area, (P, 4).
 
@@ -150,10 +130,12 @@ class Footprints:
             State in which a enters, first state after a has left, and the same of b. -1 means unknown or
             no common area: the first state of the object is in the area, or its last one.
         """
-        found = self.common(a, b)
-        crossed = np.full_like(found, -1)
+        search = _Search(self, len(a))
+        known = np.flatnonzero(self.known[a] & self.known[b])
+        search.run(known, a[known], b[known])
+        crossed = np.full((len(a), 4), -1)
         for one, objects in enumerate((a, b)):
-            enters, leaves = found[:, 2 * one], found[:, 2 * one + 1] + 1
+            enters, leaves = search.first[one], search.last[one] + 1
             begins = np.flatnonzero((enters > self.begins[objects]) & (leaves > 0))
             ends = np.flatnonzero((leaves < self.begins[objects + 1]) & (leaves > 0))
             crossed[begins, 2 * one] = self.states[enters[begins]]
@@ -162,7 +144,13 @@ class Footprints:
 
 
 class _Search:
-    """Search for the first and last rows of pairs of objects in their common areas."""
+    """Search for the first and last rows of pairs of objects in their common areas.
+
+    Attributes
+    ----------
+    first, last : (2, P) int64
+        Rows of the first and of the second object; the first is greater than the last without a common area.
+    """
 
     def __init__(self, of: Footprints, pairs: int) -> None:
         self._of = of
@@ -281,9 +269,9 @@ def crossings_of(
         object. -1 means unknown or no common area.
     """
     traces = np.array(sorted(sources))
-    rank = traces.searchsorted(frames >> _FRAME_BITS)
+    rank = traces.searchsorted(trace_of(frames))
     objects = (rank << 32) + nodes + _NODES
-    order = np.argsort(objects << _FRAME_BITS | frames & (1 << _FRAME_BITS) - 1, kind="stable")
+    order = np.argsort(objects << SEQ_BITS | frames & (1 << SEQ_BITS) - 1, kind="stable")
     wanted = (np.arange(len(traces)) << 32) + np.array([sources[one] for one in traces]) + _NODES
     objects = objects[order]
     x, y, _, length, width = boxes
