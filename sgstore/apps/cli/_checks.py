@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from sgstore.apps.cli._collection_options import CollectionOptions, url_of
 from sgstore.apps.cli._junit import write_junit
@@ -40,20 +40,10 @@ verbs = Verbs()
 @verbs.command(rich_help_panel=PANEL)
 def check(
     store: AskedPath,
-    files: Annotated[
-        list[Path] | None,
-        Argument(metavar="[FILE…]", help="Files of CHECK statements; - reads stdin."),
-    ] = None,
-    explain: Annotated[
-        bool, Option("--explain", help="Print the parsed checks and their SQL.")
-    ] = False,
-    require: Annotated[
-        bool, Option("--require", help="End with exit code 4 if a trace violates a check.")
-    ] = False,
-    junit: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="Also write the verdicts as JUnit XML, for build servers."),
-    ] = None,
+    files: Annotated[list[Path] | None, Argument()] = None,
+    explain: bool = False,
+    require: bool = False,
+    junit: Path | None = None,
     *,
     whole: CollectionOptions,
     statements: Statements,
@@ -63,6 +53,17 @@ def check(
 
     One row a check and trace: true, false, unknown where it cannot be told, or pending where something is
     still due at the end; and one a violation: by whom, and from when to when.
+
+    Parameters
+    ----------
+    files : [FILE…]
+        Files of CHECK statements; - reads stdin.
+    explain
+        Print the parsed checks and their SQL.
+    require
+        End with exit code 4 if a trace violates a check.
+    junit : FILE
+        Also write the verdicts as JUnit XML, for build servers.
     """
     from sgstore.lang.syntax import joined
 

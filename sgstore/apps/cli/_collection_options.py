@@ -35,25 +35,18 @@ COLLECTIONS: Final = "Collections"
 
 @dataclass(frozen=True)
 class CollectionOptions:
-    """Command line options for queries on a collection (many stores)."""
+    """Command line options for queries on a collection (many stores).
 
-    engine: Annotated[
-        str,
-        Option(
-            "--engine",
-            metavar="NAME",
-            help="Of a collection: local:N processes, ray, ray://HOST:PORT, spark, spark:MASTER.",
-            rich_help_panel=COLLECTIONS,
-        ),
-    ] = "local"
-    partial: Annotated[
-        bool,
-        Option(
-            "--partial",
-            help="Skip bundles of a collection that fail; exit code 3.",
-            rich_help_panel=COLLECTIONS,
-        ),
-    ] = False
+    Parameters
+    ----------
+    engine : NAME
+        Of a collection: local:N processes, ray, ray://HOST:PORT, spark, spark:MASTER.
+    partial
+        Skip bundles of a collection that fail; exit code 3.
+    """
+
+    engine: Annotated[str, Option(rich_help_panel=COLLECTIONS)] = "local"
+    partial: Annotated[bool, Option("--partial", rich_help_panel=COLLECTIONS)] = False
 
     @contextmanager
     def collection_at(

@@ -64,14 +64,17 @@ collection = Verbs(
 def pack(
     store: StorePath,
     url: Place,
-    bundle_traces: Annotated[
-        int | None,
-        Option("--bundle-traces", min=1, help="Maximum traces in a bundle.", show_default="1000"),
-    ] = None,
+    bundle_traces: Annotated[int | None, Option(min=1, show_default="1000")] = None,
     *,
     out: PrintedRows,
 ) -> int:
-    """Copy the traces of a store into a collection; a missing collection is created."""
+    """Copy the traces of a store into a collection; a missing collection is created.
+
+    Parameters
+    ----------
+    bundle_traces
+        Maximum traces in a bundle.
+    """
     from sgstore.collection import pack as pack_store
 
     with count_bar("packing", "bundles") as on_bundle:
@@ -99,9 +102,15 @@ def commit(url: Place, *, out: PrintedRows) -> int:
 @collection.command()
 def unpack(
     url: Place,
-    store: Annotated[Path, Argument(metavar="STORE", help="The store to write.")],
+    store: Path,
 ) -> int:
-    """Copy all traces of a collection into one new store."""
+    """Copy all traces of a collection into one new store.
+
+    Parameters
+    ----------
+    store : STORE
+        The store to write.
+    """
     from sgstore.collection import unpack as unpack_all
 
     names = unpack_all(_place_of(url), store)
@@ -126,14 +135,18 @@ def verify(url: Place, *, out: PrintedRows) -> int:
 def rebuild(
     url: Place,
     look_in: LookIn = None,
-    everything: Annotated[
-        bool, Option("--all", help="Also rebuild bundles of the current schema version.")
-    ] = False,
+    everything: Annotated[bool, Option("--all")] = False,
     jobs: Jobs = 1,
     *,
     out: PrintedRows,
 ) -> int:
-    """Rebuild the bundles of other schema versions from their recordings, one after another."""
+    """Rebuild the bundles of other schema versions from their recordings, one after another.
+
+    Parameters
+    ----------
+    everything
+        Also rebuild bundles of the current schema version.
+    """
     from sgstore.collection import rebuild as make_anew
 
     with count_bar("rebuilding", "bundles") as on_bundle:
@@ -152,16 +165,23 @@ def rebuild(
 @collection.command()
 def gc(
     url: Place,
-    keep: Annotated[int, Option("--keep", min=1, help="Number of last snapshots to keep.")] = 1,
-    older: Annotated[
-        str,
-        Option("--older", metavar="TIME", help="Remove only files older than this."),
-    ] = "86400s",
-    dry_run: Annotated[bool, Option("--dry-run", help="Only list the files to remove.")] = False,
+    keep: Annotated[int, Option(min=1)] = 1,
+    older: str = "86400s",
+    dry_run: bool = False,
     *,
     out: PrintedRows,
 ) -> int:
-    """Remove old snapshots of a collection, and files that no snapshot uses."""
+    """Remove old snapshots of a collection, and files that no snapshot uses.
+
+    Parameters
+    ----------
+    keep
+        Number of last snapshots to keep.
+    older : TIME
+        Remove only files older than this.
+    dry_run
+        Only list the files to remove.
+    """
     from sgstore.collection import gc as collect
 
     seconds = seconds_of(older, "--older")

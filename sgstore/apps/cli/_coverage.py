@@ -165,12 +165,18 @@ def classes_(
 @coverage.command("of")
 def of_(
     a: A,
-    by: Annotated[str, Option("--by", metavar="B", help="Frames that cover A, written like A.")],
+    by: Annotated[str, Option()],
     *,
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """Measure how much of the frames of A is covered by B, by classes and by frames."""
+    """Measure how much of the frames of A is covered by B, by classes and by frames.
+
+    Parameters
+    ----------
+    by : B
+        Frames that cover A, written like A.
+    """
     from sgstore.testsets.coverage import covered
 
     ask.report(covered(*scenes.of(ask, a, by, slots=scenes.slots)))
@@ -179,17 +185,22 @@ def of_(
 @coverage.command("novel")
 def novel_(
     a: A,
-    than: Annotated[str, Option("--not-in", metavar="B", help="Known frames, written like A.")],
-    listing: Annotated[
-        Literal["classes", "frames", "clips"],
-        Option("--list", help="Classes, frames, or clips of consecutive frames."),
-    ] = "classes",
+    than: Annotated[str, Option("--not-in")],
+    listing: Annotated[Literal["classes", "frames", "clips"], Option("--list")] = "classes",
     limit: Limit = None,
     *,
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """List the classes of scenes of A that do not occur in B, the rarest first."""
+    """List the classes of scenes of A that do not occur in B, the rarest first.
+
+    Parameters
+    ----------
+    than : B
+        Known frames, written like A.
+    listing
+        Classes, frames, or clips of consecutive frames.
+    """
     from sgstore.testsets.coverage import novel, novel_clips, novel_frames
 
     listed = {"classes": novel, "frames": novel_frames, "clips": novel_clips}[listing]
@@ -208,13 +219,19 @@ def venn_(a: A, b: B, *, scenes: SceneOptions, ask: FrameAskOptions) -> None:
 def growth_(
     a: A,
     unit: Unit = "frame",
-    points: Annotated[int, Option("--points", min=2, help="Number of rows of the curve.")] = 40,
+    points: Annotated[int, Option(min=2)] = 40,
     picture: Picture = None,
     *,
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """Compare the growth of the number of scene classes with frames in random order."""
+    """Compare the growth of the number of scene classes with frames in random order.
+
+    Parameters
+    ----------
+    points
+        Number of rows of the curve.
+    """
     from sgstore.testsets.coverage import growth
 
     (frames,) = scenes.of(ask, a, slots=scenes.slots)
@@ -232,29 +249,32 @@ def growth_(
 @coverage.command("combos")
 def combos_(
     a: A,
-    k: Annotated[int, Option("--k", min=1, help="Number of features in a combination.")] = 2,
-    by: Annotated[
-        str | None,
-        Option(
-            "--by", metavar="B", help="Reference: combinations that occur in B; by default all."
-        ),
-    ] = None,
+    k: Annotated[int, Option(min=1)] = 2,
+    by: str | None = None,
     abstraction: Abstraction = "RSV",
-    of_ego: Annotated[
-        bool, Option("--ego", help="Use only features of the ego and of its lanes.")
-    ] = False,
+    of_ego: Annotated[bool, Option("--ego")] = False,
     slots: Slots = None,
     missing: Missing = False,
     covered: Covered = False,
     picture: Picture = None,
-    top: Annotated[
-        int, Option("--top", min=2, help="Features in the picture, most gaps first.")
-    ] = 40,
+    top: Annotated[int, Option(min=2)] = 40,
     limit: Limit = None,
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """Count the combinations of k features, such as (car near ego), or of values of declared slots."""
+    """Count the combinations of k features, such as (car near ego), or of values of declared slots.
+
+    Parameters
+    ----------
+    k
+        Number of features in a combination.
+    by : B
+        Reference: combinations that occur in B; by default all.
+    of_ego
+        Use only features of the ego and of its lanes.
+    top
+        Features in the picture, most gaps first.
+    """
     from sgstore.testsets.coverage import combos
 
     if slots is not None:
@@ -282,22 +302,29 @@ def combos_(
 @coverage.command("sequences")
 def sequences_(
     a: A,
-    k: Annotated[int, Option("--k", min=1, help="Number of manoeuvres in a sequence.")] = 2,
-    by: Annotated[
-        str | None,
-        Option("--by", metavar="B", help="Reference: sequences that occur in B; by default all."),
-    ] = None,
+    k: Annotated[int, Option(min=1)] = 2,
+    by: str | None = None,
     manoeuvres: Manoeuvres = None,
     within: Within = None,
-    missing: Annotated[bool, Option("--missing", help="List the missing items.")] = False,
-    covered: Annotated[
-        bool, Option("--covered", help="List the covered items, with their first place.")
-    ] = False,
+    missing: bool = False,
+    covered: bool = False,
     limit: Limit = None,
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """Count the sequences of k manoeuvres, such as (car stops, ego stops)."""
+    """Count the sequences of k manoeuvres, such as (car stops, ego stops).
+
+    Parameters
+    ----------
+    k
+        Number of manoeuvres in a sequence.
+    by : B
+        Reference: sequences that occur in B; by default all.
+    missing
+        List the missing items.
+    covered
+        List the covered items, with their first place.
+    """
     from sgstore.testsets.coverage import manoeuvres_named, sequences
 
     named = manoeuvres_named(manoeuvres or ())
@@ -320,15 +347,10 @@ def within_seconds(text: str | None) -> float:
 @coverage.command("spec")
 def spec_(
     a: A,
-    query: Annotated[
-        str | None,
-        Argument(metavar="QUERY", help="'MATCH … RETURN a, b': each combination is a cell."),
-    ] = None,
+    query: Annotated[str | None, Argument()] = None,
     slots: Slots = None,
-    cells: Annotated[int, Option("--cells", min=0, help="Number of cells, if known.")] = 0,
-    by: Annotated[
-        str | None, Option("--by", metavar="B", help="Use the cells that occur in B.")
-    ] = None,
+    cells: Annotated[int, Option(min=0)] = 0,
+    by: str | None = None,
     missing: Missing = False,
     covered: Covered = False,
     picture: Picture = None,
@@ -336,7 +358,17 @@ def spec_(
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """Measure the coverage of a specification: value combinations of a query, or declared slots."""
+    """Measure the coverage of a specification: value combinations of a query, or declared slots.
+
+    Parameters
+    ----------
+    query : QUERY
+        'MATCH … RETURN a, b': each combination is a cell.
+    cells
+        Number of cells, if known.
+    by : B
+        Use the cells that occur in B.
+    """
     from sgstore.testsets.coverage import specification
 
     if (query is None) == (slots is None):
@@ -379,18 +411,28 @@ def windows_(
 @coverage.command("explain")
 def explain_(
     b: B,
-    versus: Annotated[str, Option("--vs", metavar="A", help="Frames to compare with, like B.")],
+    versus: Annotated[str, Option("--vs")],
     abstraction: Abstraction = "RSV",
-    tree: Annotated[
-        bool, Option("--tree", help="Print a decision tree of a few questions instead.")
-    ] = False,
-    depth: Annotated[int, Option("--depth", min=1, max=10, help="Maximum questions.")] = 4,
-    frames: Annotated[bool, Option("--frames", help="Weight classes by their frames.")] = False,
+    tree: bool = False,
+    depth: Annotated[int, Option(min=1, max=10)] = 4,
+    frames: bool = False,
     limit: Limit = None,
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """Explain how the scenes of B differ from those of A: the features that differ most."""
+    """Explain how the scenes of B differ from those of A: the features that differ most.
+
+    Parameters
+    ----------
+    versus : A
+        Frames to compare with, like B.
+    tree
+        Print a decision tree of a few questions instead.
+    depth
+        Maximum questions.
+    frames
+        Weight classes by their frames.
+    """
     from sgstore.testsets.coverage import explain
 
     ours, theirs = WindowOptions(abstraction).of(ask, b, versus)
@@ -402,27 +444,31 @@ def explain_(
 
 @coverage.command("failures")
 def failures_(
-    train: Annotated[str, Option("--train", metavar="A", help="Training frames.")],
-    test: Annotated[str, Option("--test", metavar="B", help="Test frames.")],
-    outcomes: Annotated[
-        Path,
-        Option(
-            "--outcomes",
-            metavar="FILE",
-            help="CSV: frame (or town, filename), and failed, or error, or label and pred.",
-        ),
-    ],
-    threshold: Annotated[
-        str | None,
-        Option("--threshold", help="Errors above it are failures.", show_default="5/140, as S3C"),
-    ] = None,
-    novel: Annotated[bool, Option("--novel", help="List the novel failures.")] = False,
+    train: Annotated[str, Option()],
+    test: Annotated[str, Option()],
+    outcomes: Annotated[Path, Option()],
+    threshold: Annotated[str | None, Option(show_default="5/140, as S3C")] = None,
+    novel: bool = False,
     limit: Limit = None,
     *,
     windows: WindowOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """List failures of a system in novel scenes, and failures that coverage would have predicted (S3C)."""
+    """List failures of a system in novel scenes, and failures that coverage would have predicted (S3C).
+
+    Parameters
+    ----------
+    train : A
+        Training frames.
+    test : B
+        Test frames.
+    outcomes : FILE
+        CSV: frame (or town, filename), and failed, or error, or label and pred.
+    threshold
+        Errors above it are failures.
+    novel
+        List the novel failures.
+    """
     from sgstore.testsets.coverage import S3C_THRESHOLD, failures, read_outcomes
 
     limits = S3C_THRESHOLD if threshold is None else _fraction(threshold)

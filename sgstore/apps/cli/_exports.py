@@ -42,63 +42,43 @@ verbs = Verbs()
 
 @dataclass(frozen=True)
 class ClipOptions:
-    """Command line options for the content of exported clips."""
+    """Command line options for the content of exported clips.
 
-    before: Annotated[
-        str, Option("--before", metavar="TIME", help="Time before each match: 2s, 500ms.")
-    ] = "2s"
-    after: Annotated[str, Option("--after", metavar="TIME", help="Time after each match.")] = "2s"
-    labels: Annotated[
-        list[str] | None,
-        Option(
-            "--label",
-            metavar="NAME=TEXT",
-            help="A value for each frame: an expression, or a query that is true where it matches.",
-        ),
-    ] = None
-    with_graph: Annotated[
-        bool,
-        Option(
-            "--with-graph",
-            help="mcap: include the scene graphs, as JSON and as drawings.",
-        ),
-    ] = False
-    mounts: Annotated[
-        list[str] | None,
-        Option(
-            "--mount",
-            metavar="AXES=X,Y,Z[,YAW]",
-            help="mcap, rrd, with graphs: where a sensor sits on the ego, by the frame_id of its"
-            " messages; m, degrees; repeatable.",
-        ),
-    ] = None
-    rebase_context: Annotated[
-        bool,
-        Option(
-            "--rebase-context",
-            help="mcap: move static messages, such as the map, to the start of each clip.",
-        ),
-    ] = False
-    abstraction: Annotated[
-        str,
-        Option("--abstraction", help="nx, pyg, s3c: abstraction of the graphs."),
-    ] = ""
-    graphml: Annotated[
-        bool,
-        Option("--graphml", help="nx: also write each frame as GraphML, for Gephi."),
-    ] = False
-    channels: Annotated[
-        list[str] | None,
-        Option(
-            "--channel",
-            metavar="TOPIC",
-            help="frames: use only this sensor; repeatable.",
-        ),
-    ] = None
-    clouds: Annotated[
-        Literal["pcd", "npy", "bin"],
-        Option("--clouds", help="frames: format of point clouds."),
-    ] = "pcd"
+    Parameters
+    ----------
+    before : TIME
+        Time before each match: 2s, 500ms.
+    after : TIME
+        Time after each match.
+    labels : NAME=TEXT
+        A value for each frame: an expression, or a query that is true where it matches.
+    with_graph
+        mcap: include the scene graphs, as JSON and as drawings.
+    mounts : AXES=X,Y,Z[,YAW]
+        mcap, rrd, with graphs: where a sensor sits on the ego, by the frame_id of its messages;
+        m, degrees; repeatable.
+    rebase_context
+        mcap: move static messages, such as the map, to the start of each clip.
+    abstraction
+        nx, pyg, s3c: abstraction of the graphs.
+    graphml
+        nx: also write each frame as GraphML, for Gephi.
+    channels : TOPIC
+        frames: use only this sensor; repeatable.
+    clouds
+        frames: format of point clouds.
+    """
+
+    before: str = "2s"
+    after: str = "2s"
+    labels: Annotated[list[str] | None, Option("--label")] = None
+    with_graph: bool = False
+    mounts: Annotated[list[str] | None, Option("--mount")] = None
+    rebase_context: bool = False
+    abstraction: str = ""
+    graphml: bool = False
+    channels: Annotated[list[str] | None, Option("--channel")] = None
+    clouds: Literal["pcd", "npy", "bin"] = "pcd"
 
     def order(self, store: Store, clips: Sequence[Clip], **about: Any) -> Export:
         """Return an export of clips from a store, with the settings of the command line."""
@@ -122,28 +102,10 @@ class ClipOptions:
 def export(
     store: StorePath,
     question: Question,
-    to: Annotated[
-        Path,
-        Option("--to", metavar="DIR", help="Folder to write; no file is overwritten."),
-    ] = Path("clips"),
-    frames: Annotated[
-        Path | None,
-        Option("--frames", help="Instead of a query: a file with a FRAME a line; - is stdin."),
-    ] = None,
-    lock: Annotated[
-        Path | None,
-        Option(
-            "--lock", metavar="FILE", help="Instead of a query: each case of a lock, a clip each."
-        ),
-    ] = None,
-    form: Annotated[
-        str,
-        Option(
-            "--format",
-            help="mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, or that of a package.",
-            autocompletion=completion.formats,
-        ),
-    ] = "mcap",
+    to: Path = Path("clips"),
+    frames: Path | None = None,
+    lock: Path | None = None,
+    form: Annotated[str, Option("--format", autocompletion=completion.formats)] = "mcap",
     as_json: AsJson = False,
     *,
     clip: ClipOptions,
@@ -155,6 +117,17 @@ def export(
     again (xosc), labels (openlabel), recordings for Rerun (rrd), graphs for networkx (nx), PyTorch
     Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s) in the query wins over
     --before and --after.
+
+    Parameters
+    ----------
+    to : DIR
+        Folder to write; no file is overwritten.
+    frames
+        Instead of a query: a file with a FRAME a line; - is stdin.
+    lock : FILE
+        Instead of a query: each case of a lock, a clip each.
+    form
+        mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, or that of a package.
     """
     from sgstore.exporters import (
         check_folder,
@@ -227,22 +200,8 @@ def _clips(
 def shrink(
     store: StorePath,
     question: Question,
-    clip: Annotated[
-        str | None,
-        Option(
-            "--clip",
-            metavar="CLIP",
-            help="A clip to cut: TRACE@12s..18s or TRACE#120..180; by default every whole trace.",
-        ),
-    ] = None,
-    to: Annotated[
-        Path | None,
-        Option(
-            "--to",
-            metavar="DIR",
-            help="Folder for the clips, with the original messages; existing files are not overwritten.",
-        ),
-    ] = None,
+    clip: str | None = None,
+    to: Path | None = None,
     *,
     out: PrintedRows,
     bounds: QueryLimits,
@@ -251,6 +210,13 @@ def shrink(
 
     One row for each trace, and for each check. What is cut out is asked as if it were the
     whole recording.
+
+    Parameters
+    ----------
+    clip : CLIP
+        A clip to cut: TRACE@12s..18s or TRACE#120..180; by default every whole trace.
+    to : DIR
+        Folder for the clips, with the original messages; existing files are not overwritten.
     """
     from sgstore.exporters import check_folder
     from sgstore.testsets.diff import has_checks
@@ -301,31 +267,33 @@ def _cut_out(
 
 @dataclass(frozen=True)
 class DrawOptions:
-    """Command line options for drawing a frame or an animation."""
+    """Command line options for drawing a frame or an animation.
 
-    relations: Annotated[
-        Literal["ego", "all", "none"], Option("--relations", help="Edges to draw.")
-    ] = "ego"
-    camera: Annotated[
-        str | None,
-        Option("--camera", help="Channel of a picture to put beside it; 'none' for no picture."),
-    ] = None
-    radius: Annotated[
-        float | None, Option("--radius", help="Half the side of the window, in metres.")
-    ] = None
-    north_up: Annotated[
-        bool, Option("--north-up", help="Draw north up, not the ego's heading.")
-    ] = False
-    diagram: Annotated[bool, Option("--graph", help="Also draw the graph as nodes and edges.")] = (
-        False
-    )
-    names: Annotated[
-        Literal["number", "ident", "type"],
-        Option("--names", help="Labels of entities: number, id or type of the simulator."),
-    ] = "number"
-    fps: Annotated[
-        float, Option("--fps", min=0.1, max=50.0, help="Pictures per second of an animation.")
-    ] = 10.0
+    Parameters
+    ----------
+    relations
+        Edges to draw.
+    camera
+        Channel of a picture to put beside it; 'none' for no picture.
+    radius
+        Half the side of the window, in metres.
+    north_up
+        Draw north up, not the ego's heading.
+    diagram
+        Also draw the graph as nodes and edges.
+    names
+        Labels of entities: number, id or type of the simulator.
+    fps
+        Pictures per second of an animation.
+    """
+
+    relations: Literal["ego", "all", "none"] = "ego"
+    camera: str | None = None
+    radius: float | None = None
+    north_up: bool = False
+    diagram: Annotated[bool, Option("--graph")] = False
+    names: Literal["number", "ident", "type"] = "number"
+    fps: Annotated[float, Option(min=0.1, max=50.0)] = 10.0
 
     def options(self, matches: Matches | None) -> dict[str, Any]:
         """Return the drawing options as keyword arguments, without those of animations."""
@@ -337,29 +305,24 @@ class DrawOptions:
 @verbs.command(rich_help_panel=PANEL)
 def show(
     store: StorePath,
-    frame: Annotated[
-        str,
-        Argument(
-            metavar="FRAME",
-            help="A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s.",
-            autocompletion=completion.frames,
-        ),
-    ],
+    frame: Annotated[str, Argument(autocompletion=completion.frames)],
     question: Question,
     output: Annotated[
-        Path | None,
-        Option(
-            "--output",
-            "-o",
-            help="The picture: .png or .svg; of a clip: .gif, .mp4 or .webm.",
-            show_default="frame.png, clip.gif",
-        ),
+        Path | None, Option("--output", "-o", show_default="frame.png, clip.gif")
     ] = None,
     *,
     drawn: DrawOptions,
     bounds: QueryLimits,
 ) -> int:
-    """Draw a frame from above, or a clip as an animation; a QUERY marks its matches."""
+    """Draw a frame from above, or a clip as an animation; a QUERY marks its matches.
+
+    Parameters
+    ----------
+    frame : FRAME
+        A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s.
+    output
+        The picture: .png or .svg; of a clip: .gif, .mp4 or .webm.
+    """
     from sgstore.draw import draw_clip, draw_stored
     from sgstore.model.frame_ids import range_of
 

@@ -35,36 +35,18 @@ if TYPE_CHECKING:
 
 verbs = Verbs()
 
-SensorFile = Annotated[
-    Path | None,
-    Option("--sensors", help="With --serve: cameras for the ego of CARLA, as for record."),
-]
-
 
 @verbs.command(rich_help_panel=PANEL)
 def monitor(
-    trace: Annotated[
-        str, Argument(metavar="TRACE", help="A recording; or carla://HOST:PORT, until Ctrl-C.")
-    ],
-    files: Annotated[
-        list[Path] | None,
-        Argument(metavar="[FILE…]", help="Files of CHECK and MATCH statements; - reads stdin."),
-    ] = None,
-    ego: Annotated[
-        str,
-        Option("--ego", help="Ego: id, role or name; by default that of the recording."),
-    ] = "",
-    duration: Annotated[
-        str | None,
-        Option("--duration", metavar="TIME", help="Simulation time: 60s."),
-    ] = None,
-    require: Annotated[
-        bool, Option("--require", help="End with exit code 4 if a check is violated.")
-    ] = False,
+    trace: str,
+    files: Annotated[list[Path] | None, Argument()] = None,
+    ego: str = "",
+    duration: str | None = None,
+    require: bool = False,
     as_json: AsJson = False,
-    serve: Annotated[bool, Option("--serve", help="Show the running monitor on a page.")] = False,
-    port: Annotated[int, Option("--port", min=0, max=65535, help="Its port; 0: any free.")] = 0,
-    sensors: SensorFile = None,
+    serve: bool = False,
+    port: Annotated[int, Option(min=0, max=65535)] = 0,
+    sensors: Path | None = None,
     *,
     statements: Statements,
     reading: ReadingOptions,
@@ -74,6 +56,25 @@ def monitor(
     One line for each violation and each match, as soon as it is known; then the verdicts. The answers are
     those of check and find over a store. With --serve a page shows
     the scene, a recording in its own time; it stays until Ctrl-C.
+
+    Parameters
+    ----------
+    trace : TRACE
+        A recording; or carla://HOST:PORT, until Ctrl-C.
+    files : [FILE…]
+        Files of CHECK and MATCH statements; - reads stdin.
+    ego
+        Ego: id, role or name; by default that of the recording.
+    duration : TIME
+        Simulation time: 60s.
+    require
+        End with exit code 4 if a check is violated.
+    serve
+        Show the running monitor on a page.
+    port
+        Its port; 0: any free.
+    sensors
+        With --serve: cameras for the ego of CARLA, as for record.
     """
     from sgstore.lang.syntax import joined
     from sgstore.model.config import Config

@@ -10,7 +10,16 @@ from collections import Counter
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import typer
 from typer import Argument, Option
@@ -187,20 +196,28 @@ _hints = cache(partial(get_type_hints, include_extras=True))
 """Types of parameters or fields; many verbs share the dataclasses of options."""
 
 
+_DESCRIBED: Final = re.compile(r"^(\w+)(?: : (.+))?((?:\n +.+)+)", re.MULTILINE)
+"""Option in the docstring of a command: name, placeholder and help."""
+
+
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function with plain parameters for typer: each dataclass parameter is replaced by its fields."""
+    """Return a function with plain parameters for typer: each dataclass parameter is replaced by its fields.
+
+    Docstrings describe the options: the section *Parameters* has a name, a placeholder such as
+    ``TIME`` if the help needs one, and the help.
+    """
     hints = _hints(function)
     bundles: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
     parameters: list[inspect.Parameter] = []
     for one in inspect.signature(function).parameters.values():
         bundle = bundles.get(one.name)
         if bundle is None:
-            parameters.append(one.replace(annotation=hints[one.name], kind=one.KEYWORD_ONLY))
+            parameters.append(_described(one, hints[one.name], function))
             continue
         own = _hints(bundle)
         for field in fields(bundle):
             option = inspect.Parameter(field.name, one.KEYWORD_ONLY, default=field.default)
-            parameters.append(option.replace(annotation=own[field.name]))
+            parameters.append(_described(option, own[field.name], *bundle.__mro__))
 
     parameters += (
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=about)
@@ -214,9 +231,32 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
             values[name] = bundle(**{one.name: values.pop(one.name) for one in fields(bundle)})
         return function(**values)
 
+    verb.__doc__ = _sections(function)[0]
     verb.__annotations__ = {one.name: one.annotation for one in parameters}
     vars(verb)["__signature__"] = inspect.Signature(parameters)
     return verb
+
+
+def _sections(documented: Any) -> tuple[str, str]:
+    """Return the text of a docstring, and its section *Parameters*."""
+    text = inspect.cleandoc(documented.__doc__ or "")
+    about, _, parameters = text.partition("\n\nParameters\n----------\n")
+    return about, parameters.partition("\n\n")[0]
+
+
+def _described(parameter: inspect.Parameter, hint: Any, *documented: Any) -> inspect.Parameter:
+    """Return a parameter of a command with the placeholder and the help of the first docstring that has it."""
+    texts = (found for one in documented for found in _DESCRIBED.findall(_sections(one)[1]))
+    for name, placeholder, about in texts:
+        if name == parameter.name:
+            kind, *infos = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+            required = parameter.default is parameter.empty
+            flag = [f"--{name.replace('_', '-')}"] * (kind is bool)
+            info = infos[0] if infos else Argument() if required else Option(*flag)
+            info.help, info.metavar = " ".join(about.split()), placeholder or None
+            hint = Annotated[kind, info]
+            break
+    return parameter.replace(annotation=hint, kind=parameter.KEYWORD_ONLY)
 
 
 ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
@@ -338,11 +378,15 @@ Output = Annotated[
 
 @dataclass(frozen=True)
 class PrintedRows:
-    """Command line options for the format of result rows, with the methods that print the rows."""
+    """Command line options for the format of result rows, with the methods that print the rows.
 
-    form: Annotated[
-        Format, Option("--format", help="Format of the rows.", rich_help_panel=ROWS)
-    ] = Format.table
+    Parameters
+    ----------
+    form
+        Format of the rows.
+    """
+
+    form: Annotated[Format, Option("--format", rich_help_panel=ROWS)] = Format.table
     as_json: AsJson = False
 
     def __post_init__(self) -> None:
@@ -421,27 +465,18 @@ class RowOptions(PrintedRows):
 
 @dataclass(frozen=True)
 class QueryLimits:
-    """Command line options that limit the time and the temporary disk space of a query."""
+    """Command line options that limit the time and the temporary disk space of a query.
 
-    timeout: Annotated[
-        str | None,
-        Option(
-            "--timeout",
-            metavar="TIME",
-            help="Stop after this time, such as 30s.",
-            rich_help_panel=LIMITS,
-        ),
-    ] = None
-    max_spill: Annotated[
-        str | None,
-        Option(
-            "--max-spill",
-            metavar="SIZE",
-            help="Maximum disk space for data that exceeds memory: 500MB, 50GB.",
-            show_default="10GB",
-            rich_help_panel=LIMITS,
-        ),
-    ] = None
+    Parameters
+    ----------
+    timeout : TIME
+        Stop after this time, such as 30s.
+    max_spill : SIZE
+        Maximum disk space for data that exceeds memory: 500MB, 50GB.
+    """
+
+    timeout: Annotated[str | None, Option(rich_help_panel=LIMITS)] = None
+    max_spill: Annotated[str | None, Option(show_default="10GB", rich_help_panel=LIMITS)] = None
 
     def spill(self) -> int:
         """Start the time limit of the command, and return the limit for temporary disk space in bytes.
@@ -498,17 +533,20 @@ class Question:
 
 @dataclass(frozen=True)
 class Statements:
-    """Statements of a command: from files, from the library and from the command line."""
+    """Statements of a command: from files, from the library and from the command line.
+
+    Parameters
+    ----------
+    texts : TEXT
+        'CHECK ALWAYS …'; repeatable.
+    sgsm_compat
+        Violated if any prefix of a trace is, as in SGSM.
+    """
 
     names: PatternNames = None
-    texts: Annotated[
-        list[str] | None,
-        Option("--expression", "-e", metavar="TEXT", help="'CHECK ALWAYS …'; repeatable."),
-    ] = None
+    texts: Annotated[list[str] | None, Option("--expression", "-e")] = None
     parameters: Parameters = None
-    sgsm_compat: Annotated[
-        bool, Option("--sgsm-compat", help="Violated if any prefix of a trace is, as in SGSM.")
-    ] = False
+    sgsm_compat: bool = False
 
     def asked(self, files: Sequence[Path] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
         """Return the statements by source (file, library, command line), and the values of their parameters.
@@ -540,20 +578,18 @@ class Statements:
 
 @dataclass(frozen=True)
 class GraphOptions:
-    """Command line options that select the settings of the scene graphs: a file or a preset."""
+    """Command line options that select the settings of the scene graphs: a file or a preset.
 
-    config: Annotated[
-        Path | None, Option("--config", help="TOML file with settings of the scene graphs.")
-    ] = None
-    preset: Annotated[
-        str | None,
-        Option(
-            "--preset",
-            metavar="NAME",
-            help="Name of a preset; config --list shows them.",
-            autocompletion=completion.presets,
-        ),
-    ] = None
+    Parameters
+    ----------
+    config
+        TOML file with settings of the scene graphs.
+    preset : NAME
+        Name of a preset; config --list shows them.
+    """
+
+    config: Path | None = None
+    preset: Annotated[str | None, Option(autocompletion=completion.presets)] = None
 
     def settings(self) -> Config | None:
         """Return the scene graph settings of ``--config`` or ``--preset``.
@@ -572,15 +608,15 @@ class GraphOptions:
 
 @dataclass(frozen=True)
 class ReadingOptions(GraphOptions):
-    """Command line options for reading a recording: its road map, and the settings of the scene graphs."""
+    """Command line options for reading a recording: its road map, and the settings of the scene graphs.
 
-    road_map: Annotated[
-        Path | None,
-        Option(
-            "--map",
-            help="OpenDRIVE or Lanelet2 file, or a folder of them, for recordings without a map.",
-        ),
-    ] = None
+    Parameters
+    ----------
+    road_map
+        OpenDRIVE or Lanelet2 file, or a folder of them, for recordings without a map.
+    """
+
+    road_map: Annotated[Path | None, Option("--map")] = None
 
 
 _ENDINGS: Final = {

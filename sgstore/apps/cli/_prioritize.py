@@ -38,16 +38,8 @@ verbs = Verbs()
 @verbs.command(rich_help_panel=PANEL)
 def criticality(
     store: StorePath,
-    measures: Annotated[
-        list[str] | None,
-        Option(
-            "--measure", "-m", metavar="NAME", help="A measure: pet; by default all; repeatable."
-        ),
-    ] = None,
-    most: Annotated[
-        float | None,
-        Option("--most", metavar="X", help="Keep only pairs with a first measure of at most X."),
-    ] = None,
+    measures: Annotated[list[str] | None, Option("--measure", "-m")] = None,
+    most: float | None = None,
     *,
     out: RowOptions,
     bounds: QueryLimits,
@@ -56,6 +48,13 @@ def criticality(
 
     A row is the ego of a trace and one of those that it could meet: the view
     encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.
+
+    Parameters
+    ----------
+    measures : NAME
+        A measure: pet; by default all; repeatable.
+    most : X
+        Keep only pairs with a first measure of at most X.
     """
     from sgstore.model.criticality import RECORDED, recorded
     from sgstore.testsets.coverage import ChosenFrames, ReportTable
@@ -72,37 +71,29 @@ def criticality(
 
 @dataclass(frozen=True)
 class OrderOptions:
-    """Command line options for the order of test cases: its rule, and the unit (frame, clip or trace)."""
+    """Command line options for the order of test cases: its rule, and the unit (frame, clip or trace).
 
-    by: Annotated[
-        Literal["risk", "diverse", "both", "learned"],
-        Option(
-            "--by",
-            help="Order: most critical first, one of each class first, both, or most likely to fail first.",
-        ),
-    ] = "risk"
+    Parameters
+    ----------
+    by
+        Order: most critical first, one of each class first, both, or most likely to fail first.
+    measures : NAME
+        Rank by this measure of criticality, or by an expression, least first; may be repeated.
+    abstraction : NAME
+        Classes to distinguish: situations of the ego, or classes of an abstraction.
+    seed
+        Random seed.
+    """
+
+    by: Literal["risk", "diverse", "both", "learned"] = "risk"
     measures: Annotated[
-        list[str] | None,
-        Option(
-            "--measure",
-            "-m",
-            metavar="NAME",
-            help="Rank by this measure of criticality, or by an expression, least first; may be repeated.",
-            show_default="closing_time, ttc_mild",
-        ),
+        list[str] | None, Option("--measure", "-m", show_default="closing_time, ttc_mild")
     ] = None
     budget: Budget = ""
     unit: CaseUnit = "frame"
     clip: LongestClip = "2s"
-    abstraction: Annotated[
-        str,
-        Option(
-            "--abstraction",
-            metavar="NAME",
-            help="Classes to distinguish: situations of the ego, or classes of an abstraction.",
-        ),
-    ] = "situation"
-    seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
+    abstraction: str = "situation"
+    seed: Annotated[int, Option(min=0, max=(1 << 63) - 1)] = 0
 
     def spec(self) -> PrioritySpec:
         """Return the specification of a test case order from the command line options."""
@@ -128,36 +119,24 @@ class OrderOptions:
 
 @dataclass(frozen=True)
 class OutcomeOptions:
-    """Command line options for known test results, from which an order is learned or rated."""
+    """Command line options for known test results, from which an order is learned or rated.
 
-    outcomes: Annotated[
-        Path | None,
-        Option(
-            "--outcomes",
-            metavar="CSV",
-            help="Known outcomes, to measure how early failures come and to learn from.",
-        ),
-    ] = None
-    learn_outcomes: Annotated[
-        Path | None,
-        Option(
-            "--learn-outcomes",
-            metavar="CSV",
-            help="Outcomes to learn from; by default those of --outcomes.",
-        ),
-    ] = None
-    learn_from: Annotated[
-        Path | None,
-        Option(
-            "--learn-from",
-            metavar="STORE",
-            help="Store of the runs of --learn-outcomes; by default STORE.",
-        ),
-    ] = None
-    picture: Annotated[
-        Path | None,
-        Option("--picture", metavar="FILE", help="Draw the failures found: .png or .svg."),
-    ] = None
+    Parameters
+    ----------
+    outcomes : CSV
+        Known outcomes, to measure how early failures come and to learn from.
+    learn_outcomes : CSV
+        Outcomes to learn from; by default those of --outcomes.
+    learn_from : STORE
+        Store of the runs of --learn-outcomes; by default STORE.
+    picture : FILE
+        Draw the failures found: .png or .svg.
+    """
+
+    outcomes: Path | None = None
+    learn_outcomes: Path | None = None
+    learn_from: Path | None = None
+    picture: Path | None = None
 
     def check(self, by: str) -> None:
         """Raise an error for an option that has no effect without another one.
@@ -183,9 +162,7 @@ def prioritize(
     results: OutcomeOptions,
     query: QueryText = None,
     parameters: Parameters = None,
-    output: Annotated[
-        Path | None, Option("--output", "-o", metavar="FILE", help="Write a lock.")
-    ] = None,
+    output: Annotated[Path | None, Option("--output", "-o")] = None,
     no_payloads: NoPayloads = False,
     *,
     out: PrintedRows,
@@ -196,6 +173,11 @@ def prioritize(
     The risk of a case is the sum of its ranks by measures of criticality of the
     ego and others that move. With --by learned it is the probability that it
     fails, as the outcomes of other cases teach.
+
+    Parameters
+    ----------
+    output : FILE
+        Write a lock.
     """
     from sgstore.testsets.coverage import ChosenFrames, read_outcomes
     from sgstore.testsets.locks import ENDING

@@ -71,22 +71,13 @@ MaxRows = Annotated[int, Option("--max-rows", min=0, help="Maximum number of row
 def find(
     store: AskedPath,
     question: Question,
-    count: Annotated[
-        bool, Option("--count", help="Print only the number of distinct frames.")
-    ] = False,
-    explain: Annotated[
-        bool, Option("--explain", help="Print the stages of the query and its SQL.")
-    ] = False,
-    require: Annotated[
-        bool, Option("--require", help="End with exit code 4 without matches.")
-    ] = False,
+    count: bool = False,
+    explain: bool = False,
+    require: bool = False,
     safe: Safe = False,
     max_rows: MaxRows = 10_000,
     tables: With = None,
-    each_frame: Annotated[
-        bool,
-        Option("--rows", help="Print one row for each match and frame, always."),
-    ] = False,
+    each_frame: Annotated[bool, Option("--rows")] = False,
     *,
     whole: CollectionOptions,
     ask: AskOptions,
@@ -95,6 +86,17 @@ def find(
 
     One row a match: the frame, its time, and what each variable is bound to; or what RETURN asks for.
     Without RETURN, a terminal shows stretches of frames in which a match lasts.
+
+    Parameters
+    ----------
+    count
+        Print only the number of distinct frames.
+    explain
+        Print the stages of the query and its SQL.
+    require
+        End with exit code 4 without matches.
+    each_frame
+        Print one row for each match and frame, always.
     """
     text, values = question.asked()
     if (url := url_of(store)) is not None:
@@ -247,21 +249,11 @@ def why_not(
 def like(
     store: AskedPath,
     frame: FrameName,
-    ignore: Annotated[
-        list[str] | None,
-        Option("--ignore", metavar="NAME", help="Ignore a relation or a kind; repeatable."),
-    ] = None,
+    ignore: list[str] | None = None,
     abstraction: Abstraction = "RSV",
-    limit: Annotated[int, Option("--limit", min=1, help="Number of runs of frames.")] = 10,
-    every: Annotated[
-        bool,
-        Option(
-            "--all", help="Show all runs of a trace, not only the best, and those near the frame."
-        ),
-    ] = False,
-    pattern: Annotated[
-        bool, Option("--pattern", help="Print a pattern that describes the frame instead.")
-    ] = False,
+    limit: Annotated[int, Option(min=1)] = 10,
+    every: Annotated[bool, Option("--all")] = False,
+    pattern: bool = False,
     *,
     whole: CollectionOptions,
     out: RowOptions,
@@ -272,6 +264,17 @@ def like(
     One row for each trace: its best run of consecutive frames that are as like as each other. It says how
     many, how like, whether the graphs are the same, and what only the example has, or only they.
     Frames less than 5 s from the example are left out; --all takes them, and every run, too.
+
+    Parameters
+    ----------
+    ignore : NAME
+        Ignore a relation or a kind; repeatable.
+    limit
+        Number of runs of frames.
+    every
+        Show all runs of a trace, not only the best, and those near the frame.
+    pattern
+        Print a pattern that describes the frame instead.
     """
     opened = whole.opened_at(store, bounds)
     if pattern:
@@ -322,13 +325,19 @@ def _differing(features: dict[str, int]) -> str:
 
 @verbs.command(rich_help_panel=PANEL)
 def translate(
-    file: Annotated[Path, Argument(metavar="FILE", help="File to translate; - reads stdin.")],
-    language: Annotated[
-        Literal["sgl"], Option("--from", help="sgl: properties of SGSM, as Python.")
-    ] = "sgl",
+    file: Path,
+    language: Annotated[Literal["sgl"], Option("--from")] = "sgl",
     output: Output = None,
 ) -> int:
-    """Translate properties of other tools into the query language, without running any code of the file."""
+    """Translate properties of other tools into the query language, without running any code of the file.
+
+    Parameters
+    ----------
+    file : FILE
+        File to translate; - reads stdin.
+    language
+        sgl: properties of SGSM, as Python.
+    """
     from sgstore.lang.contrib.sgsm import translated
 
     write_text(translated(text_of(file)), output)
@@ -338,21 +347,12 @@ def translate(
 @verbs.command(rich_help_panel=PANEL)
 def sql(
     store: AskedPath,
-    statement: Annotated[
-        str | None, Argument(metavar="SQL", help="'SELECT … FROM frames, nodes, edges …'")
-    ] = None,
+    statement: Annotated[str | None, Argument()] = None,
     file: QueryFile = None,
     safe: Safe = False,
     max_rows: MaxRows = 10_000,
     tables: With = None,
-    each: Annotated[
-        bool,
-        Option(
-            "--each",
-            help="Run it in each bundle of a collection, with a column 'bundle'.",
-            rich_help_panel=COLLECTIONS,
-        ),
-    ] = False,
+    each: Annotated[bool, Option("--each", rich_help_panel=COLLECTIONS)] = False,
     *,
     whole: CollectionOptions,
     ask: AskOptions,
@@ -361,6 +361,13 @@ def sql(
 
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
     What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …').
+
+    Parameters
+    ----------
+    statement : SQL
+        'SELECT … FROM frames, nodes, edges …'
+    each
+        Run it in each bundle of a collection, with a column 'bundle'.
     """
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask, tables, safe=safe) as opened:
@@ -469,15 +476,18 @@ def _write_patterns(found: list[NamedPattern], out: RowOptions) -> None:
 
 @library.command("search")
 def search_patterns(
-    words: Annotated[
-        list[str],
-        Argument(metavar="WORD…", help="Words, in any order: pedestrian crossing."),
-    ],
+    words: list[str],
     kinds: PatternKinds = None,
     *,
     out: RowOptions,
 ) -> int:
-    """Search the patterns of the library by words, with the best match first."""
+    """Search the patterns of the library by words, with the best match first.
+
+    Parameters
+    ----------
+    words : WORD…
+        Words, in any order: pedestrian crossing.
+    """
     from sgstore.lang.library import search
 
     _write_patterns(search(" ".join(words), [*(kinds or ())]), out)
@@ -504,32 +514,30 @@ def show_pattern(name: LibraryName, as_json: AsJson = False, output: Output = No
 def run_pattern(
     store: StorePath,
     name: LibraryName,
-    chosen: Annotated[
-        list[str] | None,
-        Argument(metavar="NAME=VALUE", help="Parameters of the pattern, such as within=2s."),
-    ] = None,
-    clips: Annotated[
-        bool, Option("--clips", help="Print clips (trace, start_ns, end_ns) in log time.")
-    ] = False,
-    before: Annotated[
-        str, Option("--before", metavar="TIME", help="Time before each match, with --clips.")
-    ] = "0s",
-    after: Annotated[
-        str, Option("--after", metavar="TIME", help="Time after each match, with --clips.")
-    ] = "0s",
-    require: Annotated[
-        bool,
-        Option(
-            "--require",
-            help="End with exit code 4 without matches, or if the property is violated.",
-        ),
-    ] = False,
+    chosen: Annotated[list[str] | None, Argument()] = None,
+    clips: bool = False,
+    before: str = "0s",
+    after: str = "0s",
+    require: bool = False,
     *,
     ask: AskOptions,
 ) -> int:
     """Find a pattern of the library in a store: times of the matches, and their entities.
 
     Of a property: whether each trace keeps it, and where it does not.
+
+    Parameters
+    ----------
+    chosen : NAME=VALUE
+        Parameters of the pattern, such as within=2s.
+    clips
+        Print clips (trace, start_ns, end_ns) in log time.
+    before : TIME
+        Time before each match, with --clips.
+    after : TIME
+        Time after each match, with --clips.
+    require
+        End with exit code 4 without matches, or if the property is violated.
     """
     from sgstore.lang.library import pattern_named
 

@@ -58,37 +58,34 @@ def ingest(
     store: StorePath,
     traces: Recordings,
     reading: ReadingOptions,
-    ego: Annotated[
-        list[str] | None,
-        Option(
-            "--ego",
-            help="Id, role or name of the ego; repeatable, each makes a trace; all: every vehicle.",
-        ),
-    ] = None,
+    ego: list[str] | None = None,
     jobs: Jobs = 1,
-    since: Annotated[
-        str | None, Option("--since", help="Start at this time of a recording: 10s.")
-    ] = None,
-    until: Annotated[str | None, Option("--until", help="Stop at this time: 1min.")] = None,
-    rate: Annotated[
-        float | None, Option("--rate", min=0, help="Frames per second to keep; 0: all.")
-    ] = None,
+    since: str | None = None,
+    until: str | None = None,
+    rate: Annotated[float | None, Option(min=0)] = None,
     force: Force = False,
-    dry_run: Annotated[
-        bool, Option("--dry-run", help="Report the planned work without doing it.")
-    ] = False,
-    shard: Annotated[
-        str | None,
-        Option(
-            "--shard",
-            metavar="I/N",
-            help="Into a collection: land share I of N of the recordings; then 'collection commit'.",
-        ),
-    ] = None,
+    dry_run: bool = False,
+    shard: str | None = None,
     *,
     out: PrintedRows,
 ) -> int:
-    """Read recordings into a store; recordings that it already contains are skipped."""
+    """Read recordings into a store; recordings that it already contains are skipped.
+
+    Parameters
+    ----------
+    ego
+        Id, role or name of the ego; repeatable, each makes a trace; all: every vehicle.
+    since
+        Start at this time of a recording: 10s.
+    until
+        Stop at this time: 1min.
+    rate
+        Frames per second to keep; 0: all.
+    dry_run
+        Report the planned work without doing it.
+    shard : I/N
+        Into a collection: land share I of N of the recordings; then 'collection commit'.
+    """
     from sgstore.apps.cli._output import ingest_bar
     from sgstore.ingest import ingest as ingest_traces
     from sgstore.ingest import recordings
@@ -207,18 +204,17 @@ def _outcome_row(outcome: TraceOutcome) -> tuple[Any, ...]:
 @verbs.command(rich_help_panel=PANEL)
 def info(
     store: AskedPath,
-    traces: Annotated[
-        list[str] | None,
-        Option(
-            "--trace",
-            help="Show details of a trace, by name, id, or start of one; repeatable.",
-            autocompletion=completion.traces,
-        ),
-    ] = None,
+    traces: Annotated[list[str] | None, Option("--trace", autocompletion=completion.traces)] = None,
     *,
     out: PrintedRows,
 ) -> int:
-    """List the traces of a store or a collection, or describe a trace in full."""
+    """List the traces of a store or a collection, or describe a trace in full.
+
+    Parameters
+    ----------
+    traces
+        Show details of a trace, by name, id, or start of one; repeatable.
+    """
     from sgstore.model.scope import scope_of
 
     if (url := url_of(store)) is not None:
@@ -327,35 +323,36 @@ PORT: Final = 2000
 
 @verbs.command(rich_help_panel=PANEL)
 def record(
-    output: Annotated[Path, Argument(metavar="FILE", help="Recording to write: a new FILE.mcap.")],
-    host: Annotated[str, Option("--host", help="Host of the CARLA server.")] = "localhost",
-    port: Annotated[int, Option("--port", help="Its port.")] = PORT,
-    ego: Annotated[
-        str, Option("--ego", help="Id or role name of the ego; by default hero, ego_vehicle.")
-    ] = "",
-    sensors: Annotated[
-        Path | None,
-        Option("--sensors", help="A TOML file with a table [[sensor]] for each sensor."),
-    ] = None,
-    duration: Annotated[
-        str | None,
-        Option("--duration", metavar="TIME", help="Simulation time: 60s; by default until Ctrl-C."),
-    ] = None,
-    step: Annotated[
-        str | None,
-        Option(
-            "--step", metavar="TIME", help="Drive the world in steps: 50ms; by default follow it."
-        ),
-    ] = None,
-    scenery: Annotated[
-        bool,
-        Option(
-            "--scenery/--no-scenery",
-            help="Include buildings, poles and other objects of the level.",
-        ),
-    ] = True,
+    output: Path,
+    host: str = "localhost",
+    port: int = PORT,
+    ego: str = "",
+    sensors: Path | None = None,
+    duration: str | None = None,
+    step: str | None = None,
+    scenery: Annotated[bool, Option("--scenery/--no-scenery")] = True,
 ) -> int:
-    """Record a running CARLA into an MCAP file: frames, road map and sensors of the ego."""
+    """Record a running CARLA into an MCAP file: frames, road map and sensors of the ego.
+
+    Parameters
+    ----------
+    output : FILE
+        Recording to write: a new FILE.mcap.
+    host
+        Host of the CARLA server.
+    port
+        Its port.
+    ego
+        Id or role name of the ego; by default hero, ego_vehicle.
+    sensors
+        A TOML file with a table [[sensor]] for each sensor.
+    duration : TIME
+        Simulation time: 60s; by default until Ctrl-C.
+    step : TIME
+        Drive the world in steps: 50ms; by default follow it.
+    scenery
+        Include buildings, poles and other objects of the level.
+    """
     from sgstore.apps.record import record as record_world
     from sgstore.readers import connect, load_sensors
 
@@ -399,65 +396,56 @@ def _counter() -> Generator[Callable[[int, float], None] | None]:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Command line options that map labels of imported graphs to kinds and relations."""
+    """Command line options that map labels of imported graphs to kinds and relations.
 
-    kind: Annotated[
-        list[str] | None,
-        Option("--kind", metavar="LABEL=KIND", help="Kind of a label; repeatable."),
-    ] = None
-    relation: Annotated[
-        list[str] | None,
-        Option("--relation", metavar="NAME=RELATION", help="Relation for a name; repeatable."),
-    ] = None
-    unknown_as: Annotated[
-        str,
-        Option(
-            "--unknown-as",
-            metavar="KIND",
-            help="Import unknown labels as this kind ('other': unknown kind) and skip unknown relations; "
-            "'own': use labels as kinds and names as relations.",
-        ),
-    ] = ""
-    new_kind: Annotated[
-        list[str] | None,
-        Option("--new-kind", metavar="KIND", help="Additional kind for --kind; repeatable."),
-    ] = None
-    answers: Annotated[
-        list[str] | None,
-        Option(
-            "--answers",
-            metavar="RELATION",
-            help="Relation that the graphs can contain, even if it never occurs; repeatable.",
-        ),
-    ] = None
-    period: Annotated[
-        str,
-        Option("--period", metavar="TIME", help="Time between frames, if the file has no times."),
-    ] = "1s"
+    Parameters
+    ----------
+    kind : LABEL=KIND
+        Kind of a label; repeatable.
+    relation : NAME=RELATION
+        Relation for a name; repeatable.
+    unknown_as : KIND
+        Import unknown labels as this kind ('other': unknown kind) and skip unknown relations;
+        'own': use labels as kinds and names as relations.
+    new_kind : KIND
+        Additional kind for --kind; repeatable.
+    answers : RELATION
+        Relation that the graphs can contain, even if it never occurs; repeatable.
+    period : TIME
+        Time between frames, if the file has no times.
+    """
+
+    kind: list[str] | None = None
+    relation: list[str] | None = None
+    unknown_as: str = ""
+    new_kind: list[str] | None = None
+    answers: list[str] | None = None
+    period: str = "1s"
 
 
 @verbs.command("import", rich_help_panel=PANEL)
 def import_(
     store: StorePath,
-    files: Annotated[
-        list[Path],
-        Argument(metavar="FILE…", help="Files of graphs, each a trace; .xz, .gz and .bz2 too."),
-    ],
-    form_of_graphs: Annotated[
-        Literal["s3c", "nodelink", "csv", "openlabel"],
-        Option(
-            "--format",
-            help="s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx;"
-            " openlabel: ASAM OpenLABEL 1.0.",
-        ),
-    ],
+    files: list[Path],
+    form_of_graphs: Annotated[Literal["s3c", "nodelink", "csv", "openlabel"], Option("--format")],
     force: Force = False,
-    form: Annotated[Format, Option("--rows", help="Format of the rows.")] = Format.table,
+    form: Annotated[Format, Option("--rows")] = Format.table,
     as_json: AsJson = False,
     *,
     meaning: ImportOptions,
 ) -> int:
-    """Import graphs of other tools into a store: each graph becomes a frame."""
+    """Import graphs of other tools into a store: each graph becomes a frame.
+
+    Parameters
+    ----------
+    files : FILE…
+        Files of graphs, each a trace; .xz, .gz and .bz2 too.
+    form_of_graphs
+        s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx; openlabel:
+        ASAM OpenLABEL 1.0.
+    form
+        Format of the rows.
+    """
     from sgstore.model.vocabulary import relation_named
     from sgstore.pipeline.importing import Words, import_graphs
 

@@ -28,22 +28,28 @@ verbs = Verbs()
 @verbs.command(rich_help_panel=PANEL)
 def serve(
     store: StorePath,
-    compare: Annotated[
-        Path | None, Option("--compare", metavar="STORE", help="Second store to show side by side.")
-    ] = None,
-    write_to: Annotated[
-        Path | None,
-        Option("--write-to", metavar="DIR", help="Let the page write locks and clips below DIR."),
-    ] = None,
-    host: Annotated[
-        str, Option("--host", help="Address to listen on; by default only this machine.")
-    ] = "127.0.0.1",
-    port: Annotated[int, Option("--port", min=0, max=65535, help="Port; 0: any free.")] = 0,
-    browse: Annotated[bool, Option("--open/--no-open", help="Open the page in a browser.")] = False,
+    compare: Path | None = None,
+    write_to: Path | None = None,
+    host: str = "127.0.0.1",
+    port: Annotated[int, Option(min=0, max=65535)] = 0,
+    browse: Annotated[bool, Option("--open/--no-open")] = False,
 ) -> int:
     """Explore a store in a browser: search, view matches, and see why a frame matches or not.
 
     Prints an address with a token, for this machine alone. Needs the extra ui. Ends with Ctrl-C.
+
+    Parameters
+    ----------
+    compare : STORE
+        Second store to show side by side.
+    write_to : DIR
+        Let the page write locks and clips below DIR.
+    host
+        Address to listen on; by default only this machine.
+    port
+        Port; 0: any free.
+    browse
+        Open the page in a browser.
     """
     from sgstore.apps.explorer import serve as run
 
@@ -72,25 +78,29 @@ def serve(
 def report(
     store: StorePath,
     question: Question,
-    output: Annotated[
-        Path, Option("--output", "-o", help="The page: FILE.html.", show_default="report.html")
-    ] = Path("report.html"),
-    limit: Annotated[
-        int, Option("--limit", min=1, help="Maximum number of matches or violations in the page.")
-    ] = 100,
-    around: Annotated[
-        str, Option("--around", metavar="TIME", help="Time before and after each match.")
-    ] = "2s",
-    pictures: Annotated[
-        bool,
-        Option("--pictures/--no-pictures", help="Add a camera picture for each second of a match."),
-    ] = False,
+    output: Annotated[Path, Option("--output", "-o", show_default="report.html")] = Path(
+        "report.html"
+    ),
+    limit: Annotated[int, Option(min=1)] = 100,
+    around: str = "2s",
+    pictures: Annotated[bool, Option("--pictures/--no-pictures")] = False,
     *,
     bounds: QueryLimits,
 ) -> int:
     """Write the matches of a query as one HTML page that works without a server or network.
 
     Of checks it shows the violations.
+
+    Parameters
+    ----------
+    output
+        The page: FILE.html.
+    limit
+        Maximum number of matches or violations in the page.
+    around : TIME
+        Time before and after each match.
+    pictures
+        Add a camera picture for each second of a match.
     """
     from sgstore.apps.report import report as write
 
@@ -115,20 +125,24 @@ def report(
 @verbs.command(rich_help_panel="Questions")
 def mcp(
     store: StorePath,
-    write_to: Annotated[
-        Path | None,
-        Option("--write-to", metavar="DIR", help="Allow the export of clips to this folder."),
-    ] = None,
-    question_timeout: Annotated[
-        str, Option("--timeout", metavar="TIME", help="Maximum time for a query.")
-    ] = "10s",
-    max_rows: Annotated[int, Option("--max-rows", min=1, help="Maximum rows of an answer.")] = 1000,
+    write_to: Path | None = None,
+    question_timeout: Annotated[str, Option("--timeout")] = "10s",
+    max_rows: Annotated[int, Option(min=1)] = 1000,
     tables: With = None,
 ) -> None:
     """Serve a store to an AI assistant by the Model Context Protocol, on stdin and stdout.
 
     For the settings of an assistant: {"command": "sgstore", "args": ["mcp", "/path/to/drives.sgstore"]}.
     Queries run in a separate process that sees nothing but the store; files are written with --write-to only.
+
+    Parameters
+    ----------
+    write_to : DIR
+        Allow the export of clips to this folder.
+    question_timeout : TIME
+        Maximum time for a query.
+    max_rows
+        Maximum rows of an answer.
     """
     try:
         from sgstore.apps.assistant import StoreTools, serve

@@ -41,11 +41,17 @@ verbs = Verbs()
 @verbs.command(rich_help_panel=PANEL)
 def verify(
     store: StorePath,
-    payloads: Annotated[bool, Option("--payloads", help="Also hash the recordings again.")] = False,
+    payloads: bool = False,
     *,
     out: PrintedRows,
 ) -> int:
-    """Verify that a store has not changed since it was published; list every fault."""
+    """Verify that a store has not changed since it was published; list every fault.
+
+    Parameters
+    ----------
+    payloads
+        Also hash the recordings again.
+    """
     from sgstore.store import verify_file
 
     found = verify_file(store, recordings=payloads)
@@ -62,21 +68,20 @@ def verify(
 @verbs.command(rich_help_panel=PANEL)
 def remove(
     store: StorePath,
-    traces: Annotated[
-        list[str] | None,
-        Argument(
-            metavar="TRACE…",
-            help="Names, ids, or beginnings of names.",
-            autocompletion=completion.traces,
-        ),
-    ] = None,
-    compact: Annotated[
-        bool, Option("--compact", help="Rewrite the file to free its space; also without a TRACE.")
-    ] = False,
+    traces: Annotated[list[str] | None, Argument(autocompletion=completion.traces)] = None,
+    compact: bool = False,
     *,
     out: PrintedRows,
 ) -> int:
-    """Remove traces from a store, all or none; the recordings stay."""
+    """Remove traces from a store, all or none; the recordings stay.
+
+    Parameters
+    ----------
+    traces : TRACE…
+        Names, ids, or beginnings of names.
+    compact
+        Rewrite the file to free its space; also without a TRACE.
+    """
     from sgstore.store import StoreFile
 
     if not traces and not compact:
@@ -96,20 +101,18 @@ def remove(
 def rebuild(
     store: StorePath,
     look_in: LookIn = None,
-    leave_out: Annotated[
-        list[str] | None,
-        Option(
-            "--leave-out",
-            metavar="TRACE",
-            help="Trace to leave out, if it cannot be rebuilt; repeatable.",
-            autocompletion=completion.traces,
-        ),
-    ] = None,
+    leave_out: Annotated[list[str] | None, Option(autocompletion=completion.traces)] = None,
     jobs: Jobs = 1,
     *,
     out: PrintedRows,
 ) -> None:
-    """Rebuild a store from its recordings; the old one stays until the new one is complete."""
+    """Rebuild a store from its recordings; the old one stays until the new one is complete.
+
+    Parameters
+    ----------
+    leave_out : TRACE
+        Trace to leave out, if it cannot be rebuilt; repeatable.
+    """
     from sgstore.apps.cli._output import ingest_bar
     from sgstore.pipeline.rebuild import rebuild as make_anew
 
@@ -128,29 +131,28 @@ def rebuild(
 @verbs.command(rich_help_panel=PANEL)
 def derive(
     store: StorePath,
-    name: Annotated[
-        str | None, Option("--as", metavar="NAME", help="Name of the set: USING ABSTRACTION NAME.")
-    ] = None,
-    abstraction: Annotated[
-        str | None,
-        Option(
-            "--abstraction",
-            metavar="NAME",
-            help="Abstraction whose graphs to store, such as roadscene2vec.",
-        ),
-    ] = None,
+    name: Annotated[str | None, Option("--as")] = None,
+    abstraction: str | None = None,
     trace: Traces = None,
-    force: Annotated[
-        bool, Option("--force", help="Replace a set of this name with other settings.")
-    ] = False,
-    remove: Annotated[
-        str | None, Option("--remove", metavar="NAME", help="Delete a set instead.")
-    ] = None,
+    force: bool = False,
+    remove: str | None = None,
     *,
     graphs: GraphOptions,
     out: PrintedRows,
 ) -> int:
-    """Derive another set of relations from the stored states; without --as, list the sets."""
+    """Derive another set of relations from the stored states; without --as, list the sets.
+
+    Parameters
+    ----------
+    name : NAME
+        Name of the set: USING ABSTRACTION NAME.
+    abstraction : NAME
+        Abstraction whose graphs to store, such as roadscene2vec.
+    force
+        Replace a set of this name with other settings.
+    remove : NAME
+        Delete a set instead.
+    """
     from sgstore.model.config import Config
     from sgstore.pipeline.derive import derive as derive_set
     from sgstore.pipeline.derive import keep_abstraction
@@ -188,20 +190,20 @@ def _write_derived(done: list[Derivation], out: PrintedRows) -> int:
 
 @verbs.command("map", rich_help_panel=PANEL)
 def map_(
-    file: Annotated[
-        Path,
-        Argument(
-            metavar="FILE",
-            help="OpenDRIVE (.xodr), Lanelet2 (.osm), or a recording that carries roads.",
-        ),
-    ],
-    picture: Annotated[
-        Path | None, Option("--output", "-o", help="Picture to draw, north up: .png or .svg.")
-    ] = None,
+    file: Path,
+    picture: Annotated[Path | None, Option("--output", "-o")] = None,
     *,
     out: PrintedRows,
 ) -> int:
-    """Summarize a road map: lanes by type, junctions, signals, and problems."""
+    """Summarize a road map: lanes by type, junctions, signals, and problems.
+
+    Parameters
+    ----------
+    file : FILE
+        OpenDRIVE (.xodr), Lanelet2 (.osm), or a recording that carries roads.
+    picture
+        Picture to draw, north up: .png or .svg.
+    """
     from sgstore.maps.roads import summary
 
     road_map = _road_map(file)
@@ -249,22 +251,21 @@ def _road_map(file: Path) -> RoadMap:
 def payload(
     store: StorePath,
     frame: FrameName,
-    channel: Annotated[
-        str | None,
-        Argument(
-            metavar="CHANNEL",
-            help="Topic; by default list the topics.",
-            autocompletion=completion.channels,
-        ),
-    ] = None,
+    channel: Annotated[str | None, Argument(autocompletion=completion.channels)] = None,
     output: Output = None,
-    message: Annotated[
-        bool, Option("--message", help="Write the message as recorded, not the picture in it.")
-    ] = False,
+    message: bool = False,
     *,
     out: PrintedRows,
 ) -> int:
-    """Fetch the sensor data of a frame: a picture, a video up to the frame, or the message."""
+    """Fetch the sensor data of a frame: a picture, a video up to the frame, or the message.
+
+    Parameters
+    ----------
+    channel : CHANNEL
+        Topic; by default list the topics.
+    message
+        Write the message as recorded, not the picture in it.
+    """
     from sgstore.store import StoreFile
 
     file = StoreFile(store)
@@ -303,27 +304,26 @@ def _list_channels(file: StoreFile, frame: str, out: PrintedRows) -> None:
 
 @verbs.command(rich_help_panel=PANEL)
 def config(
-    file: Annotated[
-        Path | None,
-        Argument(metavar="FILE", help="TOML file to check and print in full."),
-    ] = None,
-    preset: Annotated[
-        str | None,
-        Option(
-            "--preset",
-            metavar="NAME",
-            help="Print the settings of this preset.",
-            autocompletion=completion.presets,
-        ),
-    ] = None,
-    every: Annotated[bool, Option("--list", help="List the presets.")] = False,
-    page: Annotated[
-        bool, Option("--page", help="Print the page docs/parameters.md instead.")
-    ] = False,
+    file: Annotated[Path | None, Argument()] = None,
+    preset: Annotated[str | None, Option(autocompletion=completion.presets)] = None,
+    every: Annotated[bool, Option("--list")] = False,
+    page: bool = False,
     *,
     out: PrintedRows,
 ) -> None:
-    """Print all settings as commented TOML, as a template for ingest."""
+    """Print all settings as commented TOML, as a template for ingest.
+
+    Parameters
+    ----------
+    file : FILE
+        TOML file to check and print in full.
+    preset : NAME
+        Print the settings of this preset.
+    every
+        List the presets.
+    page
+        Print the page docs/parameters.md instead.
+    """
     from sgstore.model.config import PRESETS, Config, as_markdown, as_toml, load
     from sgstore.model.config import preset as preset_named
 
@@ -342,14 +342,18 @@ def config(
 
 @verbs.command(rich_help_panel=PANEL)
 def demo(
-    folder: Annotated[
-        Path, Argument(metavar="DIR", help="Folder for its store, pictures and clips.")
-    ] = Path("sgstore-demo"),
-    recording: Annotated[
-        Path | None, Option("--recording", help="The sample recording; by default the package's.")
-    ] = None,
+    folder: Annotated[Path, Argument()] = Path("sgstore-demo"),
+    recording: Path | None = None,
 ) -> int:
-    """Run the main commands on the bundled recording: ingest, find, show, export."""
+    """Run the main commands on the bundled recording: ingest, find, show, export.
+
+    Parameters
+    ----------
+    folder : DIR
+        Folder for its store, pictures and clips.
+    recording
+        The sample recording; by default the package's.
+    """
     from sgstore.apps.demo import run_demo
 
     run_demo(folder, typer.echo, recording)

@@ -67,55 +67,56 @@ Objective = Literal["units", "frames", "seconds", "bytes"]
 
 @dataclass(frozen=True)
 class ChoiceOptions:
-    """Command line options for selecting test cases: strategy, units and limits."""
+    """Command line options for selecting test cases: strategy, units and limits.
 
-    minimal: Annotated[
-        bool, Option("--minimal", help="Select the smallest set that keeps all items.")
-    ] = False
-    per_class: Annotated[
-        int | None,
-        Option("--per-class", metavar="K", min=1, help="Each class (stratum) K times."),
-    ] = None
-    rarest: Annotated[bool, Option("--rarest", help="Select the rarest classes first.")] = False
-    stratify: Annotated[
-        str, Option("--stratify", metavar="EXPR", help="Strata by a value: 'ego.speed > 8'.")
-    ] = ""
-    weakest: Annotated[
-        str,
-        Option("--weakest", metavar="EXPR", help="Least value first: 'robustness(ego.speed < 9)'."),
-    ] = ""
+    Parameters
+    ----------
+    minimal
+        Select the smallest set that keeps all items.
+    per_class : K
+        Each class (stratum) K times.
+    rarest
+        Select the rarest classes first.
+    stratify : EXPR
+        Strata by a value: 'ego.speed > 8'.
+    weakest : EXPR
+        Least value first: 'robustness(ego.speed < 9)'.
+    stride : TIME
+        Time between the starts of two clips; clips overlap if it is less than --clip.
+    combos : K
+        Keep combinations of K features.
+    ego
+        With --combos: only of the ego.
+    sequences : K
+        Keep sequences of K manoeuvres.
+    objective
+        Quantity that --minimal minimizes.
+    alpha
+        Weight of strata: 1 by frequency, 0 all equal.
+    seed
+        Random seed.
+    """
+
+    minimal: bool = False
+    per_class: Annotated[int | None, Option(min=1)] = None
+    rarest: bool = False
+    stratify: str = ""
+    weakest: str = ""
     budget: Budget = ""
     unit: CaseUnit = "frame"
     clip: LongestClip = "2s"
-    stride: Annotated[
-        str,
-        Option(
-            "--stride",
-            metavar="TIME",
-            help="Time between the starts of two clips; clips overlap if it is less than --clip.",
-            show_default="--clip",
-        ),
-    ] = ""
+    stride: Annotated[str, Option(show_default="--clip")] = ""
     abstraction: Abstraction = "RSV"
-    combos: Annotated[
-        int, Option("--combos", metavar="K", min=0, help="Keep combinations of K features.")
-    ] = 0
-    ego: Annotated[bool, Option("--ego", help="With --combos: only of the ego.")] = False
-    sequences: Annotated[
-        int, Option("--sequences", metavar="K", min=0, help="Keep sequences of K manoeuvres.")
-    ] = 0
+    combos: Annotated[int, Option(min=0)] = 0
+    ego: bool = False
+    sequences: Annotated[int, Option(min=0)] = 0
     manoeuvres: Manoeuvres = None
     within: Within = None
-    objective: Annotated[
-        Objective, Option("--objective", help="Quantity that --minimal minimizes.")
-    ] = "units"
-    alpha: Annotated[
-        float,
-        Option("--alpha", help="Weight of strata: 1 by frequency, 0 all equal."),
-    ] = 1.0
+    objective: Objective = "units"
+    alpha: float = 1.0
     least: Annotated[Objective | None, Option("--least", hidden=True)] = None  # until 0.3
     temper: Annotated[float | None, Option("--temper", hidden=True)] = None  # until 0.3
-    seed: Annotated[int, Option("--seed", min=0, max=(1 << 63) - 1, help="Random seed.")] = 0
+    seed: Annotated[int, Option(min=0, max=(1 << 63) - 1)] = 0
 
     def spec(self) -> SelectionSpec:
         """Return the specification of a test case selection from the command line options."""
@@ -164,19 +165,11 @@ def select(
     choice: ChoiceOptions,
     query: QueryText = None,
     parameters: Parameters = None,
-    split: Annotated[
-        str, Option("--split", help="Parts that share no recording: train=0.8,test=0.2.")
-    ] = "",
-    output: Annotated[
-        Path | None, Option("--output", "-o", metavar="FILE", help="Write a lock.")
-    ] = None,
+    split: str = "",
+    output: Annotated[Path | None, Option("--output", "-o")] = None,
     no_payloads: NoPayloads = False,
-    curve: Annotated[
-        bool, Option("--curve", help="Print the kept share by size, and that of a random order.")
-    ] = False,
-    picture: Annotated[
-        Path | None, Option("--picture", metavar="FILE", help="Draw the curve: .png or .svg.")
-    ] = None,
+    curve: bool = False,
+    picture: Path | None = None,
     *,
     whole: CollectionOptions,
     out: PrintedRows,
@@ -186,6 +179,17 @@ def select(
 
     Without --minimal, --per-class, --rarest, --stratify or --weakest all are taken,
     or some at random within the --budget.
+
+    Parameters
+    ----------
+    split
+        Parts that share no recording: train=0.8,test=0.2.
+    output : FILE
+        Write a lock.
+    curve
+        Print the kept share by size, and that of a random order.
+    picture : FILE
+        Draw the curve: .png or .svg.
     """
     from sgstore.testsets.locks import ENDING
     from sgstore.testsets.selection import listed, parse_split, split_table
@@ -277,9 +281,7 @@ def verify_(
     path: LockPath,
     store: AskedPath,
     no_payloads: NoPayloads = False,
-    strict: Annotated[
-        bool, Option("--strict", help="Count another version of sgstore as a difference.")
-    ] = False,
+    strict: bool = False,
     *,
     whole: CollectionOptions,
     ask: AskOptions,
@@ -288,6 +290,11 @@ def verify_(
 
     Exit code 1 if not. Other versions alone are told, and no difference
     without --strict.
+
+    Parameters
+    ----------
+    strict
+        Count another version of sgstore as a difference.
     """
     from sgstore.testsets.locks import read_lock, verify
 
@@ -346,27 +353,32 @@ def say_made(made: Lock, output: Path) -> None:
 
 @verbs.command(rich_help_panel=PANEL)
 def diff(
-    a: Annotated[
-        str, Argument(metavar="A", help="Before: a store or collection, STORE:QUERY, or a lock.")
-    ],
-    b: Annotated[str, Argument(metavar="B", help="After, as A.")],
+    a: str,
+    b: str,
     name: Annotated[str | None, pattern_option("Compare the matches of a library pattern.")] = None,
-    query: Annotated[
-        str | None,
-        Option("--query", "-q", metavar="TEXT", help="Compare by a query, or by 'CHECK …'."),
-    ] = None,
-    by_frame: Annotated[
-        bool, Option("--by-frame", help="Compare traces of the same name frame by frame.")
-    ] = False,
+    query: Annotated[str | None, Option("--query", "-q")] = None,
+    by_frame: bool = False,
     abstraction: Abstraction = "RSV",
     parameters: Parameters = None,
-    require: Annotated[
-        bool, Option("--require", help="End with exit code 4 if the results differ.")
-    ] = False,
+    require: bool = False,
     *,
     ask: FrameAskOptions,
 ) -> int:
-    """Compare two stores or runs: scenes, verdicts and matches that appeared, vanished or changed."""
+    """Compare two stores or runs: scenes, verdicts and matches that appeared, vanished or changed.
+
+    Parameters
+    ----------
+    a : A
+        Before: a store or collection, STORE:QUERY, or a lock.
+    b : B
+        After, as A.
+    query : TEXT
+        Compare by a query, or by 'CHECK …'.
+    by_frame
+        Compare traces of the same name frame by frame.
+    require
+        End with exit code 4 if the results differ.
+    """
     from sgstore.testsets import diff as differences
     from sgstore.testsets.coverage import classed
 

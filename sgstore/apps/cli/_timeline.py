@@ -34,30 +34,14 @@ verbs = Verbs()
 @verbs.command(rich_help_panel=PANEL)
 def timeline(
     store: StorePath,
-    queries: Annotated[
-        list[str] | None, Argument(metavar="[QUERY…]", help="'MATCH …', or 'CHECK …'.")
-    ] = None,
-    files: Annotated[
-        list[Path] | None,
-        Option("--file", "-f", help="Read a query, or checks, from a file; repeatable."),
-    ] = None,
+    queries: Annotated[list[str] | None, Argument()] = None,
+    files: Annotated[list[Path] | None, Option("--file", "-f")] = None,
     names: PatternNames = None,
     parameters: Parameters = None,
     traces: Traces = None,
-    output: Annotated[
-        Path | None, Option("--output", "-o", help="Picture to write: FILE.png or FILE.svg.")
-    ] = None,
-    every: Annotated[
-        bool, Option("--all", help="Include traces without matches and violations.")
-    ] = False,
-    parts: Annotated[
-        str | None,
-        Option(
-            "--parts",
-            metavar="FRAME",
-            help="Show where each part of one pattern holds for the match in this frame.",
-        ),
-    ] = None,
+    output: Annotated[Path | None, Option("--output", "-o")] = None,
+    every: Annotated[bool, Option("--all")] = False,
+    parts: str | None = None,
     *,
     bounds: QueryLimits,
 ) -> int:
@@ -65,6 +49,19 @@ def timeline(
 
     In the terminal, or with -o as a picture; all traces have one scale. With --parts FRAME one lane
     for each part of a pattern.
+
+    Parameters
+    ----------
+    queries : [QUERY…]
+        'MATCH …', or 'CHECK …'.
+    files
+        Read a query, or checks, from a file; repeatable.
+    output
+        Picture to write: FILE.png or FILE.svg.
+    every
+        Include traces without matches and violations.
+    parts : FRAME
+        Show where each part of one pattern holds for the match in this frame.
     """
     from sgstore.draw import LETTERS, NAME, lines_of, parts_timeline, timelines
 
