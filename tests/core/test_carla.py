@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from carla_recordings import idents, read, states
-from hypothesis import example, given
-from hypothesis import strategies as st
+from carla_recordings import Bridge, idents, read, states, thing
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from thorough import LONG
@@ -22,7 +20,6 @@ from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config
 from sgstore.model.vocabulary import KINDS, LIGHT_STATES
 from sgstore.readers import read_message
-from sgstore.readers.carla._trace import _turned
 from sgstore.sgg import SceneGraphGenerator
 
 if TYPE_CHECKING:
@@ -263,15 +260,21 @@ def test_a_picture_is_read_back_by_its_place(data: Path) -> None:
     assert all(b"\xff\xd8\xff" in data for data in found.values())
 
 
-@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
-@example([1.0, 0.0, 1.0, 0.0])
-@example([0.0, 1.0, 0.0, 1.0])
-@example([0.3, -0.7, -0.3, -0.7])
-@example([0.7, 0.3, -0.7, 0.3])
-def test_angles_turn_as_the_quaternion_does_straight_up_and_down_too(given: list[float]) -> None:
-    q = np.array(given) / np.linalg.norm(given)
-    angles, up = _turned(q[None, :])
+def test_angles_turn_as_the_quaternion_does_straight_up_and_down_too(tmp_path: Path) -> None:
+    upright = [[1, 0, 1, 0], [0, 1, 0, 1], [0.3, -0.7, -0.3, -0.7], [0.7, 0.3, -0.7, 0.3]]
+    quaternions = np.concatenate([upright, np.random.default_rng(4).normal(size=(200, 4))])
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    turns = [dict(zip("xyzw", q.tolist(), strict=True)) for q in quaternions]
+    with Bridge(tmp_path / "turns.mcap") as bridge:
+        bridge.actors(dict.fromkeys(range(len(turns)), ("vehicle.audi.tt", "")))
+        objects = [thing(i, turn=turn, size=[4, 2, 1]) for i, turn in enumerate(turns)]
+        bridge.objects(0.0, objects)
 
-    expected = matrix_of(SimpleNamespace(x=q[0], y=q[1], z=q[2], w=q[3]))
-    np.testing.assert_allclose(matrix(*angles[0]), expected, rtol=0, atol=2e-6)
-    np.testing.assert_allclose(up[0], expected[:, 2], rtol=0, atol=1e-12)
+    (frame,) = states(read(tmp_path / "turns.mcap")[1])
+
+    for i, turn in enumerate(turns):
+        expected, state = matrix_of(SimpleNamespace(**turn)), frame[str(i)]
+        angles = matrix(state["heading"], state["pitch"], state["roll"])
+        np.testing.assert_allclose(angles, expected, rtol=0, atol=2e-6)
+        middle = [state[axis] for axis in "xyz"]  # lifted by half the height
+        np.testing.assert_allclose(middle, expected[:, 2] / 2, rtol=0, atol=1e-12)

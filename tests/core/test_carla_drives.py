@@ -23,7 +23,6 @@ from carla_recordings import (
 )
 
 from sgstore.errors import TraceError
-from sgstore.readers.carla._survey import meaning_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -215,9 +214,8 @@ def test_an_actor_that_changes_its_name_keeps_the_first_and_that_is_said(path: P
     assert any("the first name counts" in warning for warning in report.warnings)
 
 
-@pytest.mark.parametrize(
-    ("blueprint", "kind", "special"),
-    [
+def test_blueprints_are_known_by_the_beginning_of_their_ids(path: Path) -> None:
+    meanings = [
         ("vehicle.carlamotors.firetruck", "truck", "emergency"),
         ("vehicle.Ford.Ambulance", "van", "emergency"),
         ("vehicle.ford.crown", "car", "taxi"),
@@ -227,14 +225,16 @@ def test_an_actor_that_changes_its_name_keeps_the_first_and_that_is_said(path: P
         ("vehicle.nissan.new_in_2027", "car", ""),
         ("sensor.camera.rgb", "unknown", ""),
         ("", "unknown", ""),
-    ],
-)
-def test_blueprints_are_known_by_the_beginning_of_their_ids(
-    blueprint: str, kind: str, special: str
-) -> None:
-    meaning = meaning_of(blueprint)
+    ]
+    with Bridge(path) as bridge:
+        bridge.actors({i: (blueprint, "") for i, (blueprint, _, _) in enumerate(meanings)})
+        bridge.objects(0.0, [vehicle(i, 9 * i, classification=0) for i in range(len(meanings))])
 
-    assert (meaning.kind, meaning.special) == (kind, special)
+    _, blocks, _ = read(path)
+
+    expected = {str(i): kind for i, (_, kind, _) in enumerate(meanings)}
+    assert kinds(blocks) == expected
+    assert list(blocks[0].entities.special) == [special for _, _, special in meanings]
 
 
 # The ego ------------------------------------------------------------------------------------------

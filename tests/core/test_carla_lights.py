@@ -6,7 +6,6 @@ shuffled, shifted, left out and made up, and must come back as what they are.
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from functools import cache
@@ -29,7 +28,6 @@ from sgstore.ingest import ingest  # noqa: E402
 from sgstore.maps.opendrive import read_map  # noqa: E402
 from sgstore.model.config import Config  # noqa: E402
 from sgstore.readers import LiveWorld  # noqa: E402
-from sgstore.readers.carla._signals import least_sum  # noqa: E402
 from sgstore.temporal import opened  # noqa: E402
 
 if TYPE_CHECKING:
@@ -326,20 +324,3 @@ def test_a_recorded_world_that_contradicts_itself_is_told(tmp_path: Path) -> Non
     assert [w.rpartition(", in ")[0] for w in done.warnings] == [
         "lane '1/0/-1': red by traffic light '40' and green by '41' at once"
     ]
-
-
-@pytest.mark.parametrize("seed", range(30))
-def test_no_other_assignment_has_a_smaller_sum(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    rows = int(rng.integers(1, 6))
-    columns = rows + int(rng.integers(0, 3))
-    cost = rng.choice([rng.random((rows, columns)), rng.integers(0, 3, (rows, columns)) * 1.0])
-
-    chosen = least_sum(cost)
-
-    assert len(set(chosen.tolist())) == rows
-    best = min(
-        sum(cost[row, column] for row, column in enumerate(one))
-        for one in itertools.permutations(range(columns), rows)
-    )
-    assert cost[np.arange(rows), chosen].sum() == pytest.approx(best)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from dataclasses import replace
@@ -31,7 +32,7 @@ from sgstore.model.vocabulary import LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.model.world import Clip, Event
 from sgstore.pipeline.doctor import examine
 from sgstore.readers import open_trace
-from sgstore.readers.carla._signals import Light, signals_of
+from sgstore.readers.carla._signals import Light, least_sum, signals_of
 from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
@@ -388,6 +389,23 @@ BOX = {"centre": (-11.75, 23, -3)}
 
 def without_signals() -> RoadMap:
     return read_map(re.sub(r"<signals>.*?</signals>", "", crossing().text, flags=re.DOTALL), "bare")
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_no_other_assignment_has_a_smaller_sum(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = int(rng.integers(1, 6))
+    columns = rows + int(rng.integers(0, 3))
+    cost = rng.choice([rng.random((rows, columns)), rng.integers(0, 3, (rows, columns)) * 1.0])
+
+    chosen = least_sum(cost)
+
+    assert len(set(chosen.tolist())) == rows
+    best = min(
+        sum(cost[row, column] for row, column in enumerate(one))
+        for one in itertools.permutations(range(columns), rows)
+    )
+    assert cost[np.arange(rows), chosen].sum() == pytest.approx(best)
 
 
 def test_a_light_that_the_map_does_not_have_applies_to_the_lanes_of_its_box() -> None:

@@ -12,10 +12,12 @@ from xml.etree import ElementTree
 import pytest
 from knowledge import Car, Checks, Known, car, frame_of, random_scene, reduced, road
 from oracle_over_time import compare_unknown, unknown_check, worlds
+from recordings import Recorder
+from recordings import car as recorded
 from thorough import LONG
 
 import sgstore
-from sgstore.apps.cli._junit import write_junit
+from sgstore.apps.cli import run
 from sgstore.ingest import ingest
 from sgstore.model.config import Config, RangeSettings
 from sgstore.temporal import Monitor
@@ -379,10 +381,16 @@ def test_all_that_is_due_may_be_pending() -> None:
 
 def test_build_servers_skip_what_is_not_decided(tmp_path: Path) -> None:
     scene = following(10, gone_in_between)
+    with Recorder(tmp_path / "drive.mcap") as recorder:
+        for number, cars in enumerate(scene):
+            told = [recorded(int(c["ident"] == "ego"), c["x"], v=(10, 0)) for c in cars]
+            recorder.ground_truth(number / 10, told, host=1)
+    ingest(tmp_path / "drive.sgstore", [tmp_path / "drive.mcap"])
     texts = ["EVENTUALLY[0s, 5s] ego.speed > 30", "FORALL (v:Car) ALWAYS gap(ego, v) > 5"]
-    told = [judged(f"CHECK c{n}: {text}", scene) for n, text in enumerate(texts)]
+    rules = ";".join(f"CHECK c{n}: {text}" for n, text in enumerate(texts))
 
-    write_junit(tmp_path / "junit.xml", told)
+    junit = str(tmp_path / "junit.xml")
+    assert run(["check", str(tmp_path / "drive.sgstore"), "-e", rules, "--junit", junit]) == 0
 
     pending, kept = ElementTree.parse(tmp_path / "junit.xml").getroot().findall("*/testcase")
     (skipped,) = pending

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pytest
 from carla_recordings import Bridge, vehicle
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from recordings import Recorder, car
 
 import sgstore
 from sgstore.ingest import ingest
 from sgstore.model.config import Config
-from sgstore.model.frame_ids import frame_ids
-from sgstore.model.world import Event
 from sgstore.store import StoreFile
-from sgstore.store._payloads import Happenings
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -121,75 +115,3 @@ def test_more_events_than_a_report_lists_are_in_the_store(tmp_path: Path) -> Non
     assert rows(
         store, "SELECT DISTINCT n FROM (SELECT count(*) AS n FROM events GROUP BY frame_id)"
     ) == [(60,)]
-
-
-# The nearest frame --------------------------------------------------------------------------------
-
-
-class Frames:
-    """As much of a block as counts here."""
-
-    def __init__(self, seq: np.ndarray, time_ns: np.ndarray, events: tuple[Event, ...]) -> None:
-        self.seq, self.time_ns, self.log_time_ns, self.events = seq, time_ns, time_ns, events
-
-
-@settings(max_examples=200)
-@given(
-    steps=st.lists(st.integers(1, 50), min_size=1, max_size=30),
-    places=st.lists(st.integers(-100, 1500), max_size=20),
-    size=st.integers(1, 10),
-    early=st.integers(0, 3),
-)
-def test_the_nearest_frame_does_not_depend_on_blocks(
-    steps: list[int], places: list[int], size: int, early: int
-) -> None:
-    times = np.cumsum(steps)
-    events = [Event("x", time, time, 0, detail=str(i)) for i, time in enumerate(sorted(places))]
-    happenings, found = Happenings(7), {}
-
-    def take(columns: Any) -> None:
-        for detail, frame in zip(columns["detail"], columns["frame_id"].tolist(), strict=True):
-            assert detail not in found
-            found[detail] = frame
-
-    left = events
-    for start in range(0, len(times), size):
-        block = times[start : start + size]
-        # What stands in the file with these frames, and a little of what comes later.
-        upto = block[-1] + early * 20 if start + size < len(times) else np.inf
-        now, left = [e for e in left if e.time_ns <= upto], [e for e in left if e.time_ns > upto]
-        seq = np.arange(start, start + len(block))
-        take(happenings.of(Frames(seq, block, tuple(now))))
-    take(happenings.rest())
-
-    ids = frame_ids(7, np.arange(len(times)))
-    assert found.keys() == {event.detail for event in events}
-    for event in events:
-        apart = np.abs(times - event.time_ns)
-        assert apart[ids.tolist().index(found[event.detail])] == apart.min()
-
-
-def test_the_first_events_of_a_block_come_with_many_of_the_one_before() -> None:
-    times = np.arange(400) * 100
-    events = [Event("x", int(time), int(time), 0) for time in times for _ in range(60)]
-    happenings, upto = Happenings(7), 201 * 60
-
-    told = [
-        happenings.of(Frames(np.arange(200), times[:200], tuple(events[:upto]))),
-        happenings.of(Frames(np.arange(200, 400), times[200:], tuple(events[upto:]))),
-        happenings.rest(),
-    ]
-
-    found = np.concatenate([columns["frame_id"] for columns in told])
-    assert np.unique(found, return_counts=True)[1].tolist() == [60] * 400
-
-
-def test_a_stamp_of_another_clock_goes_by_log_time() -> None:
-    frames = Frames(np.arange(3), np.array([0, 100, 200]) * 1_000_000, ())
-    event = Event("collision", 10**18, 110_000_000, 1)
-    happenings = Happenings(7)
-    frames.events = (event,)
-
-    told = happenings.of(frames)
-
-    assert told["frame_id"].tolist() == frame_ids(7, np.array([1])).tolist()

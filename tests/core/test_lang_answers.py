@@ -9,9 +9,9 @@ import pytest
 from scenes import Scene, actor, along, cone, ego, light, store_of, street
 
 from sgstore.graphs.online import Replay
-from sgstore.lang.bind._in_range import in_range
-from sgstore.lang.catalog import RelationScope, TraceFacts
+from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts, Type
 from sgstore.lang.ir import Value
+from sgstore.lang.sql import compile_query
 from sgstore.model.config import Config, PairSettings, Proximity
 from sgstore.temporal import Monitor
 
@@ -125,8 +125,10 @@ def test_map_parts_are_not_in_range_pairs(related: Store) -> None:
 
 def test_in_range_is_unknown_for_unknown_settings() -> None:
     assert RelationScope.of({}) is None
-    traces = [TraceFacts(1, "imported", "", frozenset())]
-    assert in_range("a", "b", traces) == Value(None, in_range("a", "b", traces).type)
+    catalog = Catalog(traces=(TraceFacts(1, "imported", "", frozenset()),))
+    query = compile_query("MATCH (a:Car), (b:Car) RETURN in_range(a, b)", catalog)
+    (column,) = query.bound.result.columns
+    assert column.value == Value(None, Type.boolean)
 
 
 @pytest.mark.parametrize("name", [name for name in CONFIGS if not name.startswith("nobody,")])

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 
 import pytest
+from knowledge import car, frame_of
 
 from sgstore.errors import QueryError
 from sgstore.lang import ir
 from sgstore.lang.bind import Horizon, horizon
 from sgstore.lang.catalog import Catalog
 from sgstore.lang.sql import compile_checks, compile_query
-from sgstore.temporal._known_range import short_range
+from sgstore.model.config import Config, RangeSettings
+from sgstore.temporal import Monitor
 
 
 def looked(text: str, speed: float = 30.0) -> Horizon:
@@ -77,12 +79,34 @@ def test_safe_distance_grows_with_greatest_speed() -> None:
     assert 50 < slow < 133 < fast < 500
 
 
-def test_reason_names_needed_and_known_range() -> None:
-    assert short_range(Horizon(120, 0), 50).of(holds=False) == ""
-    reason = short_range(Horizon(119.2, 0), 50).of(holds=True)
-    assert reason == "it depends on 120 m around the ego, but the trace covers 50 m"
-    reason = short_range(Horizon(0, math.inf), 50).of(holds=False)
-    assert reason == "it depends on everything around the ego, but the trace covers 50 m"
+@pytest.mark.parametrize(
+    ("check", "places", "verdict", "reason"),
+    [
+        ("FORALL (v:Vehicle) ALWAYS dist(ego, v) > 119.2", (12, 300), "false", ""),
+        (
+            "FORALL (v:Vehicle) ALWAYS dist(ego, v) > 119.2",
+            (300,),
+            "unknown",
+            "it depends on 120 m around the ego, but the trace covers 50 m",
+        ),
+        (
+            "ALWAYS EXISTS {(v:Vehicle) WHERE v.speed > 70}",
+            (300,),
+            "unknown",
+            "it depends on everything around the ego, but the trace covers 50 m",
+        ),
+    ],
+)
+def test_reason_names_needed_and_known_range(
+    check: str, places: tuple[float, ...], verdict: str, reason: str
+) -> None:
+    near = Config(range=RangeSettings(radius=20, world=50))
+    monitor = Monitor(f"CHECK {check}", config=near)
+    monitor.step(frame_of(0, [car("ego", 0), *(car(f"v{x}", x) for x in places)]))
+
+    (found,) = monitor.finish()
+
+    assert (found.verdict, found.reason) == (verdict, reason)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import pytest
 from opendrive_maps import a_map, a_road, arc, element, lane, line, link, mark, section
 
 from sgstore.maps.opendrive import read_map
-from sgstore.maps.opendrive._lane_changes import permitted
 from sgstore.model.vocabulary import RELATION_CODE
 
 if TYPE_CHECKING:
@@ -251,7 +250,22 @@ def test_lanes_across_a_median_are_neighbours_and_oppose_one_another() -> None:
 def test_a_mark_permits_what_its_attribute_says_else_what_its_type_does(
     kind: str, attribute: str, owner: int, expected: tuple[bool, bool]
 ) -> None:
-    assert permitted(kind, attribute, owner) == expected
+    line_of = mark(kind, laneChange=attribute)
+    both = {"kind": "bidirectional"}  # else no change across the centre
+    lanes = {
+        -1: section(lane(0), lane(-1, line_of), lane(-2)),
+        0: section(lane(1, **both), lane(0, line_of), lane(-1, **both)),
+        1: section(lane(2), lane(1, line_of), lane(0)),
+    }[owner]
+    higher, lower = {-1: (-1, -2), 0: (1, -1), 1: (2, 1)}[owner]
+
+    road_map = read_map(a_map(a_road("1", line(40.0), sections=lanes)), "road")
+
+    changes, names = road_map.lane_changes, road_map.nodes.name[1:]
+    ways = {(names[a], names[b]) for a, b in zip(changes.lane, changes.to, strict=True)}
+    up, down = (f"1/0/{lower}", f"1/0/{higher}"), (f"1/0/{higher}", f"1/0/{lower}")
+    assert (up in ways, down in ways) == expected
+    assert ways <= {up, down}
 
 
 def test_lanes_may_be_changed_where_the_mark_between_them_permits_it() -> None:

@@ -600,18 +600,17 @@ def test_relations_equal_their_definition_where_everything_lies_on_bounds(
     assert of == {edge for edge in defined(things) if edge[1] != "isIn"}
 
 
-def test_a_crowd_that_is_looked_at_in_parts_is_related_like_any_other(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_crowd_that_is_looked_at_in_parts_is_related_like_any_other() -> None:
     things = [t for t in crowd(1, 60, 25) if t.kind != "traffic_light"]
     scenes = [[t for t in things if t.name != name] for name in ("e1", "e2", "e3")]
     whole = graph_of(frames(*scenes), TOWN)
 
-    monkeypatch.setattr("sgstore.graphs.relations._scene.CHUNK", 100)
-    parts = graph_of(frames(*scenes), TOWN)
+    parts = graph_of(frames(*scenes * 100), TOWN)  # more pairs than one part holds
 
-    for frame in range(3):
-        assert edges(parts, frame, TOWN) == edges(whole, frame, TOWN)
+    counts = np.bincount(parts.edges.frame).reshape(-1, 3)
+    assert (counts == np.bincount(whole.edges.frame)).all()
+    for frame in (*range(3), *range(297, 300)):
+        assert edges(parts, frame, TOWN) == edges(whole, frame % 3, TOWN)
 
 
 def test_absurd_positions_are_related_to_nothing_and_disturb_nobody() -> None:

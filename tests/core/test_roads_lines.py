@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import sgstore.maps.roads._lane_lines as lanelines
 from sgstore.errors import MapError
 from sgstore.maps.opendrive import parse_map
 from sgstore.maps.roads import (
@@ -380,20 +379,17 @@ def test_what_is_no_lane_is_left_out_and_said() -> None:
     assert [w for w in road_map.warnings if "point, none, still" in w and "and 15 more" in w]
 
 
-def test_the_numbers_of_lanes_neighbours_and_ways_are_bounded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    lines = [a_line(str(i), left_beside=("1", "2", "3")) for i in range(4)]
-    area = Area("a", (("1", "2"), ("1", "3"), ("2", "3")))
-    for bound, reason in (
-        ("MAX_WAYS", "3 ways through intersections; a map may have 2"),
-        ("MAX_RELATED", "12 neighbours"),
-        ("MAX_LANES", "4 lanes"),
+def test_the_numbers_of_lanes_neighbours_and_ways_are_bounded() -> None:
+    line = a_line("1")
+    beside = [a_line(str(i), left_beside=("1",) * 100) for i in range(5_001)]
+    area = Area("a", (("1", "2"),) * 20_001)
+    for lines, areas, reason in (
+        ([line], [area], "20,001 ways through intersections; a map may have 20,000"),
+        (beside, [], "500,100 neighbours of lanes; a map may have 500,000"),
+        ([line] * 30_001, [], "30,001 lanes; a map may have 30,000"),
     ):
-        monkeypatch.setattr(lanelines, bound, 2)
         with pytest.raises(MapError, match=reason):
-            plain_lanes(lines, [area])
-        monkeypatch.undo()
+            plain_lanes(lines, areas)
 
 
 def town(turn: float = 0.0, dx: float = 0.0, dy: float = 0.0) -> list[LaneLine]:

@@ -14,6 +14,7 @@ from recordings import Recorder, car
 
 import sgstore
 import sgstore.maps.roads._lane_lines as lanelines
+import sgstore.maps.roads._lane_text as lanetext
 from sgstore.draw._stored import map_of
 from sgstore.ingest import ingest
 from sgstore.maps.opendrive import read_map
@@ -433,6 +434,14 @@ def test_too_many_points_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(osi_lanes, "MAX_POINTS", 5)
     with pytest.raises(MapError, match="more than 5 points"):
+        made(two_way())
+
+
+def test_too_many_cross_sections_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    from sgstore.errors import MapError
+
+    monkeypatch.setattr(lanetext, "MAX_SECTIONS", 5)
+    with pytest.raises(MapError, match="more than 5 cross sections"):
         made(two_way())
 
 

@@ -17,14 +17,11 @@ from test_roads_osi import (
     made,
     pairs,
     record,
-    schema_of,
     two_way,
 )
 
 import sgstore as library
-from sgstore.maps.opendrive import read_map
 from sgstore.readers import open_trace
-from sgstore.readers.osi._lanes import OsiLanes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -138,21 +135,20 @@ def test_lanes_between_boundaries_are_those_around_the_centre_lines(make: Any, s
 @pytest.mark.parametrize("name", ["cut-in", "pedestrian", "traffic_lights", "highway_merge"])
 def test_the_lanes_of_esmini_need_no_centre_lines(data: Path, name: str) -> None:
     with (data / f"traces/esmini/{name}.mcap").open("rb") as file:
-        schema, message = next(
-            (schema, message)
+        data_of = next(
+            message.data
             for schema, _, message in make_reader(file).iter_messages()
             if schema is not None and schema.name.startswith("osi3.Ground")
         )
     maps: list[RoadMap] = []
     for bare in (False, True):
-        lanes = OsiLanes(schema)
-        ground = lanes._class.FromString(message.data)
+        truth = Truth()
+        truth.ground.ParseFromString(data_of)
         if bare:
-            without_lines(ground, 1)
-        lanes.take(ground.SerializeToString())
-        maps.append(read_map(lanes.text()[0], "lanes"))
-        assert lanes.lost == []
+            without_lines(truth.ground, 1)
+        maps.append(made(truth))
     expected, found = maps
+    assert not [w for one in maps for w in one.warnings if "left out" in w]
 
     assert found.nodes.name == expected.nodes.name
     for relation in RELATIONS:
@@ -256,10 +252,8 @@ def test_a_border_of_very_many_pieces_is_named_and_takes_no_time() -> None:
     names = [tuple(range(start, start + 1200)) for start in (10_000, 20_000)]
     truth.lane(1, [], borders=(names[0], names[1]))
     truth.lane(2, [], borders=(names[0][:900], names[1][:900]))
-    lanes = OsiLanes(schema_of())
-    lanes.take(truth.ground.SerializeToString())
 
-    road_map = read_map(lanes.text()[0], "lanes")
+    road_map = made(truth)
 
-    assert lanes.lost == ["lane 1: left out: more than 1000 boundaries to its left"]
+    assert road_map.warnings == ("lane 1: left out: more than 1000 boundaries to its left",)
     assert road_map.nodes.length[1] == pytest.approx(900)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,6 @@ from mcap.stream_reader import StreamReader
 from recordings import Recorder, bulb, car, drive, house, ns
 
 from sgstore.errors import ExportError, TraceError
-from sgstore.exporters._clips import clip_name
 from sgstore.model.world import Clip, MessageRefs, States
 from sgstore.readers import open_trace
 
@@ -479,22 +477,3 @@ def test_a_source_without_context_has_none(tmp_path: Path) -> None:
 
     assert clip.context == 0
     assert messages(clip.file) == within(path, 0.5, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("trace", "name"),
-    [
-        ("swarm_Town04", "swarm_Town04_007.mcap"),
-        ("../../etc/passwd", "etc_passwd_007.mcap"),
-        ("a/b\\c:d\0e", "a_b_c_d_e_007.mcap"),
-        ("CON", "_CON_007.mcap"),
-        ("com1.txt", "_com1.txt_007.mcap"),
-        ("...", "clip_007.mcap"),
-        ("", "clip_007.mcap"),
-        ("Größe", "Gr_e_007.mcap"),
-        ("x" * 300, "x" * 80 + "_007.mcap"),
-    ],
-)
-def test_a_clips_name_is_safe_whatever_the_trace_is_called(trace: str, name: str) -> None:
-    assert clip_name(trace, 7, ".mcap") == name
-    assert os.sep not in name

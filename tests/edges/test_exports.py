@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import math
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +35,7 @@ from sgstore.exporters import (
     parse_labels,
     write_export,
 )
-from sgstore.exporters._clips import export_folder, safe_name
+from sgstore.exporters._clips import clip_name, export_folder, safe_name
 from sgstore.exporters._pyg import ACTORS, RELATIONS
 from sgstore.exporters.graph_data import GraphData
 from sgstore.ingest import ingest
@@ -356,6 +357,25 @@ def test_a_format_that_breaks_is_told_by_its_name_in_one_line(
 )
 def test_a_name_is_safe_whatever_a_sensor_is_called(text: str, name: str) -> None:
     assert safe_name(text, "sensor") == name
+
+
+@pytest.mark.parametrize(
+    ("trace", "name"),
+    [
+        ("swarm_Town04", "swarm_Town04_007.mcap"),
+        ("../../etc/passwd", "etc_passwd_007.mcap"),
+        ("a/b\\c:d\0e", "a_b_c_d_e_007.mcap"),
+        ("CON", "_CON_007.mcap"),
+        ("com1.txt", "_com1.txt_007.mcap"),
+        ("...", "clip_007.mcap"),
+        ("", "clip_007.mcap"),
+        ("Größe", "Gr_e_007.mcap"),
+        ("x" * 300, "x" * 80 + "_007.mcap"),
+    ],
+)
+def test_a_clips_name_is_safe_whatever_the_trace_is_called(trace: str, name: str) -> None:
+    assert clip_name(trace, 7, ".mcap") == name
+    assert os.sep not in name
 
 
 # Labels ----------------------------------------------------------------------------------------------
