@@ -115,32 +115,42 @@ class Term:
                 return any(operand.ended for operand in self.operands)
 
 
-def may_end(term: Term, tick: Tick) -> bool:  # noqa: PLR0911 - a case each
+def may_end(term: Term, tick: Tick, *, due: bool = True) -> bool:
     """True if obligations (conditions on later frames) are fulfilled or still open when the trace ends.
 
     A forward operator is open if its bound is not over, and so is ``NEXT``. An operator without an upper bound
     has failed.
+
+    Parameters
+    ----------
+    term : Term
+    tick : Tick
+        The last frame.
+    due : bool
+        Truth value of an open operator: false under an odd number of negations.
     """
     match term.word:
         case "duty":
-            formula, since, weak = term.operands
-            if weak or not isinstance(formula, Until):
-                return True
-            if formula.bound.high is None:
-                return False
-            if since is None:
-                return True
-            frames = formula.bound.frames
-            age = (tick.number if frames else tick.time) - since
-            return age < formula.bound.high - (0 if frames else tick.tolerance)
+            return due if _is_open(term, tick) else term.ended
         case "not":
-            return not term.operands[0].ended
+            return not may_end(term.operands[0], tick, due=not due)
         case "and":
-            return all(may_end(operand, tick) for operand in term.operands)
+            return all(may_end(operand, tick, due=due) for operand in term.operands)
         case "or":
-            return any(may_end(operand, tick) for operand in term.operands)
+            return any(may_end(operand, tick, due=due) for operand in term.operands)
         case _:
             return term.ended
+
+
+def _is_open(duty: Term, tick: Tick) -> bool:
+    formula, since, _ = duty.operands
+    if not isinstance(formula, Until):
+        return True
+    if formula.bound.high is None or since is None:
+        return formula.bound.high is not None
+    frames = formula.bound.frames
+    age = (tick.number if frames else tick.time) - since
+    return age < formula.bound.high - (0 if frames else tick.tolerance)
 
 
 class Terms:

@@ -340,16 +340,22 @@ class Told:
             case "NEXT" | "WEAKNEXT":
                 if i < last:
                     return self.true(one, i + 1, binding)
-                return e.word == "WEAKNEXT" or (self.due is True and not waits(one))
+                if self.due is None or waits(one):
+                    return e.word == "WEAKNEXT"
+                return self.due
             case "PREVIOUS":
                 return i > 0 and self.true(one, i - 1, binding)
             case "ALWAYS" | "HISTORICALLY":
-                return all(self.true(one, j, binding) for j in near)
+                held = all(self.true(one, j, binding) for j in near)
+                return held and not self.is_due(e, i, counts_as=False)
             case "EVENTUALLY" | "ONCE":
                 return any(self.true(one, j, binding) for j in near) or self.is_due(e, i)
             case "RELEASE":
                 left = e.operands[0]
-                return all(
+                ends = self.is_due(e, i, counts_as=False) and not any(
+                    self.true(left, k, binding) for k in range(i, last + 1)
+                )
+                return not ends and all(
                     self.true(one, j, binding)
                     or any(self.true(left, k, binding) for k in range(i, j))
                     for j in near
@@ -368,9 +374,9 @@ class Told:
                     for j in near
                 )
 
-    def is_due(self, e: s.Temporal, i: int) -> bool:
-        """Whether an operator counts as true that looks ahead, for its bound is not over at the end."""
-        if not self.due or e.word not in AHEAD or e.bound is None or e.bound[1] is None:
+    def is_due(self, e: s.Temporal, i: int, *, counts_as: bool = True) -> bool:
+        """Whether an operator that looks ahead counts as true or false: its bound is not over at the end."""
+        if self.due is not counts_as or e.word not in AHEAD or not e.bound or e.bound[1] is None:
             return False
         high = e.bound[1]
         if high.unit == "frames":
