@@ -12,6 +12,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from recordings import Recorder, car
+from thorough import LONG
 
 import sgstore
 from sgstore.ingest import ingest
@@ -68,7 +69,7 @@ def _store(folder: Path, name: str, config: Any) -> Any:
 @example(bound=6.5, origin=0.0)
 @example(bound=8.3, origin=0.1)
 @example(bound=6.7, origin=5_334_000.7)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6 if LONG else 2, deadline=None)
 def test_what_is_exactly_at_a_bound_is_the_same_by_ingest_derive_and_dist(
     between: str, bound: float, origin: float
 ) -> None:

@@ -344,7 +344,7 @@ def test_verbs_that_ask_a_store_say_in_the_same_words_how_they_are_bounded() -> 
         assert len(set(map(str, having.values()))) == 1
 
 
-@pytest.mark.parametrize("verb", ASKING)
+@pytest.mark.parametrize("verb", thorough.some(ASKING, 3))
 def test_every_verb_that_asks_heeds_its_bounds_and_leaves_nothing_where_time_is_over(
     verb: str,
     files: dict[str, str],
@@ -544,7 +544,7 @@ def begun(town_store: Path, drives: Path, tmp_path: Path):
     return start
 
 
-SENT = [*((verb, signal.SIGTERM) for verb in LONG), ("find", signal.SIGHUP)]
+SENT = [*((verb, signal.SIGTERM) for verb in thorough.some([*LONG], 2)), ("find", signal.SIGHUP)]
 """Each kind of run is ended once. Ctrl-C: ``test_a_find_of_long_steps_ends``; ``test_ctrl_c_…`` of ingest."""
 if thorough.LONG:  # make oracle
     SENT += [("ingest --jobs", signal.SIGHUP)]
@@ -597,7 +597,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next_start(
     assert not list(begun.temporary.iterdir())
 
 
-@pytest.mark.parametrize("verb", ["export", "shrink"])
+@pytest.mark.parametrize("verb", ["export", "shrink"] if thorough.LONG else ["export"])
 def test_a_refused_export_removes_the_folders_of_a_killed_one(
     verb: str, town_store: Path, tmp_path: Path
 ) -> None:

@@ -140,7 +140,7 @@ def test_distance_relations_beyond_graph_equal_wider_graph(
     assert found == rows(wide, text)
 
 
-@pytest.mark.parametrize("trace", TRACES)
+@pytest.mark.parametrize("trace", some(TRACES, 4))
 def test_memory_search_equals_sql_beyond_graph(near: Store, trace: str) -> None:
     sql = f"SELECT frame_id FROM frames WHERE trace = '{trace}' AND seq % 8 = 2"
     frames = [frame for (frame,) in near.sql(sql).values]
@@ -162,7 +162,7 @@ def test_distance_relations_exist_beyond_graph(near: Store) -> None:
         assert rows(near, f"USING SCOPE world {text}") != rows(near, text)
 
 
-@pytest.mark.parametrize("trace", TRACES)
+@pytest.mark.parametrize("trace", some(TRACES, 4))
 def test_check_of_distance_relations_equals_wider_graph(
     near: Store, wide: Store, trace: str
 ) -> None:

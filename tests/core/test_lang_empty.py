@@ -51,10 +51,10 @@ STEPS = f"{NOTHING} AS a THEN WITHIN 2s MATCH (v) WHERE v.speed < 1 AS b"
 
 
 def constructs() -> Iterator[str]:
-    """Statements of the docs and the library, one in three of them, and each kind of result of no match."""
+    """Statements of the docs and the library, one in seven of them, and each kind of result of no match."""
     pages = sorted((ROOT / "docs").glob("*.md"))
     written = [text for page in pages for text in BLOCK.findall(page.read_text())]
-    yield from some([*written, *(f"MATCH {name}()" for name in patterns())], 3)
+    yield from some([*written, *(f"MATCH {name}()" for name in patterns())], 7)
     yield from (f"{NOTHING} RETURN {value}" for value in VALUES)
     yield from (f"{NOTHING} RETURN {word}(v.speed) OVER match AS x" for word in OVER)
     yield from (f"{NOTHING} RETURN INTERVALS, {word}(v.speed) OVER match AS x" for word in OVER)

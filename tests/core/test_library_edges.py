@@ -9,6 +9,7 @@ import pytest
 from library_edges import COLLISIONS, EDGES, RULES, Edge
 from library_scenes import SCENES
 from scenes import store_of
+from thorough import some
 
 from sgstore.lang.library import patterns
 from sgstore.model.config import from_dict
@@ -60,11 +61,14 @@ def test_every_rule_has_scenes_that_break_it_keep_it_and_barely_do_either() -> N
 
 @pytest.mark.parametrize(
     ("name", "edge"),
-    [
-        pytest.param(name, edge, id=f"{name}-{number}")
-        for name, edges in EDGES.items()
-        for number, edge in enumerate(edges)
-    ],
+    some(
+        [
+            pytest.param(name, edge, id=f"{name}-{number}")
+            for name, edges in EDGES.items()
+            for number, edge in enumerate(edges)
+        ],
+        2,
+    ),
 )
 def test_a_hair_decides_whether_a_rule_is_kept(tmp_path: Path, name: str, edge: Edge) -> None:
     # Graphs of 50 m and the world around them say what wide graphs say; a monitor sees wide graphs.

@@ -350,7 +350,7 @@ def peak_of(work: Callable[[], object]) -> int:
 
 
 @pytest.mark.parametrize(
-    ("name", "place"), some([(name, place) for name in LOG_TIMES for place in (None, -1)], 3)
+    ("name", "place"), some([(name, place) for name in LOG_TIMES for place in (None, -1)], 5)
 )
 def test_an_index_takes_at_most_24_bytes_a_message(name: str, place: int | None) -> None:
     count = 1_500_000

@@ -103,7 +103,7 @@ def test_frame_by_frame_gives_the_same_graphs(data: Path, name: str) -> None:
     online = SceneGraphGenerator(road_map, Config())
 
     for block, graph in zip(blocks, graphs(path), strict=True):
-        for frame in some(range(len(block)), 3):  # two of them are neighbours where a block ends
+        for frame in some(range(len(block)), 7):  # two of them are neighbours where a block ends
             assert rows(online.block(alone(block, frame)), 0) == rows(graph, frame)
 
 

@@ -166,7 +166,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("what", some([*CHANGES], 2))
+@pytest.mark.parametrize("what", some([*CHANGES], 5))
 def test_a_change_is_found_and_named(store: Any, what: Any) -> None:
     statement, check = CHANGES[what]
 
