@@ -13,7 +13,7 @@ from roundabouts import MIDDLE, circling, driven, lanelets, opendrive, roundabou
 from scenes import Scene, actor, ego, store_of
 from test_lane_dist import driven as by_dijkstra
 from test_lane_dist import lane_ways
-from thorough import LONG
+from thorough import LONG, some
 
 from sgstore.graphs.online import Frame
 from sgstore.lang.memory import FrameView
@@ -235,7 +235,7 @@ def test_it_stands_in_patterns_as_a_junction_does(drive: Store, text: str, frame
     found = {frame.frame_id for frame in drive.find(text).frames()}
     assert len(found) > frames
 
-    for frame in drive.find("MATCH (:Ego)").frames():
+    for frame in some([*drive.find("MATCH (:Ego)").frames()], 7):
         assert (drive.why_not(frame.frame_id, text).as_dict()["failed"] is None) == (
             frame.frame_id in found
         )
