@@ -18,7 +18,7 @@ import typer
 from verb_lines import verbs
 
 from sgstore.apps.cli import app, run
-from sgstore.apps.cli._examples import EXAMPLES
+from sgstore.apps.cli._options import examples
 from sgstore.apps.cli._output import Format, write_rows
 from sgstore.lang.syntax import parse
 
@@ -41,13 +41,13 @@ def known() -> tuple[Any, dict[str, Any]]:
 
 
 def test_every_verb_has_two_examples(known: tuple[Any, dict[str, Any]]) -> None:
-    leaves = {name for name, lines in EXAMPLES.items() if name not in {"", "patterns", "lock"}}
+    leaves = {name for name, lines in examples().items() if name not in {"", "patterns", "lock"}}
 
     assert leaves - {"coverage", "collection"} == {*known[1]}
-    assert {len(lines) for lines in EXAMPLES.values()} == {2}
+    assert {len(lines) for lines in examples().values()} == {2}
 
 
-@pytest.mark.parametrize("line", [line for lines in EXAMPLES.values() for line in lines])
+@pytest.mark.parametrize("line", [line for lines in examples().values() for line in lines])
 def test_an_example_is_a_command_line_and_its_queries_are_the_language(
     line: str, known: tuple[Any, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

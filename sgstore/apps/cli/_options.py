@@ -6,9 +6,11 @@ import inspect
 import os
 import re
 import sys
+import tomllib
 from collections import Counter
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, partial, wraps
+from importlib import resources
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -29,6 +31,7 @@ import sgstore.apps.cli._completion as completion
 from sgstore.apps.cli._completion import STORE
 from sgstore.apps.cli._output import LONG_TABLE, Format, say, say_json, set_verbosity, write_rows
 from sgstore.apps.cli._process import set_deadline
+from sgstore.base.docstrings import split_docstring
 from sgstore.errors import ConfigError, url_named
 
 if TYPE_CHECKING:
@@ -73,10 +76,20 @@ class Verb(TyperCommand):
         _write_examples(ctx)
 
 
-def _write_examples(ctx: Any) -> None:
-    from sgstore.apps.cli._examples import examples_of
+@cache
+def examples() -> dict[str, list[str]]:
+    """Return the examples in the help of each command: the rest of a command line, and its purpose."""
+    text = resources.files("sgstore.apps.cli").joinpath("examples.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
 
-    typer.echo(examples_of(ctx.command_path.partition(" ")[2]), nl=False)
+
+def _write_examples(ctx: Any) -> None:
+    """Print the examples of a command without a frame and line breaks, so that users can copy them."""
+    lines: list[str] = []
+    for one in examples().get(ctx.command_path.partition(" ")[2], ()):
+        typed, _, purpose = one.rpartition("  # ")
+        lines += ["", f"   # {purpose}", f"   sgstore {typed}"]
+    typer.echo("\n".join([" Examples:", *lines[1:], "", ""]) if lines else "", nl=False)
 
 
 def _with_store(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
@@ -196,10 +209,6 @@ _hints = cache(partial(get_type_hints, include_extras=True))
 """Types of parameters or fields; many verbs share the dataclasses of options."""
 
 
-_DESCRIBED: Final = re.compile(r"^(\w+)(?: : (.+))?((?:\n +.+)+)", re.MULTILINE)
-"""Option in the docstring of a command: name, placeholder and help."""
-
-
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function with plain parameters for typer: each dataclass parameter is replaced by its fields.
 
@@ -231,31 +240,24 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
             values[name] = bundle(**{one.name: values.pop(one.name) for one in fields(bundle)})
         return function(**values)
 
-    verb.__doc__ = _sections(function)[0]
+    verb.__doc__ = split_docstring(function)[0]
     verb.__annotations__ = {one.name: one.annotation for one in parameters}
     vars(verb)["__signature__"] = inspect.Signature(parameters)
     return verb
 
 
-def _sections(documented: Any) -> tuple[str, str]:
-    """Return the text of a docstring, and its section *Parameters*."""
-    text = inspect.cleandoc(documented.__doc__ or "")
-    about, _, parameters = text.partition("\n\nParameters\n----------\n")
-    return about, parameters.partition("\n\n")[0]
-
-
 def _described(parameter: inspect.Parameter, hint: Any, *documented: Any) -> inspect.Parameter:
     """Return a parameter of a command with the placeholder and the help of the first docstring that has it."""
-    texts = (found for one in documented for found in _DESCRIBED.findall(_sections(one)[1]))
-    for name, placeholder, about in texts:
-        if name == parameter.name:
-            kind, *infos = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-            required = parameter.default is parameter.empty
-            flag = [f"--{name.replace('_', '-')}"] * (kind is bool)
-            info = infos[0] if infos else Argument() if required else Option(*flag)
-            info.help, info.metavar = " ".join(about.split()), placeholder or None
-            hint = Annotated[kind, info]
-            break
+    known = next(
+        (d for one in documented if (d := split_docstring(one)[1].get(parameter.name))), None
+    )
+    if known is not None:
+        kind, *infos = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        required = parameter.default is parameter.empty
+        flag = [f"--{parameter.name.replace('_', '-')}"] * (kind is bool)
+        info = infos[0] if infos else Argument() if required else Option(*flag)
+        info.metavar, info.help = known[0] or None, known[1]
+        hint = Annotated[kind, info]
     return parameter.replace(annotation=hint, kind=parameter.KEYWORD_ONLY)
 
 

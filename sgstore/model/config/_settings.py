@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base import plugins
 from sgstore.errors import ConfigError
-from sgstore.model.config._values import check, one_of, setting, unknown_setting, value_of
+from sgstore.model.config._values import check, one_of, unknown_setting, value_of
 from sgstore.model.vocabulary import (
     DIRECTIONS,
     ENTITY_KINDS,
@@ -46,10 +46,6 @@ JOINS: Final = ("nearest", "latest")
 ORIENTATIONS: Final = ("asam", "carla")
 ALL_EGOS: Final = "all"
 
-OF_LABELS: Final = (
-    "only related pairs of these labels, in either order: [['Ego', 'Vehicle']]; empty: all"
-)
-
 MOST_CORNERS: Final = 64
 MOST_LENGTH: Final = 100_000.0
 """Largest length of a range; m. No map is larger, and numbers stay exact."""
@@ -59,46 +55,58 @@ _WORD: Final = re.compile(r"[a-z0-9][a-z0-9_]{0,39}|")
 
 @dataclass(frozen=True, slots=True)
 class RangeSettings:
-    """Settings of the area around the ego that the graph covers."""
+    """Settings of the area around the ego that the graph covers.
 
-    radius: float = setting(50.0, "shape 'radius': how far from the ego's centre; m")
-    shape: str = setting(
-        "radius",
-        "'radius': a circle around the ego's centre; 'rectangle' and 'polygon': in the ego's axes; 'corridor': "
-        "along the lanes ahead of the ego (straight ahead where it is in no driving lane)",
-    )
-    front: float = setting(50.0, "shape 'rectangle': how far ahead of the ego's centre; m")
-    rear: float = setting(25.0, "shape 'rectangle': how far behind it; m")
-    side: float = setting(25.0, "shape 'rectangle': how far to each side; m")
-    polygon: tuple[tuple[float, ...], ...] = setting(
-        (), "shape 'polygon': its corners, [ahead, to the left] of the ego's centre; m"
-    )
-    width: float = setting(10.0, "shape 'corridor': from side to side, across the lane's centre; m")
-    length: float = setting(100.0, "shape 'corridor': how far along the lanes, through forks; m")
-    by: str = setting(
-        "footprint",
-        "part of an entity that must be in range: 'footprint': any part of it; 'centre': its centre",
-    )
-    static_by: str = setting(
-        "footprint", "likewise for entities that never move; parts of a map count by their shape"
-    )
-    height: tuple[float, ...] = setting(
-        (),
-        "[lowest, highest]: how far below or above the ground under the ego the ground under an entity, and "
-        "the road, may be (storeys); signals may hang up to 6 m above it; m. Empty: at any height",
-    )
-    grade: float = setting(
-        0.0,
-        "with height: entities that rise or fall by less than this per metre of distance also count",
-    )
-    height_of_entities: bool = setting(
-        default=True, comment="whether height holds for entities, too, or only for parts of the map"
-    )
-    world: float = setting(
-        200.0,
-        "how far from the ego's centre entities are known beyond its graph: states and places in lanes, no "
-        "edges; m. 0: the graph alone; inf: all of the recording",
-    )
+    Attributes
+    ----------
+    radius : float
+        shape 'radius': how far from the ego's centre; m
+    shape : str
+        'radius': a circle around the ego's centre; 'rectangle' and 'polygon': in the ego's axes;
+        'corridor': along the lanes ahead of the ego (straight ahead where it is in no driving lane)
+    front : float
+        shape 'rectangle': how far ahead of the ego's centre; m
+    rear : float
+        shape 'rectangle': how far behind it; m
+    side : float
+        shape 'rectangle': how far to each side; m
+    polygon : tuple of tuple of float
+        shape 'polygon': its corners, [ahead, to the left] of the ego's centre; m
+    width : float
+        shape 'corridor': from side to side, across the lane's centre; m
+    length : float
+        shape 'corridor': how far along the lanes, through forks; m
+    by : str
+        part of an entity that must be in range: 'footprint': any part of it; 'centre': its centre
+    static_by : str
+        likewise for entities that never move; parts of a map count by their shape
+    height : tuple of float
+        [lowest, highest]: how far below or above the ground under the ego the ground under an
+        entity, and the road, may be (storeys); signals may hang up to 6 m above it; m. Empty: at
+        any height
+    grade : float
+        with height: entities that rise or fall by less than this per metre of distance also count
+    height_of_entities : bool
+        whether height holds for entities, too, or only for parts of the map
+    world : float
+        how far from the ego's centre entities are known beyond its graph: states and places in
+        lanes, no edges; m. 0: the graph alone; inf: all of the recording
+    """
+
+    radius: float = 50.0
+    shape: str = "radius"
+    front: float = 50.0
+    rear: float = 25.0
+    side: float = 25.0
+    polygon: tuple[tuple[float, ...], ...] = ()
+    width: float = 10.0
+    length: float = 100.0
+    by: str = "footprint"
+    static_by: str = "footprint"
+    height: tuple[float, ...] = ()
+    grade: float = 0.0
+    height_of_entities: bool = True
+    world: float = 200.0
 
     def __post_init__(self) -> None:
         check(self.shape in SHAPES, "range.shape", self.shape, one_of(SHAPES))
@@ -139,27 +147,31 @@ class RangeSettings:
 
 @dataclass(frozen=True, slots=True)
 class LaneSettings:
-    """Settings of the map elements in a graph, and of the relations between lanes."""
+    """Settings of the map elements in a graph, and of the relations between lanes.
 
-    ahead: float = setting(
-        100.0,
-        "how far along the lanes the next one ahead is looked for ('leads'), and how far upstream of a signal "
-        "lanes may be affected by it ('mayAffect'); m. 0: neither, so that nothing is known of them",
-    )
-    granularity: str = setting(
-        "lane",
-        "'none': no lanes, roads, junctions, crosswalks; 'lane': these; 'waypoint': points of lanes, too",
-    )
-    spacing: float = setting(1.0, "granularity 'waypoint': from point to point along a lane; m")
-    types: tuple[str, ...] = setting(
-        (),
-        "types of lanes that are kept, as OpenDRIVE has them ('driving', 'sidewalk', …); empty: all",
-    )
-    sections: bool = setting(
-        default=True,
-        comment="whether each section of a road has lanes of its own ('12/0/-1'); otherwise the lanes of a "
-        "number are one node ('12_-1'), as CARLASGG has it",
-    )
+    Attributes
+    ----------
+    ahead : float
+        how far along the lanes the next one ahead is looked for ('leads'), and how far upstream of
+        a signal lanes may be affected by it ('mayAffect'); m. 0: neither, so that nothing is known
+        of them
+    granularity : str
+        'none': no lanes, roads, junctions, crosswalks; 'lane': these; 'waypoint': points of lanes,
+        too
+    spacing : float
+        granularity 'waypoint': from point to point along a lane; m
+    types : tuple of str
+        types of lanes that are kept, as OpenDRIVE has them ('driving', 'sidewalk', …); empty: all
+    sections : bool
+        whether each section of a road has lanes of its own ('12/0/-1'); otherwise the lanes of a
+        number are one node ('12_-1'), as CARLASGG has it
+    """
+
+    ahead: float = 100.0
+    granularity: str = "lane"
+    spacing: float = 1.0
+    types: tuple[str, ...] = ()
+    sections: bool = True
 
     def __post_init__(self) -> None:
         known = 0 <= self.ahead <= MOST_LENGTH
@@ -175,23 +187,26 @@ class LaneSettings:
 
 @dataclass(frozen=True, slots=True)
 class Proximity:
-    """Distance relations. The first one with an upper bound at or above the distance holds."""
+    """Distance relations. The first one with an upper bound at or above the distance holds.
 
-    names: tuple[str, ...] = setting(
-        PROXIMITY,
-        "relations from the nearest to the farthest, by these names or others; empty: none",
-    )
-    upper: tuple[float, ...] = setting(
-        (2.0, 4.0, 7.0, 10.0, 16.0, 25.0),
-        "their upper bounds, included; m. Each begins where that before it ends",
-    )
-    between: str = setting(
-        "centres",
-        "'centres' of the boxes, in space; 'origins': what CARLA takes for the place of an entity "
-        "(a vehicle's is on the ground); 'footprints': the gap between them, in the plane. "
-        "[pairs] has the same distance",
-    )
-    kinds: tuple[tuple[str, ...], ...] = setting((), OF_LABELS)
+    Attributes
+    ----------
+    names : tuple of str
+        relations from the nearest to the farthest, by these names or others; empty: none
+    upper : tuple of float
+        their upper bounds, included; m. Each begins where that before it ends
+    between : str
+        'centres' of the boxes, in space; 'origins': what CARLA takes for the place of an entity (a
+        vehicle's is on the ground); 'footprints': the gap between them, in the plane. [pairs] has
+        the same distance
+    kinds : tuple of tuple of str
+        only related pairs of these labels, in either order: [['Ego', 'Vehicle']]; empty: all
+    """
+
+    names: tuple[str, ...] = PROXIMITY
+    upper: tuple[float, ...] = (2.0, 4.0, 7.0, 10.0, 16.0, 25.0)
+    between: str = "centres"
+    kinds: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         check_pairs("proximity.kinds", self.kinds)
@@ -204,28 +219,32 @@ class Direction:
     """Angular relations between entities, such as ``inFrontOf``.
 
     The first one with an upper bound at or above the absolute bearing holds; else the last.
+
+    Attributes
+    ----------
+    names : tuple of str
+        relations from ahead to behind, by these names or others; empty: none
+    upper : tuple of float
+        upper bounds of all but the last, included; degrees
+    ties : str
+        what holds exactly on a bound: 'ahead': the relation nearer to dead ahead; 'both'
+        (RoadScene2Vec); 'carlasgg': its order: 45° and 90° to the left nearer ahead, 135° and 90°
+        to the right nearer behind
+    sides : str
+        toLeftOf and toRightOf: 'open': what is dead ahead or dead behind is neither; 'closed': it
+        is to the left (CARLASGG); 'none': no such relations among entities
+    within : float
+        up to this distance, as [proximity] measures it; m. 0: as far as pairs are related
+    kinds : tuple of tuple of str
+        only related pairs of these labels, in either order: [['Ego', 'Vehicle']]; empty: all
     """
 
-    names: tuple[str, ...] = setting(
-        DIRECTIONS, "relations from ahead to behind, by these names or others; empty: none"
-    )
-    upper: tuple[float, ...] = setting(
-        (45.0, 90.0, 135.0), "upper bounds of all but the last, included; degrees"
-    )
-    ties: str = setting(
-        "ahead",
-        "what holds exactly on a bound: 'ahead': the relation nearer to dead ahead; 'both' (RoadScene2Vec); "
-        "'carlasgg': its order: 45° and 90° to the left nearer ahead, 135° and 90° to the right nearer behind",
-    )
-    sides: str = setting(
-        "open",
-        "toLeftOf and toRightOf: 'open': what is dead ahead or dead behind is neither; 'closed': it is to the "
-        "left (CARLASGG); 'none': no such relations among entities",
-    )
-    within: float = setting(
-        0.0, "up to this distance, as [proximity] measures it; m. 0: as far as pairs are related"
-    )
-    kinds: tuple[tuple[str, ...], ...] = setting((), OF_LABELS)
+    names: tuple[str, ...] = DIRECTIONS
+    upper: tuple[float, ...] = (45.0, 90.0, 135.0)
+    ties: str = "ahead"
+    sides: str = "open"
+    within: float = 0.0
+    kinds: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         check_pairs("direction.kinds", self.kinds)
@@ -239,21 +258,28 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class PairSettings:
-    """Settings of the pairs of entities that can have relations."""
+    """Settings of the pairs of entities that can have relations.
 
-    within: float = setting(
-        25.0, "all entities that move, up to this distance from one another; m. 0: none"
-    )
-    ego: bool = setting(default=True, comment="the ego with everything in range")
-    static: bool = setting(
-        default=False,
-        comment="entities that never move with one another too, up to the same distance",
-    )
-    ego_within: float = setting(0.0, "maximum distance from the ego; m. 0: no limit")
-    kinds: tuple[tuple[str, ...], ...] = setting(
-        (),
-        "only pairs of these labels, in either order: [['Ego', 'Vehicle'], ['Person', 'Car']]; empty: all",
-    )
+    Attributes
+    ----------
+    within : float
+        all entities that move, up to this distance from one another; m. 0: none
+    ego : bool
+        the ego with everything in range
+    static : bool
+        entities that never move with one another too, up to the same distance
+    ego_within : float
+        maximum distance from the ego; m. 0: no limit
+    kinds : tuple of tuple of str
+        only pairs of these labels, in either order: [['Ego', 'Vehicle'], ['Person', 'Car']]; empty:
+        all
+    """
+
+    within: float = 25.0
+    ego: bool = True
+    static: bool = False
+    ego_within: float = 0.0
+    kinds: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("within", "ego_within"):
@@ -264,14 +290,19 @@ class PairSettings:
 
 @dataclass(frozen=True, slots=True)
 class Payloads:
-    """Settings of the join of sensor messages to frames."""
+    """Settings of the join of sensor messages to frames.
 
-    join: str = setting("nearest", "'nearest' in log time, or 'latest' at or before the frame")
-    tolerance: float = setting(
-        0.0,
-        "greatest difference of log times; s. 0: half the median period of the channel, or of the frames if "
-        "that is longer ('nearest'), the whole of it ('latest')",
-    )
+    Attributes
+    ----------
+    join : str
+        'nearest' in log time, or 'latest' at or before the frame
+    tolerance : float
+        greatest difference of log times; s. 0: half the median period of the channel, or of the
+        frames if that is longer ('nearest'), the whole of it ('latest')
+    """
+
+    join: str = "nearest"
+    tolerance: float = 0.0
 
     def __post_init__(self) -> None:
         check(self.join in JOINS, "payloads.join", self.join, one_of(JOINS))
@@ -296,6 +327,47 @@ class Config:
     Equal configs give equal graphs. The comment of each field, ``docs/parameters.md`` and ``sgstore config``
     explain the settings.
 
+    Attributes
+    ----------
+    ego : str
+        the simulator's id, role or name of the ego; empty: that of the trace
+    mapping : str
+        mapping of the boxes of a Foxglove scene to kinds: a shipped mapping ('nuscenes2mcap') or
+        the path of a TOML file; empty: the shipped one that fits. Other recordings need none
+    sees : bool
+        whether visibility from the ego is computed; if not, it is unknown
+    egos : tuple of str
+        several egos, each with graphs of its own: their ids, roles or names; ['all']: every vehicle
+    rate : float
+        frames kept for each second of the trace's clock: the first frame at or after each step of
+        1/rate. 0: all frames
+    kinds : tuple of str
+        labels of what is kept: entities ('Vehicle', 'Person', 'Signal') and parts of the map
+        ('Lane'); the ego always is. What is not kept is as if it were not there. Empty: everything
+    exclude_ids : tuple of str
+        entities that are left out, as if they were not there: the simulator's ids, or roles or
+        names of vehicles as for ego; an ego never is
+    without : tuple of str
+        relations that are not computed and stay unknown: ['overlaps', 'follows']
+    orientation : str
+        whom a signal of an OpenDRIVE map applies to that has no <validity>: 'asam': traffic in the
+        direction of its orientation along the road, as the standard says; 'carla': the lanes to the
+        left of the road's line where it is '+', to the right where it is '-'. Where the place of
+        signals contradicts, that is said
+    new_kinds : tuple of str
+        kinds of your own, for types to name: ['scooter']
+    types : mapping of str to TypeMeaning
+        type names of the simulator, and type codes of the map's signals ('206'), without regard to
+        case -> what they mean: kind, special kind and subkind, before what sgstore knows of them:
+
+        "vehicle.acme.patrol" = { kind = "car", special = "emergency" }
+    relations : mapping of str to mapping
+        settings of relations of other packages, a table for each:
+
+        [relations.besides]
+
+        reach = 3.0
+
     Examples
     --------
     >>> config = sgstore.Config(ego="hero", rate=5.0)
@@ -311,57 +383,18 @@ class Config:
     pairs: PairSettings = field(default_factory=PairSettings)
     lanes: LaneSettings = field(default_factory=LaneSettings)
     payloads: Payloads = field(default_factory=Payloads)
-    ego: str = setting("", "the simulator's id, role or name of the ego; empty: that of the trace")
-    mapping: str = setting(
-        "",
-        "mapping of the boxes of a Foxglove scene to kinds: a shipped mapping ('nuscenes2mcap') or the path of "
-        "a TOML file; empty: the shipped one that fits. Other recordings need none",
-    )
-    sees: bool = setting(
-        default=True,
-        comment="whether visibility from the ego is computed; if not, it is unknown",
-    )
-    egos: tuple[str, ...] = setting(
-        (),
-        "several egos, each with graphs of its own: their ids, roles or names; ['all']: every vehicle",
-    )
-    rate: float = setting(
-        0.0,
-        "frames kept for each second of the trace's clock: the first frame at or after each step of 1/rate. "
-        "0: all frames",
-    )
-    kinds: tuple[str, ...] = setting(
-        (),
-        "labels of what is kept: entities ('Vehicle', 'Person', 'Signal') and parts of the map ('Lane'); the "
-        "ego always is. What is not kept is as if it were not there. Empty: everything",
-    )
-    exclude_ids: tuple[str, ...] = setting(
-        (),
-        "entities that are left out, as if they were not there: the simulator's ids, or roles or names of "
-        "vehicles as for ego; an ego never is",
-    )
-    without: tuple[str, ...] = setting(
-        (),
-        "relations that are not computed and stay unknown: ['overlaps', 'follows']",
-    )
-    orientation: str = setting(
-        "asam",
-        "whom a signal of an OpenDRIVE map applies to that has no <validity>: 'asam': traffic in the "
-        "direction of its orientation along the road, as the standard says; 'carla': the lanes to the left "
-        "of the road's line where it is '+', to the right where it is '-'. Where the place of signals "
-        "contradicts, that is said",
-    )
-    new_kinds: tuple[str, ...] = setting((), "kinds of your own, for types to name: ['scooter']")
-    types: Mapping[str, TypeMeaning] = setting(
-        {},
-        "type names of the simulator, and type codes of the map's signals ('206'), without regard to case -> "
-        "what they mean: kind, special kind and subkind, before what sgstore knows of them:\n"
-        '"vehicle.acme.patrol" = { kind = "car", special = "emergency" }',
-    )
-    relations: Mapping[str, Mapping[str, Any]] = setting(
-        {},
-        "settings of relations of other packages, a table for each:\n[relations.besides]\nreach = 3.0",
-    )
+    ego: str = ""
+    mapping: str = ""
+    sees: bool = True
+    egos: tuple[str, ...] = ()
+    rate: float = 0.0
+    kinds: tuple[str, ...] = ()
+    exclude_ids: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
+    orientation: str = "asam"
+    new_kinds: tuple[str, ...] = ()
+    types: Mapping[str, TypeMeaning] = field(default_factory=dict)
+    relations: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check(not (self.ego and self.egos), "egos", self.egos, "either ego or egos, not both")

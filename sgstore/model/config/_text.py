@@ -8,8 +8,8 @@ from dataclasses import asdict, fields, is_dataclass
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.docstrings import split_docstring
 from sgstore.model.config._settings import Config
-from sgstore.model.config._values import COMMENT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,39 +23,35 @@ WIDTH: Final = 98
 
 def as_toml(config: Config) -> str:
     """Return all settings as TOML text, each with its comment. :func:`load` reads this text."""
+    _, own = split_docstring(Config)
     lines = ["# Settings of sgstore. Lengths are metres, angles degrees, times seconds.", ""]
     tables: list[str] = []
     for one in fields(config):
         value = getattr(config, one.name)
         if is_dataclass(value):
-            tables += ["", *(f"# {line}" for line in _summary(type(value))), f"[{one.name}]"]
+            about, comments = split_docstring(type(value))
+            tables += ["", f"# {about.splitlines()[0]}", f"[{one.name}]"]
             for inner in fields(value):
-                tables += _setting(inner, getattr(value, inner.name))
+                tables += _setting(inner.name, getattr(value, inner.name), comments)
         elif one.name == "relations":
-            tables += ["", *_comment(one), *([] if value else ["[relations]"])]
+            tables += ["", *_comment(own[one.name][1]), *([] if value else ["[relations]"])]
             for name, values in value.items():
                 tables.append(f"[relations.{name}]")
                 tables += [f"{k} = {_literal(v)}" for k, v in values.items()]
         elif isinstance(value, Mapping):
-            tables += ["", *_comment(one), f"[{one.name}]"]
+            tables += ["", *_comment(own[one.name][1]), f"[{one.name}]"]
             tables += [f"{_text(key)} = {_meaning(asdict(v))}" for key, v in value.items()]
         else:
-            lines += _setting(one, value)
+            lines += _setting(one.name, value, own)
     return "\n".join([*lines, *tables, ""])
 
 
-def _setting(one: Any, value: Any) -> Iterator[str]:
-    yield from _comment(one)
-    yield f"{one.name} = {_literal(value)}"
+def _setting(name: str, value: Any, comments: Mapping[str, tuple[str, str]]) -> list[str]:
+    return [*_comment(comments[name][1]), f"{name} = {_literal(value)}"]
 
 
-def _comment(one: Any) -> Iterator[str]:
-    for paragraph in one.metadata[COMMENT].splitlines():
-        yield from (f"# {line}" for line in wrap(paragraph, WIDTH))
-
-
-def _summary(cls: type) -> list[str]:
-    return (cls.__doc__ or "").strip().splitlines()[:1]
+def _comment(text: str) -> list[str]:
+    return [f"# {line}" for paragraph in text.splitlines() for line in wrap(paragraph, WIDTH)]
 
 
 def _literal(value: Any) -> str:

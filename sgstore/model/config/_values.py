@@ -5,28 +5,14 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import MISSING, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, TypeVar, get_args, get_origin, get_type_hints
+from dataclasses import MISSING, fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, get_args, get_origin, get_type_hints
 
 from sgstore.errors import ConfigError
 from sgstore.model.vocabulary import suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-COMMENT: Final = "comment"
-"""Metadata key of a setting's comment."""
-
-T = TypeVar("T")
-
-
-def setting(default: T, comment: str) -> T:
-    """Return a dataclass field for a setting, with its default and its comment."""
-    plain: Any = default
-    metadata = {COMMENT: comment}
-    if isinstance(default, dict):
-        return field(default_factory=dict, metadata=metadata)  # pyright: ignore[reportReturnType]
-    return field(default=plain, metadata=metadata)
 
 
 def check(holds: bool, name: str, value: object, right: str) -> None:  # noqa: FBT001
