@@ -40,7 +40,7 @@ CODECS: Final[dict[str, tuple[tuple[str, ...], dict[str, str]]]] = {
     ),
 }
 """Encoders of each kind of video, best first, with their settings."""
-MOST_CHANGE: Final = 40
+FILM_CHANGE: Final = 40
 """Greatest change of a colour channel by an earlier palette, 0 … 255."""
 
 
@@ -162,7 +162,7 @@ class Gif(Animation):
         if self._palette is not None:
             part = picture.crop(box)
             made = part.quantize(palette=self._palette, dither=Image.Dither.NONE)
-            if greatest_change(made, part) <= MOST_CHANGE:
+            if greatest_change(made, part) <= FILM_CHANGE:
                 return made
         self._palette = quantized(picture)
         return self._palette.crop(box)

@@ -16,7 +16,7 @@ from PIL import Image
 
 from sgstore.apps.cli import run
 from sgstore.draw import draw_clip, draw_stored
-from sgstore.draw._animation import MOST_CHANGE, Gif, animation, changed
+from sgstore.draw._animation import FILM_CHANGE, Gif, animation, changed
 from sgstore.draw._film import FilmPage, TextSprites
 from sgstore.draw._page import TEXT, Page, own_style, printable
 from sgstore.draw._picture import diagram_page, frame_page
@@ -61,7 +61,7 @@ def noise(seed: int, height: int = 40, width: int = 60) -> NDArray[np.uint8]:
 
 def alike(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> bool:
     """True if no colour differs by more than a palette may change it."""
-    return bool(np.abs(a.astype(int) - b).max() <= MOST_CHANGE)
+    return bool(np.abs(a.astype(int) - b).max() <= FILM_CHANGE)
 
 
 # The container ------------------------------------------------------------------------------------
