@@ -1,18 +1,23 @@
-"""Counts by masks: the same as counting frame by frame."""
+"""Counts by masks and other plans of a query: the same rows as frame by frame and without each rule."""
 
 from __future__ import annotations
 
 import random
 from collections import Counter
+from contextlib import suppress
 from operator import eq, ge, gt, le, lt, ne
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import duckdb
 import pytest
+from oracle import disagreement
+from oracle_patterns import Writer
 from oracle_worlds import World, random_world
 from thorough import LONG
 
+import sgstore.lang.sql._masks as sql
 import sgstore.lang.sql._rewrite as rewrite
+from sgstore.errors import QueryError
 from sgstore.lang.sql import compile_query
 from sgstore.lang.sql._mask_counts import MOST, CountRange, frames_with
 
@@ -20,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sgstore.lang.catalog import Catalog
-    from sgstore.lang.ir import Query
     from sgstore.lang.sql import SqlStatement
 
 SIGNS: dict[str, Callable[[float, float], bool]] = {
@@ -32,6 +36,14 @@ SIGNS: dict[str, Callable[[float, float], bool]] = {
     "<>": ne,
 }
 Rows = list[tuple[int, int, int]]
+
+
+def rows_of(world: World, statement: SqlStatement) -> list[tuple[Any, ...]]:
+    return world.connection.execute(statement.sql, list(statement.values)).fetchall()
+
+
+def unchanged(of: Any, _: Catalog, **__: bool) -> Any:
+    return of
 
 
 def found(rows: Rows, wanted: CountRange) -> set[tuple[int, int, int]]:
@@ -123,16 +135,10 @@ def test_bucket_counts_equal_frame_counts(
 ) -> None:
     compiled = compile_query(text, world.catalog)
 
-    def unchanged(query: Query, _: Catalog) -> Query:
-        return query
-
     monkeypatch.setattr(rewrite, "count_by_buckets", unchanged)
     by_frames = compile_query(text, world.catalog).rows()
 
-    def rows(of: SqlStatement) -> list[tuple[object, ...]]:
-        return world.connection.execute(of.sql, list(of.values)).fetchall()
-
-    assert rows(compiled.rows()) == rows(by_frames)
+    assert rows_of(world, compiled.rows()) == rows_of(world, by_frames)
     assert "held" in compiled.rows().sql
     assert "held" not in by_frames.sql
 
@@ -144,3 +150,72 @@ def test_changing_values_are_not_counted_by_bucket(returned: str, world: World) 
     statement = compile_query(f"MATCH (a)-[:near]->(b) RETURN {returned}", world.catalog).rows()
 
     assert "held" not in statement.sql
+
+
+# Other plans of a query
+
+
+# Without labels_to_conditions, labels of nodes outside a block have no SQL.
+OPTIONAL = (
+    "push_negations",
+    "counts_to_existence",
+    "unfold_paths",
+    "labels_from_conditions",
+    "open_exists",
+    "entities_of_pairs",
+    "narrowed",
+    "ordered",
+    "count_by_buckets",
+)
+
+
+@pytest.fixture(scope="module")
+def answered() -> tuple[World, dict[str, list[tuple[Any, ...]]]]:
+    """Random queries with their rows by all rules."""
+    world, answers = random_world(11), {}
+    for number in range(400, 416):
+        text = Writer(number).query()
+        with suppress(QueryError):
+            answers[text] = rows_of(world, compile_query(text, world.catalog).rows())
+    assert len(answers) > 10
+    return world, answers
+
+
+@pytest.mark.parametrize("rule", OPTIONAL)
+def test_rewriting_rule_keeps_results(
+    rule: str,
+    answered: tuple[World, dict[str, list[tuple[Any, ...]]]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world, answers = answered
+    monkeypatch.setattr(rewrite, rule, unchanged)
+    for text, rows in answers.items():
+        assert rows_of(world, compile_query(text, world.catalog).rows()) == rows, text
+
+
+PATHS = [
+    "MATCH (a:Car)-[:isIn]->(l:Lane)-[:travelsTo*1..2]->(m:Lane)<-[:isIn]-(b)",
+    "MATCH (a:Car)-[:near|visible*1..3]->(b)-[r:isIn]->(l:Lane)",
+    "USING NODES any MATCH (a:Car)-[:isIn]->(l:Lane)-[:travelsTo|opposes*2..4]->(l)",
+    "MATCH (a)-[:near*1..2]->(b)-[:visible*1..2]->(c), (a)-[:isIn]->(:Lane)",
+    "MATCH (a:Car) WHERE COUNT {(a)-[:isIn]->(l:Lane)-[:travelsTo*1..3]->(m)} >= 2",
+    "MATCH (a:Person)-[:isIn]->(l:Lane)-[:near*1..2]->(m:Lane)",
+]
+
+
+@pytest.mark.parametrize("text", PATHS)
+def test_paths_start_at_bound_nodes_without_changing_results(
+    text: str, world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rows() -> tuple[str, list[tuple[Any, ...]]]:
+        statement = compile_query(text, world.catalog).rows()
+        return statement.sql, rows_of(world, statement)
+
+    unfolded, found = rows()
+    monkeypatch.setattr(sql, "_BRANCHES", 0)
+    at_once, same = rows()
+
+    assert found == same
+    assert ":lengths" not in at_once
+    assert ":lengths" in unfolded or '"ways ' in unfolded or not found
+    assert disagreement(text, world)[0] == ""

@@ -8,15 +8,14 @@ from itertools import permutations
 from typing import TYPE_CHECKING
 
 import pytest
-from oracle import disagreement
 from oracle_worlds import World, random_world
 
-import sgstore.lang.sql._masks as sql
 from sgstore.lang.sql import compile_query
-from sgstore.store._catalog import catalog_of
+from sgstore.store import StoreFile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from sgstore.lang.catalog import Catalog
 
@@ -67,46 +66,19 @@ def test_rare_edge_follows_a_connected_edge(world: World) -> None:
     assert order(statement.sql) == ["near", "visible", "inDFrontOf"]
 
 
-def test_catalog_counts_rows_exactly(world: World) -> None:
-    catalog = catalog_of(world.connection)
+def test_catalog_counts_rows_exactly(town_store: Path) -> None:
+    file = StoreFile(town_store)
+    catalog = file.catalog()
 
     for table, counts in (("edge", catalog.edges), ("map_edge", catalog.map_edges)):
-        sql = f"SELECT relation, src_kind, dst_kind, count(*) FROM {table} GROUP BY ALL"
-        rows = world.connection.execute(sql).fetchall()
+        sql = f"SELECT relation, src_kind, dst_kind, count(*) FROM inside.{table} GROUP BY ALL"
+        rows = file.rows(sql).values
         assert dict(counts) == {(r, s, d): n for r, s, d, n in rows}
         assert len(rows) > 3
 
 
-PATHS = [
-    "MATCH (a:Car)-[:isIn]->(l:Lane)-[:travelsTo*1..2]->(m:Lane)<-[:isIn]-(b)",
-    "MATCH (a:Car)-[:near|visible*1..3]->(b)-[r:isIn]->(l:Lane)",
-    "USING NODES any MATCH (a:Car)-[:isIn]->(l:Lane)-[:travelsTo|opposes*2..4]->(l)",
-    "MATCH (a)-[:near*1..2]->(b)-[:visible*1..2]->(c), (a)-[:isIn]->(:Lane)",
-    "MATCH (a:Car) WHERE COUNT {(a)-[:isIn]->(l:Lane)-[:travelsTo*1..3]->(m)} >= 2",
-    "MATCH (a:Person)-[:isIn]->(l:Lane)-[:near*1..2]->(m:Lane)",
-]
-
-
-@pytest.mark.parametrize("text", PATHS)
-def test_paths_start_at_bound_nodes_without_changing_results(
-    text: str, world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def rows() -> tuple[str, list[tuple[object, ...]]]:
-        statement = compile_query(text, world.catalog).rows()
-        return statement.sql, world.connection.execute(statement.sql, statement.values).fetchall()
-
-    unfolded, found = rows()
-    monkeypatch.setattr(sql, "_BRANCHES", 0)
-    at_once, same = rows()
-
-    assert found == same
-    assert ":lengths" not in at_once
-    assert ":lengths" in unfolded or '"ways ' in unfolded or not found
-    assert disagreement(text, world)[0] == ""
-
-
 def test_paths_are_searched_in_answerable_traces(world: World) -> None:
-    text = PATHS[0]
+    text = "MATCH (a:Car)-[:isIn]->(l:Lane)-[:travelsTo*1..2]->(m:Lane)<-[:isIn]-(b)"
     silent, *others = world.catalog.traces
     catalog = replace(world.catalog, traces=(replace(silent, answers=frozenset()), *others))
 

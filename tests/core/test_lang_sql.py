@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from oracle_patterns import Writer
 from oracle_worlds import World, random_world
 
-import sgstore.lang.sql._rewrite as rewrite
 from sgstore.errors import QueryError
 from sgstore.lang.catalog import NODE_ATTRIBUTES, DisplayUnit
 from sgstore.lang.sql import SqlStatement, Window, compile_query
@@ -29,7 +27,6 @@ from sgstore.model.pair_numbers import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sgstore.lang.catalog import Catalog
 
 pytestmark = pytest.mark.seconds(14)
 
@@ -250,42 +247,6 @@ def test_parameters_have_types(value: Any, frames: bool | None, world: World) ->
             found(world, text, v=value)
     else:
         assert found(world, text, v=value)
-
-
-# Without labels_to_conditions, labels of nodes outside a block have no SQL.
-OPTIONAL = (
-    "push_negations",
-    "counts_to_existence",
-    "unfold_paths",
-    "labels_from_conditions",
-    "open_exists",
-    "entities_of_pairs",
-    "narrowed",
-    "ordered",
-    "count_by_buckets",
-)
-
-
-def unchanged(of: Any, _: Catalog, **__: bool) -> Any:
-    return of
-
-
-@pytest.mark.parametrize("rule", OPTIONAL)
-def test_rewriting_rule_keeps_results(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    world = random_world(11)
-    tried = 0
-    for number in range(400, 416):
-        text = Writer(number).query()
-        try:
-            with_rule = compile_query(text, world.catalog)
-        except QueryError:
-            continue
-        with monkeypatch.context() as patch:
-            patch.setattr(rewrite, rule, unchanged)
-            without = compile_query(text, world.catalog)
-        assert rows_of(world, without.rows()) == rows_of(world, with_rule.rows()), text
-        tried += 1
-    assert tried > 10
 
 
 def test_same_text_gives_same_sql(world: World) -> None:

@@ -14,7 +14,7 @@ from recordings import Recorder, car
 from sgstore.apps.cli import run as run_verb
 from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
-from sgstore.lang.bind._needed_values import MEASURED
+from sgstore.lang.bind import MOTION
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Type
 from sgstore.model.vocabulary import VEHICLE_LIGHTS, natural, normalize_name
 from sgstore.query import Store
@@ -60,7 +60,12 @@ def silent(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
         yield store
 
 
-OF_ENTITIES = sorted(MEASURED - {"speed_limit", "curvature", "light_state"})
+OF_ENTITIES = sorted(
+    {
+        *(*MOTION, *VEHICLE_LIGHTS, "heading", "pitch", "roll", "length", "width", "height"),
+        *("steer", "throttle", "brake", "gear", "hand_brake", "parked"),
+    }
+)
 CARS = {
     *VEHICLE_LIGHTS,
     "parked",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import networkx as nx
 import pytest
+from graph_blocks import add_labels
 
 import sgstore
 from sgstore.errors import ConfigError, QueryError, QueryNameError, StoreError
@@ -336,15 +337,9 @@ def test_a_kind_that_cannot_be_is_told(tmp_path: Path, text: str, told: str) -> 
 
 
 def test_a_store_whose_kinds_are_no_names_is_refused(tmp_path: Path) -> None:
-    import duckdb
-
     path = tmp_path / "x.sgstore"
     StoreFile.create(path)
-    from sgstore.store._schema import widen
-
-    with duckdb.connect() as connection:
-        connection.execute(f"ATTACH '{path}' AS other")
-        widen(connection, "other", {"kind": ["a b"]})
+    add_labels(path, "kind", ["a b"])
 
     with pytest.raises(StoreError, match="a kind: 'a b' is not a name"):
         StoreFile(path)
@@ -352,14 +347,9 @@ def test_a_store_whose_kinds_are_no_names_is_refused(tmp_path: Path) -> None:
 
 def with_names(path: Path, **names: list[str]) -> Path:
     """A store of the sample whose enumerations have more names, as another process may have made it."""
-    import duckdb
-
-    from sgstore.store._schema import widen
-
     ingest(path, [sgstore.__path__[0] + "/apps/sample/town.mcap"], until=1.0)
-    with duckdb.connect() as connection:
-        connection.execute(f"ATTACH '{path}' AS other")
-        widen(connection, "other", names)
+    for enum, labels in names.items():
+        add_labels(path, enum, labels)
     return path
 
 

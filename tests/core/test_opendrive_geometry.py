@@ -14,6 +14,7 @@ from opendrive_maps import (
     arc,
     border,
     cubic,
+    element,
     lane,
     line,
     param_poly3,
@@ -24,7 +25,6 @@ from opendrive_maps import (
 )
 
 from sgstore.maps.opendrive import read_map
-from sgstore.maps.opendrive._piecewise import last_before
 
 if TYPE_CHECKING:
     from sgstore.maps.roads import LanePoints, RoadMap
@@ -336,20 +336,26 @@ def test_lanes_of_no_width_and_sections_of_no_length_are_there_and_touch_nothing
 
 def test_the_record_that_holds_is_the_last_that_starts_at_or_before() -> None:
     rng = np.random.default_rng(3)
-    group, at = rng.integers(0, 5, 60), rng.integers(0, 20, 60).astype(float)
-    asked_group, asked_at = rng.integers(0, 7, 300), rng.uniform(-2, 22, 300).round()
+    lanes = "".join(section(lane(0), lane(-1), s=s) for s in range(0, 24, 2))
+    starts = {str(road): rng.integers(2, 22, road * 3).tolist() for road in range(5)}
+    roads = []
+    for road, records in starts.items():
+        speeds = (element("speed", max=i + 1, unit="m/s") for i in range(len(records)))
+        types = (element("type", speed, s=s) for speed, s in zip(speeds, records, strict=True))
+        roads.append(a_road(road, line(24.0), sections=lanes, type="".join(types)))
 
-    found = last_before(group, at, asked_group, asked_at)
+    nodes = read_map(a_map(*roads), "speeds").nodes
 
-    for g, s, row in zip(asked_group, asked_at, found, strict=True):
-        mine = np.flatnonzero(group == g)
-        if not len(mine):
-            assert row == -1
-            continue
-        begun = mine[at[mine] <= s]
-        starts = at[begun].max() if len(begun) else at[mine].min()
-        assert group[row] == g
-        assert at[row] == starts
+    for road, records in starts.items():
+        for number in range(12):
+            speed = nodes.speed_limit[nodes.name.index(f"{road}/{number}/-1")]
+            begun = [(s, i) for i, s in enumerate(records) if s <= 2 * number + 1]
+            if begun:
+                assert speed == max(begun)[1] + 1  # of two that start at once the later one
+            elif records:
+                assert speed == records.index(min(records)) + 1
+            else:
+                assert np.isnan(speed)
 
 
 def test_the_turn_of_a_lane_through_a_junction_is_that_of_its_own_traffic() -> None:

@@ -8,21 +8,19 @@ import tomllib
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-import duckdb
 import numpy as np
 import pytest
+from graph_blocks import add_labels
 
-import sgstore.graphs.relations._registry as registry
 from sgstore.apps.demo import RECORDING
 from sgstore.base import plugins
 from sgstore.errors import ConfigError, QueryNameError, StoreError
-from sgstore.graphs.relations import BlockScene, Relation, edges_between
+from sgstore.graphs.relations import BlockScene, Relation, edges_between, relations
 from sgstore.ingest import ingest
 from sgstore.model import vocabulary
 from sgstore.model.config import Config, Direction, Proximity, as_toml, from_dict, load
 from sgstore.query import Store
 from sgstore.store import StoreFile
-from sgstore.store._schema import widen
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -65,7 +63,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
         for (held, _), value in zip(kept, values, strict=True):
             held.clear()
             held.extend(value) if isinstance(held, list) else held.update(value)
-        registry.relations.cache_clear()
+        relations.cache_clear()
         vocabulary._add_plugins.cache_clear()
 
     monkeypatch.setattr(plugins, "entry_points", lambda group: [])
@@ -77,7 +75,7 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 def installed(monkeypatch: pytest.MonkeyPatch, loaded: Any = ABREAST_OF) -> None:
     found = {plugins.RELATIONS.group: [entry(loaded)]}
     monkeypatch.setattr(plugins, "entry_points", lambda group: found.get(group, []))
-    registry.relations.cache_clear()
+    relations.cache_clear()
     vocabulary._add_plugins.cache_clear()
 
 
@@ -140,9 +138,7 @@ def test_a_store_whose_relations_are_no_names_is_refused(
 ) -> None:
     path = tmp_path / "s.db"
     StoreFile.create(path)
-    with duckdb.connect() as connection:
-        connection.execute(f"ATTACH '{path}' AS other")
-        widen(connection, "other", {"relation": [label]})
+    add_labels(path, "relation", [label])
 
     with pytest.raises(StoreError, match="a relation: "):
         StoreFile(path)
@@ -180,7 +176,7 @@ def test_a_package_whose_relation_cannot_be_loaded_is_named(
     installed(monkeypatch, loaded)
 
     with pytest.raises(ConfigError, match="the relation 'abreast_of'"):
-        registry.relations()
+        relations()
 
 
 def edges_of_pairs_near_enough(scene: BlockScene) -> Edges:
@@ -227,7 +223,7 @@ def test_a_relation_that_the_tree_lists_has_settings(
 ) -> None:
     monkeypatch.setitem(plugins.RELATIONS.own, "abreast_of", "unused:ABREAST_OF")
     monkeypatch.setitem(plugins.RELATIONS._loaded, "abreast_of", NEAR_ENOUGH)
-    registry.relations.cache_clear()
+    relations.cache_clear()
 
     config = from_dict({"relations": {"abreast_of": {"reach": 3}}})
 

@@ -15,8 +15,6 @@ from sgstore.errors import StoreError
 from sgstore.model.config import Config, RangeSettings
 from sgstore.model.vocabulary import RELATIONS
 from sgstore.store import StoreFile
-from sgstore.store._lease import give_back
-from sgstore.store._locking import BLOCK_SIZE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,14 +35,11 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoreFile]:
 
 def content(path: Path) -> list[tuple[str, int]]:
     """Tables of a database and how many rows each has."""
-    give_back()
-    with duckdb.connect(str(path), read_only=True) as connection:
-        sql = "SELECT schema_name || '.' || table_name FROM duckdb_tables() ORDER BY 1"
-        names = connection.execute(sql).fetchall()
-        return [
-            (name, *connection.execute(f"SELECT count(*) FROM {name}").fetchone())
-            for (name,) in names
-        ]
+    store = StoreFile(path)
+    names = store.rows("SELECT schema_name || '.' || table_name FROM duckdb_tables() ORDER BY 1")
+    return [
+        (name, *store.rows(f"SELECT count(*) FROM {name}").values[0]) for (name,) in names.values
+    ]
 
 
 # Opening
@@ -389,5 +384,5 @@ def test_an_empty_store_is_small_and_one_written_anew_stays_so(tmp_path: Path) -
         file.close()
         with duckdb.connect(str(file.path), read_only=True) as connection:
             (size,) = connection.execute("SELECT block_size FROM pragma_database_size()").fetchone()
-        assert size == BLOCK_SIZE
+        assert size == 1 << 16
         file.compact()

@@ -42,6 +42,7 @@ from sgstore.testsets.selection import (
     within,
 )
 from sgstore.testsets.selection._bounds import bounded
+from sgstore.testsets.selection._cover import reduced
 from sgstore.testsets.selection._sets import greedy
 
 if TYPE_CHECKING:
@@ -166,6 +167,47 @@ def test_what_a_handler_of_signals_raises_ends_a_search() -> None:
     command = [sys.executable, "-c", ENDED]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=600)
     assert done.stdout == "ended\n"
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_where_every_element_is_in_consecutive_sets_reductions_alone_decide(seed: int) -> None:
+    # Stabbing of intervals: the fewest points are found by the classical greedy choice of ends.
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, 60, 40)
+    last = np.minimum(first + rng.integers(0, 9, 40), 59)
+    pairs = np.array(
+        [(s, e) for e in range(40) for s in range(int(first[e]), int(last[e]) + 1)], np.int64
+    ).T
+    points: list[int] = []
+    for end, begin in sorted(zip(last.tolist(), first.tolist(), strict=True)):
+        if not points or points[-1] < begin:
+            points.append(end)
+
+    forced, parts = reduced(SetFamily.of(pairs, 60, 40))
+
+    assert parts == []
+    assert len(forced) == len(points)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_what_is_superfluous_changes_no_optimum_whatever_sets_cost(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sets, elements = 10, 14
+    holds = rng.random((sets, elements)) < 0.3
+    cost = rng.integers(1, 5, sets).astype(np.float64)
+    of = SetFamily.of(np.array(np.nonzero(holds)), sets, elements, cost, 1 + seed % 2)
+    reachable = of.need.sum()
+    every = [list(c) for n in range(sets + 1) for c in combinations(range(sets), n)]
+    best = min(
+        cost[c].sum() for c in every if np.minimum(holds[c].sum(axis=0), of.need).sum() == reachable
+    )
+
+    forced, parts = reduced(of)
+    left = sum(minimal(part).cost for part, _ in parts)
+
+    assert cost[forced].sum() + left >= best - 1e-9
+    if SOLVER:  # the extra [solver], which finds the optimum of what is left
+        assert cost[forced].sum() + left == pytest.approx(best)
 
 
 def test_ties_are_broken_by_rank_alone() -> None:

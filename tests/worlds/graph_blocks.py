@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import duckdb
 import numpy as np
 
 from sgstore.maps.roads import LaneCourses, MapEdges, MapNodes, MapPlaces
@@ -30,6 +31,8 @@ from sgstore.model.world import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from sgstore.store import StoreFile
 
 PERIOD_NS = 100_000_000
@@ -306,3 +309,19 @@ def publish(store: StoreFile, trace: RandomTrace, config: Config | None = None) 
         for graph in trace.blocks:
             segment.append(graph)
         return store.publish(segment.seal(TraceReport(frames=trace.frames)))
+
+
+def add_labels(path: Path, enum: str, labels: Sequence[str]) -> None:
+    """Add labels to an enumeration of a store, as a process with other plugins may have done."""
+    with duckdb.connect(str(path)) as connection:
+        old = connection.execute(f"SELECT enum_range(NULL::main.{enum})").fetchall()[0][0]
+        narrow, wide = (f"ENUM({str(each)[1:-1]})" for each in (old, [*old, *labels]))
+        columns = connection.execute(
+            "SELECT table_name, column_name FROM duckdb_columns() SEMI JOIN duckdb_tables()"
+            " USING (schema_name, table_name) WHERE data_type = $1",
+            [narrow],
+        ).fetchall()
+        assert columns
+        for table, column in columns:
+            connection.execute(f"ALTER TABLE inside.{table} ALTER {column} TYPE {wide}")
+        connection.execute(f"DROP TYPE main.{enum}; CREATE TYPE main.{enum} AS {wide}")
