@@ -29,12 +29,12 @@ SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
 """Bits of a frame id below the trace id."""
 
 
-def trace_bucket(trace_id: int, seq: Ints) -> Ints:
+def trace_bucket(trace_id: int | Ints, seq: Ints) -> Ints:
     """Return the bucket number (group of 64 frames) of each frame number of a trace."""
     return (trace_id << BUCKET_BITS) + seq // BUCKET_FRAMES
 
 
-def frame_ids(trace_id: int, seq: Ints) -> Ints:
+def frame_ids(trace_id: int | Ints, seq: Ints) -> Ints:
     """Return the frame id of each frame number of a trace."""
     return (trace_bucket(trace_id, seq) << FRAME_BITS) + seq % BUCKET_FRAMES
 

@@ -24,9 +24,10 @@ from sgstore.store._catalog import subset_catalogs
 from sgstore.store._classes import Abstracted
 from sgstore.store._clients import duckdb
 from sgstore.store._coded_classes import CodedClasses, Triples
-from sgstore.store._contents import Mark, MessagePlaces, graph_digests
+from sgstore.store._contents import Mark, MessagePlaces
 from sgstore.store._encounters import measured
 from sgstore.store._file import StoreFile
+from sgstore.store._graph_digests import graph_digests
 from sgstore.store._inbox_segments import split_segment, whole_segment
 from sgstore.store._joins import UserTables
 from sgstore.store._merge import PartFile

@@ -72,24 +72,30 @@ class Checksum:
 
         ``None`` means an all-missing column.
         """
-        count = next((len(values) for values in columns.values() if values is not None), 0)
-        hashes, words, shifted = (np.empty(min(count, _AT_ONCE), np.uint64) for _ in range(3))
-        for first in range(0, count, _AT_ONCE):
-            here = slice(first, min(first + _AT_ONCE, count))
-            size = here.stop - first
-            mixed, word, spare = hashes[:size], words[:size], shifted[:size]
-            mixed[:] = 0
-            for number, name in enumerate(sorted(columns)):
-                values = columns[name]
-                if values is None:
-                    word[:] = _MISSING
-                else:
-                    _words(values[here], word)
-                word ^= np.uint64((number + 1) * _STEP & 0xFFFFFFFFFFFFFFFF)
-                mixed += word
-                _mix(mixed, spare)
-            self.value = (self.value + int(mixed.sum(dtype=np.uint64))) & 0x7FFFFFFFFFFFFFFF
-        self.rows += count
+        hashes = row_words(columns)
+        self.value = (self.value + int(hashes.sum(dtype=np.uint64))) & 0x7FFFFFFFFFFFFFFF
+        self.rows += len(hashes)
+
+
+def row_words(columns: Mapping[str, NDArray[Any] | None]) -> Words:
+    """Return a hash of each row, (N,), of columns as for :meth:`Checksum.add`."""
+    count = next((len(values) for values in columns.values() if values is not None), 0)
+    hashes = np.zeros(count, np.uint64)
+    words, shifted = (np.empty(min(count, _AT_ONCE), np.uint64) for _ in range(2))
+    for first in range(0, count, _AT_ONCE):
+        here = slice(first, first + _AT_ONCE)
+        mixed = hashes[here]
+        word, spare = words[: len(mixed)], shifted[: len(mixed)]
+        for number, name in enumerate(sorted(columns)):
+            values = columns[name]
+            if values is None:
+                word[:] = _MISSING
+            else:
+                _words(values[here], word)
+            word ^= np.uint64((number + 1) * _STEP & 0xFFFFFFFFFFFFFFFF)
+            mixed += word
+            _mix(mixed, spare)
+    return hashes
 
 
 def _mix(words: Words, spare: Words) -> None:
@@ -160,10 +166,13 @@ def columns_of(
     return [(name, kind) for name, kind, *_ in rows]
 
 
-def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -> str:
+def expressions(
+    connection: DuckDBPyConnection, table: str, catalog: str = "", only: Sequence[str] = ()
+) -> str:
     """Return an SQL list of a table's columns as numbers, for a checksum of the stored rows.
 
-    Numbers stay unchanged. Enumerations become codes, and texts become 60 bits of their MD5.
+    Numbers stay unchanged. Enumerations become codes, and texts become 60 bits of their MD5. ``only``: columns
+    to return; empty means all.
     """
     listed: list[str] = []
     for name, kind in columns_of(connection, table, catalog):
@@ -172,6 +181,6 @@ def expressions(connection: DuckDBPyConnection, table: str, catalog: str = "") -
             value = code_sql(value, kind)
         elif kind in TEXTS:
             value = f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
-        if (table, name) not in _ASSIGNED:
+        if (table, name) not in _ASSIGNED and (not only or name in only):
             listed.append(f'{value} AS "{name}"')
     return ", ".join(listed)

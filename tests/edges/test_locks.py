@@ -252,6 +252,38 @@ def test_a_digest_tells_every_number_and_every_edge_apart(store: Store) -> None:
     assert graph_digests(store.file, [ids[::2]]) != graph_digests(store.file, [ids])
 
 
+def test_a_digest_is_the_same_however_the_store_is_read(
+    store: Store, lock: Lock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import sgstore.store._graph_digests as reading
+
+    ids = frames_of_lock(lock, store)
+    groups = [ids[30:], ids[:61:7], ids[5:50], ids[12:13]]
+    whole = graph_digests(store.file, groups)
+    monkeypatch.setattr(reading, "FIRST", 1)
+    monkeypatch.setattr(reading, "_ROWS_TOGETHER", 1)
+
+    assert graph_digests(store.file, groups) == whole
+    assert [graph_digests(store.file, [group])[0] for group in groups] == whole
+
+
+def test_a_lock_of_format_1_is_read_and_verified(store: Store, lock: Lock, tmp_path: Path) -> None:
+    ids = frames_of_lock(lock, store)
+    groups = [ids[case.first : case.last + 1] for case in lock.cases]
+    digests = graph_digests(store.file, groups, older=True)
+    cases = [replace(case, graph=one) for case, one in zip(lock.cases, digests, strict=True)]
+    cases[3] = replace(cases[3], graph="0" * 32)
+    old = replace(lock, cases=tuple(cases), format=1)
+    old.write(tmp_path / "old.lock")
+
+    assert '"sgstore_lock": 1' in old.text()
+    assert read_lock(tmp_path / "old.lock") == old
+    assert what_changed(old, store) == {"graph": {cases[3].id}}
+    assert union(old, old) == replace(old, selection={"union": [lock.selection, lock.selection]})
+    with pytest.raises(StoreError, match="formats 1 and 2"):
+        union(old, lock)
+
+
 # Sets -------------------------------------------------------------------------------------------------------
 
 
@@ -305,7 +337,7 @@ def test_one_case_of_two_contents_is_no_set(lock: Lock) -> None:
 CHANGES: list[tuple[Callable[[dict[str, Any]], object], str]] = [
     (lambda v: v.pop("cases"), "missing or unknown: 'cases'"),
     (lambda v: v.update(more=1), "missing or unknown: 'more'"),
-    (lambda v: v.update(sgstore_lock=9), "expected 1: upgrade"),
+    (lambda v: v.update(sgstore_lock=9), "expected 1 to 2: upgrade"),
     (lambda v: v.update(traces={}), "traces: expected a list"),
     (lambda v: v["cases"][0].pop("graph"), "cases[0]: expected id, trace"),
     (lambda v: v["cases"][1].update(first="0"), "cases[1].first: '0'; expected int"),

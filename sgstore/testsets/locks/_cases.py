@@ -73,24 +73,45 @@ def lock_of(
         return _lock_of_bundles(store, parts, selection, payloads=payloads, progress=progress)
     with store.file.snapshot():
         known = {trace.trace_id: trace for trace in store.info()}
-        of = [known[int(trace_of(frame_id[:1])[0])] for frame_id, _, _ in parts]
-        pairs = sorted(
-            zip(parts, of, strict=True), key=lambda one: (natural(one[1].name), one[0][0][0])
-        )
-        parts, of = [part for part, _ in pairs], [trace for _, trace in pairs]
-        groups = [frame_id for frame_id, _, _ in parts]
+        cases, groups = _cases(parts, known)
         graphs = graph_digests(store.file, groups)
         read = payload_digests(store, groups) if payloads else iter([None] * len(parts))
-        cases: list[LockedCase] = []
-        for part, trace, graph, payload in zip(parts, of, graphs, read, strict=True):
-            cases.append(_case(part, trace.name, graph, payload))
-            if progress is not None:
-                progress(len(cases), len(parts))
+        found: list[LockedCase] = []
+        for case, graph, payload in zip(cases, graphs, read, strict=True):
+            found.append(LockedCase(*case, graph, payload))
+            if progress is not None and (payloads or len(found) == len(parts)):
+                progress(len(found), len(parts))
         made = Mark.of_traces(store.file)
-        used = {trace.trace_id: trace for trace in of}
-        traces = [locked(trace, made[i]) for i, trace in used.items()]
+        used = {case.trace for case in found}
+        traces = [locked(trace, made[i]) for i, trace in known.items() if trace.name in used]
         traces.sort(key=lambda trace: natural(trace.name))
-    return Lock(made_with(), selection, tuple(traces), tuple(cases))
+    return Lock(made_with(), selection, tuple(traces), tuple(found))
+
+
+def _cases(
+    parts: Sequence[CasePart], known: Mapping[int, StoredTrace]
+) -> tuple[Iterator[tuple[Any, ...]], list[Ints]]:
+    """Return the fields of test cases without digests, and their frame ids, by trace name and first frame."""
+    if not parts:
+        return iter(()), []
+    ends = np.cumsum([len(frame_id) for frame_id, _, _ in parts])
+    starts = np.append(0, ends[:-1])
+    ids, times = (np.concatenate(column) for column in list(zip(*parts, strict=True))[:2])
+    trace_id = trace_of(ids[starts])
+    used = sorted(np.unique(trace_id).tolist(), key=lambda one: natural(known[one].name))
+    rank = {one: place for place, one in enumerate(used)}
+    order = np.lexsort((ids[starts], [rank[one] for one in trace_id.tolist()]))
+    names = [known[one].name for one in trace_id[order].tolist()]
+    first, last = seq_of(ids[starts])[order].tolist(), seq_of(ids[ends - 1])[order].tolist()
+    labels = [
+        f"{name}#{a}" if a == b else f"{name}#{a}-{b}"
+        for name, a, b in zip(names, first, last, strict=True)
+    ]
+    bounds = (ufunc.reduceat(times, starts)[order].tolist() for ufunc in (np.minimum, np.maximum))
+    sizes, places = (ends - starts)[order].tolist(), order.tolist()
+    splits = [parts[place][2] for place in places]
+    fields = zip(labels, names, first, last, *bounds, sizes, splits, strict=True)
+    return fields, [parts[place][0] for place in places]
 
 
 def _lock_of_bundles(
@@ -125,23 +146,6 @@ def lock_in(
     """Return the text of a lock (list of test cases) of some clips in one bundle of a collection."""
     own = [(np.array(ids, np.int64), np.array(times, np.int64), of) for ids, times, of in parts]
     return lock_of(store, own, {}, payloads=payloads).text()
-
-
-def _case(part: CasePart, trace: str, graph: str, payload: Payload | None) -> LockedCase:
-    frame_id, log_time_ns, split = part
-    first, last = (int(seq) for seq in seq_of(frame_id[[0, -1]]))
-    return LockedCase(
-        id=f"{trace}#{first}" if first == last else f"{trace}#{first}-{last}",
-        trace=trace,
-        first=first,
-        last=last,
-        start_ns=int(log_time_ns.min()),
-        end_ns=int(log_time_ns.max()),
-        frames=len(frame_id),
-        split=split,
-        graph=graph,
-        payload=payload,
-    )
 
 
 def payload_digests(store: Store, groups: Sequence[Ints]) -> Iterator[Payload]:

@@ -22,6 +22,8 @@ from sgstore.testsets.locks._text import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from sgstore.collection import Collection
     from sgstore.model.world import Ints
 
@@ -79,12 +81,14 @@ def _not_there(trace: LockedTrace, place: str | Path) -> StoreError:
     )
 
 
-def rows_of(case: LockedCase, trace_id: int, frame_id: Ints) -> slice:
-    """Return the slice of a test case's frames in an ascending array of frame ids."""
-    first, last = frame_ids(trace_id, np.array([case.first, case.last]))
-    return slice(
-        int(np.searchsorted(frame_id, first)), int(np.searchsorted(frame_id, last, side="right"))
-    )
+def rows_of(
+    cases: Sequence[LockedCase], trace_ids: Sequence[int], frame_id: Ints
+) -> tuple[Ints, Ints]:
+    """Return the first row, and the row after the last, of each test case in ascending frame ids."""
+    of = np.array(trace_ids, np.int64)
+    first = frame_ids(of, np.array([case.first for case in cases], np.int64))
+    last = frame_ids(of, np.array([case.last for case in cases], np.int64))
+    return np.searchsorted(frame_id, first), np.searchsorted(frame_id, last, side="right")
 
 
 def frames_of_lock(lock: Lock, store: Store | Collection) -> Ints:
@@ -104,10 +108,11 @@ def frames_of_lock(lock: Lock, store: Store | Collection) -> Ints:
         return np.sort(np.concatenate([np.zeros(0, np.int64), *found]))
     traces = {one.name: _same(one, store).trace_id for one in lock.traces}
     there, _ = store.file.abstracted.times()
-    wanted = np.zeros(len(there), np.bool_)
-    for case in lock.cases:
-        wanted[rows_of(case, traces[case.trace], there)] = True
-    return there[wanted]
+    begin, end = rows_of(lock.cases, [traces[case.trace] for case in lock.cases], there)
+    step = np.zeros(len(there) + 1, np.int64)
+    np.add.at(step, begin, 1)
+    np.add.at(step, end, -1)
+    return there[np.cumsum(step)[:-1] > 0]
 
 
 def frames_in(store: Store, lock: str) -> list[int]:
@@ -131,7 +136,7 @@ def by_bundle(
     for bundle in dict.fromkeys(home.values()):
         traces = tuple(one for one in lock.traces if home.get(one.name) == bundle)
         cases = tuple(one for one in lock.cases if home.get(one.trace) == bundle)
-        by_bundle[bundle] = Lock(made_with(), {}, traces, cases)
+        by_bundle[bundle] = Lock(made_with(), {}, traces, cases, lock.format)
     return by_bundle, [one for one in lock.traces if one.name not in home]
 
 

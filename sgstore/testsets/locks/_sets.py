@@ -88,6 +88,11 @@ def _placed(lock: Lock) -> dict[tuple[Source, int, int], LockedCase]:
 
 def _check(a: Lock, b: Lock) -> None:
     """Raise an error if two locks contradict each other about a trace or a test case."""
+    if a.format != b.format:
+        raise StoreError(
+            f"the locks have formats {a.format} and {b.format}, with different digests of graphs; make the"
+            " older lock again"
+        )
     theirs = {(trace.recording, trace.ego): trace for trace in b.traces}
     for trace in a.traces:
         other = theirs.get((trace.recording, trace.ego))
@@ -123,7 +128,7 @@ def _made(how: str, a: Lock, b: Lock, ours: list[LockedCase], theirs: list[Locke
     kept = (trace for trace in traces.values() if trace.name in used)
     ordered = tuple(sorted(kept, key=lambda trace: natural(trace.name)))
     selection: dict[str, Any] = {how: [dict(a.selection), dict(b.selection)]}
-    return Lock(made_with(), selection, ordered, tuple(cases))
+    return Lock(made_with(), selection, ordered, tuple(cases), a.format)
 
 
 def _renamed(case: LockedCase, trace: str) -> LockedCase:

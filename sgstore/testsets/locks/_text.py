@@ -11,18 +11,20 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import version
+from itertools import islice
+from json.encoder import encode_basestring
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from sgstore.base.output_files import write_bytes
+from sgstore.base.output_files import written
 from sgstore.errors import ExportError, StoreError
 from sgstore.store import SCHEMA_VERSION
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
-FORMAT: Final = 1
-"""Version of the text."""
+FORMAT: Final = 2
+"""Version of the text. Version 1 differs in the digests of graphs; it can be read and verified."""
 
 LARGEST: Final = 1 << 30
 """Largest lock file; bytes."""
@@ -117,21 +119,31 @@ class Lock:
         By name, in natural order.
     cases : tuple of LockedCase
         By trace and first frame.
+    format : int
+        Version of the text, and of the digests of graphs.
     """
 
     made_with: Mapping[str, Any]
     selection: Mapping[str, Any]
     traces: tuple[LockedTrace, ...] = field(default=())
     cases: tuple[LockedCase, ...] = field(default=())
+    format: int = FORMAT
 
     def text(self) -> str:
         """Return the text of the lock file."""
-        head = {KEY: FORMAT, "made_with": dict(self.made_with), "selection": dict(self.selection)}
-        whole = json.dumps(head, ensure_ascii=False, indent=2, sort_keys=True)[:-2]
-        for name, rows in (("traces", self.traces), ("cases", self.cases)):
-            lines = ",\n".join(f"    {json.dumps(asdict(r), ensure_ascii=False)}" for r in rows)
-            whole += f',\n  "{name}": [\n{lines}\n  ]' if rows else f',\n  "{name}": []'
-        return f"{whole}\n}}\n"
+        return "".join(self._pieces())
+
+    def _pieces(self) -> Iterator[str]:
+        head = {KEY: self.format, "made_with": self.made_with, "selection": self.selection}
+        yield _indented(head)[:-2]
+        traces = (json.dumps(asdict(trace), ensure_ascii=False) for trace in self.traces)
+        for name, lines in (("traces", traces), ("cases", map(_case_text, self.cases))):
+            before = f',\n  "{name}": [\n    '
+            while some := ",\n    ".join(islice(lines, 1_000)):
+                yield before + some
+                before = ",\n    "
+            yield "\n  ]" if getattr(self, name) else f',\n  "{name}": []'
+        yield "\n}\n"
 
     @property
     def ordered(self) -> tuple[LockedCase, ...]:
@@ -152,15 +164,46 @@ class Lock:
         path = Path(path)
         if path.suffix != ENDING:
             raise ExportError(f"{path}: a lock name must end in {ENDING}, such as tests{ENDING}")
-        try:
-            data = self.text().encode()
-        except UnicodeEncodeError as error:
-            raise ExportError(f"{path}: {error}") from error
-        write_bytes(path, data)
+        with written(path) as stream:
+            for piece in self._pieces():
+                try:
+                    stream.write(piece.encode())
+                except UnicodeEncodeError as error:
+                    raise ExportError(f"{path}: {error}") from error
 
     def trace(self, name: str) -> LockedTrace:
         """Return the entry of the lock (list of test cases) for a trace name."""
         return next(one for one in self.traces if one.name == name)
+
+
+def _case_text(case: LockedCase) -> str:
+    payload = "null"
+    if case.payload is not None:
+        payload = json.dumps(case.payload, ensure_ascii=False)
+    return (
+        f'{{"id": {encode_basestring(case.id)}, "trace": {encode_basestring(case.trace)},'
+        f' "first": {case.first}, "last": {case.last}, "start_ns": {case.start_ns},'
+        f' "end_ns": {case.end_ns}, "frames": {case.frames},'
+        f' "split": {encode_basestring(case.split)}, "graph": {encode_basestring(case.graph)},'
+        f' "payload": {payload}}}'
+    )
+
+
+def _indented(value: Any, pad: str = "\n  ") -> str:
+    """Return JSON text, indented by two spaces and sorted by key. The json module is slow with long lists."""
+    if isinstance(value, str):
+        return encode_basestring(value)
+    if isinstance(value, dict) and value:
+        parts = [
+            f"{encode_basestring(key)}: {_indented(value[key], pad + '  ')}"
+            for key in sorted(value)
+        ]
+    elif isinstance(value, list | tuple) and value:
+        parts = [_indented(one, pad + "  ") for one in value]
+    else:
+        return json.dumps(value, ensure_ascii=False)
+    start, end = "{}" if isinstance(value, dict) else "[]"
+    return f"{start}{pad}{f',{pad}'.join(parts)}{pad[:-2]}{end}"
 
 
 def read_lock(path: str | Path) -> Lock:
@@ -194,8 +237,8 @@ def lock_from(text: str) -> Lock:
 def _lock(values: Any) -> Lock:
     if not isinstance(values, dict) or KEY not in values:
         raise StoreError(f"expected an object with {KEY!r}")
-    if values[KEY] != FORMAT:
-        raise StoreError(f"{KEY} is {values[KEY]!r}; expected {FORMAT}: upgrade sgstore")
+    if values[KEY] not in range(1, FORMAT + 1):
+        raise StoreError(f"{KEY} is {values[KEY]!r}; expected 1 to {FORMAT}: upgrade sgstore")
     known = {KEY, "made_with", "selection", "traces", "cases"}
     if values.keys() != known:
         odd = ", ".join(sorted(map(repr, values.keys() ^ known)))
@@ -206,7 +249,7 @@ def _lock(values: Any) -> Lock:
     traces = tuple(_row(LockedTrace, r, f"traces[{i}]") for i, r in enumerate(values["traces"]))
     cases = tuple(_row(LockedCase, r, f"cases[{i}]") for i, r in enumerate(values["cases"]))
     _check_names(traces, cases)
-    return Lock(values["made_with"], values["selection"], traces, cases)
+    return Lock(values["made_with"], values["selection"], traces, cases, int(values[KEY]))
 
 
 def _check_names(traces: tuple[LockedTrace, ...], cases: tuple[LockedCase, ...]) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,13 +14,23 @@ from sgstore.query import Store
 from sgstore.store import Identity, Mark, StoredTrace, graph_digests
 from sgstore.testsets.locks._cases import locked, payload_digests
 from sgstore.testsets.locks._find import by_bundle, rows_of
-from sgstore.testsets.locks._text import Lock, LockedCase, LockedTrace, lock_from, made_with
+from sgstore.testsets.locks._text import (
+    FORMAT,
+    Lock,
+    LockedCase,
+    LockedTrace,
+    lock_from,
+    made_with,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from sgstore.collection import Collection
     from sgstore.model.world import Ints
+
+    _StoredCase = tuple[LockedCase, Ints, tuple[int, int], str]
+    """Test case; in a store, its frame ids, first and last log time (ns), and digest (empty without frames)."""
 
 
 _COMPARED = ("recording", "ego", "since", "until", "frames", "config", "map", "flavour", "version")
@@ -69,17 +80,30 @@ def verify(lock: Lock, store: Store | Collection, *, payloads: bool = True) -> I
     if not isinstance(store, Store):
         yield from _of_bundles(lock, store, payloads=payloads)
         return
+    for _, differences in _by_trace(lock, store, payloads=payloads):
+        yield from differences
+
+
+def _by_trace(
+    lock: Lock, store: Store, *, payloads: bool
+) -> Iterator[tuple[LockedTrace, Iterator[Difference]]]:
+    """Yield each trace of a lock, with its differences from a store and those of its test cases."""
     with store.file.snapshot():
-        known = store.info()
+        known = {one.name: one for one in store.info()}
+        known |= {one.trace_id: one for one in known.values()}
         made = Mark.of_traces(store.file)
+        found = {one.name: _found(one, known) for one in lock.traces}
+        cases = [case for case in lock.cases if found[case.trace] is not None]
+        by_trace: dict[str, list[_StoredCase]] = {}
+        for one in _stored(cases, found, lock, store):
+            by_trace.setdefault(one[0].trace, []).append(one)
         for trace in lock.traces:
-            found = _found(trace, known)
-            if found is None:
-                yield _missing(trace)
+            now = found[trace.name]
+            if now is None:
+                yield trace, iter([_missing(trace)])
                 continue
-            yield from _trace(trace, locked(found, made[found.trace_id]))
-            cases = [case for case in lock.cases if case.trace == trace.name]
-            yield from _cases(cases, store, found, payloads=payloads)
+            own = _cases(by_trace.get(trace.name, ()), store, now, payloads=payloads)
+            yield trace, chain(_trace(trace, locked(now, made[now.trace_id])), own)
 
 
 def _missing(trace: LockedTrace) -> Difference:
@@ -99,13 +123,10 @@ def _of_bundles(lock: Lock, whole: Collection, *, payloads: bool) -> Iterator[Di
 
 def differences_in(store: Store, lock: str, *, payloads: bool) -> dict[str, list[Any]]:
     """Return the differences between part of a lock file and one bundle of a collection, by trace."""
-    whole = lock_from(lock)
-    found: dict[str, list[Any]] = {}
-    for trace in whole.traces:
-        cases = tuple(case for case in whole.cases if case.trace == trace.name)
-        own = replace(whole, traces=(trace,), cases=cases)
-        found[trace.name] = [astuple(one) for one in verify(own, store, payloads=payloads)]
-    return found
+    return {
+        trace.name: [astuple(one) for one in differences]
+        for trace, differences in _by_trace(lock_from(lock), store, payloads=payloads)
+    }
 
 
 def verify_case(
@@ -122,19 +143,20 @@ def verify_case(
     graphs, payloads : bool
         True to read and compare the scene graphs, and the messages.
     """
-    locked_trace = lock.trace(case.trace)
+    trace = lock.trace(case.trace)
     with store.file.snapshot():
-        found = _found(locked_trace, store.info())
+        known = {one.name: one for one in store.info()}
+        found = _found(trace, known | {one.trace_id: one for one in known.values()})
         if found is None:
-            yield Difference(case.trace, "trace", "not in the store")
+            yield _missing(trace)
             return
-        yield from _cases([case], store, found, graphs=graphs, payloads=payloads)
+        stored = _stored([case], {case.trace: found}, lock, store, graphs=graphs)
+        yield from _cases(stored, store, found, payloads=payloads)
 
 
-def _found(trace: LockedTrace, known: Sequence[StoredTrace]) -> StoredTrace | None:
-    trace_id = Identity.id_of(trace.recording, trace.ego)
-    by_id = [one for one in known if one.trace_id == trace_id]
-    return next(iter(by_id or [one for one in known if one.name == trace.name]), None)
+def _found(trace: LockedTrace, known: Mapping[int | str, StoredTrace]) -> StoredTrace | None:
+    """Return the trace of a lock among the traces of a store, by id or by name."""
+    return known.get(Identity.id_of(trace.recording, trace.ego)) or known.get(trace.name)
 
 
 def _trace(was: LockedTrace, now: LockedTrace) -> Iterator[Difference]:
@@ -150,41 +172,64 @@ def _short(value: object) -> str:
     return f"{text[:12]}…" if len(text) > 20 else text or "none"
 
 
-def _cases(
+def _stored(
     cases: Sequence[LockedCase],
+    traces: Mapping[str, StoredTrace | None],
+    lock: Lock,
     store: Store,
-    trace: StoredTrace,
     *,
     graphs: bool = True,
-    payloads: bool,
+) -> list[_StoredCase]:
+    """Return the test cases of a lock as a store has them.
+
+    Without ``graphs``, the digests are those of the lock.
+    """
+    of = [one.trace_id for case in cases if (one := traces[case.trace]) is not None]
+    if not of:
+        return []
+    ids, times = _frames(cases, of, store)
+    begin, end = rows_of(cases, of, ids)
+    rows = list(map(range, begin.tolist(), end.tolist()))
+    groups = [ids[row.start : row.stop] for row in rows]
+    digests = iter(
+        graph_digests(
+            store.file, [group for group in groups if len(group)], older=lock.format < FORMAT
+        )
+        if graphs
+        else [case.graph for case, row in zip(cases, rows, strict=True) if row]
+    )
+    found: list[_StoredCase] = []
+    for case, group, row in zip(cases, groups, rows, strict=True):
+        own = times[row.start : row.stop]
+        bounds = (int(own.min()), int(own.max())) if row else (0, 0)
+        found.append((case, group, bounds, next(digests) if row else ""))
+    return found
+
+
+def _cases(
+    cases: Sequence[_StoredCase], store: Store, trace: StoredTrace, *, payloads: bool
 ) -> Iterator[Difference]:
-    there, times = _frames(cases, store, trace)
-    groups: list[Ints] = []
-    kept: list[LockedCase] = []
-    for case in cases:
-        rows = rows_of(case, trace.trace_id, there)
-        ids, log_times = there[rows], times[rows]
+    there = [(case, ids, graph) for case, ids, _, graph in cases if len(ids)]
+    for case, ids, now, _ in cases:
+        was = case.start_ns, case.end_ns
         if len(ids) != case.frames:
             yield Difference(case.id, "frames", f"were {case.frames}, are {len(ids)}")
-        elif len(ids):
-            was, now = (case.start_ns, case.end_ns), (int(log_times.min()), int(log_times.max()))
-            if was != now:
-                yield Difference(case.id, "time", f"was {_span(was)}, is {_span(now)}")
-        if len(ids):
-            groups.append(ids)
-            kept.append(case)
-    if graphs:
-        for case, graph in zip(kept, graph_digests(store.file, groups), strict=True):
-            if graph != case.graph:
-                yield Difference(case.id, "graph", f"was {case.graph[:12]}…, is {graph[:12]}…")
+        elif len(ids) and was != now:
+            yield Difference(case.id, "time", f"was {_span(was)}, is {_span(now)}")
+    for case, _, graph in there:
+        if graph != case.graph:
+            yield Difference(case.id, "graph", f"was {case.graph[:12]}…, is {graph[:12]}…")
     if payloads:
-        yield from _payloads(kept, store, groups, trace)
+        yield from _payloads([(case, ids) for case, ids, _ in there], store, trace)
 
 
-def _frames(cases: Sequence[LockedCase], store: Store, trace: StoredTrace) -> tuple[Ints, Ints]:
-    """Return the ids and log times of a trace's frames from the first to the last test case."""
-    numbers = [min((c.first for c in cases), default=0), max((c.last for c in cases), default=0)]
-    first, last = frame_ids(trace.trace_id, np.array(numbers)).tolist()
+def _frames(
+    cases: Sequence[LockedCase], trace_ids: Sequence[int], store: Store
+) -> tuple[Ints, Ints]:
+    """Return the ids and log times of the frames from the first to the last test case, ascending."""
+    of = np.array(trace_ids, np.int64)
+    first = int(frame_ids(of, np.array([case.first for case in cases])).min())
+    last = int(frame_ids(of, np.array([case.last for case in cases])).max())
     found = store.file.arrays(
         "SELECT frame_id, log_time_ns FROM frames WHERE frame_id BETWEEN $first AND $last ORDER BY frame_id",
         {"first": first, "last": last},
@@ -197,9 +242,9 @@ def _span(times: tuple[int, int]) -> str:
 
 
 def _payloads(
-    cases: Sequence[LockedCase], store: Store, groups: Sequence[Ints], trace: StoredTrace
+    cases: Sequence[tuple[LockedCase, Ints]], store: Store, trace: StoredTrace
 ) -> Iterator[Difference]:
-    read = [(c, g) for c, g in zip(cases, groups, strict=True) if c.payload is not None]
+    read = [(case, ids) for case, ids in cases if case.payload is not None]
     try:
         for (case, _), now in zip(read, payload_digests(store, [g for _, g in read]), strict=True):
             was = case.payload or {}
