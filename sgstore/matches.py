@@ -40,11 +40,13 @@ from sgstore.store import (
     FrameRef,
     GivenTable,
     ParquetTable,
+    StoreFile,
     Tabular,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+    from contextlib import AbstractContextManager
     from typing import Self
 
     import networkx as nx
@@ -55,7 +57,7 @@ if TYPE_CHECKING:
     from sgstore.lang.help import Compared
     from sgstore.lang.ir import Query
     from sgstore.lang.sql import Gathered, SqlStatement, UnionParts
-    from sgstore.store import Given, StoreFile
+    from sgstore.store import Given, Rows
     from sgstore.temporal.truth_lanes import TruthLanes
 
 SHOWN: Final = 80
@@ -210,6 +212,8 @@ class Matches(Tabular):
         from sgstore.base.display import html_media
         from sgstore.draw import thumbnail
 
+        if not isinstance(self._file, StoreFile):
+            return  # a collection
         before: FrameRef | None = None
         left = PICTURES
         for frame in islice(self.frames(), LOOKED_AT):
@@ -326,7 +330,7 @@ class Matches(Tabular):
 
     def _rows(self, *, whole: bool) -> Iterator[Row]:
         with self._compiled() as compiled:
-            layout, rows = compiled.layout, self._stream(Compiled.rows, whole=whole)
+            layout, rows = compiled.layout, self._answered("rows", whole=whole)
             row = row_type(self.columns)
             yield from map(row._make, rows if layout is None else map(layout.row, rows))
 
@@ -370,12 +374,10 @@ class Matches(Tabular):
 
     def _frames(self) -> Iterator[tuple[Any, ...]]:
         with self._compiled() as compiled:
-            if (limited := compiled.limited_to_frames) is None:
-                yield from self._stream(Compiled.frames, "frames")
-                return
-            rows = self._stream(lambda _, window: limited.rows(window))
-            found = ((*row[: len(FRAME_COLUMNS)], row[-1]) for row in rows)
-            yield from dict.fromkeys(found)
+            rows = self._answered("frames")
+            if compiled.limited_to_frames is not None:
+                rows = dict.fromkeys((*row[: len(FRAME_COLUMNS)], row[-1]) for row in rows)
+            yield from rows
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
         """Return all bindings in one frame: variable name → node id. ``RETURN`` has no effect.
@@ -452,12 +454,7 @@ class Matches(Tabular):
 
         with self._compiled() as compiled:
             layout = Layout.of(compiled.bound)
-            ready = replace(compiled, query=rewritten(layout.query, compiled.catalog))
-            asked = self.graphs or compiled.query.result.whole
-            rows = self._stream(
-                lambda _, window: ready.rows(window), None if asked else "subgraphs"
-            )
-            for row in rows:
+            for row in self._answered("subgraphs"):
                 *values, nodes, edges = layout.row(row)
                 about = dict(zip(layout.columns, values, strict=False))
                 yield graph_of_records(nodes, edges, **about)
@@ -481,11 +478,11 @@ class Matches(Tabular):
         town 55.9 56.0 van 141
         town 68.8 68.9 truck 143
         """
-        ask = Compiled.bound_intervals if bound else Compiled.intervals
+        form = "bound" if bound else "intervals"
         with self._compiled() as compiled:
             width = len(INTERVAL_COLUMNS)
-            names = ask(compiled).columns[width:]
-            for row in self._stream(ask, "intervals"):
+            names = self._columns_of(compiled, form)[width:]
+            for row in self._answered(form):
                 yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
@@ -512,12 +509,8 @@ class Matches(Tabular):
                 clips = sorted(around, key=lambda clip: (natural(clip.trace), clip.start_ns))
                 yield from merged(clips, self._slack)
                 return
-
-            def statement(compiled: Compiled, window: Window | None) -> SqlStatement:
-                return compiled.clips(start, end, window)
-
-            clips = (Clip(*row[:3]) for row in self._stream(statement, "clips"))
-            yield from merged(clips, self._slack)
+            rows = self._answered("clips", (start, end))
+            yield from merged((Clip(*row[:3]) for row in rows), self._slack)
 
     @property
     def _slack(self) -> dict[str, int]:
@@ -636,6 +629,33 @@ class Matches(Tabular):
         """Return columns and rows in readable form; see :func:`sgstore.lang.sql.for_people`."""
         return for_people(self.columns, self, graphs=self.graphs)
 
+    def _columns_of(self, compiled: Compiled, form: str) -> tuple[str, ...]:
+        return _INTERVALS[form](compiled).columns
+
+    def _answered(
+        self, form: str, offsets: tuple[int, int] = (0, 0), *, whole: bool = False
+    ) -> Iterator[tuple[Any, ...]]:
+        """Run the query, and yield its rows in one form: rows, frames, subgraphs, intervals, bound, clips."""
+        with self._compiled() as compiled:
+            match form:
+                case "rows":
+                    yield from self._stream(Compiled.rows, whole=whole)
+                case "frames" if (limited := compiled.limited_to_frames) is not None:
+                    yield from self._stream(lambda _, window: limited.rows(window))
+                case "frames":
+                    yield from self._stream(Compiled.frames, form)
+                case "subgraphs":
+                    layout = Layout.of(compiled.bound)
+                    ready = replace(compiled, query=rewritten(layout.query, compiled.catalog))
+                    asked = self.graphs or compiled.query.result.whole
+                    yield from self._stream(
+                        lambda _, window: ready.rows(window), None if asked else form
+                    )
+                case "clips":
+                    yield from self._stream(lambda of, window: of.clips(*offsets, window), form)
+                case _:
+                    yield from self._stream(_INTERVALS[form], "intervals")
+
     def _stream(
         self,
         statement: Callable[[Compiled, Window | None], SqlStatement],
@@ -701,6 +721,9 @@ class Matches(Tabular):
                 steps.rows += len(block[0])
                 for low in range(0, len(block[0]), BLOCK):
                     yield [column[low : low + BLOCK] for column in block]
+
+
+_INTERVALS: Final = {"intervals": Compiled.intervals, "bound": Compiled.bound_intervals}
 
 
 class UnionMatches(Matches):
@@ -781,9 +804,12 @@ class UnionMatches(Matches):
                 found = self._merged(parts, lambda row: (natural(row[1]), row[2]), repr)
                 yield from islice(found, self._limit)
                 return
-            with self._file.batches(**self._joined()) as batches:
+            with self._joined_batches() as batches:
                 for batch in batches:
                     yield from map(row._make, batch.values)
+
+    def _joined_batches(self) -> AbstractContextManager[Iterable[Rows]]:
+        return self._file.batches(**self._joined())
 
     def _merged(
         self, parts: Sequence[Iterable[T]], key: Callable[[T], Any], told: Callable[[T], object]

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from sgstore.matches import Interval, Matches
     from sgstore.model.world import Clip
     from sgstore.pipeline.recording_ingest import TraceOutcome
-    from sgstore.store import Rows, SimilarFrames, StoredTrace
+    from sgstore.store import Rows, SimilarFrames, StoredTrace, UserSql
     from sgstore.temporal import CheckRun, ShortestClip
     from sgstore.temporal.truth_lanes import TruthLanes
 
@@ -461,9 +461,7 @@ class Store:
         """
         with self.file.snapshot():
             asked = UserStatement(self.find, self.catalog().tables, text)
-            found = self.file.user_rows(
-                asked.sql, timeout_s=timeout_s, max_rows=max_rows, given=asked.given
-            )
+            found = asked.on(self.file, timeout_s).rows_on_demand(max_rows)
             found.reasons = asked.reasons
             return found
 
@@ -1066,10 +1064,6 @@ class UserStatement:
 
     Attributes
     ----------
-    sql : str
-        SQL statement to run.
-    given : function or None
-        Creates the tables of its patterns; see :meth:`sgstore.store.StoreFile.user_sql`.
     reasons : mapping of str to str
         Reasons why a pattern skips traces, by trace name.
     notes : tuple of str
@@ -1077,20 +1071,24 @@ class UserStatement:
     """
 
     def __init__(self, find: Callable[..., Matches], tables: Collection[str], text: str) -> None:
-        self.sql, self.given = text, None
+        self._sql, self._given = text, None
         self.reasons: dict[str, str] = {}
         self.notes: tuple[str, ...] = ()
         if "sgql" not in text.lower():
             return
         from sgstore.lang.syntax import pattern_tables
 
-        self.sql, calls = pattern_tables(text, tables)
+        self._sql, calls = pattern_tables(text, tables)
         found = [(one.name, find(one.text, **dict(one.values))) for one in calls]
         for _, matches in found:
             self.reasons |= matches.reasons
             self.notes += matches.notes
         if found:
-            self.given = lambda: [part for name, of in found for part in of.as_table(name)]
+            self._given = lambda: [part for name, of in found for part in of.as_table(name)]
+
+    def on(self, file: StoreFile, timeout_s: float | None = None) -> UserSql:
+        """Return the statement on a store, with the tables of its patterns."""
+        return file.user_sql(self._sql, timeout_s, self._given)
 
 
 def _png(image: Image) -> bytes:

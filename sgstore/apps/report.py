@@ -24,6 +24,7 @@ from sgstore.apps.explorer import PAGE, Reads, answer, as_json, packed
 from sgstore.base.output_files import write_bytes
 from sgstore.errors import SgstoreError
 from sgstore.model.user_notes import NotesFile
+from sgstore.store import StateColumns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -264,7 +265,9 @@ def _columns(
 
 def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[int, int]]) -> bytes:
     """Return the states of a trace in some frame ranges as bytes; frames outside the ranges have no states."""
-    frames, states = store.file.states(trace, first, last)
+    of = StateColumns(store.file)
+    with store.file.snapshot():
+        frames, states = of.frames(trace, first, last), of.states(trace, first, last)
     seq = states.pop("seq")
     inside = np.zeros(len(seq), bool)
     for low, high in spans:

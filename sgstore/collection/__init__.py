@@ -10,34 +10,32 @@ Ray, Spark) then runs ``_worker`` on each bundle that may have results. ``_quest
 results.
 """
 
-from sgstore.collection._commit import commit
-from sgstore.collection._frames import CollectionFrames
 from sgstore.collection._landing import land
-from sgstore.collection._maintenance import CollectionFaults, Garbage, gc, verify
-from sgstore.collection._open import open
-from sgstore.collection._pack import Commit, pack, unpack
+from sgstore.collection._maintenance import CollectionFaults, Garbage, gc, rebuild, verify
+from sgstore.collection._pack import Commit, commit, pack, unpack
 from sgstore.collection._questions import (
     Collection,
-    PartedChecks,
-    PartedMatches,
-    PartedRows,
-    PartedUnion,
+    CollectionChecks,
+    CollectionFrames,
+    CollectionMatches,
+    CollectionRows,
+    CollectionUnion,
     PartialAnswerError,
+    open,
 )
-from sgstore.collection._remake import rebuild
 from sgstore.collection._storage import ABOUT
 
 __all__ = [
     "ABOUT",
     "Collection",
+    "CollectionChecks",
     "CollectionFaults",
     "CollectionFrames",
+    "CollectionMatches",
+    "CollectionRows",
+    "CollectionUnion",
     "Commit",
     "Garbage",
-    "PartedChecks",
-    "PartedMatches",
-    "PartedRows",
-    "PartedUnion",
     "PartialAnswerError",
     "commit",
     "gc",

@@ -11,9 +11,9 @@ import hashlib
 import json
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection._storage import ABOUT, MissingObjectError, digest_of_file
@@ -32,7 +32,6 @@ from sgstore.store import (
     CATALOGUE,
     SCHEMA_VERSION,
     ParquetTable,
-    parquet_rows,
     subset_catalogs,
 )
 
@@ -43,6 +42,8 @@ if TYPE_CHECKING:
     from sgstore.lang.catalog import Triple
     from sgstore.store import Facts
 
+T = TypeVar("T")
+
 FORMAT: Final = 1
 """Version of the layout."""
 
@@ -51,6 +52,9 @@ BUNDLE_TRACES: Final = 1_000
 
 BUNDLE_BYTES: Final = 512 << 20
 """Approximate greatest size of a bundle; bytes."""
+
+ATTEMPTS: Final = 100
+"""Number of retries of a commit after concurrent commits."""
 
 _SNAPSHOTS: Final = "catalogue"
 
@@ -82,12 +86,8 @@ def about(place: Place) -> About:
     """
     try:
         told = json.loads(place.read(ABOUT))
-        known = (
-            told["format"],
-            About(
-                str(told["schema_version"]), int(told["bundle_traces"]), int(told["bundle_bytes"])
-            ),
-        )
+        sizes = int(told["bundle_traces"]), int(told["bundle_bytes"])
+        known = told["format"], About(str(told["schema_version"]), *sizes)
     except MissingObjectError as error:
         raise StoreError(
             f"{place.url}: not a collection ({error}); 'sgstore collection pack STORE URL' makes one"
@@ -109,12 +109,7 @@ def _damage(error: Exception) -> str:
 
 def create(place: Place, wanted: About) -> About:
     """Return the settings of a collection, and create a missing collection."""
-    told = {
-        "format": FORMAT,
-        "schema_version": wanted.schema_version,
-        "bundle_traces": wanted.bundle_traces,
-        "bundle_bytes": wanted.bundle_bytes,
-    }
+    told = {"format": FORMAT} | asdict(wanted)
     place.write_new(ABOUT, json.dumps(told, indent=2).encode() + b"\n")
     return about(place)
 
@@ -421,7 +416,7 @@ def read(place: Place, number: int) -> Snapshot:
                 raise StoreError(
                     f"{place.url}/{name}: not as it was committed: its SHA-256 differs"
                 )
-            facts[table] = parquet_rows(path, columns)
+            facts[table] = ParquetTable.read_rows(path, [*columns], later="scope")
     return Snapshot(number, facts)
 
 
@@ -453,6 +448,28 @@ def write(place: Place, number: int, facts: Facts) -> bool:
             with suppress(StoreError):
                 place.remove(name)
     return False
+
+
+def changed(place: Place, change: Callable[[Snapshot], tuple[T, Facts | None]]) -> T:
+    """Write a changed snapshot, and return the result of the change. Repeat it after a concurrent commit.
+
+    Parameters
+    ----------
+    place : Place
+    change : function
+        Function from the newest snapshot to a result and the new catalogue rows. ``None`` means no change.
+
+    Raises
+    ------
+    StoreError
+        Other processes commit without a pause.
+    """
+    for _ in range(ATTEMPTS):
+        before = latest(place)
+        result, facts = change(before)
+        if facts is None or write(place, before.number + 1, facts):
+            return result
+    raise StoreError(f"{place.url}: others commit without a pause; try again later")
 
 
 def joined(facts: Iterable[Facts]) -> Facts:

@@ -13,7 +13,7 @@ import sys
 from collections import Counter, deque
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.processes import WorkerPool, requests, send_reply
 from sgstore.errors import (
@@ -39,27 +39,6 @@ TOGETHER: Final = 256
 
 Task = dict[str, Any]
 Outcome = dict[str, Any]
-
-
-class Engine(Protocol):
-    """Interface of an engine that runs tasks in parallel: local processes, Ray or Spark.
-
-    Attributes
-    ----------
-    shares_files : bool
-        True if this process can read local files that a task writes.
-    """
-
-    shares_files: bool
-
-    def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
-        """Run a function on all tasks in parallel, and yield each result on arrival.
-
-        A failed task gives ``{"bundle": …, "error": …}``.
-
-        :func:`refusal` adds details for :func:`fault_of_question`.
-        """
-        ...
 
 
 def engine_named(name: str) -> Engine:
@@ -107,9 +86,22 @@ def fault_of_question(outcome: Outcome) -> SgstoreError | None:
 
 
 class _Here:
+    """Engine that runs tasks one by one in this process.
+
+    Attributes
+    ----------
+    shares_files : bool
+        True if this process can read local files that a task writes.
+    """
+
     shares_files = True
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
+        """Run a function on all tasks in parallel, and yield each result on arrival.
+
+        A failed task gives ``{"bundle": …, "error": …}``. :func:`refusal` adds details for
+        :func:`fault_of_question`.
+        """
         for task in tasks:
             try:
                 yield function(task)
@@ -217,6 +209,10 @@ class _Spark:
         lines = self._spark.sparkContext.parallelize([*map(json.dumps, tasks)], len(tasks))
         done = lines.mapPartitions(partial(_lines_done, name)).collect()
         return [*map(json.loads, done)]
+
+
+Engine = _Here | _Processes | _Ray | _Spark
+"""Engine that runs tasks in parallel: local processes, Ray or Spark."""
 
 
 def _session(sql: Any, master: str) -> Any:

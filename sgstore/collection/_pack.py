@@ -1,4 +1,4 @@
-"""Conversion of a store to bundles (store files) of a collection, and of a collection to one store.
+"""Bundles (store files) of a collection: made from a store or from ingested segments, and copied to one store.
 
 Committed traces and road maps keep their names. New traces are named in the order of the digests of
 their recordings, so that names depend only on the committed contents.
@@ -6,31 +6,36 @@ their recordings, so that names depend only on the committed contents.
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
-from sgstore.collection._cache import bundle_path
-from sgstore.collection._storage import digest_of_file, place_at
+from sgstore.collection._catalogue import BUNDLE_TRACES
+from sgstore.collection._landing import FILES
+from sgstore.collection._storage import bundle_path, digest_of_file, place_at
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import natural
-from sgstore.store import CATALOGUE, BundleSource, Identity, StoreFile, facts_of
+from sgstore.store import (
+    CATALOGUE,
+    BundleSource,
+    Folder,
+    Identity,
+    Sealed,
+    StoreFile,
+    facts_of,
+    whole_segment,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from sgstore.collection._catalogue import About, Snapshot
+    from sgstore.collection._catalogue import Snapshot
     from sgstore.collection._storage import Place
     from sgstore.store import Facts
-
-ATTEMPTS: Final = 100
-"""Number of retries of a commit after concurrent commits."""
-
-GRACE_S: Final = 86_400.0
-"""Time that unreferenced files stay, because a commit may be in progress; s."""
 
 TRACE: Final = {name: place for place, name in enumerate(CATALOGUE["trace"])}
 
@@ -59,6 +64,22 @@ class Commit:
     renamed: dict[str, str] = field(default_factory=dict[str, str])
     bundles: list[str] = field(default_factory=list[str])
     refused: list[str] = field(default_factory=list[str])
+
+    def name(self, before: Snapshot, new: Iterable[tuple[int, str]]) -> dict[int, str]:
+        """Return a unique name for each new trace. Names do not depend on the order of arrival."""
+        taken = {row["name"] for row in before.traces}
+        names: dict[int, str] = {}
+        for trace_id, name in new:
+            names[trace_id] = Identity.free_name(name, taken)
+            taken.add(names[trace_id])
+        self.added = sorted(names.values(), key=natural)
+        return names
+
+    def with_bundles(self, before: Snapshot, new: Sequence[Facts]) -> Facts:
+        """Return the catalogue rows of a snapshot with new bundles (store files)."""
+        self.bundles = [one["bundle"][0][0] for one in new]
+        self.number = before.number + 1
+        return catalogue.joined([before.facts, *new])
 
 
 def pack(
@@ -90,95 +111,56 @@ def pack(
     """
     place = place_at(url)
     known = StoreFile(store).path  # an invalid store is rejected before any change
-    wanted = catalogue.About() if bundle_traces is None else _sized(bundle_traces)
-    about = catalogue.create(place, wanted)
-    limit = about.bundle_traces if bundle_traces is None else bundle_traces
-    source = _Source(known, about, limit, on_bundle)
-    for _ in range(ATTEMPTS):
-        done = source.committed(place)
-        if done is not None:
-            return done
-    raise StoreError(f"{place.url}: others commit without a pause; try again later")
+    if bundle_traces is not None and bundle_traces < 1:
+        raise StoreError(f"a bundle has 1 trace or more, not {bundle_traces}")
+    about = catalogue.create(place, catalogue.About(bundle_traces=bundle_traces or BUNDLE_TRACES))
+    limit = bundle_traces or about.bundle_traces
 
-
-def _sized(traces: int) -> About:
-    if traces < 1:
-        raise StoreError(f"a bundle has 1 trace or more, not {traces}")
-    return catalogue.About(bundle_traces=traces)
-
-
-@dataclass(slots=True)
-class _Source:
-    """Store whose traces are copied to a collection."""
-
-    path: Path
-    about: About
-    limit: int
-    on_bundle: Callable[[int, int], None] | None = None
-
-    def committed(self, place: Place) -> Commit | None:
-        """Add the new traces to the collection, and return the result.
-
-        ``None`` means that another process committed first.
-        """
-        before = catalogue.latest(place)
+    def add(before: Snapshot) -> tuple[Commit, Facts | None]:
         done = Commit(before.number)
-        names = self._named(before, done, place)
+        new = _lacking(known, place, before, done)
+        names = done.name(before, new)
         if not names:
-            return done
-        maps = map_names(before, BundleSource(self.path).maps(names))
-        parts = self._groups(names)
+            return done, None
+        done.renamed = {name: names[trace] for trace, name in new if names[trace] != name}
+        maps = map_names(before, BundleSource(known).maps(names))
+        each = max(known.stat().st_size // max(len(BundleSource(known).names()), 1), 1)
+        parts = groups(names, max(min(limit, about.bundle_bytes // each), 1))
+        facts: list[Facts] = []
         with working_folder("bundles") as folder:
-            facts: list[Facts] = []
             for number, group in enumerate(parts):
-                facts.append(
-                    put_bundle(place, self.path, folder / f"{number}.sgstore", group, maps)
-                )
-                if self.on_bundle is not None:
-                    self.on_bundle(number + 1, len(parts))
-        done.bundles = [one["bundle"][0][0] for one in facts]
-        done.number = before.number + 1
-        whole = catalogue.joined([before.facts, *facts])
-        return done if catalogue.write(place, done.number, whole) else None
+                facts.append(put_bundle(place, known, folder / f"{number}.sgstore", group, maps))
+                if on_bundle is not None:
+                    on_bundle(number + 1, len(parts))
+        return done, done.with_bundles(before, facts)
 
-    def _named(self, before: Snapshot, done: Commit, place: Place) -> dict[int, str]:
-        """Return the traces of the store that the collection lacks, with unique names.
+    return catalogue.changed(place, add)
 
-        Raises
-        ------
-        StoreError
-            A trace has the id of another one by chance.
-        """
-        there = {row["trace_id"]: row for row in before.traces}
-        new: list[tuple[str, str, str, int]] = []
-        for trace_id, (name, digest, ego) in BundleSource(self.path).names().items():
-            row = there.get(trace_id)
-            if row is None:
-                new.append((digest, ego, name, trace_id))
-            elif (row["digest"], row["ego"]) == (digest, ego):
-                done.present.append(row["name"])
-            else:
-                raise StoreError(
-                    f"{place.url}: two traces have the id {trace_id} by chance: {row['name']!r} (recording"
-                    f" {row['uri']}, SHA-256 {row['digest'][:12]}…, ego {row['ego']!r}) and {name!r} of"
-                    f" {self.path} (SHA-256 {digest[:12]}…, ego {ego!r}); put one of them into a collection of"
-                    " its own"
-                )
-        taken = {row["name"] for row in before.traces}
-        names: dict[int, str] = {}
-        for _, _, name, trace_id in sorted(new):
-            names[trace_id] = Identity.free_name(name, taken)
-            taken.add(names[trace_id])
-            done.added.append(names[trace_id])
-            if names[trace_id] != name:
-                done.renamed[name] = names[trace_id]
-        done.added.sort(key=natural)
-        return names
 
-    def _groups(self, names: Mapping[int, str]) -> list[dict[int, str]]:
-        """Return the new traces divided into groups, one group for each bundle (store file)."""
-        each = max(self.path.stat().st_size // max(len(BundleSource(self.path).names()), 1), 1)
-        return groups(names, max(min(self.limit, self.about.bundle_bytes // each), 1))
+def _lacking(store: Path, place: Place, before: Snapshot, done: Commit) -> list[tuple[int, str]]:
+    """Return the traces of a store that the collection lacks, with their names, by recording digest.
+
+    Raises
+    ------
+    StoreError
+        A trace has the id of another one by chance.
+    """
+    there = {row["trace_id"]: row for row in before.traces}
+    new: list[tuple[str, str, str, int]] = []
+    for trace_id, (name, digest, ego) in BundleSource(store).names().items():
+        row = there.get(trace_id)
+        if row is None:
+            new.append((digest, ego, name, trace_id))
+        elif (row["digest"], row["ego"]) == (digest, ego):
+            done.present.append(row["name"])
+        else:
+            raise StoreError(
+                f"{place.url}: two traces have the id {trace_id} by chance: {row['name']!r} (recording"
+                f" {row['uri']}, SHA-256 {row['digest'][:12]}…, ego {row['ego']!r}) and {name!r} of"
+                f" {store} (SHA-256 {digest[:12]}…, ego {ego!r}); put one of them into a collection of"
+                " its own"
+            )
+    return [(trace_id, name) for _, _, name, trace_id in sorted(new)]
 
 
 def groups(names: Mapping[int, str], most: int) -> list[dict[int, str]]:
@@ -248,8 +230,6 @@ def unpack(url: str | Path, store: str | Path) -> list[str]:
         The store path exists, a bundle differs from the committed one, or a file cannot be read or
         written.
     """
-    from pathlib import Path
-
     place, to = place_at(url), Path(store)
     if to.exists():
         raise StoreError(f"{to}: exists already; name a store that is to be made")
@@ -259,8 +239,6 @@ def unpack(url: str | Path, store: str | Path) -> list[str]:
     names = {row["trace_id"]: row["name"] for row in snapshot.traces}
     maps = {row["map_digest"]: row["map"] for row in snapshot.traces if row["map_digest"]}
     refuse_others(place, snapshot)
-    from sgstore.store import Folder
-
     with Folder(to) as beside:
         fresh = beside.path / "store"
         paths = [bundle_path(place, one["bundle"]) for one in snapshot.bundles]
@@ -291,3 +269,156 @@ def refuse_others(place: Place, snapshot: Snapshot) -> None:
             f"{place.url}: {len(odd)} of {len(snapshot.bundles)} bundles are of another version than {wanted}:"
             f" {listed}{more}; 'sgstore collection rebuild' makes them anew from their recordings"
         )
+
+
+@dataclass(frozen=True, slots=True)
+class _Landed:
+    """Ingested segment (file of one trace) in a collection that is not committed yet."""
+
+    segment: str
+    size: int
+    sealed: Sealed
+
+    @property
+    def of(self) -> tuple[str, str]:
+        """Return the digest of the recording, and the ego."""
+        return self.sealed.identity.digest, self.sealed.identity.ego
+
+    @property
+    def whose(self) -> str:
+        return f"{self.sealed.path} (SHA-256 {self.of[0][:12]}…, ego {self.of[1]!r})"
+
+    @property
+    def read(self) -> tuple[Any, ...]:
+        """Return the settings, map digest, frame count and start time with which it was read."""
+        identity, trace = self.sealed.identity, self.sealed.trace
+        about = identity.settings_digest, identity.map_digest
+        return *about, trace["frames"], trace["start_ns"]
+
+
+def commit(url: str | Path) -> Commit:
+    """Create bundles (store files) from all ingested segments, and a snapshot that contains them.
+
+    Raises
+    ------
+    StoreError
+        The collection is missing, or cannot be read or written.
+    """
+    place = place_at(url)
+    about = catalogue.about(place)
+
+    def add(before: Snapshot) -> tuple[Commit, Facts | None]:
+        done = Commit(before.number)
+        with working_folder("commit") as folder:
+            waiting = _accepted(_waiting(place, before, folder), before, done)
+            by_trace = {one.sealed.identity.trace_id: one for one in waiting}
+            new = ((trace_id, one.sealed.path.stem) for trace_id, one in by_trace.items())
+            names = done.name(before, new)
+            if not names:
+                return done, None
+            each = max(sum(one.size for one in waiting) // len(waiting), 1)
+            most = max(min(about.bundle_traces, about.bundle_bytes // each), 1)
+            identities = (one.sealed.identity for one in waiting)
+            found = {one.map_digest: one.map_name or "map" for one in identities if one.map_digest}
+            maps = map_names(before, found)
+            facts = [
+                _bundled(
+                    place, folder, {trace_id: by_trace[trace_id] for trace_id in group}, group, maps
+                )
+                for group in groups(names, most)
+            ]
+        return done, done.with_bundles(before, facts)
+
+    return catalogue.changed(place, add)
+
+
+def _waiting(place: Place, before: Snapshot, folder: Path) -> list[_Landed]:
+    """Return the ingested segments that no bundle (store file) contains yet, ordered by recording digest."""
+    known = {row["segment"] for row in before.traces}
+    sizes: dict[str, int] = {}
+    complete: set[str] = set()
+    for name, size, _ in place.names("segments"):
+        segment = name.split("/")[2]
+        sizes[segment] = sizes.get(segment, 0) + size
+        if name.endswith(f"/{FILES[0]}"):
+            complete.add(segment)
+    found: list[_Landed] = []
+    for segment in sorted(complete - known):
+        sealed = Sealed.read(_fetched(place, segment, folder, FILES[:1]))
+        found.append(_Landed(segment, sizes[segment], sealed))
+    return sorted(found, key=lambda one: (*one.of, one.segment))
+
+
+def _fetched(place: Place, segment: str, folder: Path, files: Iterable[str] = FILES) -> Path:
+    to = folder / segment
+    to.mkdir(exist_ok=True)
+    for name in files:
+        if not (to / name).exists():
+            place.fetch(f"segments/{segment[:2]}/{segment}/{name}", to / name)
+    return to
+
+
+def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_Landed]:
+    """Return the segments that can be committed; rejected segments are recorded with a reason."""
+    there = {row["trace_id"]: row for row in before.traces}
+    by_id: dict[int, list[_Landed]] = {}
+    for one in waiting:
+        by_id.setdefault(one.sealed.identity.trace_id, []).append(one)
+    found: list[_Landed] = []
+    for trace_id, same in by_id.items():
+        row = there.get(trace_id)
+        whose = [one.whose for one in same]
+        if row is not None:
+            held = f"{row['uri']} (SHA-256 {row['digest'][:12]}…, ego {row['ego']!r})"
+            whose.insert(0, f"{held}, which is {row['name']!r}")
+        of = {one.of for one in same}
+        of |= set() if row is None else {(row["digest"], row["ego"])}
+        if row is not None and len(of) == 1 and {one.read for one in same} == {_read_of(row)}:
+            done.present.append(row["name"])
+        elif len(of) > 1:
+            done.refused.append(
+                f"the id {trace_id} belongs to several traces by chance: {' and '.join(whose)};"
+                " put one of them into a collection of its own"
+            )
+        elif len(whose) > 1:
+            done.refused.append(
+                f"one trace was ingested with different settings, map, part or place: {' and '.join(whose)};"
+                " a collection has it once"
+            )
+        else:
+            found.append(same[0])
+    return found
+
+
+def _read_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return the settings, map digest, frame count and start time with which a trace was read."""
+    return row["config"], row["map_digest"] or "", row["frames"], row["start_ns"]
+
+
+def _bundled(
+    place: Place,
+    folder: Path,
+    waiting: Mapping[int, _Landed],
+    names: Mapping[int, str],
+    maps: Mapping[str, str],
+) -> Facts:
+    """Create a bundle (store file) from some segments, upload it, and return its catalogue rows."""
+    path = folder / "published.sgstore"
+    file = StoreFile.create(path)
+    for one in waiting.values():
+        folders = [_fetched(place, one.segment, folder)]
+        if digest := one.sealed.identity.map_digest:
+            folders.append(folder / f"map-{digest}")
+            folders[1].mkdir(exist_ok=True)
+            if not (folders[1] / "tables").exists():
+                place.fetch(f"maps/{digest}/tables", folders[1] / "tables")
+        to = folder / f"whole-{one.segment}"
+        to.mkdir()
+        file.publish(whole_segment(folders, to))
+        shutil.rmtree(to)
+        shutil.rmtree(folders[0])
+    file.close()
+    segments = {trace_id: one.segment for trace_id, one in waiting.items()}
+    facts = put_bundle(place, path, folder / "bundle.sgstore", names, maps, segments)
+    path.unlink()
+    return facts

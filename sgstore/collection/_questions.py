@@ -10,31 +10,29 @@ from __future__ import annotations
 import base64
 import json
 import re
-from contextlib import contextmanager
-from copy import copy
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
 from heapq import merge
 from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self, cast, overload
+
+import numpy as np
 
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _worker as worker
 from sgstore.collection._engines import engine_named, fault_of_question
-from sgstore.collection._frames import CollectionFrames
 from sgstore.collection._pack import refuse_others
 from sgstore.collection._storage import place_at
 from sgstore.errors import QueryError, SqlError, StoreError
 from sgstore.lang.bind import CLASSES_GIVEN
 from sgstore.lang.catalog import TableFacts, Type
 from sgstore.lang.sql import (
-    Layout,
     compile_checks,
-    compile_query,
-    for_people,
     joined_rows,
     traces_of,
     union_parts,
@@ -42,10 +40,9 @@ from sgstore.lang.sql import (
 from sgstore.lang.sql.collection_parts import PARTS, parted
 from sgstore.lang.sql.collection_pruning import Pruning, class_questions
 from sgstore.lang.syntax import pattern_tables
-from sgstore.matches import Interval, UnionMatches, merged, row_type
-from sgstore.model.frame_ids import SEQ_BITS
+from sgstore.matches import UnionMatches
+from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.vocabulary import natural
-from sgstore.model.world import Clip, tolerance_ns
 from sgstore.query import Store
 from sgstore.store import (
     Example,
@@ -53,17 +50,21 @@ from sgstore.store import (
     Identity,
     ParquetTable,
     PartFile,
+    Rows,
     SimilarFrames,
     StoreFile,
     Tabular,
+    Triples,
     UserTables,
 )
 from sgstore.temporal import TemporalMatches, kept_throughout
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+    from contextlib import AbstractContextManager
 
     import networkx as nx
+    from numpy.typing import NDArray
 
     from sgstore.collection._catalogue import Snapshot
     from sgstore.collection._engines import Engine
@@ -73,12 +74,14 @@ if TYPE_CHECKING:
     from sgstore.lang.sql.collection_pruning import ClassQuestion
     from sgstore.lang.syntax import Pattern
     from sgstore.model.world import Floats, Ints
+    from sgstore.store import CodedClasses
     from sgstore.temporal import Verdict
+
+    Parameters = Sequence[Any] | Mapping[str, Any]
+    Words = Mapping[str, Sequence[str]]
 
 _SHOWN: Final = 8
 """Number of bundles that a message names; further bundles are counted."""
-
-_ALL: Final = f"FROM {PARTS}"
 
 
 class PartialAnswerError(StoreError):
@@ -196,8 +199,9 @@ class Collection:
     def _table_facts(self) -> dict[str, TableFacts]:
         """Return for each user table how its rows match the frames of the collection."""
         told: dict[str, dict[str, Any]] = {}
-        for result in self.ask({"kind": "tables"}, self.bundles() or [worker.EMPTY]):
-            for name, one in result["tables"].items():
+        bundles = self.bundles() or [worker.EMPTY]
+        for _, tables in self.each(worker.tables_in, {one: {} for one in bundles}):
+            for name, one in tables.items():
                 known = told.setdefault(name, {**one, "matched": 0, "frames": 0, "traces": None})
                 known["matched"] += one["matched"]
                 known["frames"] += one["frames"]
@@ -230,7 +234,7 @@ class Collection:
 
     def find(
         self, query: str | Pattern | nx.Graph[Any], /, **parameters: object
-    ) -> PartedMatches | PartedUnion:
+    ) -> CollectionMatches | CollectionUnion:
         """Return the matches of a pattern; see :meth:`sgstore.Store.find`.
 
         Raises
@@ -252,9 +256,9 @@ class Collection:
             query, parameters = str(pattern), {**pattern.parameters, **parameters}
         asked = union_parts(query, parameters)
         if asked is None:
-            return PartedMatches(self, query, parameters)
-        parts: list[Any] = asked.each(partial(PartedMatches, self), query)
-        return PartedUnion(query, asked, parts)
+            return CollectionMatches(self, query, parameters)
+        parts: list[Any] = asked.each(partial(CollectionMatches, self), query)
+        return CollectionUnion(query, asked, parts)
 
     def check(
         self,
@@ -264,7 +268,7 @@ class Collection:
         sgsm_compat: bool = False,
         status: bool = False,
         **parameters: object,
-    ) -> PartedChecks:
+    ) -> CollectionChecks:
         """Return the verdicts of ``CHECK`` statements for every trace; see :meth:`sgstore.Store.check`.
 
         Raises
@@ -279,9 +283,9 @@ class Collection:
         <Verdict 'slow' of 'town': true>
         """
         about = {"sgsm_compat": sgsm_compat, "status": status}
-        return PartedChecks(self, text, parameters, about)
+        return CollectionChecks(self, text, parameters, about)
 
-    def sql(self, text: str, *, each: bool = False) -> PartedRows:
+    def sql(self, text: str, *, each: bool = False) -> CollectionRows:
         """Run an SQL statement on every bundle (store), and return the rows after a column ``bundle``.
 
         Parameters
@@ -307,7 +311,7 @@ class Collection:
                 "a statement in SQL cannot be split over bundles: add --each (each=True) to run it in"
                 " every bundle, with a column 'bundle'; or 'sgstore collection unpack' makes one store of all"
             )
-        return PartedRows(self, text)
+        return CollectionRows(self, text)
 
     def like(
         self,
@@ -512,9 +516,7 @@ class Collection:
             bundles = [b for b in self.bundles() if one.table or b in homes]
             found = set[str]()
             for result in self.ask({"kind": "classes"} | about, bundles):
-                parts = [PartFile.from_dict(part) for part in result["parts"]]
-                with PartFile.merged_rows({PARTS: parts}, {}, _ALL, ()) as batches:
-                    found |= {row[0] for batch in batches for row in batch.values}
+                found |= {row[0] for row in _rows(_parts_of(result), {})}
             rows += [(one.dataset, one.abstraction, name, 0) for name in sorted(found)]
         if not asked:
             return {}
@@ -577,7 +579,7 @@ def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
     return TableFacts(name, columns, refused, told["traces"], joins=told["joins"])
 
 
-class PartedMatches(Tabular):
+class CollectionMatches(TemporalMatches):
     """Matches of a query in all bundles of a collection, with the interface of matches in one store.
 
     Each method runs the query again.
@@ -592,35 +594,25 @@ class PartedMatches(Tabular):
         True if the only returned value belongs to each match as a whole.
     """
 
-    of_match = TemporalMatches.of_match
-
     def __init__(self, whole: Collection, text: str, parameters: Mapping[str, object]) -> None:
-        self._file, self.snapshot = _NoFile(), whole.snapshot
-        self._whole, self._text, self._parameters = whole, text, dict(parameters)
-        self._limit: int | None = None
-        self._ready: Compiled = compile_query(text, whole.catalog, parameters)
-        parted(self._ready)  # unmergeable queries are rejected before a bundle is opened
-        self.graphs = self._ready.layout is not None
-        self.columns = self._ready.columns
+        self._whole, self.snapshot = whole, whole.snapshot
         self._reasons: dict[str, str] = {}
+        super().__init__(cast("StoreFile", whole.file), lambda: whole.catalog, text, parameters)
 
-    def __repr__(self) -> str:
-        return f"<PartedMatches of {' '.join(self._text.split())[:80]!r}>"
+    def _compile(self, catalog: Catalog) -> Compiled:
+        compiled = super()._compile(catalog)
+        parted(compiled)  # unmergeable queries are rejected before a bundle is opened
+        return compiled
 
-    def limit(self, most: int) -> Self:
-        """Return the same matches, limited to at most ``most`` rows.
+    @contextmanager
+    def _compiled(self) -> Generator[Compiled]:
+        yield self._ready
 
-        Raises
-        ------
-        ValueError
-            The number is negative.
-        """
-        if most < 0:
-            raise ValueError(f"limit is {most}, expected 0 or more")
-        fewer = copy(self)
-        fewer._limit = most if self._limit is None else min(self._limit, most)  # noqa: SLF001
-        fewer._ready = self._ready.limited(most)  # noqa: SLF001
-        return fewer
+    def _table(self) -> None:
+        return None
+
+    def _record_batches(self) -> Generator[Any]:
+        yield from ()
 
     @property
     def of_all(self) -> bool:
@@ -634,11 +626,6 @@ class PartedMatches(Tabular):
         return {name: found[name] for name in sorted(found, key=natural)}
 
     @property
-    def left_out(self) -> tuple[str, ...]:
-        """Return the names of the traces that cannot answer the query because a required value is unknown."""
-        return tuple(self.reasons)
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """Return an empty tuple: a collection does not search queries for likely mistakes."""
         return ()
@@ -648,19 +635,6 @@ class PartedMatches(Tabular):
         """Return the data that settings excluded from the queried traces, as JSON values."""
         chosen = (trace.trace_id for trace in self._ready.chosen)
         return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
-
-    def _rows(self, *, whole: bool) -> Iterator[Any]:
-        del whole  # a bundle always runs the complete query
-        return iter(self)
-
-    def __iter__(self) -> Iterator[Any]:
-        layout, row = self._ready.layout, row_type(self.columns)
-        rows = self._answered("rows")
-        yield from map(row._make, rows if layout is None else map(layout.row, rows))
-
-    def rows(self) -> list[Any]:
-        """Return all rows of the matches as a list."""
-        return list(self)
 
     def numpy(self) -> dict[str, Any]:
         """Return all columns of the matches as arrays; NULL values are masked."""
@@ -677,57 +651,8 @@ class PartedMatches(Tabular):
             total = 0
             for result in self._whole.ask(self._question("count", folder), bundles):
                 self._reasons |= result["reasons"]
-                parts = [PartFile.from_dict(part) for part in result["parts"]]
-                with PartFile.merged_rows({PARTS: parts}, {}, _ALL, ()) as batches:
-                    total += sum(row[0] for batch in batches for row in batch.values)
+                total += sum(row[0] for row in _rows(_parts_of(result), {}))
             return total
-
-    def frames(self) -> Iterator[FrameRef]:
-        """Yield the distinct frames with a match, ordered by trace name and frame number.
-
-        With ``LIMIT``, they have the order of the rows.
-        """
-        for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
-            yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
-
-    def _frames(self) -> Iterator[tuple[Any, ...]]:
-        rows = ((*row[:5], row[-1]) for row in self._answered("frames"))
-        yield from rows if self._ready.limited_to_frames is None else dict.fromkeys(rows)
-
-    def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
-        """Yield each match as a graph of its nodes and edges; see :meth:`sgstore.Matches.subgraphs`."""
-        from sgstore.model.graph import graph_of_records
-
-        layout = Layout.of(self._ready.bound)
-        for row in self._answered("subgraphs"):
-            *values, nodes, edges = layout.row(row)
-            about = dict(zip(layout.columns, values, strict=False))
-            yield graph_of_records(nodes, edges, **about)
-
-    def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
-        """Yield maximal runs of frames with the same match; see :meth:`sgstore.Matches.intervals`."""
-        form, width, result = "bound" if bound else "intervals", 8, self._ready.query.result
-        names = parted(self._ready, form).columns[width:]
-        most = result.limit if result.form == "intervals" else None
-        for row in islice(self._answered(form), most):
-            yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
-
-    def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
-        """Yield clips around the matching frames, in log time; see :meth:`sgstore.Matches.clips`."""
-        start, end = round(before * 1e9), round(after * 1e9)
-        if self._ready.limited_to_frames is not None:
-            around = (Clip(row[1], row[-1] - start, row[-1] + end) for row in self._frames())
-            clips = sorted(around, key=lambda clip: (natural(clip.trace), clip.start_ns))
-            yield from merged(clips, self._slack)
-            return
-        rows = self._answered("clips", (start, end))
-        yield from merged((Clip(*row[:3]) for row in rows), self._slack)
-
-    @property
-    def _slack(self) -> dict[str, int]:
-        """Return the time tolerance of each trace in ns, by trace name."""
-        traces = self._ready.catalog.traces
-        return {trace.name: tolerance_ns(trace.period_ns) for trace in traces}
 
     def explain(self) -> str:
         """Return an explanation of the query: its SQL stages, and the merge of the results of all stores."""
@@ -738,12 +663,8 @@ class PartedMatches(Tabular):
         told = f"---- bundles\n{len(bundles)} of {number} may answer\n\n---- merge\n{text}"
         return f"{self._ready.stages()}\n\n{told}"
 
-    def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-        """Return the columns and rows of the matches in a readable form, with names of entities."""
-        return for_people(self.columns, self, graphs=self.graphs)
-
-    def _described(self) -> tuple[tuple[str, ...], None]:
-        return self.columns, None
+    def _columns_of(self, compiled: Compiled, form: str) -> tuple[str, ...]:
+        return parted(compiled, form).columns
 
     def _question(
         self, form: str, folder: Path, offsets: tuple[int, int] = (0, 0)
@@ -753,22 +674,25 @@ class PartedMatches(Tabular):
             "kind": "find",
             "form": form,
             "text": self._text,
-            "parameters": self._parameters,
+            "parameters": dict(self._parameters),
             "limit": self._limit,
             "before": offsets[0],
             "after": offsets[1],
             "given": given,
         }
 
-    def _answered(self, form: str, offsets: tuple[int, int] = (0, 0)) -> Iterator[tuple[Any, ...]]:
+    def _answered(
+        self, form: str, offsets: tuple[int, int] = (0, 0), *, whole: bool = False
+    ) -> Iterator[tuple[Any, ...]]:
         """Run the query, and yield the merged rows of all stores in one form (rows, frames, intervals, …)."""
-        asked = parted(self._ready, form, *offsets)
+        del whole  # a bundle always runs the complete query
+        result = self._ready.query.result
+        cut = form in _INTERVAL_FORMS and result.form == "intervals"
         with self._tables(form, offsets) as tables:
-            text, values = asked.statement(self._ready.catalog)
-            words = self.snapshot.words
-            with PartFile.merged_rows(tables, words, text, values) as batches:
-                for batch in batches:
-                    yield from batch.values
+            asked = parted(self._ready, form, *offsets).statement(self._ready.catalog)
+            with PartFile.merged_rows(tables, self.snapshot.words, *asked) as batches:
+                rows = (row for batch in batches for row in batch.values)
+                yield from islice(rows, result.limit if cut else None)
 
     def written_apart(self, to: Path) -> PartFile:
         """Write the rows of one part of a ``UNION`` to a file, with columns that distinguish equal node ids."""
@@ -796,10 +720,13 @@ class PartedMatches(Tabular):
             yield tables
 
 
-class PartedUnion(UnionMatches):
+_INTERVAL_FORMS: Final = {"intervals", "bound"}
+
+
+class CollectionUnion(UnionMatches):
     """Matches of a ``UNION`` query in all bundles of a collection."""
 
-    _parts: Sequence[Any]  # PartedMatches
+    _parts: Sequence[Any]  # CollectionMatches
 
     @property
     def of_all(self) -> bool:
@@ -814,14 +741,10 @@ class PartedUnion(UnionMatches):
         snapshot = self._parts[0].snapshot
         return snapshot.scope(world=any(one.bound.world for one in parts), traces=chosen)
 
-    def _rows(self, *, whole: bool) -> Iterator[Any]:
-        if self.graphs:
-            yield from super()._rows(whole=whole)
-            return
-        row = row_type(self.columns)
+    @contextmanager
+    def _joined_batches(self) -> Generator[Iterable[Rows]]:
         with self._tables() as asked, PartFile.merged_rows(*asked) as batches:
-            for batch in batches:
-                yield from map(row._make, batch.values)
+            yield batches
 
     def numpy(self) -> dict[str, Any]:
         """Return all columns of the matches as arrays; NULL values are masked."""
@@ -846,15 +769,7 @@ class PartedUnion(UnionMatches):
             yield tables, snapshot.words, select.text(), [traces] if named else []
 
 
-class _NoFile:
-    """Placeholder for the file of a store; a collection has no single file."""
-
-    @contextmanager
-    def snapshot(self) -> Generator[None]:
-        yield
-
-
-class PartedChecks:
+class CollectionChecks:
     """``CHECK`` statements over a collection. Iteration runs them and yields the verdicts."""
 
     def __init__(
@@ -942,7 +857,7 @@ def _verdicts(path: Path) -> Iterator[Verdict]:
             yield worker.as_verdict(json.loads(line))
 
 
-class PartedRows(Tabular):
+class CollectionRows(Tabular):
     """Rows of an SQL statement in every bundle of a collection. Iteration runs the statement."""
 
     def __init__(self, whole: Collection, text: str) -> None:
@@ -978,3 +893,216 @@ class PartedRows(Tabular):
 
     def _described(self) -> tuple[tuple[str, ...], None]:
         return self.columns, None
+
+
+@overload
+def open(
+    path: str | Path,
+    *,
+    create: bool = False,
+    memory: int = 0,
+    tables: Mapping[str, object] | None = None,
+    max_spill: int = 0,
+    root: str | Path | None = None,
+) -> Store: ...
+
+
+@overload
+def open(
+    path: str | Path,
+    *,
+    engine: str,
+    tables: Mapping[str, object] | None = None,
+    partial: bool = False,
+) -> Collection: ...
+
+
+def open(  # noqa: PLR0913  those of a store, and those of a collection
+    path: str | Path,
+    *,
+    create: bool = False,
+    memory: int = 0,
+    tables: Mapping[str, object] | None = None,
+    max_spill: int = 0,
+    root: str | Path | None = None,
+    engine: str = "",
+    partial: bool = False,
+) -> Store | Collection:
+    """Open a store, or with ``engine`` a collection of stores.
+
+    Parameters
+    ----------
+    path : str or Path
+        Path of a store; place of a collection: a folder, or ``s3://bucket/prefix``.
+    create, memory, tables, max_spill, root
+        As in :class:`sgstore.Store`; for a collection only ``tables``.
+    engine : str
+        Engine for a collection: ``local``, ``local:8``, ``ray``, ``ray://HOST:PORT``, ``spark``.
+    partial : bool
+        True if results of a collection may lack stores that cannot answer.
+
+    Raises
+    ------
+    StoreError
+        The store or collection is missing, or has another version.
+
+    Examples
+    --------
+    >>> import sgstore
+    >>> with sgstore.open("demo.sgstore") as store:  # made by 'sgstore demo .'
+    ...     print(store.find("MATCH (e:Ego)-[:near_coll]->(p:Person)").count(), "frames")
+    4 frames
+    >>> with sgstore.open("fleet", engine="local") as fleet:  # made by 'sgstore collection pack'
+    ...     print(len(fleet.traces()), "trace")
+    1 trace
+    """
+    if not engine:
+        return Store(
+            path, create=create, memory=memory, tables=tables, max_spill=max_spill, root=root
+        )
+    from sgstore.collection._questions import Collection
+
+    return Collection(path, engine=engine, tables=tables, partial=partial)
+
+
+_TIMES: Final = "SELECT frame_id, time_ns FROM frame"
+_IMPORTS: Final = "SELECT graph, frame_id FROM imports"
+_ALL: Final = f"FROM {PARTS} ORDER BY ALL"
+
+
+class CollectionFrames:
+    """Frames of all bundles of a collection, with the interface of a single store file.
+
+    Parameters
+    ----------
+    whole : Collection
+    catalog : function
+        Function that returns the contents of all bundles, for the compiler of queries.
+    """
+
+    def __init__(self, whole: Collection, catalog: Callable[[], Catalog]) -> None:
+        self._whole, self.catalog = whole, catalog
+        self._words, self._homes = whole.snapshot.words, whole.snapshot.homes
+        self._bundles = whole.bundles() or [worker.EMPTY]
+
+    @property
+    def abstracted(self) -> Self:
+        """Return this object, which also has the methods for graph abstractions."""
+        return self
+
+    def snapshot(self) -> AbstractContextManager[object]:
+        """Return an empty context manager, because the snapshot of a collection never changes."""
+        return nullcontext()
+
+    def arrays(self, sql: str, parameters: Parameters = ()) -> dict[str, NDArray[np.generic]]:
+        """Run an SQL statement on all stores of the collection, and return its columns as arrays.
+
+        Each row must belong to one trace. The rows are ordered by value.
+
+        Parameters
+        ----------
+        sql : str
+        parameters : sequence or mapping
+            ``frames`` has ids of frames: each bundle gets its own ids, and bundles without any are
+            skipped.
+        """
+        with self._told(sql, parameters) as parts:
+            return PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
+
+    def rows(self, sql: str, parameters: Parameters = ()) -> Rows:
+        """Run an SQL statement on all stores of the collection, and return its rows."""
+        with self._told(sql, parameters) as parts:
+            values = [*_rows(parts, self._words)]
+            return Rows(parts[0].columns, parts[0].types, values)
+
+    @contextmanager
+    def _told(self, sql: str, parameters: Parameters) -> Generator[list[PartFile]]:
+        asked: dict[str, dict[str, Any]] = {one: {"values": parameters} for one in self._bundles}
+        if isinstance(parameters, Mapping) and "frames" in parameters:
+            each = self.by_bundle(np.array(parameters["frames"], np.int64))
+            asked = {b: {"values": {**parameters, "frames": of.tolist()}} for b, (_, of) in each}
+            asked = asked or {worker.EMPTY: {"values": parameters}}
+        with self._parts({"kind": "rows", "sql": sql}, asked) as parts:
+            yield parts
+
+    def by_bundle(self, frame_id: Ints) -> list[tuple[str, tuple[Ints, Ints]]]:
+        """Return the stores that contain the given frames, each with the indices and ids of its frames."""
+        traces, number = np.unique(trace_of(frame_id), return_inverse=True)
+        homes = [self._homes[trace] for trace in traces.tolist()]
+        of = {bundle: place for place, bundle in enumerate(dict.fromkeys(homes))}
+        bundle = np.array([of[home] for home in homes], np.int64)[number]
+        rows = ((name, np.flatnonzero(bundle == place)) for name, place in of.items())
+        return [(name, (some, frame_id[some])) for name, some in rows]
+
+    def coded(self, name: str) -> CodedClasses:
+        """Return the class number of each frame in an abstraction. Classes that are not stored are computed."""
+        with self._parts({"kind": "coded", "abstraction": name}) as parts:
+            return PartFile.merged_classes(parts)
+
+    def times(self) -> tuple[Ints, Ints]:
+        """Return the ids of all frames, ascending, and their simulation times in ns."""
+        frame_id, time_ns = self.arrays(_TIMES).values()
+        return np.asarray(frame_id, np.int64), np.asarray(time_ns, np.int64)
+
+    def imported_names(self) -> dict[str, int]:
+        """Return the frame ids of imported graphs, by the name of the graph in its file."""
+        found = sorted(self.rows(_IMPORTS).values, key=lambda row: row[1])
+        return dict(found)
+
+    def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
+        """Yield the features of frames (label counts of their graphs) in an abstraction, store by store.
+
+        Parameters and results as in :meth:`sgstore.store._classes.Abstracted.features`.
+        """
+        homes = dict(self.by_bundle(frame_id))
+        each = {bundle: {"frames": of.tolist()} for bundle, (_, of) in homes.items()}
+        question = {"kind": "features", "abstraction": name}
+        for result in self._whole.ask(question, [*homes], each):
+            number: dict[str, int] = {}
+            found = [
+                (frame, number.setdefault(feature, len(number)), often)
+                for frame, feature, often in _rows(_parts_of(result), self._words)
+            ]
+            columns = np.array(found, np.int64).reshape(-1, 3).T
+            names = [tuple(json.loads(feature)) for feature in number]
+            yield homes[result["bundle"]][0], Triples(names, *columns)
+
+    def margins(self, question: dict[str, Any]) -> Iterator[tuple[Ints, Floats]]:
+        """Yield frame ids with the robustness margins of a check, one bundle (store file) after another."""
+        with self._parts({"kind": "margins"} | question) as parts:
+            found = PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
+        yield (
+            found["frame_id"].astype(np.int64),
+            np.ma.filled(found["margin"].astype(np.float64), np.nan),
+        )
+
+    @contextmanager
+    def _parts(
+        self, question: dict[str, Any], each: Mapping[str, dict[str, Any]] = MappingProxyType({})
+    ) -> Generator[list[PartFile]]:
+        """Context manager with the result files of all bundles (store files) for a query.
+
+        If ``each`` has entries, only their bundles run it.
+        """
+        with working_folder("parts") as folder:
+            found: list[PartFile] = []
+            for bundles in ([*each] or self._bundles, [worker.EMPTY]):  # all bundles may be missing
+                if not found:
+                    asked = {one: each.get(one, _any_of(each)) for one in bundles}
+                    answers = self._whole.ask(question, bundles, asked)
+                    found = [part.moved(folder) for a in answers for part in _parts_of(a)]
+            yield found
+
+
+def _any_of(each: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    return next(iter(each.values()), {})
+
+
+def _parts_of(answer: Mapping[str, Any]) -> list[PartFile]:
+    return [PartFile.from_dict(part) for part in answer["parts"]]
+
+
+def _rows(parts: list[PartFile], words: Words) -> Iterator[tuple[Any, ...]]:
+    with PartFile.merged_rows({PARTS: parts}, words, _ALL, ()) as batches:
+        for batch in batches:
+            yield from batch.values

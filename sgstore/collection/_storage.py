@@ -7,12 +7,13 @@ processes write the same name at once, one of them learns that it was late.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import secrets
 import shutil
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import StoreError, url_named
 from sgstore.mcap import (
@@ -34,46 +35,6 @@ PIECE: Final = 1 << 20
 
 class MissingObjectError(StoreError):
     """Error for a missing file of a collection."""
-
-
-class Place(Protocol):
-    """Interface of a collection's storage: files with names such as ``bundles/….sgstore``.
-
-    Attributes
-    ----------
-    url : str
-        Its name for users.
-    """
-
-    url: str
-
-    def read(self, name: str) -> bytes:
-        """Return the content of a file."""
-        ...
-
-    def write_new(self, name: str, data: bytes) -> bool:
-        """Write a new file; return False if a file with this name exists."""
-        ...
-
-    def upload(self, path: Path, name: str) -> None:
-        """Copy a local file to a name in the storage."""
-        ...
-
-    def fetch(self, name: str, to: Path) -> None:
-        """Copy a file from the storage to a local path."""
-        ...
-
-    def names(self, folder: str) -> Iterator[tuple[str, int, float]]:
-        """Yield the name, size in bytes and time (s since 1970) of all files below a folder."""
-        ...
-
-    def remove(self, name: str) -> None:
-        """Remove a file from the storage; a missing file is ignored."""
-        ...
-
-    def local(self, name: str) -> Path | None:
-        """Return the local path of a file in the storage; ``None`` means that it must be fetched."""
-        ...
 
 
 def place_at(url: str | Path) -> Place:
@@ -112,6 +73,14 @@ def digest_of_file(path: Path) -> str:
 
 
 class _Folder:
+    """Local folder with the files of a collection, with names such as ``bundles/….sgstore``.
+
+    Attributes
+    ----------
+    url : str
+        Its name for users.
+    """
+
     def __init__(self, root: Path) -> None:
         self.root = root.absolute()
         self.url = str(self.root)
@@ -128,10 +97,12 @@ class _Folder:
             raise StoreError(f"{self.root / name}: {error.strerror or error}") from error
 
     def read(self, name: str) -> bytes:
+        """Return the content of a file."""
         with self._told(name):
             return (self.root / name).read_bytes()
 
     def write_new(self, name: str, data: bytes) -> bool:
+        """Write a new file; return False if a file with this name exists."""
         with self._told(name), self._beside(name) as (fresh, path):
             with fresh.open("xb") as file:
                 file.write(data)
@@ -144,6 +115,7 @@ class _Folder:
             return True
 
     def upload(self, path: Path, name: str) -> None:
+        """Copy a local file to a name in the storage."""
         with self._told(name), self._beside(name) as (fresh, to):
             shutil.copyfile(path, fresh)
             fresh.replace(to)
@@ -160,10 +132,12 @@ class _Folder:
             fresh.unlink(missing_ok=True)
 
     def fetch(self, name: str, to: Path) -> None:
+        """Copy a file from the storage to a local path."""
         with self._told(name):
             shutil.copyfile(self.root / name, to)
 
     def names(self, folder: str) -> Iterator[tuple[str, int, float]]:
+        """Yield the name, size in bytes and time (s since 1970) of all files below a folder."""
         with self._told(folder):
             for path in sorted((self.root / folder).rglob("*")):
                 if path.is_file() and not path.name.startswith("."):
@@ -171,6 +145,7 @@ class _Folder:
                     yield path.relative_to(self.root).as_posix(), about.st_size, about.st_mtime
 
     def remove(self, name: str) -> None:
+        """Remove a file from the storage; a missing file is ignored."""
         path = self.root / name
         with self._told(name):
             path.unlink(missing_ok=True)
@@ -179,6 +154,7 @@ class _Folder:
                 path.parent.rmdir()
 
     def local(self, name: str) -> Path:
+        """Return the local path of a file in the storage; ``None`` means that it must be fetched."""
         return self.root / name
 
 
@@ -233,3 +209,104 @@ class _Remote:
     def local(self, name: str) -> Path | None:
         del name  # it must be fetched
         return None
+
+
+CACHE: Final = "SGSTORE_CACHE"
+"""Environment variable: the folder for fetched bundles."""
+
+
+def cache_folder() -> Path:
+    """Return the folder for fetched bundles (store files of a collection), and create it if missing.
+
+    Raises
+    ------
+    StoreError
+        The folder cannot be created.
+    """
+    told = os.environ.get(CACHE)
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    folder = Path(told) if told else Path(base).expanduser() / "sgstore"
+    try:
+        (folder / "bundles").mkdir(parents=True, exist_ok=True)
+        (folder / "seen").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(
+            f"{folder}: cannot be written: {error.strerror}; {CACHE} names another folder for bundles"
+        ) from error
+    return folder
+
+
+def bundle_path(place: Place, sha: str, *, again: bool = False) -> Path:
+    """Return the path of a bundle (store file of a collection) on this machine, after verification.
+
+    Parameters
+    ----------
+    place : Place
+    sha : str
+    again : bool
+        True to verify the file again.
+
+    Raises
+    ------
+    StoreError
+        The file is missing, cannot be fetched, or differs from the committed one.
+    """
+    folder, name = cache_folder(), f"bundles/{sha}.sgstore"
+    path = place.local(name)
+    if path is None:
+        path = folder / name
+        if not path.exists():
+            _fetch(place, name, sha, path)
+            return path
+    if again or not _seen(folder, sha, path):
+        if (held := digest_of_file(path)) != sha:
+            raise StoreError(
+                f"{place.url}/{name}: not as it was committed: its SHA-256 is {held[:12]}…;"
+                " put the file back from a copy, or remove its traces from the collection"
+            )
+        _remember(folder, sha, path)
+    return path
+
+
+def _fetch(place: Place, name: str, sha: str, path: Path) -> None:
+    fresh = path.with_name(f".{sha}.{os.getpid()}-{secrets.token_hex(4)}")
+    try:
+        place.fetch(name, fresh)
+        if (held := digest_of_file(fresh)) != sha:
+            raise StoreError(
+                f"{place.url}/{name}: not as it was committed: its SHA-256 is {held[:12]}…"
+            )
+        fresh.replace(path)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error
+    finally:
+        with suppress(OSError):
+            fresh.unlink(missing_ok=True)
+
+
+def _stamp(path: Path) -> list[int]:
+    about = path.stat()
+    return [about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns]
+
+
+def _seen(folder: Path, sha: str, path: Path) -> bool:
+    """True if a bundle file has been verified and has not changed since."""
+    try:
+        return json.loads((folder / "seen" / sha).read_text()) == _stamp(path)
+    except FileNotFoundError:
+        if not path.exists():
+            raise StoreError(f"{path}: a bundle that the catalogue speaks of is gone") from None
+        return False
+    except (OSError, ValueError):
+        return False
+
+
+def _remember(folder: Path, sha: str, path: Path) -> None:
+    fresh = folder / "seen" / f".{sha}.{os.getpid()}"
+    with suppress(OSError):  # then it is verified again
+        fresh.write_text(json.dumps(_stamp(path)))
+        fresh.replace(folder / "seen" / sha)
+
+
+Place = _Folder | _Remote
+"""Storage of a collection."""

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from sgstore.base.temporary_folders import working_folder
-from sgstore.collection._cache import bundle_path
-from sgstore.collection._storage import place_at
+from sgstore.collection._storage import bundle_path, place_at
 from sgstore.errors import StoreError
 from sgstore.lang.catalog import Type
 from sgstore.lang.sql import Compiled
@@ -106,7 +105,7 @@ class PartMatches(TemporalMatches):
             return [self._written(one, one.rows(), folder) for one in asked]
 
     def _written(self, _compiled: Compiled, statement: Any, folder: Path) -> PartFile:
-        to = folder / f"{secrets.token_hex(8)}.parquet"
+        to = _fresh(folder)
         asked = self._asked(statement)
         sql = asked["sql"], asked["parameters"]
         return PartFile.of_statement(self._file, sql, statement.columns, asked["given"], to)
@@ -196,6 +195,14 @@ def _tables_of(task: dict[str, Any], held: Path) -> dict[str, Path]:
     return given
 
 
+def _fresh(folder: Path, ending: str = "parquet") -> Path:
+    return folder / f"{secrets.token_hex(8)}.{ending}"
+
+
+def _part(part: PartFile) -> dict[str, Any]:
+    return {"parts": [part.as_dict()], "reasons": {}}
+
+
 def _find(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
@@ -218,7 +225,7 @@ def _check(
         sgsm_compat=task["sgsm_compat"],
         status=task["status"],
     )
-    path = to / f"{secrets.token_hex(8)}.ndjson"
+    path = _fresh(to, "ndjson")
     with path.open("w", encoding="utf-8") as lines:
         for verdict in run:
             lines.write(json.dumps(_values_of(verdict), default=_plain))
@@ -275,23 +282,21 @@ def _classes(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
     """Write the classes of the frames of one bundle (store) to a file."""
-    path = to / f"{secrets.token_hex(8)}.parquet"
-    part = PartFile.of_classes(file, task["abstraction"], task["traces"], task["table"], path)
-    return {"parts": [part.as_dict()], "reasons": {}}
+    about = task["abstraction"], task["traces"], task["table"]
+    return _part(PartFile.of_classes(file, *about, _fresh(to)))
 
 
 def _sql(
     task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
     """Write the rows of a user's SQL statement on one bundle (store file) to a file, as JSON lines."""
-    path = to / f"{secrets.token_hex(8)}.ndjson"
+    path = _fresh(to, "ndjson")
 
     def find(text: str, **values: object) -> Matches:
         return matches_of(file, catalog, text, values)
 
     asked = UserStatement(find, catalog().tables, task["text"])
-    rows = file.user_batches(asked.sql, given=asked.given)
-    with path.open("w", encoding="utf-8") as lines, rows as batches:
+    with path.open("w", encoding="utf-8") as lines, asked.on(file).batches() as batches:
         columns, types = batches.columns, batches.types
         for batch in batches:
             for row in batch.values:
@@ -304,8 +309,7 @@ def _sql(
 def _coded(
     task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
 ) -> dict[str, Any]:
-    part = PartFile.of_coded(file, task["abstraction"], to / f"{secrets.token_hex(8)}.parquet")
-    return {"parts": [part.as_dict()], "reasons": {}}
+    return _part(PartFile.of_coded(file, task["abstraction"], _fresh(to)))
 
 
 def _features(
@@ -324,8 +328,7 @@ def _features(
             )
 
     columns = {"frame": "BIGINT", "feature": "VARCHAR", "often": "BIGINT"}
-    part = PartFile.of_rows(columns, rows(), to / f"{secrets.token_hex(8)}.parquet")
-    return {"parts": [part.as_dict()], "reasons": {}}
+    return _part(PartFile.of_rows(columns, rows(), _fresh(to)))
 
 
 def _margins(
@@ -338,8 +341,7 @@ def _margins(
     found = ((ids, np.broadcast_to(margins, len(ids))) for ids, margins in run.margins())
     rows = (row for one in found for row in zip(*(of.tolist() for of in one), strict=True))
     columns = {"frame_id": "BIGINT", "margin": "DOUBLE"}
-    part = PartFile.of_rows(columns, rows, to / f"{secrets.token_hex(8)}.parquet")
-    return {"parts": [part.as_dict()], "reasons": {}}
+    return _part(PartFile.of_rows(columns, rows, _fresh(to)))
 
 
 def _rows(
@@ -347,10 +349,7 @@ def _rows(
 ) -> dict[str, Any]:
     statement = task["sql"], task["values"]
     columns = [row[0] for row in file.rows(f"DESCRIBE {task['sql']}", task["values"]).values]
-    part = PartFile.of_statement(
-        file, statement, columns, (), to / f"{secrets.token_hex(8)}.parquet"
-    )
-    return {"parts": [part.as_dict()], "reasons": {}}
+    return _part(PartFile.of_statement(file, statement, columns, (), _fresh(to)))
 
 
 def _step(
@@ -361,12 +360,10 @@ def _step(
     return {"value": step(Store.of(file), **task["values"])}
 
 
-def _tables(
-    _task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
-) -> dict[str, Any]:
+def tables_in(store: Store) -> dict[str, Any]:
     """Return how the rows of the user tables match the frames of one bundle (store file)."""
-    joined, told = file.joined(), dict[str, Any]()
-    for name, facts in file.catalog().tables.items():
+    joined, told = store.file.joined(), dict[str, Any]()
+    for name, facts in store.file.catalog().tables.items():
         rows = joined.get(name)
         told[name] = {
             "columns": {column: kind.value for column, kind in facts.columns.items()},
@@ -375,7 +372,7 @@ def _tables(
             "frames": rows.frames if rows else 0,
             "traces": None if facts.traces is None else sorted(facts.traces),
         }
-    return {"tables": told}
+    return told
 
 
 def example_in(store: Store, **asked: Any) -> dict[str, Any]:
@@ -393,7 +390,6 @@ _KINDS: Final[dict[str, Any]] = {
     "check": _check,
     "classes": _classes,
     "sql": _sql,
-    "tables": _tables,
     "coded": _coded,
     "features": _features,
     "margins": _margins,
@@ -423,11 +419,11 @@ def brought(result: dict[str, Any], folder: Path) -> dict[str, Any]:
     try:
         for part in result.get("parts", ()):
             if "data" in part:
-                to = folder / f"{secrets.token_hex(8)}.parquet"
+                to = _fresh(folder)
                 to.write_bytes(base64.b64decode(part.pop("data")))
                 part["path"] = str(to)
         if "data" in result:
-            to = folder / f"{secrets.token_hex(8)}.ndjson"
+            to = _fresh(folder, "ndjson")
             to.write_text(result.pop("data"), encoding="utf-8")
             result["lines"] = str(to)
     except OSError as error:

@@ -14,7 +14,7 @@ from sgstore.model.world import tolerance_ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from sgstore.collection import PartedMatches, PartedUnion
+    from sgstore.collection import CollectionMatches, CollectionUnion
     from sgstore.exporters._labels import Labels
     from sgstore.exporters._transforms import Mount
     from sgstore.matches import Matches
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sgstore.query import Store
     from sgstore.store import StoredTrace
 
-    AnyMatches = Matches | PartedMatches | PartedUnion
+    AnyMatches = Matches | CollectionMatches | CollectionUnion
 
 WINDOW: Final = 240
 """Frames that are read from the store at once, as columns."""

@@ -23,12 +23,12 @@ from sgstore.model.frame_ids import frame_ids, trace_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from sgstore.collection import Collection, PartedMatches, PartedUnion
+    from sgstore.collection import Collection, CollectionMatches, CollectionUnion
     from sgstore.matches import Matches
     from sgstore.model.world import Ints
     from sgstore.query import Store
 
-    AnyMatches = Matches | PartedMatches | PartedUnion
+    AnyMatches = Matches | CollectionMatches | CollectionUnion
 
 
 NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,62}")

@@ -14,21 +14,25 @@ computes their checksums. ``_payloads`` joins messages to frames, and ``_publish
 ``_classes`` adds frame classes, ``_derive`` adds derived sets of relations; ``_similarity`` compares frames.
 ``_verify`` verifies a store; ``_creation`` creates stores, and ``_rebuild`` rewrites them.
 
-Collections: ``_bundles`` copies traces into new stores, and ``_bundle_catalogue`` describes their content.
-``_inbox_segments`` keeps segments before that, and ``_merge`` merges the results of several bundles.
+Collections: ``_bundles`` copies traces into new stores, describes their content, and splits segments
+before that. ``_merge`` merges the results of several bundles.
 """
 
-from sgstore.store._bundle_catalogue import CATALOGUE, Facts, facts_of, parquet_rows
-from sgstore.store._bundles import BundleSource
+from sgstore.store._bundles import (
+    CATALOGUE,
+    BundleSource,
+    Facts,
+    facts_of,
+    split_segment,
+    whole_segment,
+)
 from sgstore.store._catalog import subset_catalogs
-from sgstore.store._classes import Abstracted
+from sgstore.store._classes import Abstracted, CodedClasses, Triples
 from sgstore.store._clients import duckdb
-from sgstore.store._coded_classes import CodedClasses, Triples
 from sgstore.store._contents import Mark, MessagePlaces
 from sgstore.store._encounters import measured
 from sgstore.store._file import StoreFile
 from sgstore.store._graph_digests import graph_digests
-from sgstore.store._inbox_segments import split_segment, whole_segment
 from sgstore.store._joins import UserTables
 from sgstore.store._merge import PartFile
 from sgstore.store._publish import PresentError
@@ -37,6 +41,7 @@ from sgstore.store._rows import Rows, Tabular, count_parquet
 from sgstore.store._schema import SCHEMA_VERSION
 from sgstore.store._similarity import Example, SimilarFrames
 from sgstore.store._staging import Sealed
+from sgstore.store._state_columns import StateColumns
 from sgstore.store._store_paths import Folder
 from sgstore.store._table_files import ParquetTable
 from sgstore.store._temporary_tables import Given, GivenTable
@@ -70,6 +75,7 @@ __all__ = [
     "Sealed",
     "Segment",
     "SimilarFrames",
+    "StateColumns",
     "StoreFile",
     "StoredTrace",
     "Tabular",
@@ -80,7 +86,6 @@ __all__ = [
     "facts_of",
     "graph_digests",
     "measured",
-    "parquet_rows",
     "split_segment",
     "subset_catalogs",
     "verify_file",

@@ -7,9 +7,9 @@ copied unchanged.
 from __future__ import annotations
 
 import os
-from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
 
 import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
@@ -22,15 +22,17 @@ from sgstore.store._engine_errors import translated
 from sgstore.store._locking import Access, default_memory, spill_folder
 from sgstore.store._publish import SHARED
 from sgstore.store._rows import run
-from sgstore.store._staging import scratch
+from sgstore.store._staging import Sealed, scratch
+from sgstore.store._table_stream import FILE, TableFile
 from sgstore.store._traces import stored_traces
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
 
+    from sgstore.store._file import StoreFile
 
 TOGETHER: Final = 64
 """Largest number of stores to join at once. More stores are joined in several steps."""
@@ -231,3 +233,188 @@ def _chosen(table: str, database: str) -> str:
         return f"SELECT *{place} FROM {inside}.{table} WHERE {chosen}"
     column = next(name for name in _TRACE_OF if name in types_of(table))
     return f"SELECT * FROM {inside}.{table} WHERE {_TRACE_OF[column]} IN (SELECT key FROM chosen)"
+
+
+CATALOGUE: Final = {
+    table: dict(column.split() for column in columns.split(", "))
+    for table, columns in {
+        "bundle": "bundle VARCHAR, bytes BIGINT, frames BIGINT, traces BIGINT, schema_version VARCHAR, "
+        "schema_digest VARCHAR, created_by VARCHAR, start_ns BIGINT, end_ns BIGINT",
+        "trace": "bundle VARCHAR, trace_id BIGINT, name VARCHAR, digest VARCHAR, ego VARCHAR, "
+        "map VARCHAR, map_digest VARCHAR, config VARCHAR, answers VARCHAR, frames BIGINT, "
+        "start_ns BIGINT, end_ns BIGINT, period_ns BIGINT, uri VARCHAR, first_bucket BIGINT, "
+        "buckets BIGINT, scope VARCHAR, segment VARCHAR",
+        "config": "config VARCHAR, settings VARCHAR",
+        "triple": "bundle VARCHAR, set VARCHAR, moving BOOLEAN, relation VARCHAR, src_kind VARCHAR, "
+        "dst_kind VARCHAR, rows BIGINT",
+        "kind": "bundle VARCHAR, home VARCHAR, kind VARCHAR",
+        "word": "bundle VARCHAR, what VARCHAR, word VARCHAR, type VARCHAR, place BIGINT",
+        "class_count": "bundle VARCHAR, abstraction VARCHAR, class VARCHAR, frames BIGINT, traces BIGINT",
+        "set": "bundle VARCHAR, name VARCHAR, trace_id BIGINT, digest VARCHAR, settings VARCHAR, "
+        "answers VARCHAR",
+    }.items()
+}
+"""Tables of a catalogue, with their columns and the types of these in the database.
+
+``word``: the names that the compiler must know beside its own: of an enumeration (``kind``, ``relation``,
+``light_state``), of user-defined attributes (``own``, ``own_edges``, with their types), and of abstractions
+with stored frame classes (``classed``). ``trace.scope``: counts of excluded data from its report, as JSON;
+empty or NULL: unknown.
+"""
+
+Facts = dict[str, list[tuple[Any, ...]]]
+"""Rows of a catalogue by table."""
+
+_TRACES: Final = """
+SELECT t.trace_id, t.name, r.digest, coalesce(t.ego, ''), coalesce(m.name, ''), coalesce(m.digest, ''),
+c.digest,
+       to_json(t.answers)::VARCHAR, t.frames, t.start_ns, t.end_ns, t.period_ns, r.uri, b.first, b.buckets,
+       coalesce(json_extract(t.report, '$.scope')::VARCHAR, '')
+FROM trace t JOIN recording r ON r.recording_id = t.recording_id JOIN config c ON c.config_id = t.config_id
+     LEFT JOIN map m ON m.map_id = t.map_id
+     JOIN (SELECT trace_id, min(bucket) AS first, max(bucket) - min(bucket) + 1 AS buckets FROM bucket GROUP BY
+     trace_id) b
+       ON b.trace_id = t.trace_id
+ORDER BY t.trace_id
+"""
+
+_CLASSES: Final = """
+SELECT abstraction, replace(class::VARCHAR, '-', ''), CAST(sum(bit_count(mask)) AS BIGINT),
+       count(DISTINCT bucket >> 18)
+FROM (SELECT * FROM frame_class UNION ALL SELECT * FROM later_class)
+WHERE class IS NOT NULL GROUP BY ALL ORDER BY ALL
+"""
+
+_SETS: Final = """
+SELECT name, trace_id, digest, settings::VARCHAR, to_json(answers)::VARCHAR FROM derived ORDER BY name, trace_id
+"""
+
+_INFO: Final = "SELECT key, value FROM store_info"
+
+
+def facts_of(file: StoreFile, bundle: str, size: int) -> Facts:
+    """Return table rows that summarise a store: its traces, frame classes, names and settings.
+
+    For triples outside the graphs, ``moving`` is NULL.
+
+    Parameters
+    ----------
+    file : StoreFile
+    bundle : str
+        Name of the bundle in the catalogue.
+    size : int
+        File size in bytes.
+    """
+    with file.access.reading() as connection:
+        catalog = file.catalog()
+        info = dict(run(connection, _INFO).values)
+        traces = run(connection, _TRACES).values
+        sets = run(connection, _SETS).values
+        classes = run(connection, _CLASSES).values
+        settings = run(connection, "SELECT digest, settings FROM config ORDER BY digest").values
+    found: Facts = {
+        "bundle": [
+            (
+                *(bundle, size, sum(row[8] for row in traces), len(traces)),
+                *(info[name] for name in ("schema_version", "schema_digest", "created_by")),
+                min((row[9] for row in traces), default=0),
+                max((row[10] for row in traces), default=0),
+            )
+        ],
+        "trace": [(bundle, *row, "") for row in traces],
+        "config": settings,
+        "triple": [],
+        "kind": [
+            (bundle, home, kind)
+            for home in ("moving", "fixed", "mapped")
+            for kind in sorted(getattr(catalog, home))
+        ],
+        "word": [*_words(bundle, catalog)],
+        "class_count": [(bundle, *row) for row in classes],
+        "set": [(bundle, *row) for row in sets],
+    }
+    for name in ["", *sorted({row[0] for row in sets})]:
+        seen = catalog.under(name) if name else catalog
+        if seen is None:
+            continue
+        for moving, table in (
+            (True, seen.edges),
+            (False, seen.map_edges),
+            (None, seen.beyond_edges),
+        ):
+            found["triple"] += [
+                (bundle, name, moving, *triple, n) for triple, n in sorted(table.items())
+            ]
+    return found
+
+
+def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
+    for enum, names in (catalog.names or {}).items():
+        for place, name in enumerate(names):
+            yield bundle, enum, name, "", place
+    for what in ("own", "own_edges"):
+        for name, kind in sorted(getattr(catalog, what).items()):
+            yield bundle, what, name, kind.value, 0
+    for name in catalog.classed:
+        yield bundle, "classed", name, "", 0
+
+
+MAP_TABLES: Final = frozenset(SHARED["map"])
+"""Tables of a segment that belong to its road map."""
+
+
+def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
+    """Split an unpublished trace into trace and road map files. Return the map digest; empty without a map.
+
+    Parameters
+    ----------
+    sealed : Path
+        Folder of the segment.
+    to, of_map : Path
+        Existing empty folders for the segment without its map, and for the map.
+
+    Raises
+    ------
+    StoreError
+        The segment is not readable, or a file is not writable.
+    """
+    told = Sealed.read(sealed)
+    _copy_pieces([sealed], lambda table: of_map if table in MAP_TABLES else to, [to, of_map])
+    replace(told, folder=to).write()
+    return told.identity.map_digest
+
+
+def whole_segment(folders: Sequence[Path], to: Path) -> Sealed:
+    """Combine the files of an unpublished trace and of its road map in a new folder.
+
+    Parameters
+    ----------
+    folders : sequence of Path
+        Folder of the trace, and of its road map if it has one.
+    to : Path
+        Existing empty folder.
+
+    Raises
+    ------
+    StoreError
+        A file is not readable or writable, or is not a staging file.
+    """
+    _copy_pieces(folders, lambda _: to, [to])
+    whole = replace(Sealed.read(folders[0]), folder=to)
+    whole.write()
+    return whole
+
+
+def _copy_pieces(
+    sources: Sequence[Path], place: Callable[[str], Path], folders: Sequence[Path]
+) -> None:
+    """Copy the tables of segments to new files, each table to the file at its place."""
+    with ExitStack() as stack:
+        fresh = {
+            to: stack.enter_context(closing(TableFile(to / FILE, to, new=True))) for to in folders
+        }
+        for source in sources:
+            tables = stack.enter_context(closing(TableFile(source / FILE, source)))
+            for piece in tables.all():
+                to = fresh[place(piece.table)]
+                to.append(piece.table, tables.read(piece), tables.texts(piece))

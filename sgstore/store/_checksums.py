@@ -19,8 +19,7 @@ import numpy as np
 from sgstore.base.quoting import quoted
 from sgstore.model.vocabulary import NAMES
 from sgstore.store._columns import TEXTS, missing_of, types_of
-from sgstore.store._schema import code_sql, enums_of, own_labels
-from sgstore.store._schema_text import INSIDE
+from sgstore.store._schema import INSIDE, code_sql, enums_of, own_labels
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

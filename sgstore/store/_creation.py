@@ -12,8 +12,7 @@ from sgstore.base.quoting import literal
 from sgstore.errors import StoreError
 from sgstore.store._engine_errors import translated
 from sgstore.store._locking import BLOCK_SIZE, STORAGE_VERSION, trust
-from sgstore.store._schema import SCHEMA_VERSION, schema_digest
-from sgstore.store._schema_text import schema_sql
+from sgstore.store._schema import SCHEMA_VERSION, schema_digest, schema_sql
 from sgstore.store._store_paths import Folder, refuse_odd_name
 
 if TYPE_CHECKING:

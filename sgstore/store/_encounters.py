@@ -32,7 +32,7 @@ from sgstore.model.criticality import (
 from sgstore.store._conflict_areas import BoundedCache, ConflictAreas
 from sgstore.store._interrupts import interrupted
 from sgstore.store._lease import stamp_of
-from sgstore.store._schema_text import INSIDE
+from sgstore.store._schema import INSIDE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable

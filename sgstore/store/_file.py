@@ -8,7 +8,6 @@ from __future__ import annotations
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,7 +21,6 @@ from sgstore.store._encounters import recorded_measures
 from sgstore.store._engine_errors import EngineError, translated
 from sgstore.store._locking import WAIT_S, Access, default_memory, spill_folder, stamp_of
 from sgstore.store._rows import BATCH, Batches, Rows
-from sgstore.store._table_files import ParquetTable
 from sgstore.store._temporary_tables import Given, give
 from sgstore.store._traces import (
     FrameRef,
@@ -59,9 +57,9 @@ if TYPE_CHECKING:
     from sgstore.store._graphs import Graphs
     from sgstore.store._joins import JoinedTable, UserTables
     from sgstore.store._locking import Stamp
-    from sgstore.store._packing import Columns
-    from sgstore.store._rows import Parameters, UserTablesGiven
+    from sgstore.store._rows import Parameters
     from sgstore.store._staging import Sealed
+    from sgstore.store._user_sql import UserSql, UserTablesGiven
     from sgstore.store._verify import Verification
     from sgstore.store._write import Segment
 
@@ -193,7 +191,7 @@ class StoreFile:
         StoreError
             The database rejects the statement.
         """
-        with self._answered(lambda at, _: rows.run(at, sql, parameters), sql, given) as found:
+        with self.answered(lambda at, _: rows.run(at, sql, parameters), sql, given) as found:
             return found
 
     def arrays(
@@ -209,14 +207,14 @@ class StoreFile:
         ``plain``: the result has no enumerations. This saves one planning of the statement.
         """
         ask = partial(rows.arrays, sql=sql, parameters=parameters, plain=plain)
-        with self._answered(lambda at, _: ask(at), sql, given) as found:
+        with self.answered(lambda at, _: ask(at), sql, given) as found:
             return found
 
     def table(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Any:
         """Run a trusted SQL statement, and return all rows as an Arrow table."""
-        with self._answered(lambda at, _: table_of(at, sql, parameters), sql, given) as found:
+        with self.answered(lambda at, _: table_of(at, sql, parameters), sql, given) as found:
             return found
 
     @contextmanager
@@ -229,7 +227,7 @@ class StoreFile:
         given: Iterable[Given] = (),
     ) -> Generator[Batches]:
         """Run a trusted SQL statement, and stream its rows in batches of ``size`` rows."""
-        with self._answered(lambda at, _: Batches(at, sql, parameters, size), sql, given) as found:
+        with self.answered(lambda at, _: Batches(at, sql, parameters, size), sql, given) as found:
             yield found
 
     @contextmanager
@@ -240,7 +238,7 @@ class StoreFile:
 
         Temporary tables are created before.
         """
-        with self._answered(lambda x, _: rows.interruptible(x, partial(step, x)), "", given) as y:
+        with self.answered(lambda x, _: rows.interruptible(x, partial(step, x)), "", given) as y:
             yield y
 
     @contextmanager
@@ -248,140 +246,22 @@ class StoreFile:
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Generator[ArrowStream | None]:
         """Run a trusted SQL statement, and stream its rows as Arrow batches."""
-        with self._answered(lambda x, _: record_batches(x, sql, parameters), sql, given) as y:
+        with self.answered(lambda x, _: record_batches(x, sql, parameters), sql, given) as y:
             yield y
 
     def user_sql(
-        self,
-        sql: str,
-        *,
-        timeout_s: float | None = None,
-        max_rows: int | None = None,
-        given: UserTablesGiven | None = None,
-    ) -> Rows:
-        """Run a read-only SQL statement of a user, and return all rows.
+        self, sql: str, timeout_s: float | None = None, given: UserTablesGiven | None = None
+    ) -> UserSql:
+        """Return a read-only SQL statement of a user, with a time limit in s, and its temporary tables.
 
-        Parameters
-        ----------
-        sql : str
-            One read-only statement. It can read the store, but no files, and cannot change settings.
-        timeout_s : float, optional
-            Time limit; s.
-        max_rows : int, optional
-            Largest number of rows to return; ``Rows.truncated`` is true if there are more.
-        given : function, optional
-            Function that returns the temporary tables of the statement. Trusted statements create them from the
-            current store.
-
-        Raises
-        ------
-        SqlError
-            The text is not a single read-only statement, the database rejects it, or it runs for too long.
+        Examples
+        --------
+        >>> store.file.user_sql("SELECT count(*) FROM frames").rows().values
+        [(750,)]
         """
-        size = BATCH if max_rows is None else max(min(BATCH, max_rows + 1), 1)
-        values: list[tuple[Any, ...]] = []
-        with self.user_batches(sql, timeout_s=timeout_s, size=size, given=given) as batches:
-            for batch in batches:
-                values += batch.values
-                if max_rows is not None and len(values) > max_rows:
-                    break
-        more = max_rows is not None and len(values) > max_rows
-        return Rows(batches.columns, batches.types, values[:max_rows], truncated=more)
+        from sgstore.store._user_sql import UserSql
 
-    def user_rows(
-        self,
-        sql: str,
-        *,
-        timeout_s: float | None = None,
-        max_rows: int | None = None,
-        given: UserTablesGiven | None = None,
-    ) -> Rows:
-        """Run an SQL statement of a user. Rows beyond the first batch are loaded on demand.
-
-        Raises
-        ------
-        SqlError
-            See :meth:`user_sql`.
-        """
-        first = self.user_sql(
-            sql,
-            timeout_s=timeout_s,
-            max_rows=BATCH if max_rows is None else max_rows,
-            given=given,
-        )
-        if max_rows is not None or not first.truncated:
-            return first
-        return rows.LaterRows(
-            first,
-            partial(self.user_sql, sql, timeout_s=timeout_s, given=given),
-            lambda: self._user_step(sql, timeout_s, lambda at: table_of(at, sql), given),
-            partial(self.user_parquet, sql, timeout_s=timeout_s, given=given),
-        )
-
-    def user_parquet(
-        self,
-        sql: str,
-        to: Path,
-        *,
-        timeout_s: float | None = None,
-        given: UserTablesGiven | None = None,
-    ) -> int:
-        """Run an SQL statement of a user, write the rows to a Parquet file, and return the number of rows.
-
-        Raises
-        ------
-        SqlError
-            See :meth:`user_sql`.
-        ExportError
-            The file is not writable.
-        """
-
-        def step(connection: DuckDBPyConnection) -> int | None:
-            stream = record_batches(connection, sql)
-            return None if stream is None else ParquetTable.write_batches(stream, to)
-
-        number = self._user_step(sql, timeout_s, step, given)
-        if number is not None:
-            return number
-        with self.user_batches(sql, timeout_s=timeout_s, given=given) as batches:
-            values = chain.from_iterable(batch.values for batch in batches)
-            return ParquetTable.write_rows(batches.columns, values, to, batches.types)
-
-    def _user_step(
-        self,
-        sql: str,
-        timeout_s: float | None,
-        step: Callable[[DuckDBPyConnection], T],
-        given: UserTablesGiven | None,
-    ) -> T:
-        """Run an SQL statement of a user on a restricted connection, and return the result."""
-
-        def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
-            rows.give_to_user(connection, given, sql, timeout_s)
-            of = partial(step, connection)
-            return until.enter_context(rows.user_statement(connection, sql, timeout_s, of))
-
-        with self._answered(ask, sql, public=True) as found:
-            return found
-
-    @contextmanager
-    def user_batches(
-        self,
-        sql: str,
-        *,
-        timeout_s: float | None = None,
-        size: int = BATCH,
-        given: UserTablesGiven | None = None,
-    ) -> Generator[Batches]:
-        """Run an SQL statement of a user, and stream its rows in batches."""
-
-        def ask(connection: DuckDBPyConnection, until: ExitStack) -> Batches:
-            rows.give_to_user(connection, given, sql, timeout_s)
-            begin = partial(Batches, connection, sql, size=size, shortened=True)
-            return until.enter_context(rows.user_statement(connection, sql, timeout_s, begin))
-
-        with self._answered(ask, sql, public=True) as found:
-            yield found
+        return UserSql(self.answered, sql, timeout_s, given)
 
     def joined(self) -> dict[str, JoinedTable]:
         """Return the row counts of user tables that are joined with frames, by table name."""
@@ -471,122 +351,47 @@ class StoreFile:
             self._graphs = Graphs()
         return self._graphs
 
-    def states(self, trace: int | str, first: int, last: int) -> tuple[Columns, Columns]:
-        """Return a range of frames of a trace, and the object states in these frames, as plain columns.
-
-        Returns
-        -------
-        frames, states : dict of str to array
-            See :mod:`sgstore.store._state_columns`.
+    def trace_id(self, trace: int | str) -> int:
+        """Return the id of a trace.
 
         Raises
         ------
         StoreError
-            The trace does not exist, or these are too many frames at once.
+            The trace does not exist.
         """
-        from sgstore.store._state_columns import frame_times, states_between
-
         with self.access.reading() as connection:
-            trace_id, _ = trace_named(connection, str(trace))
-            states = states_between(connection, trace_id, first, last)
-            return frame_times(connection, trace_id, first, last), states
-
-    def states_at(self, frames: Sequence[tuple[int, int]]) -> Columns:
-        """Return object states in given frames. Column ``at`` is the index of the frame in the input."""
-        from sgstore.store._state_columns import states_at
-
-        with self.access.reading() as connection:
-            return states_at(connection, frames)
-
-    def scenery(self, trace: int | str) -> Columns:
-        """Return the static objects of a trace as plain columns. Elements of the road map are excluded."""
-        from sgstore.store._state_columns import scenery
-
-        with self.access.reading() as connection:
-            return scenery(connection, trace_named(connection, str(trace))[0])
-
-    def series(
-        self, trace: int | str, attribute: str, node: int, other: int | None = None
-    ) -> Columns:
-        """Return an attribute of a node, or of a node pair, over a trace: ``seq``, ``t`` and ``value``.
-
-        Raises
-        ------
-        StoreError
-            The trace or value does not exist.
-        """
-        from sgstore.store._state_columns import series
-
-        with self.access.reading() as connection:
-            trace_id, _ = trace_named(connection, str(trace))
-        with self.access.reading(public=True) as connection:
-            return series(connection, trace_id, attribute, node, other)
-
-    def entity_names(self, trace: int | str) -> dict[int, tuple[str, ...]]:
-        """Return kind, simulator id and type name of each object of a trace, by node id."""
-        from sgstore.store._state_columns import names_of_nodes
-
-        with self.access.reading() as connection:
-            return names_of_nodes(connection, trace_named(connection, str(trace))[0])
-
-    def places(self) -> dict[str, tuple[float, float, str, list[str]]]:
-        """Return coordinate origin, map digest and camera topics of each trace, by trace name."""
-        from sgstore.store._state_columns import places
-
-        with self.access.reading() as connection:
-            return places(connection)
-
-    def log_times(self, trace: int | str, first: int, last: int) -> NDArray[np.int64]:
-        """Return the log times of the messages of a range of frames; ns."""
-        with self.access.reading() as connection:
-            trace_id, _ = trace_named(connection, str(trace))
-            sql = "SELECT log_time_ns FROM frame WHERE trace_id = ? AND seq BETWEEN ? AND ? ORDER BY seq"
-            found = connection.execute(sql, [trace_id, first, last]).fetchnumpy()
-            return found["log_time_ns"].astype(np.int64)
-
-    def codes(self) -> dict[str, list[str]]:
-        """Return the names of object kinds and light states, indexed by their code in plain columns."""
-        from sgstore.store._state_columns import kinds_of
-
-        with self.access.reading() as connection:
-            return kinds_of(connection)
+            return trace_named(connection, str(trace))[0]
 
     def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
         """Return name and OpenDRIVE text of a trace's road map, or ``None`` without such a text."""
-        with self.access.reading() as connection:
-            trace_id, _ = trace_named(connection, str(trace))
-            sql = (
-                "SELECT m.name, m.text FROM trace t JOIN map m ON m.map_id = t.map_id"
-                " WHERE t.trace_id = ? AND m.text IS NOT NULL"  # a map of named parts has no text
-            )
-            return connection.execute(sql, [trace_id]).fetchone()
+        sql = (
+            "SELECT m.name, m.text FROM trace t JOIN map m ON m.map_id = t.map_id"
+            " WHERE t.trace_id = ? AND m.text IS NOT NULL"  # a map of named parts has no text
+        )
+        return next(iter(self.rows(sql, [self.trace_id(trace)]).values), None)
 
     def channels(self, trace: int | str) -> tuple[Channel, ...]:
         """Return the channels of a trace's recording. Their ``messages`` is -1: unknown."""
-        with self.access.reading() as connection:
-            trace_id, _ = trace_named(connection, str(trace))
-            sql = (
-                "SELECT channel_id, coalesce(topic, ''), coalesce(schema, ''), coalesce(schema_encoding, ''),"
-                " coalesce(message_encoding, ''), -1, role FROM channel WHERE trace_id = ? ORDER BY channel_id"
-            )
-            return tuple(Channel(*row) for row in connection.execute(sql, [trace_id]).fetchall())
+        sql = (
+            "SELECT channel_id, coalesce(topic, ''), coalesce(schema, ''), coalesce(schema_encoding, ''),"
+            " coalesce(message_encoding, ''), -1, role FROM channel WHERE trace_id = ? ORDER BY channel_id"
+        )
+        return tuple(Channel(*row) for row in self.rows(sql, [self.trace_id(trace)]).values)
 
     def context(self, trace: int | str) -> MessageRefs:
         """Return the file positions of recorded messages that are needed to read later messages of a trace.
 
         ``channel`` is an index into :meth:`channels`.
         """
-        with self.access.reading() as connection:
-            trace_id, _ = trace_named(connection, str(trace))
-            sql = (
-                "WITH number AS (SELECT channel_id, row_number() OVER (ORDER BY channel_id) - 1 AS channel"
-                " FROM channel WHERE trace_id = $trace)"
-                ' SELECT n.channel, c.log_time_ns, c.chunk_offset, c."offset", c.length'
-                " FROM context c JOIN number n ON n.channel_id = c.channel_id WHERE c.trace_id = $trace"
-                ' ORDER BY c.log_time_ns, c.chunk_offset, c."offset"'
-            )
-            columns = rows.arrays(connection, sql, {"trace": trace_id})
-            return MessageRefs(*(column.astype(np.int64) for column in columns.values()))
+        sql = (
+            "WITH number AS (SELECT channel_id, row_number() OVER (ORDER BY channel_id) - 1 AS channel"
+            " FROM channel WHERE trace_id = $trace)"
+            ' SELECT n.channel, c.log_time_ns, c.chunk_offset, c."offset", c.length'
+            " FROM context c JOIN number n ON n.channel_id = c.channel_id WHERE c.trace_id = $trace"
+            ' ORDER BY c.log_time_ns, c.chunk_offset, c."offset"'
+        )
+        columns = self.arrays(sql, {"trace": self.trace_id(trace)})
+        return MessageRefs(*(column.astype(np.int64) for column in columns.values()))
 
     def payload(self, ref: int | str, channel: str) -> bytes:
         """Return the raw bytes of a channel's message at a frame, read from the recording.
@@ -883,7 +688,7 @@ class StoreFile:
         refuse_others(self.path, self.access)
 
     @contextmanager
-    def _answered(
+    def answered(
         self,
         ask: Callable[[DuckDBPyConnection, ExitStack], T],
         sql: str,

@@ -32,7 +32,7 @@ from sgstore.store._engine_errors import BusyError, translated
 from sgstore.store._gate import Deadline, closed_gate, pass_gate
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import AttachedFile, OpenFile, files, stamp_of
-from sgstore.store._schema_text import INSIDE
+from sgstore.store._schema import INSIDE
 from sgstore.store._store_paths import refuse_odd_name, refuse_special, remove_left_behind
 
 _log = logger("store")

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
-    from sgstore.store._coded_classes import CodedClasses
+    from sgstore.store._classes import CodedClasses
     from sgstore.store._file import StoreFile
     from sgstore.store._rows import Given, Parameters
 
@@ -172,7 +172,7 @@ class PartFile:
     @staticmethod
     def merged_classes(parts: Sequence[PartFile]) -> CodedClasses:
         """Return the class of each frame, as a number, from the results of several stores."""
-        from sgstore.store._coded_classes import classes_coded
+        from sgstore.store._classes import classes_coded
 
         with _tables({"parts": [*parts]}, {}) as connection:
             return classes_coded(connection, "SELECT class, bucket, mask FROM parts")

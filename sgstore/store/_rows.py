@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-import threading
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -14,17 +12,14 @@ import duckdb
 
 from sgstore.base.json_text import shortest
 from sgstore.base.quoting import quoted
-from sgstore.errors import ExportError, MissingExtraError, SqlError
+from sgstore.errors import ExportError, MissingExtraError
 from sgstore.store._arrow import ARROW_TYPES, as_told, package
-from sgstore.store._engine_errors import EngineError, engine_fault, spill_fault
-from sgstore.store._interrupts import interrupt, interruptible
-from sgstore.store._schema import expected
-from sgstore.store._schema_text import INSIDE
+from sgstore.store._interrupts import interruptible
+from sgstore.store._schema import INSIDE
 from sgstore.store._table_files import ParquetTable, relation_of, write_csv
-from sgstore.store._temporary_tables import Given, give
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     import numpy as np
     from duckdb import DuckDBPyConnection
@@ -267,58 +262,6 @@ class Rows(Tabular):
         return [dict(zip(self.columns, row, strict=True)) for row in self.values]
 
 
-class LaterRows(Rows):
-    """Large query result. The first rows are in memory; the others are loaded on demand.
-
-    Parameters
-    ----------
-    first : Rows
-        First rows.
-    ask : callable
-        Function that returns all rows; they are cached.
-    table : callable
-        Function that returns an Arrow table; see :meth:`Tabular._table`.
-    parquet : callable
-        Function that writes a Parquet file, and returns the number of rows.
-    """
-
-    def __init__(
-        self,
-        first: Rows,
-        ask: Callable[[], Rows],
-        table: Callable[[], Any],
-        parquet: Callable[[Path], int],
-    ) -> None:
-        super().__init__(first.columns, first.types, first.values)
-        self._ask, self._ask_table, self._ask_parquet = ask, table, parquet
-        self._whole = False
-
-    def __repr__(self) -> str:
-        if self._whole:
-            return super().__repr__()
-        return f"<over {len(self._values):,} rows of {', '.join(self.columns)}>"
-
-    @property
-    def values(self) -> list[tuple[Any, ...]]:
-        """Rows of the result as tuples. Enumeration values are ``str``; NULL is ``None``."""
-        if not self._whole:
-            self._values, self._whole = self._ask().values, True
-        return self._values
-
-    def _table(self) -> Any:
-        return None if self._whole else self._ask_table()
-
-    def parquet(self, path: str | Path) -> int:
-        """Write all rows of the result to a Parquet file as a stream, and return their number.
-
-        Raises
-        ------
-        ExportError
-            The file is not writable.
-        """
-        return super().parquet(path) if self._whole else self._ask_parquet(Path(path))
-
-
 class Batches:
     """Result of an SQL statement as a stream; each batch of rows is a :class:`Rows` object.
 
@@ -398,88 +341,6 @@ def arrays(
     return interruptible(connection, fetched)
 
 
-@contextmanager
-def user_statement(
-    connection: DuckDBPyConnection, sql: str, timeout_s: float | None, ask: Callable[[], T]
-) -> Generator[T]:
-    """Run an SQL statement of a user on a connection that can read only the store and its views.
-
-    ``ask`` starts the statement. Read the result inside the block.
-
-    Raises
-    ------
-    SqlError
-        The text is not a single read-only statement, the database rejects it, or it runs for too long.
-    """
-    with _refused(sql, timeout_s):
-        _check(connection, sql)
-    with _interrupted_after(connection, timeout_s), _refused(sql, timeout_s):
-        yield ask()
-
-
-def _check(connection: DuckDBPyConnection, sql: str) -> None:
-    if len(sql) > MAX_SQL:
-        raise SqlError(f"the statement has {len(sql)} characters; {MAX_SQL} are allowed")
-    statements = connection.extract_statements(sql)
-    if len(statements) != 1:
-        raise SqlError(f"expected one statement, found {len(statements)}")
-    kind = statements[0].type.name
-    if kind not in _READS:
-        raise SqlError(
-            f"the store is read only here: {kind} is not allowed; expected SELECT, WITH, FROM, VALUES,"
-            " DESCRIBE, SHOW, SUMMARIZE or EXPLAIN"
-        )
-
-
-@contextmanager
-def _refused(sql: str, timeout_s: float | None) -> Generator[None]:
-    """Context manager that converts DuckDB errors to errors of the user's SQL statement."""
-    try:
-        yield
-    except duckdb.InterruptException as error:
-        after = "" if timeout_s is None else f" after {timeout_s:g} s"
-        raise SqlError(f"stopped{after}: {_shown(sql)}") from error
-    except duckdb.Error as error:
-        if (fault := engine_fault(error)) is not None:
-            raise EngineError(fault) from error
-        message = spill_fault(str(error)) or str(error).strip()
-        if "pytz" in message:  # before DuckDB 2.0.1
-            message = "times with a time zone cannot be shown; cast them: now()::TIMESTAMP"
-        raise SqlError(_TO_A_TABLE.sub(_views, message)) from error
-
-
-def _views(_: re.Match[str]) -> str:
-    return f"The views are {', '.join(expected().views)}."
-
-
-def _shown(sql: str) -> str:
-    line = " ".join(sql.split())
-    return line if len(line) <= 80 else f"{line[:79]}…"
-
-
-@contextmanager
-def _interrupted_after(connection: DuckDBPyConnection, timeout_s: float | None) -> Generator[None]:
-    """Context manager that interrupts a database connection after a timeout."""
-    if timeout_s is None:
-        yield
-        return
-    done = threading.Event()
-
-    def watch() -> None:
-        pause = timeout_s
-        while not done.wait(pause):
-            interrupt(connection)
-            pause = 0.01
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        done.set()
-        watcher.join()
-
-
 def _columns(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[list[Any]]:
     """Transpose rows to columns in batches, which keeps related values close in memory."""
     found: list[list[Any]] = [[] for _ in columns]
@@ -504,28 +365,3 @@ def count_parquet(file: Path) -> tuple[int, tuple[str, ...]]:
             return sum(len(batch) for batch in found), found.columns
     except duckdb.Error as error:
         raise ExportError(f"{file.name}: cannot be read back: {str(error).strip()}") from error
-
-
-UserTablesGiven = Callable[[], Iterable[Given]]
-"""Function that returns the temporary tables of a user's statement. Called while the store is open."""
-
-
-def give_to_user(
-    connection: DuckDBPyConnection,
-    given: UserTablesGiven | None,
-    sql: str,
-    timeout_s: float | None,
-) -> None:
-    """Create temporary tables for an SQL statement of a user, by trusted SQL statements.
-
-    Raises
-    ------
-    SqlError
-        The statements take too long, or too much memory.
-    """
-    if given is None:
-        return
-    with _interrupted_after(connection, timeout_s), _refused(sql, timeout_s):
-        connection.execute(f"USE {INSIDE}")
-        give(connection, given())
-        connection.execute("USE main")

@@ -25,7 +25,7 @@ from sgstore.model.vocabulary import (
     natural,
     suggestion,
 )
-from sgstore.store._coded_classes import coded_classes
+from sgstore.store._classes import coded_classes
 from sgstore.store._engine_errors import translated
 from sgstore.store._graphs import Graphs
 from sgstore.store._traces import FrameRef, frame_named, stored_traces

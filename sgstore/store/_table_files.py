@@ -18,7 +18,7 @@ import numpy as np
 from sgstore.base.output_files import without_controls, written_at, written_text
 from sgstore.base.quoting import literal, quoted
 from sgstore.base.temporary_folders import temporary_folder, working_folder
-from sgstore.errors import ExportError
+from sgstore.errors import ExportError, StoreError
 from sgstore.store._arrow import ROWS_AT_ONCE, as_told_batches, package
 from sgstore.store._locking import default_memory
 
@@ -223,6 +223,26 @@ class ParquetTable:
         ):
             table.add_rows(rows)
         return table.rows
+
+    @staticmethod
+    def read_rows(path: Path, columns: Sequence[str], later: str = "") -> list[tuple[Any, ...]]:
+        """Return some columns of a Parquet file as rows. The column ``later`` is NULL in older files.
+
+        Raises
+        ------
+        StoreError
+            The file is not readable, or lacks a column.
+        """
+        rows = "FROM read_parquet(?)"
+        if later in columns:
+            null = f"SELECT NULL::VARCHAR AS {quoted(later)} WHERE FALSE"
+            rows = f"FROM ({null} UNION ALL BY NAME {rows})"
+        try:
+            with duckdb.connect(":memory:") as connection:
+                sql = f"SELECT {', '.join(map(quoted, columns))} {rows}"
+                return connection.execute(sql, [str(path)]).fetchall()
+        except duckdb.Error as error:
+            raise StoreError(f"{path}: cannot be read: {str(error).strip()}") from error
 
     @staticmethod
     def write_batches(stream: ArrowStream, to: Path, names: Sequence[str] | None = None) -> int:

@@ -26,9 +26,13 @@ from sgstore.model.config import Config
 from sgstore.model.world import seconds_of
 from sgstore.temporal._check_monitor import CheckMonitor
 from sgstore.temporal._check_verdict import Verdict, within_range
-from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._known_range import SeenRange
-from sgstore.temporal._sequence_monitor import FrameTime, MonitorEvent, SequenceMonitor
+from sgstore.temporal._sequence_monitor import (
+    FrameTime,
+    MonitorEvent,
+    SequenceMonitor,
+    sequence_monitor,
+)
 from sgstore.temporal._signal_state import StreamClock
 from sgstore.temporal._valuation import NodeNames, QueryCache
 

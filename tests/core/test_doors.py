@@ -27,7 +27,7 @@ from sgstore.ingest import ingest
 from sgstore.store import StoreFile
 from sgstore.store._lease import give_back
 from sgstore.store._locking import Access
-from sgstore.store._schema_text import schema_sql
+from sgstore.store._schema import schema_sql
 from sgstore.store._staging import scratch
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from oracle_worlds import random_world
 from test_lang_match import view_of
 
 from sgstore.lang.memory import Binding, expression
-from sgstore.lang.memory._column_evaluation import crowd_test
+from sgstore.lang.memory._evaluate import crowd_test
 from sgstore.lang.memory._frame_view import crowd
 from sgstore.lang.sql import compile_query
 

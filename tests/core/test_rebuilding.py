@@ -23,7 +23,7 @@ from sgstore.pipeline.derive import derive, keep_abstraction
 from sgstore.pipeline.importing import Words, import_graphs
 from sgstore.pipeline.rebuild import rebuild
 from sgstore.store import Abstracted, Remains, StoreFile
-from sgstore.store._schema_text import schema_sql
+from sgstore.store._schema import schema_sql
 
 if TYPE_CHECKING:
     from pathlib import Path

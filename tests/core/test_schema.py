@@ -13,8 +13,7 @@ import sgstore.store._schema as shape
 from sgstore.model.vocabulary import OWN_KINDS, OWN_LIGHT_STATES, OWN_RELATIONS, VEHICLE_LIGHTS
 from sgstore.model.world import BUCKET_FRAMES
 from sgstore.store import StoreFile
-from sgstore.store._schema import schema_version
-from sgstore.store._schema_text import schema_sql
+from sgstore.store._schema import schema_sql, schema_version
 
 VIEWS = {
     "frames": "frame_id trace_id seq time_ns ego trace t log_time_ns map",

@@ -44,7 +44,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoreFile]:
     ],
 )
 def test_one_statement_that_reads_is_answered(store: Any, sql: Any) -> None:
-    assert store.user_sql(sql).values == [(130,)]
+    assert store.user_sql(sql).rows().values == [(130,)]
 
 
 @pytest.mark.parametrize(
@@ -52,11 +52,11 @@ def test_one_statement_that_reads_is_answered(store: Any, sql: Any) -> None:
     ["DESCRIBE nodes", "SHOW TABLES", "SUMMARIZE frames", "EXPLAIN FROM edges", "TABLE frames"],
 )
 def test_what_describes_is_answered(store: Any, sql: Any) -> None:
-    assert len(store.user_sql(sql)) > 0
+    assert len(store.user_sql(sql).rows()) > 0
 
 
 def test_types_of_the_result_are_told(store: Any) -> None:
-    rows = store.user_sql("SELECT frame_id, kind FROM nodes LIMIT 1")
+    rows = store.user_sql("SELECT frame_id, kind FROM nodes LIMIT 1").rows()
 
     assert rows.columns == ("frame_id", "kind")
     assert (rows.types[0], rows.types[1][:4]) == ("BIGINT", "ENUM")
@@ -64,9 +64,9 @@ def test_types_of_the_result_are_told(store: Any) -> None:
 
 
 def test_rows_beyond_the_limit_are_left_out_and_it_is_said(store: Any) -> None:
-    some = store.user_sql("SELECT seq FROM frames ORDER BY seq", max_rows=7)
-    every = store.user_sql("SELECT seq FROM frames", max_rows=130)
-    none = store.user_sql("SELECT seq FROM frames", max_rows=0)
+    some = store.user_sql("SELECT seq FROM frames ORDER BY seq").rows(max_rows=7)
+    every = store.user_sql("SELECT seq FROM frames").rows(max_rows=130)
+    none = store.user_sql("SELECT seq FROM frames").rows(max_rows=0)
 
     assert ([seq for (seq,) in some], some.truncated) == (list(range(7)), True)
     assert (len(every), every.truncated) == (130, False)
@@ -131,7 +131,7 @@ def test_nothing_but_reading_the_store_is_done(
     before = store.path.read_bytes()
 
     with pytest.raises(SqlError, match=reason):
-        store.user_sql(sql.format(secret=secret, out=out))
+        store.user_sql(sql.format(secret=secret, out=out)).rows()
 
     assert store.path.read_bytes() == before
     assert not out.exists()
@@ -142,7 +142,7 @@ def test_settings_are_the_same_for_the_next_statement(store: Any) -> None:
     sql = "SELECT value FROM duckdb_settings() WHERE name IN ('enable_external_access', 'lock_configuration')"
 
     for _ in range(2):
-        assert sorted(store.user_sql(sql).values) == [("false",), ("true",)]
+        assert sorted(store.user_sql(sql).rows().values) == [("false",), ("true",)]
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_settings_are_the_same_for_the_next_statement(store: Any) -> None:
 )
 def test_a_mistake_is_told_as_the_database_tells_it(store: Any, sql: Any, parts: Any) -> None:
     with pytest.raises(SqlError) as caught:
-        store.user_sql(sql)
+        store.user_sql(sql).rows()
 
     assert all(part.lower() in str(caught.value).lower() for part in parts), caught.value
 
@@ -163,19 +163,19 @@ def test_a_mistake_is_told_as_the_database_tells_it(store: Any, sql: Any, parts:
 def test_a_time_with_a_zone_is_shown_or_told_how_to_be(store: Any) -> None:
     asked = "SELECT TIMESTAMPTZ '2026-11-25 10:00:00+02'"
     if find_spec("pytz") or duckdb.__version__ >= "2.0.1":  # which asks zoneinfo
-        assert [row[0].timestamp() for row in store.user_sql(asked)] == [1_795_593_600]
+        assert [row[0].timestamp() for row in store.user_sql(asked).rows()] == [1_795_593_600]
     else:
         with pytest.raises(SqlError, match=r"cast them: now\(\)::TIMESTAMP"):
-            store.user_sql(asked)
+            store.user_sql(asked).rows()
 
-    assert len(store.user_sql("SELECT now()::TIMESTAMP")) == 1
+    assert len(store.user_sql("SELECT now()::TIMESTAMP").rows()) == 1
 
 
 def test_a_runaway_statement_is_stopped_in_time(store: Any) -> None:
     start = time.perf_counter()
 
     with pytest.raises(SqlError, match=r"stopped after 0.2 s: SELECT count"):
-        store.user_sql(RUNAWAY, timeout_s=0.2)
+        store.user_sql(RUNAWAY, timeout_s=0.2).rows()
 
     assert 0.2 <= time.perf_counter() - start < 1.0
 
@@ -185,7 +185,7 @@ def test_a_stream_is_stopped_in_time_too(store: Any) -> None:
 
     with (
         pytest.raises(SqlError, match="stopped after"),
-        store.user_batches(sql, timeout_s=0.3, size=1000) as batches,
+        store.user_sql(sql, 0.3).batches(1000) as batches,
     ):
         for _ in batches:
             pass
@@ -193,9 +193,9 @@ def test_a_stream_is_stopped_in_time_too(store: Any) -> None:
 
 def test_the_store_goes_on_after_a_statement_was_stopped(store: Any) -> None:
     with pytest.raises(SqlError):
-        store.user_sql(RUNAWAY, timeout_s=0.05)
+        store.user_sql(RUNAWAY, timeout_s=0.05).rows()
 
-    assert store.user_sql("SELECT 1", timeout_s=10).values == [(1,)]
+    assert store.user_sql("SELECT 1", timeout_s=10).rows().values == [(1,)]
 
 
 def test_too_much_memory_is_refused_not_taken(tmp_path: Path) -> None:
@@ -204,18 +204,18 @@ def test_too_much_memory_is_refused_not_taken(tmp_path: Path) -> None:
     sql = "SELECT list(range) FROM range(20000000)"
 
     with pytest.raises(SqlError, match=r"(?i)memory"):
-        small.user_sql(sql)
+        small.user_sql(sql).rows()
 
 
 @pytest.mark.parametrize("deep", ["(" * 100_000, "SELECT " + "-" * 100_000 + "1", "[" * 50_000])
 def test_deep_nonsense_is_an_error_not_a_crash(store: Any, deep: Any) -> None:
     with pytest.raises(SqlError):
-        store.user_sql(deep)
+        store.user_sql(deep).rows()
 
 
 def test_a_statement_that_is_too_long_is_refused(store: Any) -> None:
     with pytest.raises(SqlError, match="1048576 are allowed"):
-        store.user_sql("SELECT 1" + " " * (1 << 20))
+        store.user_sql("SELECT 1" + " " * (1 << 20)).rows()
 
 
 def test_an_error_of_sql_is_an_error_of_the_store() -> None:
@@ -251,7 +251,7 @@ class _Faulty:
 @pytest.mark.skipif(duckdb.__version__.startswith("1."), reason="DuckDB 1 has no such setting")
 def test_small_chunks_are_not_gathered_because_their_dictionaries_are_mixed_up(store: Any) -> None:
     setting = "SELECT current_setting('enable_caching_operators')"
-    assert store.user_sql(setting).values == [(False,)]
+    assert store.user_sql(setting).rows().values == [(False,)]
 
 
 @pytest.mark.parametrize("nested", [False, True])
@@ -289,7 +289,7 @@ def test_who_asks_for_a_table_beneath_the_views_is_told_of_the_views(
     with pytest.raises(
         SqlError, match=r"does not exist!\nThe views are frames, nodes, edges, "
     ) as told:
-        store.user_sql(f"SELECT * FROM {table}")
+        store.user_sql(f"SELECT * FROM {table}").rows()
     assert "inside" not in str(told.value)
 
 

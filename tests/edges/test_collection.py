@@ -29,7 +29,7 @@ from sgstore.lang.sql import collection_parts as parts
 from sgstore.lang.sql import compile_query
 from sgstore.lang.syntax import tree as syntax
 from sgstore.query import Store
-from sgstore.store import CATALOGUE, ParquetTable, StoreFile, _bundle_catalogue, _bundles
+from sgstore.store import CATALOGUE, ParquetTable, StoreFile, _bundles
 from sgstore.testsets import coverage
 
 if TYPE_CHECKING:
@@ -712,6 +712,6 @@ def test_a_catalogue_of_before_knows_no_scopes(tmp_path: Path) -> None:
     path = tmp_path / "trace.parquet"
     ParquetTable.write_rows([*columns], [("b", 7)], path, [*columns.values()])
 
-    assert _bundle_catalogue.parquet_rows(path, [*columns, "scope"]) == [("b", 7, None)]
+    assert ParquetTable.read_rows(path, [*columns, "scope"], "scope") == [("b", 7, None)]
     snapshot = catalogue.Snapshot()
     assert snapshot.scope(world=True) == {}

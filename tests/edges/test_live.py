@@ -23,6 +23,7 @@ from sgstore.apps.explorer import LiveRun, live_application
 from sgstore.errors import QueryNameError, StoreError
 from sgstore.graphs.online import Frame
 from sgstore.model.config import Config
+from sgstore.store import StateColumns
 from sgstore.temporal import Monitor, MonitorEvent, opened, paced
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ def test_curves_are_those_of_a_store(watched: Any, open_town: Store) -> None:
     asked += [(name, e, v) for name in ("gap", "ttc", "bearing", "closing_speed")]
     for attribute, node, other in asked:
         _, mine = unpacked(run.series(attribute, node, other))
-        of = open_town.file.series(trace.trace_id, attribute, node, other)
+        of = StateColumns(open_town.file).series(trace.trace_id, attribute, node, other)
         known = dict(zip(of["seq"].tolist(), zip(of["t"], of["value"], strict=True), strict=True))
         curve = dict(
             zip(mine["seq"].tolist(), zip(mine["t"], mine["value"], strict=True), strict=True)

@@ -20,9 +20,8 @@ from sgstore.lang.catalog import Catalog
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax import tree as s
 from sgstore.model.world import longest_step_ns, tolerance_ns
-from sgstore.temporal._expression_monitor import sequence_monitor
 from sgstore.temporal._offline import TimedRelation, TraceReader
-from sgstore.temporal._sequence_monitor import FrameTime
+from sgstore.temporal._sequence_monitor import FrameTime, sequence_monitor
 from sgstore.temporal._sequences import Finder
 from sgstore.temporal._signal_state import StreamClock
 from sgstore.temporal._signal_values import Clock

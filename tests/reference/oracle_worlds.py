@@ -18,7 +18,7 @@ import networkx as nx
 from sgstore.lang.catalog import Catalog, TraceFacts
 from sgstore.model.vocabulary import MAP_KINDS
 from sgstore.store._locking import without_faults
-from sgstore.store._schema_text import schema_sql
+from sgstore.store._schema import schema_sql
 
 if TYPE_CHECKING:
     from pathlib import Path

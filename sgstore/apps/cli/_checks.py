@@ -28,7 +28,7 @@ from sgstore.apps.cli._output import say
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from sgstore.collection import PartedChecks
+    from sgstore.collection import CollectionChecks
     from sgstore.matches import Interval
     from sgstore.temporal import CheckRun, Verdict
 
@@ -78,7 +78,7 @@ def check(
 
 
 def _reported(
-    run: CheckRun | PartedChecks,
+    run: CheckRun | CollectionChecks,
     ask: AskOptions,
     *,
     explain: bool,

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
     from sgstore.apps.sandbox import Answer, Sandbox
-    from sgstore.collection import Collection, PartedMatches
+    from sgstore.collection import Collection, CollectionMatches
     from sgstore.lang.library import NamedPattern
     from sgstore.matches import Interval, Matches
 
@@ -201,7 +201,7 @@ def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
 
 
 def _as_shown(
-    answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
+    answer: Matches | Answer | CollectionMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
     """Return the columns and rows of a query for an output format.
 
@@ -215,7 +215,7 @@ def _as_shown(
 
 
 def _node_link(
-    answer: Matches | Answer | PartedMatches, rows: Iterable[tuple[Any, ...]], form: Format
+    answer: Matches | Answer | CollectionMatches, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
     """Return the result rows; in JSON their graphs have the node-link form of networkx."""
     if form not in {Format.json, Format.ndjson}:
@@ -387,14 +387,11 @@ def sql(
     with opened.file.snapshot():
         asked = UserStatement(opened.find, opened.catalog().tables, query_of(statement, file))
         say_left_out(asked)
+        sql = asked.on(opened.file)
         if (form := ask.chosen) in BINARY:
-            write_binary(
-                lambda to: opened.file.user_parquet(asked.sql, to, given=asked.given),
-                form,
-                ask.output,
-            )
+            write_binary(sql.parquet, form, ask.output)
             return 0
-        with opened.file.user_batches(asked.sql, given=asked.given) as batches:
+        with sql.batches() as batches:
             rows = chain.from_iterable(batch.values for batch in batches)
             ask.write(batches.columns, rows, batches.types)
     return 0

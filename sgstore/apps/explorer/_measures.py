@@ -17,7 +17,7 @@ from sgstore.exporters import Export, write_export
 from sgstore.model.frame_ids import frame_ids
 from sgstore.model.world import Clip
 from sgstore.query import Store
-from sgstore.store import MessagePlaces
+from sgstore.store import MessagePlaces, StateColumns
 from sgstore.testsets.coverage import ChosenFrames, classed, classes, combos, covered, growth
 from sgstore.testsets.diff import by_frame, scenes
 from sgstore.testsets.locks import lock_of
@@ -80,7 +80,7 @@ def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
     path = Path(to if to.endswith(".lock") else f"{to}.lock")
     with store.file.snapshot():
         found = _frames(store, clips)
-        parts = [(ids, store.file.log_times(*clip), "") for clip, ids, _ in found]
+        parts = [(ids, StateColumns(store.file).log_times(*clip), "") for clip, ids, _ in found]
         made = lock_of(store, parts, {"chosen": "in the explorer"}, progress=_done)
     made.write(path)
     return {"result": {"file": str(path), "cases": len(made.cases)}}
@@ -89,7 +89,7 @@ def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
 def export(store: Store, clips: Clips, to: str, format: str) -> dict[str, Any]:
     """Export the selected clips into a folder, in a file format."""
     with store.file.snapshot():
-        times = [(clip[0], store.file.log_times(*clip)) for clip in clips]
+        times = [(clip[0], StateColumns(store.file).log_times(*clip)) for clip in clips]
     cut = tuple(Clip(trace, int(log.min()), int(log.max())) for trace, log in times)
     written = write_export(Export(store, cut, progress=_done), Path(to), format)
     losses = [f"{one.file.name}: {loss.reason}" for one in written for loss in one.losses]

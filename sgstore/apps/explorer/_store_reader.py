@@ -19,6 +19,7 @@ from sgstore.lang.help import words
 from sgstore.lang.library import patterns
 from sgstore.maps.opendrive import read_map
 from sgstore.maps.roads import DrawnOutlines
+from sgstore.store import StateColumns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -77,14 +78,14 @@ class Reads:
             return self._known[1], self._known[2]
 
     def _told(self, traces: dict[str, StoredTrace]) -> dict[str, Any]:
-        file, places = self._store.file, self._store.file.places()
+        file, places = self._store.file, StateColumns(self._store.file).places()
         listed: list[dict[str, Any]] = []
         for name, one in traces.items():
             x, y, digest, cameras = places[name]
             about = {"name": name, "frames": one.frames, "period": one.period_ns / 1e9}
             about |= {"seconds": (one.end_ns - one.start_ns) / 1e9, "map": one.map}
             listed.append(about | {"map_key": digest[:16], "origin": (x, y), "cameras": cameras})
-        return {"store": file.path.name, "traces": listed, "codes": file.codes()}
+        return {"store": file.path.name, "traces": listed, "codes": StateColumns(file).codes()}
 
     def about(self) -> dict[str, Any]:
         """Return the traces of the store, and the kind and light names of the codes in binary columns."""
@@ -110,28 +111,30 @@ class Reads:
             raise RequestError(f"frames: expected at most {MOST_THUMBS}")
         traces = self._traces()[0]  # read once, because the store may change
         of = [(_among(traces, trace).trace_id, seq) for trace, seq in frames]
-        return packed({}, self._store.file.states_at(of))
+        return packed({}, StateColumns(self._store.file).states_at(of))
 
     def states(self, trace: str, first: int, last: int) -> bytes:
         """Return the states of all entities in a range of frames, as binary columns."""
-        frames, states = self._store.file.states(self._trace(trace).trace_id, first, last)
+        of, columns = self._trace(trace).trace_id, StateColumns(self._store.file)
+        with self._store.file.snapshot():
+            frames, states = columns.frames(of, first, last), columns.states(of, first, last)
         # Start of the states of each frame, so that the page need not search.
         start = np.searchsorted(states.pop("seq"), [*frames["seq"].tolist(), 1 << 31])
-        columns = {f"frame.{name}": column for name, column in frames.items()}
-        columns["frame.start"] = start.astype(np.uint32)
-        return packed({"trace": trace, "first": first, "last": last}, columns | states)
+        found = {f"frame.{name}": column for name, column in frames.items()}
+        found["frame.start"] = start.astype(np.uint32)
+        return packed({"trace": trace, "first": first, "last": last}, found | states)
 
     def static(self, trace: str) -> bytes:
         """Return the static entities of a trace, and the names of all entities, as bytes."""
         of = self._trace(trace).trace_id
         with self._store.file.snapshot():
-            names = self._store.file.entity_names(of)
-            columns = self._store.file.scenery(of)
+            names = StateColumns(self._store.file).names(of)
+            columns = StateColumns(self._store.file).scenery(of)
         return packed({"trace": trace, "names": names}, columns)
 
     def map(self, trace: str) -> bytes:
         """Return the outlines of the road map of a trace as bytes; empty without a map."""
-        key = _among(self._store.file.places(), trace)[2]
+        key = _among(StateColumns(self._store.file).places(), trace)[2]
         with self._reading:  # one map at a time, so that it is not read twice
             if key not in self._maps:
                 found = self._store.file.road_map_text(trace)
@@ -148,7 +151,9 @@ class Reads:
 
     def series(self, trace: str, attribute: str, node: int, other: int | None) -> bytes:
         """Return the values of an attribute of one or two entities over time, as bytes."""
-        columns = self._store.file.series(self._trace(trace).trace_id, attribute, node, other)
+        columns = StateColumns(self._store.file).series(
+            self._trace(trace).trace_id, attribute, node, other
+        )
         return packed({"trace": trace, "attribute": attribute}, columns)
 
     def frame(self, trace: str, seq: int) -> dict[str, Any]:

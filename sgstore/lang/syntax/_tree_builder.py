@@ -38,7 +38,7 @@ class BuildError(Exception):
         super().__init__(reason)
 
 
-def _number(span: TextSpan, children: Children) -> s.Constant:
+def rule_number(span: TextSpan, children: Children) -> s.Constant:
     text: str = children[0].text
     value = int(text) if text.isdigit() else float(text)
     if abs(value) > 1e300:
@@ -56,7 +56,7 @@ def _whole(token: Any) -> int:
     return int(token.text)
 
 
-def _string(span: TextSpan, children: Children) -> s.Constant:
+def rule_string(span: TextSpan, children: Children) -> s.Constant:
     return s.Constant(_unquoted(children[0].text), span)
 
 
@@ -65,7 +65,7 @@ def _unquoted(text: str) -> str:
     return _ESCAPED.sub(lambda found: _ESCAPES.get(found[1], found[0]), text[1:-1])
 
 
-def _truth(span: TextSpan, children: Children) -> s.Constant:
+def rule_truth(span: TextSpan, children: Children) -> s.Constant:
     return s.Constant(children[0].text.upper() == "TRUE", span)
 
 
@@ -84,15 +84,15 @@ def _length(text: str, span: TextSpan) -> s.Duration:
     return s.Duration(amount, found[2].lower(), span)
 
 
-def _parameter(span: TextSpan, children: Children) -> s.Parameter:
+def rule_parameter(span: TextSpan, children: Children) -> s.Parameter:
     return s.Parameter(children[0].text[1:], span)
 
 
-def _variable(span: TextSpan, children: Children) -> s.Variable:
+def rule_variable(span: TextSpan, children: Children) -> s.Variable:
     return s.Variable(children[0].text, span)
 
 
-def _attribute(span: TextSpan, children: Children) -> s.AttributeOf:
+def rule_attribute(span: TextSpan, children: Children) -> s.AttributeOf:
     owner, name = children
     if not isinstance(owner, s.Variable):
         inner = owner.name if isinstance(owner, s.AttributeOf) else ""
@@ -105,7 +105,7 @@ def _attribute(span: TextSpan, children: Children) -> s.AttributeOf:
     return s.AttributeOf(owner, name.text, span)
 
 
-def _attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
+def rule_attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
     """Return the syntax tree of ``frame.class('E')``, which means ``frame.class_E``."""
     owner, name, value = children
     if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
@@ -118,41 +118,41 @@ def _all(_: TextSpan, children: Children) -> tuple[Any, ...]:
     return tuple(children)
 
 
-def _list(span: TextSpan, children: Children) -> s.ListOf:
+def rule_list(span: TextSpan, children: Children) -> s.ListOf:
     return s.ListOf(children[0] or (), span)
 
 
-def _call(span: TextSpan, children: Children) -> s.Call:
+def rule_call(span: TextSpan, children: Children) -> s.Call:
     name, arguments = children
     return s.Call(name.text, arguments or (), distinct=False, name_span=name.span, span=span)
 
 
-def _call_of_distinct(span: TextSpan, children: Children) -> s.Call:
+def rule_call_of_distinct(span: TextSpan, children: Children) -> s.Call:
     name, _, arguments = children
     return s.Call(name.text, arguments, distinct=True, name_span=name.span, span=span)
 
 
-def _happens(span: TextSpan, children: Children) -> s.HappensExpression:
+def rule_happens(span: TextSpan, children: Children) -> s.HappensExpression:
     _, kind, arguments = children
     return s.HappensExpression(kind.text, arguments or (), kind.span, span)
 
 
-def _count_all(span: TextSpan, _: Children) -> s.CountAll:
+def rule_count_all(span: TextSpan, _: Children) -> s.CountAll:
     return s.CountAll(span)
 
 
-def _count_values(span: TextSpan, children: Children) -> s.Call:
+def rule_count_values(span: TextSpan, children: Children) -> s.Call:
     distinct, value = children
     return s.Call(
         "count", (value,), distinct is not None, TextSpan(span.start, span.start + 5), span
     )
 
 
-def _over_match(span: TextSpan, children: Children) -> s.OverExpression:
+def rule_over_match(span: TextSpan, children: Children) -> s.OverExpression:
     return s.OverExpression(children[0], None, None, span)
 
 
-def _over_steps(span: TextSpan, children: Children) -> s.OverExpression:
+def rule_over_steps(span: TextSpan, children: Children) -> s.OverExpression:
     value, *names = children
     start, end = (name and s.Variable(name.text, name.span) for name in names)
     return s.OverExpression(value, start, end, span)
@@ -164,7 +164,7 @@ def _logic(
     return s.Logic(word, tuple(children), span)
 
 
-def _compare(span: TextSpan, children: Children) -> s.Comparison:
+def rule_compare(span: TextSpan, children: Children) -> s.Comparison:
     left, sign, right = children
     return s.Comparison("<>" if sign.text == "!=" else sign.text, left, right, span)
 
@@ -186,17 +186,17 @@ def _arithmetic(span: TextSpan, children: Children) -> s.Arithmetic:
     return s.Arithmetic(children[0], tuple((sign.text, term) for sign, term in pairs), span)
 
 
-def _sign(span: TextSpan, children: Children) -> s.Expression:
+def rule_sign(span: TextSpan, children: Children) -> s.Expression:
     sign, operand = children
     return s.Negative(operand, span) if sign.text == "-" else operand
 
 
-def _when(span: TextSpan, children: Children) -> s.When:
+def rule_when(span: TextSpan, children: Children) -> s.When:
     condition, value = children
     return s.When(condition, value, span)
 
 
-def _case(span: TextSpan, children: Children) -> s.Case:
+def rule_case(span: TextSpan, children: Children) -> s.Case:
     """Return the syntax tree of a ``CASE``. With ``CASE x WHEN y``, each branch has the condition ``x = y``."""
     subject, *branches, otherwise = children
     if subject is not None:
@@ -209,17 +209,17 @@ def _case(span: TextSpan, children: Children) -> s.Case:
     return s.Case(tuple(branches), otherwise, span)
 
 
-def _temporal(span: TextSpan, children: Children) -> s.Temporal:
+def rule_temporal(span: TextSpan, children: Children) -> s.Temporal:
     word, bound, operand = children
     return s.Temporal(word.text.upper(), (operand,), TextSpan(span.start, word.span.end), bound)
 
 
-def _temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
+def rule_temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
     left, word, bound, right = children
     return s.Temporal(word.text.upper(), (left, right), word.span, bound)
 
 
-def _bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
+def rule_bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
     """Return start and end of a time bound: ``[0s, 2s]``, or ``WITHIN 2s``, which starts at 0."""
     (found,) = children
     if isinstance(found, s.Duration | s.Parameter):
@@ -238,16 +238,16 @@ def _block_expression(word: str, span: TextSpan, children: Children) -> s.BlockE
     return s.BlockExpression(word, children[0], None, span)
 
 
-def _aggregate_block(span: TextSpan, children: Children) -> s.BlockExpression:
+def rule_aggregate_block(span: TextSpan, children: Children) -> s.BlockExpression:
     word, block, value = children
     return s.BlockExpression(word.text.upper(), block, value, span)
 
 
-def _label(span: TextSpan, children: Children) -> s.Label:
+def rule_label(span: TextSpan, children: Children) -> s.Label:
     return s.Label(children[0].text, span)
 
 
-def _label_any(span: TextSpan, _: Children) -> s.Label:
+def rule_label_any(span: TextSpan, _: Children) -> s.Label:
     return s.Label("%", span)
 
 
@@ -255,7 +255,7 @@ def _label_logic(word: Literal["!", "&", "|"], span: TextSpan, children: Childre
     return s.LabelLogic(word, tuple(children), span)
 
 
-def _prop(_: TextSpan, children: Children) -> s.Property:
+def rule_prop(_: TextSpan, children: Children) -> s.Property:
     name, value = children
     return s.Property(name.text, value, name.span)
 
@@ -264,18 +264,19 @@ def _only(_: TextSpan, children: Children) -> Any:
     return children[0]
 
 
-def _node(span: TextSpan, children: Children) -> s.NodePattern:
+def rule_node(span: TextSpan, children: Children) -> s.NodePattern:
     name, label, props, where = children
     name_span = name.span if name else span
     return s.NodePattern(name and name.text, label, props or (), where, name_span, span)
 
 
-def _edge_body(span: TextSpan, children: Children) -> tuple[Any, ...]:
+def rule_edge_body(span: TextSpan, children: Children) -> tuple[Any, ...]:
     name, label, star, props, where = children
     return name and name.text, label, star, props or (), where, span
 
 
 _Direction = Literal["right", "left", "any"]
+_DIRECTIONS: Final[tuple[_Direction, ...]] = ("right", "left", "any")
 
 
 def _edge(direction: _Direction, span: TextSpan, children: Children) -> s.EdgePattern:
@@ -290,7 +291,7 @@ def _bare(direction: _Direction, span: TextSpan, _: Children) -> s.EdgePattern:
     return s.EdgePattern(None, None, None, None, (), None, direction, span)
 
 
-def _star(span: TextSpan, children: Children) -> tuple[int, int]:
+def rule_star(span: TextSpan, children: Children) -> tuple[int, int]:
     number, upto = children
     digits = upto.text[2:].strip() if upto else ""
     if not number and not upto:
@@ -301,14 +302,14 @@ def _star(span: TextSpan, children: Children) -> tuple[int, int]:
     return _range(low, int(digits[:9]) if upto else low, span)
 
 
-def _repeat(span: TextSpan, children: Children) -> tuple[int, int]:
+def rule_repeat(span: TextSpan, children: Children) -> tuple[int, int]:
     low, high = children
     if high is None:
         raise _unbounded(span)
     return _range(_whole(low), _whole(high), span)
 
 
-def _repeat_exactly(span: TextSpan, children: Children) -> tuple[int, int]:
+def rule_repeat_exactly(span: TextSpan, children: Children) -> tuple[int, int]:
     return _range(_whole(children[0]), _whole(children[0]), span)
 
 
@@ -330,21 +331,21 @@ def _range(low: int, high: int, span: TextSpan) -> tuple[int, int]:
     return low, high
 
 
-def _path(_: TextSpan, children: Children) -> s.Path:
+def rule_path(_: TextSpan, children: Children) -> s.Path:
     return s.Path(tuple(children[::2]), tuple(children[1::2]))
 
 
-def _named_path(_: TextSpan, children: Children) -> s.Path:
+def rule_named_path(_: TextSpan, children: Children) -> s.Path:
     name, path = children
     return replace(path, name=name.text, name_span=name.span)
 
 
-def _block_body(span: TextSpan, children: Children) -> s.Block:
+def rule_block_body(span: TextSpan, children: Children) -> s.Block:
     paths, where = children
     return s.Block(paths, where, span)
 
 
-def _match_step(span: TextSpan, children: Children) -> s.StepClause:
+def rule_match_step(span: TextSpan, children: Children) -> s.StepClause:
     paths, where, *further, hold, name = children
     for more, condition in further:
         paths += more
@@ -354,7 +355,7 @@ def _match_step(span: TextSpan, children: Children) -> s.StepClause:
     return s.StepClause(block, absent=False, hold=hold, name=name, span=span)
 
 
-def _further(_: TextSpan, children: Children) -> tuple[Any, Any]:
+def rule_further(_: TextSpan, children: Children) -> tuple[Any, Any]:
     """Return the paths and the condition of a second ``MATCH`` for the same frame."""
     paths, where = children
     return paths, where
@@ -366,26 +367,26 @@ def _both(one: s.Expression | None, other: s.Expression | None) -> s.Expression 
     return s.Logic("AND", (one, other), TextSpan(one.span.start, other.span.end))
 
 
-def _holds_step(span: TextSpan, children: Children) -> s.StepClause:
+def rule_holds_step(span: TextSpan, children: Children) -> s.StepClause:
     condition, hold, name = children
     block = s.Block((), condition, condition.span)
     return s.StepClause(block, absent=False, hold=hold, name=name, span=span)
 
 
-def _absent_step(span: TextSpan, children: Children) -> s.StepClause:
+def rule_absent_step(span: TextSpan, children: Children) -> s.StepClause:
     (step,) = children
     if step.hold or step.name:
         raise BuildError("NOT MATCH cannot have a duration or a name", step.span)
     return s.StepClause(step.block, absent=True, hold=None, name=None, span=span)
 
 
-def _group_step(span: TextSpan, children: Children) -> s.GroupStep:
+def rule_group_step(span: TextSpan, children: Children) -> s.GroupStep:
     *alternatives, often = children
     low, high = often or (1, 1)
     return s.GroupStep(tuple(alternatives), low, high, span)
 
 
-def _often(span: TextSpan, children: Children) -> tuple[int, int]:
+def rule_often(span: TextSpan, children: Children) -> tuple[int, int]:
     low, high = children
     least = _whole(low)
     most = least if high is None else _whole(high)
@@ -395,7 +396,7 @@ def _often(span: TextSpan, children: Children) -> tuple[int, int]:
     return least, most
 
 
-def _scenario_step(span: TextSpan, children: Children) -> s.ScenarioStep:
+def rule_scenario_step(span: TextSpan, children: Children) -> s.ScenarioStep:
     name, *given = children
     values = tuple(value for value in given if value is not None)
     named = [normalize_name(value.name) for value in values]
@@ -404,7 +405,7 @@ def _scenario_step(span: TextSpan, children: Children) -> s.ScenarioStep:
     return s.ScenarioStep(name.text, values, name.span, span)
 
 
-def _given(span: TextSpan, children: Children) -> s.Argument:
+def rule_given(span: TextSpan, children: Children) -> s.Argument:
     name, value = children
     if not isinstance(value, s.Constant | s.Duration):
         named = value.name == "NAME"
@@ -414,7 +415,7 @@ def _given(span: TextSpan, children: Children) -> s.Argument:
     return s.Argument(name.text, value, span)
 
 
-def _hold(span: TextSpan, children: Children) -> s.HoldClause:
+def rule_hold(span: TextSpan, children: Children) -> s.HoldClause:
     *comparison, duration, inclusive = children
     word = comparison[0].text if comparison else "="
     if word in {"<>", "!="}:
@@ -422,16 +423,16 @@ def _hold(span: TextSpan, children: Children) -> s.HoldClause:
     return s.HoldClause(word, duration, inclusive is not None, span)
 
 
-def _step_name(_: TextSpan, children: Children) -> str:
+def rule_step_name(_: TextSpan, children: Children) -> str:
     return children[0].text
 
 
-def _link(span: TextSpan, children: Children) -> s.LinkClause:
+def rule_link(span: TextSpan, children: Children) -> s.LinkClause:
     kind, after, within = children[0] or ("then", None, None)
     return s.LinkClause(kind, after, within, span)
 
 
-def _immediately(_: TextSpan, __: Children) -> tuple[str, None, None]:
+def rule_immediately(_: TextSpan, __: Children) -> tuple[str, None, None]:
     return "immediately", None, None
 
 
@@ -439,11 +440,11 @@ def _other_link(kind: Literal["until", "while"], span: TextSpan, _: Children) ->
     return s.LinkClause(kind, None, None, span)
 
 
-def _sequence(span: TextSpan, children: Children) -> s.SequenceClause:
+def rule_sequence(span: TextSpan, children: Children) -> s.SequenceClause:
     return s.SequenceClause(tuple(children[::2]), tuple(children[1::2]), span)
 
 
-def _match(span: TextSpan, children: Children) -> s.MatchClause:
+def rule_match(span: TextSpan, children: Children) -> s.MatchClause:
     settings, sequence, later, returns, order, sample, top, skip, limit = children
     if any(part is not None for part in children[3:]):
         every = (s.Item("all", None, None, 0, 0, span),)
@@ -457,7 +458,7 @@ def _later_match(span: TextSpan, children: Children, *, optional: bool) -> s.Lat
     return s.LaterMatch(s.Block(paths, where, span), optional, span)
 
 
-def _with(span: TextSpan, children: Children) -> s.WithClause:
+def rule_with(span: TextSpan, children: Children) -> s.WithClause:
     distinct, items, order, skip, limit, where = children
     for item in items:
         if item.form not in {"value", "all"}:
@@ -465,7 +466,7 @@ def _with(span: TextSpan, children: Children) -> s.WithClause:
     return s.WithClause(distinct is not None, items, order or (), skip or 0, limit, where, span)
 
 
-def _union(span: TextSpan, children: Children) -> s.UnionClause:
+def rule_union(span: TextSpan, children: Children) -> s.UnionClause:
     words = {" ".join(word.text.upper().split()): word for word in children[1::2]}
     if len(words) > 1:
         last = [*words.values()][-1]
@@ -473,7 +474,7 @@ def _union(span: TextSpan, children: Children) -> s.UnionClause:
     return s.UnionClause(tuple(children[::2]), "UNION" in words, span)
 
 
-def _check(span: TextSpan, children: Children) -> s.CheckClause:
+def rule_check(span: TextSpan, children: Children) -> s.CheckClause:
     settings, name, *quantifiers, formula, reset, robustness, returns = children
     called, quantified = name and name.text, tuple(quantifiers)
     distinct, items, having, at = returns or (False, (), None, span)
@@ -487,21 +488,21 @@ def _check(span: TextSpan, children: Children) -> s.CheckClause:
     return s.CheckClause(settings or (), called, quantified, formula, reset, asked, items, span)
 
 
-def _quantifier(span: TextSpan, children: Children) -> s.QuantifierClause:
+def rule_quantifier(span: TextSpan, children: Children) -> s.QuantifierClause:
     word, *nodes, where, absent = children
     return s.QuantifierClause(word.text.upper(), tuple(nodes), where, absent is not False, span)
 
 
-def _quantified(span: TextSpan, children: Children) -> s.QuantifiedNode:
+def rule_qvar(span: TextSpan, children: Children) -> s.QuantifiedNode:
     name, label = children
     return s.QuantifiedNode(name.text, label, span)
 
 
-def _absent(_: TextSpan, children: Children) -> bool:
+def rule_absent(_: TextSpan, children: Children) -> bool:
     return children[0].text.upper() == "TRUE"
 
 
-def _setting(span: TextSpan, children: Children) -> s.Setting:
+def rule_setting(span: TextSpan, children: Children) -> s.Setting:
     name, value = children
     if value.name == "PARAM":
         return s.Setting(name.text, s.Parameter(value.text[1:], value.span), span)
@@ -509,7 +510,7 @@ def _setting(span: TextSpan, children: Children) -> s.Setting:
     return s.Setting(name.text, text, span)
 
 
-def _define(span: TextSpan, children: Children) -> s.Define:
+def rule_define(span: TextSpan, children: Children) -> s.Define:
     _, name, parameters, body = children
     formals: tuple[s.Formal, ...] = parameters or ()
     named = [normalize_name(formal.name) for formal in formals]
@@ -520,40 +521,42 @@ def _define(span: TextSpan, children: Children) -> s.Define:
     return s.Define(name.text, formals, body, name.span, span)
 
 
-def _param(span: TextSpan, children: Children) -> s.Formal:
+def rule_param(span: TextSpan, children: Children) -> s.Formal:
     name, label, default = children
     if label:
         raise BuildError("the parameters of a definition are names, without a label")
     return s.Formal(name.text, default, span)
 
 
-def _statements(_: TextSpan, children: Children) -> tuple[Any, ...]:
+def rule_start(_: TextSpan, children: Children) -> tuple[Any, ...]:
     return tuple(child for child in children if child is not None)
 
 
-def _item(span: TextSpan, children: Children) -> s.Item:
+def rule_item(span: TextSpan, children: Children) -> s.Item:
     value, name = children
     return s.Item("value", value, name and name.text, 0, 0, span)
 
 
-def _form(
-    form: Literal["all", "frames", "intervals", "subgraphs"], span: TextSpan, _: Children
-) -> s.Item:
+_Form = Literal["all", "frames", "intervals", "subgraphs"]
+_FORMS: Final[tuple[_Form, ...]] = ("all", "frames", "intervals", "subgraphs")
+
+
+def _form(form: _Form, span: TextSpan, _: Children) -> s.Item:
     return s.Item(form, None, None, 0, 0, span)
 
 
-def _clips(span: TextSpan, children: Children) -> s.Item:
+def rule_item_clips(span: TextSpan, children: Children) -> s.Item:
     return s.Item("clips", None, None, children[0], children[1], span)
 
 
-def _offset(span: TextSpan, children: Children) -> int:
+def rule_offset(span: TextSpan, children: Children) -> int:
     sign, duration = children
     if not isinstance(duration, s.Duration) or duration.unit == "frames":
         raise BuildError("the ends of clips are times such as -3s and +5s", span)
     return -duration.ns if sign and sign.text == "-" else duration.ns
 
 
-def _sort(_: TextSpan, children: Children) -> s.Sort:
+def rule_sort(_: TextSpan, children: Children) -> s.Sort:
     value, direction = children
     return s.Sort(value, bool(direction and direction.text.upper() == "DESC"))
 
@@ -562,86 +565,40 @@ def _sample(span: TextSpan, children: Children) -> s.Sample:
     return s.Sample(_whole(children[0]), children[1], span)
 
 
-def _top(span: TextSpan, children: Children) -> s.Sample:
-    return s.Sample(_whole(children[0]), children[1], span)
-
-
 def _limit(_: TextSpan, children: Children) -> int:
     return _whole(children[0])
 
 
-def _returns(span: TextSpan, children: Children) -> tuple[Any, ...]:
+def rule_returns(span: TextSpan, children: Children) -> tuple[Any, ...]:
     distinct, items, having = children
     return distinct is not None, items, having, span
 
 
+# A function ``rule_x`` builds the tree of the grammar rule ``x``.
 BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
-    "start": _statements,
-    "define": _define,
-    "params": _all,
-    "param": _param,
-    "match": _match,
-    "later": _all,
+    **{name[5:]: made for name, made in [*globals().items()] if name.startswith("rule_")},
+    **dict.fromkeys(
+        ("params", "later", "using", "patterns", "props", "arguments", "items", "order"), _all
+    ),
     "optional": partial(_later_match, optional=True),
     "again": partial(_later_match, optional=False),
-    "with": _with,
-    "union": _union,
-    "check": _check,
-    "quantifier": _quantifier,
-    "qvar": _quantified,
-    "absent": _absent,
-    "reset": _only,
-    "using": _all,
-    "setting": _setting,
-    "sequence": _sequence,
-    "absent_step": _absent_step,
-    "match_step": _match_step,
-    "further": _further,
-    "holds_step": _holds_step,
-    "group_step": _group_step,
-    "often": _often,
-    "scenario_step": _scenario_step,
-    "given": _given,
-    "hold": _hold,
-    "step_name": _step_name,
-    "link": _link,
+    **dict.fromkeys(
+        ("reset", "where", "label_expr", "times", "otherwise", "block", "having"), _only
+    ),
     "until_link": partial(_other_link, "until"),
     "while_link": partial(_other_link, "while"),
     "within": lambda _, children: ("then", None, children[0]),
     "after": lambda _, children: ("then", *children),
-    "immediately": _immediately,
-    "where": _only,
-    "patterns": _all,
-    "path": _path,
-    "named_path": _named_path,
-    "node": _node,
-    "edge_right": partial(_edge, "right"),
-    "edge_left": partial(_edge, "left"),
-    "edge_any": partial(_edge, "any"),
-    "bare_right": partial(_bare, "right"),
-    "bare_left": partial(_bare, "left"),
-    "bare_any": partial(_bare, "any"),
-    "edge_body": _edge_body,
-    "star": _star,
-    "repeat": _repeat,
-    "repeat_exactly": _repeat_exactly,
-    "label_expr": _only,
+    **{f"edge_{way}": partial(_edge, way) for way in _DIRECTIONS},
+    **{f"bare_{way}": partial(_bare, way) for way in _DIRECTIONS},
     "label_or": partial(_label_logic, "|"),
     "label_and": partial(_label_logic, "&"),
     "label_neg": partial(_label_logic, "!"),
-    "label": _label,
-    "label_any": _label_any,
-    "props": _all,
-    "prop": _prop,
     "implies": partial(_logic, "IMPLIES"),
     "disjunction": partial(_logic, "OR"),
     "exclusion": partial(_logic, "XOR"),
     "conjunction": partial(_logic, "AND"),
     "negation": partial(_logic, "NOT"),
-    "temporal": _temporal,
-    "temporal_pair": _temporal_pair,
-    "bound": _bound,
-    "compare": _compare,
     "equal": partial(_comparison, "="),
     "is_null": partial(_null_test, negated=False),
     "is_known": partial(_null_test, negated=True),
@@ -653,49 +610,14 @@ BUILDERS: Final[dict[str, Callable[[TextSpan, Children], Any]]] = {
     "resembles": partial(_comparison, "=~"),
     "sum": _arithmetic,
     "product": _arithmetic,
-    "times": _only,
-    "sign": _sign,
-    "attribute": _attribute,
-    "attribute_in": _attribute_in,
-    "over_match": _over_match,
-    "over_steps": _over_steps,
     "timespan": _duration,
-    "parameter": _parameter,
-    "variable": _variable,
-    "call": _call,
-    "call_of_distinct": _call_of_distinct,
-    "happens": _happens,
-    "count_all": _count_all,
-    "count_values": _count_values,
     "exists": partial(_block_expression, "EXISTS"),
     "count_block": partial(_block_expression, "COUNT"),
-    "aggregate_block": _aggregate_block,
-    "case": _case,
-    "when": _when,
-    "otherwise": _only,
-    "arguments": _all,
-    "list": _list,
-    "block": _only,
-    "block_body": _block_body,
-    "number": _number,
-    "string": _string,
-    "truth": _truth,
     "null": lambda span, _: s.Constant(None, span),
     "duration": _duration,
-    "returns": _returns,
-    "items": _all,
-    "item": _item,
-    "item_all": partial(_form, "all"),
-    "item_frames": partial(_form, "frames"),
-    "item_intervals": partial(_form, "intervals"),
-    "item_subgraphs": partial(_form, "subgraphs"),
-    "item_clips": _clips,
-    "offset": _offset,
-    "order": _all,
-    "sort": _sort,
+    **{f"item_{form}": partial(_form, form) for form in _FORMS},
     "sample": _sample,
-    "top": _top,
+    "top": _sample,
     "skip": _limit,
     "limit": _limit,
-    "having": _only,
 }
