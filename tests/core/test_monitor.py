@@ -17,7 +17,6 @@ from oracle_over_time import edge_questions
 from oracle_watched import CHECKS, MARGINS, SEQUENCES, VALUES, Drive, library_checks
 from thorough import LONG
 
-import sgstore.temporal._joint_bindings as joins
 from sgstore.apps.demo import RECORDING
 from sgstore.errors import QueryError
 from sgstore.graphs.online import Frame
@@ -370,17 +369,6 @@ def test_what_is_owed_in_every_frame_is_owed_once() -> None:
 def test_what_looks_ahead_has_no_value_at_once() -> None:
     with pytest.raises(QueryError, match="looks ahead"):
         Monitor("CHECK a: ALWAYS (EVENTUALLY[0s, 1s] ego.speed > 3) = TRUE")
-
-
-def test_sequences_joined_in_parts_are_those_joined_at_once(
-    town: Drive, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = SEQUENCES[1]
-    at_once = list(town.store.find(text))
-    monkeypatch.setattr(joins, "ROWS", 3)
-
-    assert list(town.store.find(text)) == at_once
-    assert len(at_once) > 1
 
 
 def test_types_of_the_simulator_are_known_while_it_drives() -> None:

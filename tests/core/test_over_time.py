@@ -35,7 +35,7 @@ from sgstore.errors import QueryError
 from sgstore.lang.ir import BoundHold, Length
 from sgstore.lang.library import pattern_named
 from sgstore.query import Store
-from sgstore.temporal import _offline, _runs, _sequences, evaluate
+from sgstore.temporal import _joint_bindings, _offline, _runs, _sequences, evaluate
 from sgstore.temporal._decision_frames import known
 from sgstore.temporal._formula import And
 from sgstore.temporal._sequences import BindingLine, Leg, matches_of
@@ -130,6 +130,17 @@ def test_traces_that_hold_too_much_together_are_asked_one_by_one(
     assert len(found) > 10_000
     monkeypatch.undo()
     assert found == store.find(LOOSE).rows()
+
+
+def test_sequences_joined_in_parts_are_those_joined_at_once(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = f"USING UNKNOWN false {PAIR} THEN WITHIN 1s MATCH (e), (v) WHERE e.speed > v.speed"
+    at_once = store.find(text).rows()
+    monkeypatch.setattr(_joint_bindings, "ROWS", 3)
+
+    assert store.find(text).rows() == at_once
+    assert len(at_once) > 10
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import duckdb
 import pytest
 from graph_blocks import RandomTrace, publish
 
-import sgstore.store._rows as rows
 from sgstore.errors import SqlError, StoreError
 from sgstore.store import GivenTable, StoreFile
 
@@ -232,20 +231,19 @@ def alone(tmp_path: Path) -> StoreFile:
     return store
 
 
-class _Faulty:
-    """Stands for what runs a statement: the database fails the first times, and then answers."""
+def fail(monkeypatch: pytest.MonkeyPatch, question: str, times: int) -> None:
+    """Let the database fail the first times that it is asked a question."""
+    execute, left = duckdb.DuckDBPyConnection.execute, [None] * times
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, times: int) -> None:
-        self.left, self._run = times, rows.run
-        monkeypatch.setattr(rows, "run", self)
-
-    def __call__(self, connection: Any, sql: Any, parameters: Any = None):
-        if self.left:
-            self.left -= 1
+    def faulty(connection: Any, sql: Any, parameters: Any = None) -> Any:
+        if left and sql == question:
+            left.pop()
             raise duckdb.InternalException(
                 "INTERNAL Error: global dictionary\n\nStack Trace:\n0x4b"
             )
-        return self._run(connection, sql, parameters)
+        return execute(connection, sql, parameters)
+
+    monkeypatch.setattr(duckdb.DuckDBPyConnection, "execute", faulty)
 
 
 @pytest.mark.skipif(duckdb.__version__.startswith("1."), reason="DuckDB 1 has no such setting")
@@ -258,16 +256,17 @@ def test_small_chunks_are_not_gathered_because_their_dictionaries_are_mixed_up(s
 def test_a_question_that_meets_a_fault_of_the_database_is_asked_again(
     alone: Any, monkeypatch: pytest.MonkeyPatch, nested: Any
 ) -> None:
-    _Faulty(monkeypatch, times=1)
+    question = "SELECT count(*) FROM frames"
+    fail(monkeypatch, question, times=1)
     with alone.snapshot() if nested else nullcontext():
-        assert alone.rows("SELECT count(*) FROM frames").values == [(5,)]
+        assert alone.rows(question).values == [(5,)]
         assert alone.rows("SELECT 1").values == [(1,)]
 
 
 def test_a_fault_that_stays_is_one_line_and_the_store_goes_on(
     alone: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _Faulty(monkeypatch, times=9)
+    fail(monkeypatch, "SELECT 1", times=9)
     with pytest.raises(StoreError, match=r"fault of DuckDB \S+ itself.*global dictionary$"):
         alone.rows("SELECT 1")
     monkeypatch.undo()
@@ -277,9 +276,10 @@ def test_a_fault_that_stays_is_one_line_and_the_store_goes_on(
 def test_what_a_question_was_given_is_given_again(
     alone: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _Faulty(monkeypatch, times=1)
+    question = "SELECT sum(n) FROM mine"
+    fail(monkeypatch, question, times=1)
     given = GivenTable("mine", {"n": "INTEGER"}, lambda: iter([[[1, 2]], [[3]]]))
-    assert alone.rows("SELECT sum(n) FROM mine", given=[given]).values == [(6,)]
+    assert alone.rows(question, given=[given]).values == [(6,)]
 
 
 @pytest.mark.parametrize("table", ["frame", "state", "edge"])

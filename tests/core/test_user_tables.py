@@ -12,9 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 import sgstore
-import sgstore.store._joins as own
 from sgstore.apps.cli import app
 from sgstore.apps.sandbox import Sandbox
+from sgstore.base.temporary_folders import temporary_folder
 from sgstore.errors import MissingExtraError, QueryError, StoreError
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ def test_readers_see_the_tables_and_no_other_file(path, table) -> None:
     with pytest.raises(StoreError, match="disabled by configuration"):
         store.sql(f"SELECT * FROM read_csv('{file}')")
     with pytest.raises(StoreError, match="disabled by configuration"):
-        store.sql(f"SELECT * FROM glob('{own.tables_folder()}/../*')")
+        store.sql(f"SELECT * FROM glob('{temporary_folder() / 'tables'}/../*')")
     with pytest.raises(StoreError, match="labels"):
         sgstore.open(path).sql("SELECT * FROM labels")
 
