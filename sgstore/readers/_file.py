@@ -5,15 +5,18 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Self
 
+import numpy as np
 from mcap.records import Channel, Schema
 
+from sgstore.mcap import MESSAGE_HEAD, Messages
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from mcap.records import Metadata
 
-    from sgstore.mcap import RecordPlace
+    from sgstore.mcap import Findings, RecordPlace
 
 
 class MessageFile:
@@ -68,6 +71,28 @@ class MessageFile:
     def close(self) -> None:
         """Do nothing, because the file object keeps no file open."""
 
+    def walk(
+        self,
+        report: Findings,
+        wanted: Callable[[int], bool] | None = None,
+        keep: Callable[[int], bool] | None = None,
+        rank: Callable[[int], int] | None = None,
+    ) -> Iterator[Messages]:
+        """Yield all messages of the file in file order. Unreadable parts are added to a report.
+
+        ``keep`` and ``rank`` have no effect: messages are not cached, and their order is fixed.
+
+        Raises
+        ------
+        TraceError
+            The file is no longer readable.
+        """
+        del keep, rank
+        return self._walk(report, wanted or (lambda _: True))
+
+    def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
+        raise NotImplementedError
+
     def settle_order(self, rank: Callable[[int], int]) -> None:
         """Do nothing, because the message order of such a file is fixed."""
         del rank
@@ -76,3 +101,36 @@ class MessageFile:
         """Return an empty iterator, because files of this format have no attachments."""
         del place
         return iter(())
+
+
+def held_messages(
+    held: dict[int, bytes],
+    times: Sequence[int],
+    *,
+    channel: int | list[int],
+    sequence: int | range | list[int] = 0,
+    chunk_offset: int = -1,
+) -> Messages:
+    """Return a group of messages in memory as columns.
+
+    Parameters
+    ----------
+    held : dict
+        Offset → message, in order.
+    times : sequence of int
+        Log time of each message; ns.
+    channel, sequence : int or one for each message
+    chunk_offset : int
+        Byte offset of the compressed part with the messages; -1 means none.
+    """
+    log_time_ns = np.array(times, np.int64)
+    return Messages(
+        chunk_offset=chunk_offset,
+        channel=np.full(len(held), channel, np.int64),
+        sequence=np.full(len(held), sequence, np.int64),
+        log_time_ns=log_time_ns,
+        publish_time_ns=log_time_ns.astype(np.uint64),
+        offset=np.array([*held], np.int64),
+        length=np.array([len(data) for data in held.values()], np.int64),
+        read=lambda at, _length: memoryview(held[at - MESSAGE_HEAD.itemsize]),
+    )

@@ -13,12 +13,11 @@ import math
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 from mcap.records import Schema
 
 from sgstore.errors import MapError, TraceError
-from sgstore.mcap import MESSAGE_HEAD, Findings, Loss, Messages, mark_of_open, open_regular
-from sgstore.readers._file import MessageFile
+from sgstore.mcap import Loss, mark_of_open, open_regular
+from sgstore.readers._file import MessageFile, held_messages
 from sgstore.readers.commonroad._document import (
     MAX_BYTES,
     ROOT,
@@ -31,6 +30,8 @@ from sgstore.readers.commonroad._lanelets import light_place, map_text, meaning_
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from sgstore.mcap import Findings, Messages
 
 ENDINGS: Final = (".xml",)
 """Suffixes of such files; :func:`is_scenario` checks the contents."""
@@ -108,33 +109,22 @@ class CommonRoadFile(MessageFile):
         if self._map:
             self.counts[_MAP_CHANNEL] = 1
 
-    def walk(
-        self,
-        report: Findings,
-        wanted: Callable[[int], bool] | None = None,
-        keep: Callable[[int], bool] | None = None,
-        rank: Callable[[int], int] | None = None,
-    ) -> Iterator[Messages]:
+    def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
         """Yield all messages of the scenario: the map, then one per time step.
 
-        Lost parts are added to ``report``.
-
-        The ``offset`` of a message is its number. ``keep`` has no effect, because messages are already in
-        memory.
+        The ``offset`` of a message is its number.
         """
-        del keep, rank
         for reason in self._scenario.lost:
             report.lose(Loss(reason, bytes=0))
         if self._scenario.more_lost:
             report.lose(Loss(f"{self._scenario.more_lost} more of the same kinds", bytes=0))
-        if wanted is not None and not wanted(-1):
+        if not wanted(-1):
             return
+        if self._map:
+            yield self._messages(range(1))
         total = len(self._steps) + 1
-        start = 0 if self._map else 1
-        while start < total:
-            stop = 1 if start == 0 else min(start + _RUN, total)
-            yield self._messages(range(start, stop))
-            start = stop
+        for start in range(1, total, _RUN):
+            yield self._messages(range(start, min(start + _RUN, total)))
 
     def message(self, number: int) -> bytes:
         """Return the bytes of a message by number: 0 is the map, followed by the time steps.
@@ -146,25 +136,16 @@ class CommonRoadFile(MessageFile):
         """
         if number == 0:
             return self._map
-        return _step_message(self._scenario, self._steps[number - 1], self._first(number))
-
-    def _first(self, number: int) -> list[Obstacle]:
-        """Return the static obstacles for the message of the first time step; empty for later steps."""
-        return self._standing if number == 1 else []
+        standing = self._standing if number == 1 else []
+        return _step_message(self._scenario, self._steps[number - 1], standing)
 
     def _messages(self, numbers: range) -> Messages:
         held = {number: self.message(number) for number in numbers}
-        channels = [_STEP_CHANNEL if number else _MAP_CHANNEL for number in numbers]
-        times = [self._time(number) for number in numbers]
-        return Messages(
-            chunk_offset=-1,
-            channel=np.array(channels, np.int64),
-            sequence=np.array([max(number - 1, 0) for number in numbers], np.int64),
-            log_time_ns=np.array(times, np.int64),
-            publish_time_ns=np.array(times, np.uint64),
-            offset=np.array(numbers, np.int64),
-            length=np.array([len(data) for data in held.values()], np.int64),
-            read=lambda at, _length: memoryview(held[at - MESSAGE_HEAD.itemsize]),
+        return held_messages(
+            held,
+            [self._time(number) for number in numbers],
+            channel=[_STEP_CHANNEL if number else _MAP_CHANNEL for number in numbers],
+            sequence=[max(number - 1, 0) for number in numbers],
         )
 
     def _time(self, number: int) -> int:

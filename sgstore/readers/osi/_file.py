@@ -14,23 +14,20 @@ from functools import cache
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
 import zstandard
 from mcap.records import Schema
 
 from sgstore.errors import TraceError
 from sgstore.mcap import (
     MAX_LOSSES,
-    MESSAGE_HEAD,
     READ_ERRORS,
     RUN_MESSAGES,
     Findings,
     Loss,
-    Messages,
     mark_of_open,
     open_regular,
 )
-from sgstore.readers._file import MessageFile
+from sgstore.readers._file import MessageFile, held_messages
 from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     GROUND_TRUTH,
@@ -49,6 +46,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
     from typing import BinaryIO
+
+    from sgstore.mcap import Messages
 
 
 PREFIX: Final = struct.Struct("<I")
@@ -258,31 +257,19 @@ class OsiFile(MessageFile):
         """Close the OSI file."""
         self._file.close()
 
-    def walk(
-        self,
-        report: Findings,
-        wanted: Callable[[int], bool] | None = None,
-        keep: Callable[[int], bool] | None = None,
-        rank: Callable[[int], int] | None = None,
-    ) -> Iterator[Messages]:
-        """Yield all messages of an OSI file in file order. Unreadable parts are added to a report.
+    def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
+        """Yield all messages of an OSI file in file order.
 
         Messages are not cached: all are ground truth, which takes longer to decode than to decompress. The
         ``chunk_offset`` of a message is the offset of the zstd frame with its start.
-
-        Raises
-        ------
-        TraceError
-            The file is no longer readable.
         """
-        del keep, rank
         run = _MessageRun()
         try:
             for place, offset, data in self._messages(report):
                 if run.held and run.is_full(place):
                     yield run.messages()
                     run = _MessageRun(run.last_ns)
-                if wanted is None or wanted(place):
+                if wanted(place):
                     run.add(place, offset, data)
         except OSError as error:
             raise TraceError(f"cannot be read: {error}", path=self.path) from error
@@ -351,18 +338,7 @@ class _MessageRun:
         return place != self.place or self.size > RUN_BYTES or len(self.held) >= RUN_MESSAGES
 
     def messages(self) -> Messages:
-        held, count = self.held, len(self.held)
-        times = np.array(self.times, np.int64)
-        return Messages(
-            chunk_offset=self.place,
-            channel=np.full(count, CHANNEL, np.int64),
-            sequence=np.zeros(count, np.int64),
-            log_time_ns=times,
-            publish_time_ns=times.astype(np.uint64),
-            offset=np.array(list(held), np.int64),
-            length=np.array([len(data) for data in held.values()], np.int64),
-            read=lambda at, _length: memoryview(held[at - MESSAGE_HEAD.itemsize]),
-        )
+        return held_messages(self.held, self.times, channel=CHANNEL, chunk_offset=self.place)
 
 
 class _Stream:

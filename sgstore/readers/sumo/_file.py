@@ -13,25 +13,18 @@ import re
 import zlib
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
 from mcap.records import Schema
 
 from sgstore.errors import TraceError
-from sgstore.mcap import (
-    MESSAGE_HEAD,
-    RUN_MESSAGES,
-    Findings,
-    Loss,
-    Messages,
-    mark_of_open,
-    open_regular,
-)
-from sgstore.readers._file import MessageFile
+from sgstore.mcap import RUN_MESSAGES, Loss, mark_of_open, open_regular
+from sgstore.readers._file import MessageFile, held_messages
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from io import BufferedIOBase
     from pathlib import Path
+
+    from sgstore.mcap import Findings, Messages
 
 STEP: Final = "sumo.Timestep"
 """Schema of the messages."""
@@ -143,34 +136,30 @@ class SumoFile(MessageFile):
         """Close the SUMO file."""
         self._file.close()
 
-    def walk(
-        self,
-        report: Findings,
-        wanted: Callable[[int], bool] | None = None,
-        keep: Callable[[int], bool] | None = None,
-        rank: Callable[[int], int] | None = None,
-    ) -> Iterator[Messages]:
-        """Yield all time steps of a SUMO file as messages, in order. Lost parts are added to ``report``.
+    def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
+        """Yield all time steps of a SUMO file as messages, in order.
 
         ``offset`` of a message is its position in the file.
         """
-        del keep, rank
-        if wanted is not None and not wanted(-1):
+        if not wanted(-1):
             return
-        held: list[tuple[int, int, bytes]] = []
+        held: dict[int, bytes] = {}
+        times: list[int] = []
         size = number = 0
         for place, data in _steps(self._file, report):
             time = time_ns(data)
             if time is None or time < 0:
                 report.lose(Loss("a time step without a time", bytes=len(data)))
                 continue
-            held.append((place, time, data))
+            held[place] = data
+            times.append(time)
             size += len(data)
+            number += 1
             if size > _RUN_BYTES or len(held) >= RUN_MESSAGES:
-                yield _messages(held, number)
-                number, held, size = number + len(held), [], 0
+                yield _messages(held, times, number)
+                held, times, size = {}, [], 0
         if held:
-            yield _messages(held, number)
+            yield _messages(held, times, number)
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int]]) -> Iterator[bytes]:
@@ -196,19 +185,9 @@ def read_messages(path: Path, places: Iterable[tuple[int, int]]) -> Iterator[byt
             yield data
 
 
-def _messages(held: list[tuple[int, int, bytes]], number: int) -> Messages:
-    data = {place: step for place, _, step in held}
-    times = [time for _, time, _ in held]
-    return Messages(
-        chunk_offset=-1,
-        channel=np.full(len(held), _CHANNEL, np.int64),
-        sequence=number + np.arange(len(held)),
-        log_time_ns=np.array(times, np.int64),
-        publish_time_ns=np.array(times, np.uint64),
-        offset=np.array([*data], np.int64),
-        length=np.array([len(step) for step in data.values()], np.int64),
-        read=lambda at, _length: memoryview(data[at - MESSAGE_HEAD.itemsize]),
-    )
+def _messages(held: dict[int, bytes], times: list[int], stop: int) -> Messages:
+    sequence = range(stop - len(held), stop)
+    return held_messages(held, times, channel=_CHANNEL, sequence=sequence)
 
 
 def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
