@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.base import numba_loops
-from sgstore.base.tables import chained, taken
+from sgstore.base.tables import begins, chained, taken
 from sgstore.errors import ConfigError
 from sgstore.graphs.abstractions import (
     Classes,
@@ -849,9 +849,7 @@ def _united(keys: Sequence[Ints]) -> Ints:
         return keys[0]
     every = np.concatenate([np.zeros(0, np.int64), *keys])
     every.sort(kind="stable")  # A stable sort is fast for a few ascending runs.
-    first = np.ones(len(every), np.bool_)
-    np.not_equal(every[1:], every[:-1], out=first[1:])
-    return every[first]
+    return every[begins(every)]
 
 
 def _in_ascending(keys: Ints, some: Ints) -> Bools:

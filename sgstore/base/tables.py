@@ -55,3 +55,37 @@ def ascending(numbers: NDArray[np.int64]) -> NDArray[np.intp]:
         digits = (numbers[order] >> shift).astype(np.uint16)
         order = order[np.argsort(digits, kind="stable")]
     return order
+
+
+def begins(*columns: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return True for each row that differs from the row before it in one of the columns."""
+    new = np.ones(len(columns[0]), np.bool_)
+    new[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+    return new
+
+
+def spread(
+    starts: NDArray[np.int64], counts: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Expand index ranges (start, count): return the range number and the index of each element.
+
+    Returns
+    -------
+    owner, index : (sum of counts,) intp
+        For each range i, ``counts[i]`` times i, and the indices from ``starts[i]`` on.
+    """
+    owner = np.repeat(np.arange(len(counts)), counts)
+    before = np.cumsum(counts) - counts
+    return owner, np.arange(len(owner)) + (starts - before)[owner]
+
+
+def components(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return, for each of ``count`` nodes, the smallest node that edges (one, other) connect it to."""
+    least = np.arange(count)
+    while True:
+        before, low = least.copy(), np.minimum(least[one], least[other])
+        np.minimum.at(least, least[one], low)
+        np.minimum.at(least, least[other], low)
+        least = least[least]
+        if np.array_equal(before, least):
+            return least

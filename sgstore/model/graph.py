@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 
-from sgstore.base.tables import taken
+from sgstore.base.tables import begins, taken
 from sgstore.model.pair_numbers import UNEVEN
 from sgstore.model.vocabulary import RELATION_CODE, RELATIONS, SIGNALS
 
@@ -85,10 +85,7 @@ def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
     """Return sorted edges, and a mask of the rows that differ from the previous row."""
     order = np.lexsort((edges.dst, edges.relation, edges.src, edges.frame))
     every = taken(edges, order)
-    columns = (every.frame, every.src, every.relation, every.dst)
-    new = np.ones(len(order), np.bool_)
-    new[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
-    return every, new
+    return every, begins(every.frame, every.src, every.relation, every.dst)
 
 
 @dataclass(frozen=True, slots=True)

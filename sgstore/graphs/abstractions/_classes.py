@@ -15,7 +15,7 @@ equivalent to a tested one need not be tested.
 from __future__ import annotations
 
 from collections import Counter, OrderedDict, defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Final
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sgstore.base.tables import ascending
+from sgstore.base.tables import ascending, begins, chained, components
 from sgstore.graphs.abstractions._columns import found
 from sgstore.graphs.abstractions._lane_roles import ego_lanes
 from sgstore.graphs.abstractions._subsets import OF_JUNCTION
@@ -320,7 +320,7 @@ def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
     for column, factor in zip(columns, (_A, _B, _C), strict=False):
         words += column.astype(np.int64, copy=False).view(np.uint64) * factor
     told = _mixed(words)
-    starts = np.flatnonzero(np.append(True, frame[1:] != frame[:-1]))
+    starts = np.flatnonzero(begins(frame))
     for total, values in zip(sums, (told, _mixed(told * _D + words)), strict=True):
         np.add.at(total, frame[starts], np.add.reduceat(values, starts))
 
@@ -355,7 +355,7 @@ class _Block:
         src, dst = rows.reshape(2, -1)
         key = src * len(graphs.node) + dst
         order = ascending(key)
-        first = np.flatnonzero(np.append(True, key[order[1:]] != key[order[:-1]])[: len(key)])
+        first = np.flatnonzero(begins(key[order]))
         label, alone = on_edges[graphs.label[order]], order[first]
         low, high = label.T.copy() if len(first) == len(key) else np.add.reduceat(label, first).T
         node_low, node_high = words[graphs.node_label].T.copy()
@@ -379,21 +379,11 @@ class _Block:
             return blocks[0]
         graphs = np.cumsum([0, *(block.graphs for block in blocks)])
         nodes = np.cumsum([0, *(len(block.node) for block in blocks)])
-        columns = [
-            (
-                b.graph + g,
-                b.node,
-                b.node_low,
-                b.node_high,
-                b.edge_graph + g,
-                b.src + n,
-                b.dst + n,
-                b.low,
-                b.high,
-            )
+        moved = [
+            replace(b, graph=b.graph + g, edge_graph=b.edge_graph + g, src=b.src + n, dst=b.dst + n)
             for b, g, n in zip(blocks, graphs.tolist(), nodes.tolist(), strict=False)
         ]
-        return cls(int(graphs[-1]), *map(np.concatenate, zip(*columns, strict=True)))
+        return replace(chained(moved), graphs=int(graphs[-1]))
 
     def contents(self) -> list[bytes]:
         """Return a 128-bit hash per graph, equal for graphs with equal nodes, edges and labels."""
@@ -472,7 +462,7 @@ def _sums(owner: Ints, values: Words, count: int) -> Words:
     """Return sums of hash words (modulo 2⁶⁴) for each graph or node."""
     total = np.zeros(count, np.uint64)
     if len(owner):
-        starts = np.flatnonzero(np.append(True, owner[1:] != owner[:-1]))
+        starts = np.flatnonzero(begins(owner))
         total[owner[starts]] = np.add.reduceat(values, starts)
     return total
 
@@ -509,10 +499,8 @@ def _refined(block: _Block) -> Words:
 def _cells(block: _Block, colour: Words) -> Ints:
     """Return the number of different node colours in each graph."""
     order = np.lexsort((colour, block.graph))
-    graph, of = block.graph[order], colour[order]
-    fresh = np.ones(len(of), np.bool_)
-    fresh[1:] = (graph[1:] != graph[:-1]) | (of[1:] != of[:-1])
-    return np.bincount(graph[fresh], minlength=block.graphs)
+    graph = block.graph[order]
+    return np.bincount(graph[begins(graph, colour[order])], minlength=block.graphs)
 
 
 def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
@@ -520,10 +508,7 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
     nodes = len(block.graph)
     order = np.lexsort((colour, block.graph))
     cell = np.zeros(nodes, np.int64)
-    graph, of = block.graph[order], colour[order]
-    fresh = np.ones(nodes, np.bool_)
-    fresh[1:] = (graph[1:] != graph[:-1]) | (of[1:] != of[:-1])
-    cell[order] = np.cumsum(fresh) - 1
+    cell[order] = np.cumsum(begins(block.graph[order], colour[order])) - 1
     size = np.bincount(cell, minlength=1)
     known = np.ones(block.graphs, np.bool_)
     if not nodes or size.max() == 1:
@@ -544,31 +529,18 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
 
 def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
     """Return a component number for each node, by the edges that distinguish equal colours."""
-    part = np.arange(len(cell))
     src, dst = block.src, block.dst
     rows = np.flatnonzero((src != dst) & (size[cell[src]] > 1) & (size[cell[dst]] > 1))
     if not len(rows):
-        return part
+        return np.arange(len(cell))
     src, dst = src[rows], dst[rows]
     a, b = cell[src], cell[dst]
     keys = (block.high[rows], block.low[rows], b, a)
     order = np.lexsort(keys)
-    fresh = np.zeros(len(order), np.bool_)
-    fresh[0] = True
-    for key in keys:
-        fresh[1:] |= key[order][1:] != key[order][:-1]
     group = np.empty(len(order), np.int64)
-    group[order] = np.cumsum(fresh) - 1
+    group[order] = np.cumsum(begins(*(key[order] for key in keys))) - 1
     partial = np.bincount(group)[group] < size[a] * (size[b] - (a == b))
-    src, dst = src[partial], dst[partial]
-    while True:
-        least = np.minimum(part[src], part[dst])
-        before = part.copy()
-        np.minimum.at(part, part[src], least)
-        np.minimum.at(part, part[dst], least)
-        part = part[part]
-        if np.array_equal(before, part):
-            return part
+    return components(len(cell), src[partial], dst[partial])
 
 
 def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> Ints | None:

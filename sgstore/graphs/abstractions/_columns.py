@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from sgstore.base.tables import begins, spread
 from sgstore.graphs.abstractions._subsets import BETWEEN_ENTITIES, SCENERY
 from sgstore.model.vocabulary import (
     DRIVING,
@@ -389,8 +390,7 @@ class Labelled:
         frame, node, label = _columns(nodes, 3)
         order = np.lexsort((node, frame))
         frame, node, label = frame[order], node[order], label[order]
-        fresh = np.ones(len(node), np.bool_)
-        fresh[1:] = (frame[1:] != frame[:-1]) | (node[1:] != node[:-1])
+        fresh = begins(frame, node)
         edge_frame, src, edge_label, dst = _columns(edges, 4)
         return cls(
             frames,
@@ -418,10 +418,8 @@ class Labelled:
         starts = np.cumsum(many) - many
         flat = np.array([one for of in several for one in of] or [-1], np.int64)
         index = np.where(self.label < 0, len(several) + self.label, self.label)
-        count = many[index]
-        edge = np.repeat(np.arange(len(index)), count)
-        within = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
-        relation = flat[starts[index[edge]] + within] if len(edge) else edge
+        edge, place = spread(starts[index], many[index])
+        relation = flat[place]
         known = relation >= 0
         edge = edge[known]
         return self.frame[edge], self.src[edge], relation[known], self.dst[edge]
@@ -465,10 +463,7 @@ def repeated(columns: Part) -> Bools:
     again = np.zeros(len(columns[0]), np.bool_)
     if len(again):
         order = np.lexsort(columns)
-        same = np.ones(len(order) - 1, np.bool_)
-        for column in columns:
-            same &= column[order][1:] == column[order][:-1]
-        again[order[1:]] = same
+        again[order] = ~begins(*(column[order] for column in columns))
     return again
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.base.tables import spread
 from sgstore.graphs.abstractions._columns import Labelled, found
 from sgstore.model.vocabulary import kinds_labelled, normalize_name, relation_named
 
@@ -75,7 +76,8 @@ class GraphFeatures:
 
     def digests(self) -> NDArray[np.uint64]:
         """Return a hash per frame, (frames,): equal for frames with equal label counts."""
-        mixed = np.array([_hash(text) for text in self.texts] or [0], np.uint64)
+        hashes = [blake2b(text.encode(), digest_size=8).digest() for text in self.texts]
+        mixed = np.frombuffer(b"".join(hashes) or bytes(8), "<u8").astype(np.uint64)
         sums = np.zeros(self.frames, np.uint64)
         np.add.at(sums, self.frame, mixed[self.feature] * self.count.astype(np.uint64))
         return sums
@@ -138,11 +140,10 @@ def _single(graphs: Labelled) -> tuple[Ints, Ints, Ints, Ints]:
     starts = np.cumsum(many) - many
     bundle = np.where(label < 0, -1 - label, 0)
     count = np.where(label < 0, many[bundle], 1)
-    edge = np.repeat(np.arange(len(label)), count)
-    within = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+    edge, place = spread(starts[bundle], count)
     bundled = label[edge] < 0
     single = label[edge]
-    single[bundled] = flat[(starts[bundle[edge]] + within)[bundled]]
+    single[bundled] = flat[place[bundled]]
     return graphs.frame[edge], graphs.src[edge], single, graphs.dst[edge]
 
 
@@ -153,10 +154,6 @@ def _text(code: int, labels: Sequence[str]) -> str:
     code, dst = divmod(code - many, many)
     src, edge = divmod(code, many)
     return f"({labels[src]})-[{labels[edge]}]->({labels[dst]})"
-
-
-def _hash(text: str) -> int:
-    return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little")
 
 
 def _ignored(label: str, names: list[str]) -> bool:

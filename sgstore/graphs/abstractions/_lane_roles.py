@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sgstore.base.tables import components
 from sgstore.graphs.abstractions._columns import (
     LANES_OF,
     EgoLanes,
@@ -112,17 +113,7 @@ def _strands(grounds: MapColumns) -> Ints:
         np.bincount(dst, minlength=len(driven))[dst] == 1
     )
     only &= (grounds.junction[src] == grounds.junction[dst]).astype(np.bool_)
-    src, dst = src[only], dst[only]
-    least = np.arange(len(driven))
-    while True:
-        before = least.copy()
-        low = np.minimum(least[src], least[dst])
-        np.minimum.at(least, src, low)
-        np.minimum.at(least, dst, low)
-        least = least[least]
-        if np.array_equal(before, least):
-            break
-    return np.where(driven, -1 - least, 0)
+    return np.where(driven, -1 - components(len(driven), src[only], dst[only]), 0)
 
 
 def role_name(role: int) -> str:

@@ -107,13 +107,12 @@ def abstraction_named(name: str) -> Abstraction:
     AbstractionError
         The name is unknown.
     """
-    known = _OWN | _REGISTERED  # the search for entry points is slow
-    if normalize_name(name) in known:
-        return known[normalize_name(name)]
-    known = abstractions()
-    if normalize_name(name) in known:
-        return known[normalize_name(name)]
-    names = [one.name for one in known.values()]
+    key = normalize_name(name)
+    # The search for entry points is slow.
+    found = (_OWN | _REGISTERED).get(key) or abstractions().get(key)
+    if found is not None:
+        return found
+    names = [one.name for one in abstractions().values()]
     like = suggestion(name, names)
     hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(names)}"
     raise AbstractionError(f"no abstraction {name!r}; {hint}")

@@ -91,7 +91,7 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
     apart = _separation(bodies, a, b)
     touch = apart < -SURE
     near = np.flatnonzero(~(touch | (apart > TOUCH + SURE)))
-    touch[near] = gap(_boxes(bodies, a[near]), _boxes(bodies, b[near])) <= TOUCH
+    touch[near] = gap(bodies.take(a[near]).boxes, bodies.take(b[near]).boxes) <= TOUCH
     return a[touch], b[touch]
 
 
@@ -116,11 +116,6 @@ def _separation(bodies: Bodies, a: Rows, b: Rows) -> Floats:
     plain = np.abs(bodies.x) + np.abs(bodies.y) + np.abs(heading) < PLAIN
     plain &= (length >= 0) & (width >= 0)
     return np.where(plain[a] & plain[b], apart, np.nan)
-
-
-def _boxes(bodies: Bodies, rows: Rows) -> Floats:
-    columns = (bodies.x, bodies.y, bodies.heading, bodies.length, bodies.width)
-    return np.stack([column[rows] for column in columns], axis=1)
 
 
 def _edges(scene: BlockScene) -> Edges:

@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.base.geometry import gap_to_points
-from sgstore.graphs.relations._scene import IS_SIGNAL, joined, spread
+from sgstore.base.tables import begins, spread
+from sgstore.graphs.relations._lane_net import Centrelines
+from sgstore.graphs.relations._scene import IS_SIGNAL, joined, parts
 from sgstore.model.pair_numbers import gap
 from sgstore.model.vocabulary import DRIVING, KIND_CODE, RELATION_CODE
 
@@ -38,9 +40,6 @@ STEP: Final = 2.0
 """Distance between the points of a lane for its height; m."""
 MOST_POINTS: Final = 1_000_000
 """Greatest number of these points per map; above 2,000 km of lanes their distance grows."""
-
-CHUNK: Final = 1 << 18
-"""Footprints times lines that are processed together: bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +112,9 @@ class Extent:
         if road_map is not None and settings.height:
             self._heights = LaneHeights.of(road_map)
         self._driving: Bools = np.zeros(0, np.bool_)
+        self._centres: Centrelines | None = None
         if road_map is not None and settings.shape == "corridor":
+            self._centres = Centrelines(road_map.ribbons)
             self._driving = np.array([t in DRIVING for t in road_map.nodes.lane_type], np.bool_)
 
     def areas(self, egos: EgoPoses) -> Areas:
@@ -138,26 +139,29 @@ class Extent:
         """Return the line pieces of the ego's corridor (lanes ahead): frames, and ends (S, 2, 2)."""
         length = self.settings.length
         there = np.flatnonzero(_exist(egos, turned=True))
-        none = np.zeros(0, np.intp), np.zeros((0, 2, 2))
-        owner, ends = none if self._map is None else self._lane_lines(self._map, egos, there)
+        owner, ends = np.zeros(0, np.intp), np.zeros((0, 2, 2))
+        if self._map is not None and self._centres is not None:
+            owner, ends = self._lane_lines(self._map, self._centres, egos, there)
         lost = there[~np.isin(there, owner)]
         start = np.stack([egos.x[lost], egos.y[lost]], axis=1)
         ahead = np.stack([np.cos(egos.heading[lost]), np.sin(egos.heading[lost])], axis=1)
         straight = np.stack([start, start + length * ahead], axis=1)
         return np.concatenate([owner, lost]), np.concatenate([ends, straight])
 
-    def _lane_lines(self, road_map: RoadMap, egos: EgoPoses, there: Rows) -> tuple[Rows, Floats]:
+    def _lane_lines(
+        self, road_map: RoadMap, centres: Centrelines, egos: EgoPoses, there: Rows
+    ) -> tuple[Rows, Floats]:
         """Return centre lines of the ego's lane and of the following lanes, as pieces."""
         points = np.column_stack([egos.x[there], egos.y[there], np.zeros((len(there), 3))])
         points[:, 2] = egos.heading[there]
         hits = road_map.lanes_of(points, egos.ground[there])
         on = self._driving[-1 - hits.lane] & (np.abs(hits.heading_error) < np.pi / 2)
         row, lane = hits.row[on], -2 - hits.lane[on]
-        along = _along(road_map, lane, points[row, 0], points[row, 1])
-        length = self.settings.length
+        lengths, length = road_map.ribbons.lengths, self.settings.length
+        along = np.clip(centres.along(lane, points[row, 0], points[row, 1]), 0, lengths[lane])
         ended, other, distance = road_map.downstream(length)
         source, way = joined(ended, lane)
-        before = road_map.ribbons.lengths[lane[source]] - along[source] + distance[way]
+        before = lengths[lane[source]] - along[source] + distance[way]
         near = before < length
         frame = there[np.concatenate([row, row[source[near]]])]
         lane = np.concatenate([lane, other[way[near]]])
@@ -165,8 +169,7 @@ class Extent:
         end = np.concatenate([along + length, length - before[near]])
         order = np.lexsort((-end, begin, lane, frame))
         frame, lane, begin, end = frame[order], lane[order], begin[order], end[order]
-        again = (np.diff(frame) == 0) & (np.diff(lane) == 0) & (np.diff(begin) == 0)
-        first = np.append(True, ~again)[: len(frame)]
+        first = begins(frame, lane, begin)
         owner, ends = _pieces(road_map, lane[first], begin[first], end[first])
         return frame[first][owner], ends
 
@@ -423,13 +426,9 @@ class Strips(Areas):
         first = np.searchsorted(self._frame, frame)
         count = np.searchsorted(self._frame, frame, side="right") - first
         reach = np.sqrt(boxes[:, 3] ** 2 + boxes[:, 4] ** 2) / 2 + half + TOUCH
-        total = np.cumsum(count)
-        bounds = (
-            np.searchsorted(total, np.arange(CHUNK, int(total[-1]), CHUNK)) if len(total) else []
-        )
-        for begin, end in zip([0, *bounds], [*bounds, len(count)], strict=True):
-            owner, line = spread(first[begin:end], count[begin:end])
-            owner += begin
+        for part in parts(count):
+            owner, line = spread(first[part], count[part])
+            owner += part.start
             dx, dy = lines[line, 0] - boxes[owner, 0], lines[line, 1] - boxes[owner, 1]
             near = np.hypot(dx, dy) <= reach[owner] + lines[line, 3] / 2
             owner, line = owner[near], line[near]
@@ -454,24 +453,6 @@ def _as_boxes(ends: Floats) -> Floats:
     x, y = (ends[:, 0] + ends[:, 1]).T / 2
     dx, dy = (ends[:, 1] - ends[:, 0]).T
     return np.stack([x, y, np.arctan2(dy, dx), np.hypot(dx, dy), np.zeros(len(ends))], axis=1)
-
-
-def _along(road_map: RoadMap, lane: Ints, x: Floats, y: Floats) -> Floats:
-    """Return, for each point, the length along a lane's centre line to its nearest position; m."""
-    ribbons = road_map.ribbons
-    first, count = ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1
-    owner, row = spread(first, count)
-    ax, ay = _centre(road_map, row)
-    bx, by = _centre(road_map, row + 1)
-    dx, dy = bx - ax, by - ay
-    square = dx * dx + dy * dy
-    share = ((x[owner] - ax) * dx + (y[owner] - ay) * dy) / np.where(square > 0, square, 1)
-    share = np.clip(share, 0, 1)
-    away = np.hypot(ax + share * dx - x[owner], ay + share * dy - y[owner])
-    order = np.lexsort((away, owner))
-    best = order[np.searchsorted(owner, np.arange(len(lane)))]
-    span = ribbons.along[row[best] + 1] - ribbons.along[row[best]]
-    return ribbons.along[row[best]] + share[best] * span
 
 
 def _pieces(road_map: RoadMap, lane: Ints, begin: Floats, end: Floats) -> tuple[Rows, Floats]:

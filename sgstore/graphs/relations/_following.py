@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.base.tables import begins
 from sgstore.graphs.relations._scene import IS_VEHICLE, Relation, carried_by, edges_between
 from sgstore.model.graph import Edges, LaneGaps
 
@@ -128,8 +129,7 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
     kept = np.flatnonzero((distance <= limit) & bodies.moves[a] & ~carried_by(bodies, a, b))
     order = kept[np.lexsort((distance[kept], b[kept], a[kept]))]
     a, b, distance = a[order], b[order], distance[order]
-    first = np.ones(len(a), np.bool_)
-    first[1:] = (a[1:] != a[:-1]) | (b[1:] != b[:-1])
+    first = begins(a, b)
     a, b = a[first], b[first]
     gap = distance[first] - (bodies.length[a] + bodies.length[b]) / 2
     return a, b, np.maximum(gap, 0)

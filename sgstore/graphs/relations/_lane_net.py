@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.base.numba_loops import worth
-from sgstore.graphs.relations._scene import parts, spread
+from sgstore.base.tables import spread
+from sgstore.graphs.relations._scene import parts
 from sgstore.model.vocabulary import RELATION_CODE, TRAFFIC
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.base.numba_loops import worth
+from sgstore.base.tables import spread
 from sgstore.graphs.relations._scene import (
     CHUNK,
     IS_SIGNAL,
@@ -20,7 +21,6 @@ from sgstore.graphs.relations._scene import (
     parts,
     span_up_to,
     spans,
-    spread,
 )
 from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled, normalize_name
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from sgstore.base.geometry import bearings
 from sgstore.base.numba_loops import worth
-from sgstore.base.tables import taken
+from sgstore.base.tables import spread, taken
 from sgstore.model.graph import Edges
 from sgstore.model.pair_numbers import STOREY, TOUCH, UPRIGHT, all_level, climb, gap, low_and_high
 from sgstore.model.vocabulary import KIND_CODE, MOST_KINDS, RELATION_CODE, SIGNALS, VEHICLES
@@ -650,9 +650,8 @@ def edges_of_pairs(
         if rows is None:
             column[:count] = values
         else:
-            np.take(
-                values, rows, out=column[:count], mode="clip"
-            )  # this copies only the selected rows
+            # This copies only the selected rows.
+            np.take(values, rows, out=column[:count], mode="clip")
     return columns, count
 
 
@@ -681,19 +680,6 @@ IS_SIGNAL: Final = kinds_mask(SIGNALS)
 IS_VEHICLE: Final = kinds_mask(VEHICLES)
 IS_UPRIGHT: Final = kinds_mask(UPRIGHT)
 IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
-
-
-def spread(starts: Ints, counts: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Expand index ranges (start, count): return the range number and the index of each element.
-
-    Returns
-    -------
-    owner, index : (sum of counts,) intp
-        For each range i, ``counts[i]`` times i, and the indices from ``starts[i]`` on.
-    """
-    owner = np.repeat(np.arange(len(counts)), counts)
-    before = np.cumsum(counts) - counts
-    return owner, np.arange(len(owner)) + (starts - before)[owner]
 
 
 def joined(keys: Ints, wanted: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -8,13 +8,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from sgstore.base.tables import chained, taken
+from sgstore.base.tables import chained, spread, taken
 from sgstore.errors import ConfigError
-from sgstore.graphs.relations._scene import Bodies, spread
 from sgstore.maps.roads import LaneHits, MapEdges, MapNodes, RoadMap
 from sgstore.model.vocabulary import DRIVING, KIND_CODE, RELATION_CODE
 
 if TYPE_CHECKING:
+    from sgstore.graphs.relations._scene import Bodies
     from sgstore.maps.roads import LanePoints
     from sgstore.model.config import LaneSettings
     from sgstore.model.world import Floats, Ints

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from sgstore.base.tables import components
 from sgstore.maps.roads import RoadMap
 from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
 from sgstore.model.world import POSE
@@ -259,17 +260,10 @@ def _heaps(near: _Near) -> Iterator[Rows]:
     """Yield groups of candidate pairs. A light or signal of one group occurs in no other group."""
     if not len(near.light):
         return
-    light, signal = near.light, near.signal
-    label = np.arange(int(light.max()) + 1)
-    while True:  # A light gets the smallest label of the lights with a common candidate.
-        least = np.full(int(signal.max()) + 1, len(label))
-        np.minimum.at(least, signal, label[light])
-        after = label.copy()
-        np.minimum.at(after, light, least[signal])
-        if (after == label).all():
-            break
-        label = after
-    heap = label[light]
+    lights = int(near.light.max()) + 1
+    heap = components(lights + int(near.signal.max()) + 1, near.light, lights + near.signal)[
+        near.light
+    ]
     order = np.argsort(heap, kind="stable")
     yield from np.split(order, np.flatnonzero(np.diff(heap[order])) + 1)
 
