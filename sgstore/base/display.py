@@ -83,3 +83,9 @@ def html_media(data: bytes, kind: str, text: str = "") -> str:
     said = f"<figcaption>{escape(text)}</figcaption>" if text else ""
     style = "display:inline-block;margin:0.3em 0.6em 0.3em 0"
     return f"<figure style='{style}'>{shown}{said}</figure>"
+
+
+def first_of(names: Sequence[str], most: int) -> str:
+    """Return the first names of a list, and the number of the others: ``a, b and 3 more``."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"

@@ -6,6 +6,7 @@ entities, so texts cannot expand. Depth and the numbers of elements and attribut
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 from xml.parsers import expat
 
@@ -14,6 +15,14 @@ if TYPE_CHECKING:
 
 MAX_DEPTH: Final = 64
 MAX_ATTRIBUTES: Final = 64
+
+
+def number(text: str, otherwise: float = math.nan) -> float:
+    """Return an attribute of an element as a number, or ``otherwise`` if it is not a number."""
+    try:
+        return float(text)
+    except ValueError:
+        return otherwise
 
 
 class MarkupError(ValueError):

@@ -7,7 +7,7 @@ from array import array
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from io import BytesIO
-from typing import TYPE_CHECKING, ClassVar, Final, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, Self
 
 import lz4.frame
 import numpy as np
@@ -280,11 +280,21 @@ class Messages:
         """Return the bytes of one message of the group."""
         return self.read(int(self.offset[row]) + MESSAGE_HEAD.itemsize, int(self.length[row]))
 
+    def stacked(self) -> Ints:
+        """Return the columns of :attr:`COLUMNS` as rows of one array."""
+        return np.stack([getattr(self, name).view(np.int64) for name in Messages.COLUMNS])
+
+    @staticmethod
+    def unstacked(columns: Ints) -> dict[str, Any]:
+        """Return the columns of messages in an array of :meth:`stacked`, by name."""
+        named: dict[str, Any] = dict(zip(Messages.COLUMNS, columns, strict=True))
+        return named | {"publish_time_ns": named["publish_time_ns"].view(np.uint64)}
+
     def span(self, start: int, stop: int) -> Self:
         """Return the messages from row ``start`` up to row ``stop``, exclusive."""
         return self.take(slice(start, stop))
 
-    def take(self, rows: NDArray[np.bool_] | slice) -> Self:
+    def take(self, rows: NDArray[Any] | slice) -> Self:
         """Return the messages with the given row numbers."""
         return replace(self, **{name: getattr(self, name)[rows] for name in self.COLUMNS})
 

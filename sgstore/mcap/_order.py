@@ -369,35 +369,25 @@ class TimeOrder:
 
     def _batch(self, rows: Ints, of: Ints, reads: Numbers) -> SortedMessages:
         """Read some messages of several chunks as one group, in order of time."""
-        columns = np.zeros((7, len(rows)), np.int64)
+        columns = np.zeros((len(Messages.COLUMNS), len(rows)), np.int64)
+        places = np.zeros(len(rows), np.int64)
         held = np.full(len(rows), None, np.object_)
         for run in np.unique(of).tolist():
             messages = self._read(run, reads)
             mine = np.flatnonzero(of == run)
             row = rows[mine]
-            columns[0, mine] = messages.channel[row]
-            columns[1, mine] = messages.sequence[row]
-            columns[2, mine] = messages.log_time_ns[row]
-            columns[3, mine] = messages.publish_time_ns[row].view(np.int64)
-            columns[4, mine] = messages.offset[row]
-            columns[5, mine] = messages.length[row]
-            columns[6, mine] = messages.chunk_offset
+            columns[:, mine] = messages.take(row).stacked()
+            places[mine] = messages.chunk_offset
             needed = self._kept[messages.channel[row]]
             for at, one in zip(mine[needed].tolist(), row[needed].tolist(), strict=True):
                 held[at] = bytes(messages.data(one))
-        channel, sequence, log_time, publish_time, offset, length, places = columns
         return SortedMessages(
-            -1,
-            channel,
-            sequence,
-            log_time,
-            publish_time.view(np.uint64),
-            offset,
-            length,
-            _no_place,
-            places,
-            held,
-            self._fetch,
+            chunk_offset=-1,
+            **Messages.unstacked(columns),
+            read=_no_place,
+            places=places,
+            held=held,
+            fetch=self._fetch,
         )
 
     def _read(self, number: int, reads: Numbers | None = None) -> Messages:

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from tempfile import SpooledTemporaryFile
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -225,17 +225,8 @@ class Spool:
         total = 8 * _COLUMNS * len(messages) + size
         if key in self._places or self._size + total > self._most:
             return
-        columns = np.stack(
-            [
-                messages.channel,
-                messages.sequence,
-                messages.log_time_ns,
-                messages.publish_time_ns.view(np.int64),
-                messages.offset,
-                messages.length,
-                np.where(kept, np.cumsum(lengths) - lengths, -1),
-            ]
-        )
+        starts = np.where(kept, np.cumsum(lengths) - lengths, -1)
+        columns = np.vstack([messages.stacked(), starts])
         try:
             if self._file is None:
                 self._file = SpooledTemporaryFile(max_size=IN_MEMORY)  # noqa: SIM115  (see close)
@@ -273,20 +264,11 @@ class Spool:
             return None
         if len(told) != 8 * _COLUMNS * count or len(data) != size:
             return None
-        columns: Any = np.frombuffer(told, np.int64).reshape(_COLUMNS, count)
-        channel, sequence, log_time, publish_time, offset, length, at = columns
-        return Messages(
-            chunk_offset=chunk_offset,
-            channel=channel,
-            sequence=sequence,
-            log_time_ns=log_time,
-            publish_time_ns=publish_time.view(np.uint64),
-            offset=offset,
-            length=length,
-            read=_reader(
-                dict(zip(offset[at >= 0].tolist(), at[at >= 0].tolist(), strict=True)), data, anew
-            ),
-        )
+        stacked = np.frombuffer(told, np.int64).reshape(_COLUMNS, count)
+        columns, at = Messages.unstacked(stacked[:-1]), stacked[-1]
+        held = at >= 0
+        starts = dict(zip(columns["offset"][held].tolist(), at[held].tolist(), strict=True))
+        return Messages(chunk_offset=chunk_offset, read=_reader(starts, data, anew), **columns)
 
     def close(self) -> None:
         """Clear the cache of messages, and delete its file."""

@@ -166,13 +166,7 @@ class McapFile:
 
     def __init__(self, path: Path, spool: Spool | None = None) -> None:
         self.path = path
-        self._spool, self._own_spool = spool or Spool(), spool is None
-        self._in_order = self._unordered = False
-        self._order: TimeOrder | None = None
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.metadata: dict[RecordPlace, Metadata] = {}
-        self.attachments: list[RecordPlace] = []
+        self._begin(spool)
         self.counts: dict[int, int] | None
         self.compression, self._has_met_chunk = "zstd", False
         self._verified: set[int] = set()
@@ -194,6 +188,15 @@ class McapFile:
         except BaseException:
             self._file.close()
             raise
+
+    def _begin(self, spool: Spool | None) -> None:
+        self._spool, self._own_spool = spool or Spool(), spool is None
+        self._in_order = self._unordered = False
+        self._order: TimeOrder | None = None
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.metadata: dict[RecordPlace, Metadata] = {}
+        self.attachments: list[RecordPlace] = []
 
     def __enter__(self) -> Self:
         return self
@@ -707,15 +710,9 @@ class McapBag(McapFile):
     """
 
     def __init__(self, path: Path, spool: Spool | None = None) -> None:
-        self._spool, self._own_spool = spool or Spool(), spool is None
-        self._in_order = self._unordered = False
-        self._order = None
+        self._begin(spool)
         self.path = path.parent if path.name == METADATA else path
         self.size, self.mtime_ns = mark_of(self.path)
-        self.schemas = {}
-        self.channels = {}
-        self.metadata = {}
-        self.attachments = []
         self.counts = {}
         self._parts = parts_of(self.path)
         self._files: dict[int, McapFile] = {}

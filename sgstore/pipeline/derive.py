@@ -98,9 +98,7 @@ def derive(
     check_name(name)
     if normalize_name(name) in abstractions():
         raise AbstractionError(f"{name!r} is the name of an abstraction; choose another")
-    file = StoreFile(store)
-    file.settle()
-    chosen = [file.trace(ref) for ref in traces] if traces else list(file.traces())
+    file, chosen = _chosen(store, traces)
     sets = file.deriving.sets()
     alike = [one for one in sets if normalize_name(one.name) == normalize_name(name)]
     known = {one.trace_id: one for one in alike}
@@ -153,9 +151,7 @@ def keep_abstraction(
     abstraction = abstraction_named(name)
     if abstraction.name in SUBSETS:
         raise AbstractionError(f"queries can name {abstraction.name!r} as it is: USING ABSTRACTION")
-    file = StoreFile(store)
-    file.settle()
-    chosen = [file.trace(ref) for ref in traces] if traces else list(file.traces())
+    file, chosen = _chosen(store, traces)
     known = {(one.name, one.trace_id) for one in file.deriving.sets()}
     results: list[Derivation] = []
     for trace in chosen:
@@ -177,6 +173,14 @@ def keep_abstraction(
             building.publish(settings, hashlib.sha256(repr(settings).encode()).hexdigest(), answers)
         results.append(Derivation(trace.name, "derived", frames, edges))
     return results
+
+
+def _chosen(
+    store: str | Path, traces: Sequence[int | str]
+) -> tuple[StoreFile, Sequence[StoredTrace]]:
+    file = StoreFile(store)
+    file.settle()
+    return file, [file.trace(ref) for ref in traces] if traces else file.traces()
 
 
 def _derived(file: StoreFile, trace: StoredTrace, config: Config, name: str) -> Derivation:

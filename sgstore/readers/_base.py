@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Sel
 
 import numpy as np
 
+from sgstore.base.display import first_of
 from sgstore.errors import TraceError
 from sgstore.graphs.online import Frame, check_entities
 from sgstore.mcap import IDS, Findings, OutOfOrder, digest_of, read_and_digest
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.graphs.online import Entity
+    from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Messages, Recording
     from sgstore.model.world import FrameBlock
 
@@ -116,6 +118,17 @@ def frame_refs(
     return refs
 
 
+def light_places(road_map: RoadMap) -> dict[str, tuple[float, float, float]]:
+    """Return the positions of the traffic lights of a map, by their names."""
+    nodes = road_map.nodes
+    places = zip(nodes.x.tolist(), nodes.y.tolist(), nodes.z.tolist(), strict=True)
+    return {
+        name: place
+        for name, place, kind in zip(nodes.name, places, nodes.kind.tolist(), strict=True)
+        if KINDS[kind] == "traffic_light"
+    }
+
+
 # First reading.
 
 BEGINNING: Final = 1_000_000_000
@@ -131,8 +144,7 @@ def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int =
 
 def listing(things: Sequence[str]) -> str:
     """Return a text that lists the possible egos of a recording, for an error message."""
-    more = f" and {len(things) - LISTED} more" if len(things) > LISTED else ""
-    return f"there are: {', '.join(things[:LISTED]) or 'none'}{more}"
+    return f"there are: {first_of(things, LISTED) or 'none'}"
 
 
 @dataclass(slots=True)

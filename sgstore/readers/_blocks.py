@@ -12,7 +12,7 @@ from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
-from typing import TYPE_CHECKING, ClassVar, Final, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -341,18 +341,11 @@ class EntityTable:
         for place, row in reversed(self._returned[self._returned_taken : returned]):
             rows.insert(place - self._taken, row)
         columns = tuple(zip(*rows, strict=True)) if rows else ((),) * len(EntityRow._fields)
-        entities = Entities(
-            first=self._taken + self._returned_taken,
-            ident=columns[0],
-            kind=np.array(columns[1], np.int8),
-            special=columns[2],
-            subkind=columns[3],
-            type_name=columns[4],
-            static=np.array(columns[5], np.bool_),
-            map_ref=columns[6],
-            lifetime=columns[7] if returned else (),
-            trailer=columns[8],
-        )
+        named: dict[str, Any] = dict(zip(EntityRow._fields, columns, strict=True))
+        named["kind"] = np.array(named["kind"], np.int8)
+        named["static"] = np.array(named["static"], np.bool_)
+        named["lifetime"] = named["lifetime"] if returned else ()
+        entities = Entities(first=self._taken + self._returned_taken, **named)
         nodes = [node for node in range(self._taken, upto) if node in self._poses]
         values = np.array([self._poses.pop(node) for node in nodes], np.float64)
         absurd = np.abs(values) >= FAR

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import inspect
 import re
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 from sgstore.base import plugins
+from sgstore.base.display import first_of
 from sgstore.errors import TraceError
 from sgstore.mcap import MAGIC, McapFile, messages_at, open_regular
 from sgstore.model.world import TraceReport
@@ -21,13 +23,13 @@ from sgstore.readers.commonroad._file import CommonRoadFile, is_scenario
 from sgstore.readers.commonroad._file import read_messages as _read_scenario_messages
 from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
 from sgstore.readers.osi._file import OsiFile
-from sgstore.readers.osi._file import read_message as _read_osi_message
+from sgstore.readers.osi._file import read_messages as _read_osi_messages
 from sgstore.readers.sumo._file import ENDINGS as _SUMO_ENDINGS
 from sgstore.readers.sumo._file import SumoFile, is_fcd
 from sgstore.readers.sumo._file import read_messages as _read_steps
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Recording
@@ -98,12 +100,8 @@ def open_recording(path: str | Path) -> RecordingFile:
     TraceError
         The file does not exist or has another format.
     """
-    path = Path(path)
-    if is_scenario(path):
-        return CommonRoadFile(path)
-    if is_fcd(path):
-        return SumoFile(path)
-    return OsiFile(path) if _is_single_channel(path) else McapFile(path)
+    opened, _ = _format_of(Path(path))
+    return opened(Path(path))
 
 
 def open_trace(
@@ -161,6 +159,17 @@ def on_map(trace: MessageTrace, road_map: RoadMap | None) -> None:
         tell(road_map)
 
 
+def _format_of(
+    path: Path,
+) -> tuple[Callable[[Path], RecordingFile], Callable[..., Iterator[bytes | memoryview]]]:
+    """Return the functions that open a file of this format, and that read single messages of it."""
+    if is_scenario(path):
+        return CommonRoadFile, _read_scenario_messages
+    if is_fcd(path):
+        return SumoFile, _read_steps
+    return (OsiFile, _read_osi_messages) if _is_single_channel(path) else (McapFile, messages_at)
+
+
 def _is_single_channel(path: Path) -> bool:
     if not path.name.lower().endswith(_OSI_ENDINGS):
         return False
@@ -204,17 +213,8 @@ def read_messages(
     TraceError
         As :func:`read_message`.
     """
-    if is_scenario(path):
-        yield from _read_scenario_messages(path, ((at, length) for _, at, length in places))
-        return
-    if is_fcd(path):
-        yield from _read_steps(path, ((at, length) for _, at, length in places))
-        return
-    if not _is_single_channel(path):
-        yield from messages_at(path, places)
-        return
-    for chunk_offset, offset, length in places:
-        yield _read_osi_message(path, chunk_offset=chunk_offset, offset=offset, length=length)
+    _, read = _format_of(path)
+    return read(path, places)
 
 
 _LOOKS: Final = (
@@ -244,11 +244,10 @@ def _no_reader(recording: Recording) -> str:
         name = schema.name if schema else "no schema"
         schemas.append(name)
         listed.append((not _TELLS_OBJECTS.search(name), f"{record.topic!r} ({name})"))
-    more = f" and {len(listed) - 12} more" if len(listed) > 12 else ""
     known = ", ".join(reader.name for reader in READERS)
     if not listed:
         return f"no channel has any message; expected ground truth of a flavour known: {known}"
     looks = (look for begins, look in _LOOKS if any(map(begins.match, schemas)))
     look = next((f"{look}: " for look in looks), "")
-    channels = ", ".join(text for _, text in sorted(listed, key=lambda one: one[0])[:12])
-    return f"{look}no ground truth of a flavour known ({known}); its channels: {channels}{more}; {_HELP}"
+    channels = first_of([text for _, text in sorted(listed, key=itemgetter(0))], 12)
+    return f"{look}no ground truth of a flavour known ({known}); its channels: {channels}; {_HELP}"

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.markup import MarkupError, MarkupParser
+from sgstore.base.display import first_of
+from sgstore.base.markup import MarkupError, MarkupParser, number
 from sgstore.errors import MapError
 from sgstore.maps.roads import MAX_POINTS
 
@@ -71,7 +72,7 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
     nodes = [one for one in builder.elements if one.kind == "node" and one.ident in used]
     warnings: list[str] = []
     places = _places(nodes, projection, warnings)
-    row = {node.ident: number for number, node in enumerate(nodes)}
+    row = {node.ident: at for at, node in enumerate(nodes)}
     document = OsmDocument({}, {}, {}, {}, warnings)
     broken: list[str] = []
     for way in ways:
@@ -84,8 +85,9 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
         document.lines[way.ident] = line
         document.nodes[way.ident], document.tags[way.ident] = refs, way.tags
     if broken:
-        named = ", ".join(broken[:8]) + (f" and {len(broken) - 8} more" if len(broken) > 8 else "")
-        warnings.append(f"ways {named}: a node of theirs is missing, or no place; left out")
+        warnings.append(
+            f"ways {first_of(broken, 8)}: a node of theirs is missing, or no place; left out"
+        )
     document.relations = {one.ident: one for one in builder.elements if one.kind == "relation"}
     return document
 
@@ -95,11 +97,11 @@ def _places(nodes: list[OsmElement], projection: Projection, warnings: list[str]
     if not nodes:
         return np.zeros((0, 3))
     height, x, y = (
-        np.array([_number(node.tags.get(tag, "")) for node in nodes]) for tag in _NODE_TAGS
+        np.array([number(node.tags.get(tag, "")) for node in nodes]) for tag in _NODE_TAGS
     )
     height = np.nan_to_num(height)
     local = np.isfinite(x) & np.isfinite(y)
-    degrees = np.array([[_number(value) for value in node.place] for node in nodes])
+    degrees = np.array([list(map(number, node.place)) for node in nodes])
     known = (np.abs(degrees) <= (90.0, 180.0)).all(axis=1)
     if (local | ~known).all() or projection.name == "Local":
         return np.column_stack((x, y, height))
@@ -112,13 +114,6 @@ def _places(nodes: list[OsmElement], projection: Projection, warnings: list[str]
         with np.errstate(all="ignore"):
             places[known] = projection.project(latitude, longitude, height[known])
     return places
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return np.nan
 
 
 class _OsmBuilder:

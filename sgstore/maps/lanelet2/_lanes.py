@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.base.display import first_of
 from sgstore.errors import MapError
 from sgstore.maps.lanelet2._document import OsmDocument, read_osm
 from sgstore.maps.lanelet2._lanelets import (
@@ -109,8 +110,8 @@ def _areas(document: OsmDocument) -> list[PlainObject]:
         told = ", ".join(f"{many} {what}" for what, many in sorted(left.items()))
         document.warnings.append(f"areas left out: {told}")
     if broken:
-        named = ", ".join(broken[:8]) + (f" and {len(broken) - 8} more" if broken[8:] else "")
-        document.warnings.append(f"areas {named}: expected an outer border that closes; left out")
+        what = "expected an outer border that closes; left out"
+        document.warnings.append(f"areas {first_of(broken, 8)}: {what}")
     return found
 
 

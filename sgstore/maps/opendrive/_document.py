@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.markup import MarkupError, MarkupParser
+from sgstore.base.markup import MarkupError, MarkupParser, number
 from sgstore.errors import MapError
 
 if TYPE_CHECKING:
@@ -344,14 +344,7 @@ def _floats(texts: list[str]) -> Floats:
     try:
         return np.fromiter(map(float, texts), np.float64, len(texts))
     except ValueError:
-        return np.array([_number(text) for text in texts], np.float64)
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+        return np.array([number(text) for text in texts], np.float64)
 
 
 def coefficients_of(document: Document, kind: str) -> Floats:

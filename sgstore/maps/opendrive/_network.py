@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from sgstore.base.markup import number
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -89,7 +91,7 @@ class Network:
         if road is None:
             return None
         if "elementS" in attributes:
-            s = _number(attributes["elementS"])
+            s = number(attributes["elementS"], 0.0)
             return Target(self.section_at(road, s), attributes.get("elementDir", ""))
         contact = attributes.get("contactPoint", START)
         return Target(self.first[road] if contact == START else self.last[road], contact)
@@ -262,7 +264,7 @@ def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]
         kind = "road/predecessor" if onward.contact == START else "road/successor"
         road = int(network.lanes.sections.road[onward.section])
         link = _road_links(document[kind]).get(road, {})
-        place = _number(link.get("elementS", junction.get("sStart", "0")))
+        place = number(link.get("elementS", junction.get("sStart", "0")), 0.0)
         section = network.section_at(main, place)
         for source, to in links[row]:
             src, dst = network.lane.get((section, source)), network.lane.get((onward.section, to))
@@ -276,10 +278,3 @@ def _whole(text: str) -> int:
         return int(text)
     except ValueError:
         return 0
-
-
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return 0.0

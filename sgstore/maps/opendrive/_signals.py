@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.base.display import first_of
 from sgstore.base.tables import chained
 from sgstore.maps.opendrive._network import END, START
 from sgstore.maps.opendrive._nodes import FIRST_LANE, speed
@@ -90,13 +91,12 @@ class Doubts:
         """Return a warning about signals with a doubtful orientation, or an empty list."""
         if not self._odd:
             return []
-        names = ", ".join(map(repr, list(self._odd)[:LISTED]))
-        more = f" and {len(self._odd) - LISTED} more" if len(self._odd) > LISTED else ""
+        names = first_of([*map(repr, self._odd)], LISTED)
         other = "carla" if self.reading == "asam" else "asam"
         better = sum(self._odd.values())
         help_ = f'; {better} of {len(self._odd)} would fit with the setting orientation = "{other}"'
         return [
-            f"signals without <validity> {names}{more}: their orientation, {_READERS[self.reading]}, names no"
+            f"signals without <validity> {names}: their orientation, {_READERS[self.reading]}, names no"
             f" traffic, or what comes out of the junction before which they stand{help_ if better else ''}"
         ]
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 import shapely
 
+from sgstore.base.display import first_of
 from sgstore.errors import MapError
 from sgstore.maps.roads._cross_sections import (
     APART,
@@ -349,8 +350,7 @@ def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[
 
 def about_lanes(lanes: Sequence[str], what: str) -> str:
     """Return a warning text that names the first few of several lanes."""
-    more = f" and {len(lanes) - LISTED} more" if len(lanes) > LISTED else ""
-    return f"{'lanes' if len(lanes) > 1 else 'lane'} {', '.join(lanes[:LISTED])}{more}: {what}"
+    return f"{'lanes' if len(lanes) > 1 else 'lane'} {first_of(lanes, LISTED)}: {what}"
 
 
 def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:

@@ -110,7 +110,7 @@ def read_lane_text(text: str, name: str) -> RoadMap:
         raise MapError(f"expected a list of 1 to {MAX_LANES:,} lanes", element="lanes")
     if not isinstance(warnings, list) or not all(isinstance(w, str) for w in warnings):
         raise MapError("expected a list of texts", element="warnings")
-    lanes = [_lane(row, number, len(rows)) for number, row in enumerate(rows)]
+    lanes = [row.lane() for row in _text_rows(document, "lane", MAX_LANES, len(rows))]
     if sum(len(lane.z) for lane in lanes) > MAX_SECTIONS:
         raise MapError(f"more than {MAX_SECTIONS:,} cross sections", element="lanes")
     signals = [row.signal() for row in _text_rows(document, "signal", MAX_SIGNALS, len(lanes))]
@@ -178,17 +178,10 @@ def _text_rows(document: dict[str, Any], what: str, most: int, lanes: int) -> li
     return [_TextRow(row, number, lanes, what) for number, row in enumerate(rows)]
 
 
-def _lane(row: Any, number: int, lanes: int) -> PlainLane:
-    if not isinstance(row, dict):
-        raise MapError(f"lane {number} is not an object", element="lanes")
-    fields: dict[str, Any] = row
-    return _TextRow(fields, number, lanes).lane()
-
-
 class _TextRow:
     """JSON object of a lane or signal, with checked access to its fields."""
 
-    def __init__(self, fields: dict[str, Any], number: int, lanes: int, what: str = "lane") -> None:
+    def __init__(self, fields: dict[str, Any], number: int, lanes: int, what: str) -> None:
         self._fields = fields
         self._what = what
         self._number = number

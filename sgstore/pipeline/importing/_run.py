@@ -242,7 +242,11 @@ class _ImportRun:
                 kinds.update([KINDS[int(code)] for code in graph.frames.entities.kind])
                 if self.on_frames is not None:
                     self.on_frames(info.path, done.frames)
-            report = TraceReport(frames=done.frames, losses=_losses(done.lost))
+            losses = [
+                Loss(f"{what} cannot be kept", messages=often)
+                for what, often in sorted(done.lost.items())
+            ]
+            report = TraceReport(frames=done.frames, losses=losses)
             how = {
                 "words": self._words.as_dict(),
                 "relations": sorted(set(self._answers)),
@@ -298,10 +302,6 @@ def _blocks(graphs: Iterable[Meant]) -> Iterator[list[Meant]]:
         size += more
     if some:
         yield some
-
-
-def _losses(lost: dict[str, int]) -> list[Loss]:
-    return [Loss(f"{what} cannot be kept", messages=often) for what, often in sorted(lost.items())]
 
 
 # Resolved graphs as blocks of scene graphs.

@@ -28,9 +28,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.model.vocabulary import KINDS, LIGHT_STATE_CODE, VEHICLE_LIGHTS, TypeMeaning
+from sgstore.model.vocabulary import LIGHT_STATE_CODE, VEHICLE_LIGHTS, TypeMeaning
 from sgstore.model.world import POSE
-from sgstore.readers._base import SurveyedDecoder, SurveyedTrace
+from sgstore.readers._base import SurveyedDecoder, SurveyedTrace, light_places
 from sgstore.readers._blocks import FAR, NAN, FrameRows
 from sgstore.readers._ros2 import ColumnReader, decode, ident_of, number, records, text
 from sgstore.readers._stamps import NO_TIME
@@ -663,15 +663,8 @@ class AutowareTrace(SurveyedTrace[AutowareSurvey]):
 
     def on_map(self, road_map: RoadMap | None) -> None:
         """Find the positions of the traffic lights in the road map."""
-        if road_map is None:
-            return
-        nodes = road_map.nodes
-        places = zip(nodes.x.tolist(), nodes.y.tolist(), nodes.z.tolist(), strict=True)
-        self._places = {
-            name: place
-            for name, place, kind in zip(nodes.name, places, nodes.kind.tolist(), strict=True)
-            if KINDS[kind] == "traffic_light"
-        }
+        if road_map is not None:
+            self._places = light_places(road_map)
 
     def _decoder(self, report: TraceReport) -> AutowareDecoder:
         if self._box is SAMPLE_VEHICLE and self.info.ego == EGO:

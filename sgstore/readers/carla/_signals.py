@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from sgstore.base.display import first_of
 from sgstore.base.tables import components
 from sgstore.maps.roads import RoadMap
 from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
@@ -495,9 +496,7 @@ class AtOnce:
 
 
 def _listed(names: list[Any]) -> str:
-    shown = ", ".join(repr(str(name)) for name in names[:MOST_NAMED])
-    more = len(names) - MOST_NAMED
-    return f"{shown} and {more} more" if more > 0 else shown
+    return first_of([repr(str(name)) for name in names], MOST_NAMED)
 
 
 # Traffic lights of CARLA's bridge: positions and states. The bridge contains the position of a light and its

@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from sgstore.base.markup import MarkupError, MarkupParser
+from sgstore.base.markup import MarkupError, MarkupParser, number
 from sgstore.errors import TraceError
 
 if TYPE_CHECKING:
@@ -277,10 +277,7 @@ def _begin(scenario: TrafficScenario, root: _Node) -> None:
         raise TraceError(f"CommonRoad version {version[:40]!r}; versions {known} are read")
     name = root.attributes.get("benchmarkID", "")
     scenario.name = name[:MAX_NAME] if name.isprintable() else ""
-    try:
-        scenario.step = float(root.attributes.get("timeStepSize", ""))
-    except ValueError:
-        scenario.step = math.nan
+    scenario.step = number(root.attributes.get("timeStepSize", ""))
     if not 1e-6 <= scenario.step <= 100:
         told = root.attributes.get("timeStepSize", "")[:40]
         raise TraceError(f"timeStepSize {told!r}: expected the seconds between two steps")
@@ -304,10 +301,7 @@ def _ident(node: _Node, name: str = "id") -> str:
 
 
 def _float(text: str, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = number(text)
     if not abs(value) < _FAR:
         raise ValueError(f"{what} {text[:40]!r} is not a number")
     return value
@@ -517,9 +511,7 @@ def _lanelet(scenario: TrafficScenario, node: _Node) -> None:
     if ident in scenario.lanelets:
         raise ValueError("there are two of this id; the first one counts")
     sides = [node.get(side) for side in ("leftBound", "rightBound")]
-    left, right = (
-        tuple(_point(point) for point in side.all("point")) if side else () for side in sides
-    )
+    left, right = (tuple(map(_point, side.all("point"))) if side else () for side in sides)
     if len(left) < 2 or len(right) < 2:
         raise ValueError("its borders need at least two points each")
     limit = node.word("speedLimit")
@@ -568,10 +560,7 @@ def _light(scenario: TrafficScenario, node: _Node) -> None:
 def _sign(scenario: TrafficScenario, node: _Node) -> None:
     plates: list[tuple[str, float]] = []
     for element in node.all("trafficSignElement"):
-        try:
-            value = float(element.word("additionalValue"))
-        except ValueError:
-            value = math.nan
+        value = number(element.word("additionalValue"))
         plates.append((element.word("trafficSignID")[:MAX_NAME], value))
     place = _position(node.get("position"))
     virtual = node.word("virtual") == "true"

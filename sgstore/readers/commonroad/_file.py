@@ -28,7 +28,7 @@ from sgstore.readers.commonroad._document import (
 from sgstore.readers.commonroad._lanelets import light_place, map_text, meaning_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from sgstore.mcap import Findings, Messages
@@ -155,7 +155,7 @@ class CommonRoadFile(MessageFile):
         return round(step * self._scenario.step * 1e9)
 
 
-def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[bytes]:
+def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
     """Yield the bytes of messages of a scenario, by their offsets and lengths.
 
     See :meth:`CommonRoadFile.walk`.
@@ -166,7 +166,7 @@ def read_messages(path: Path, places: Iterator[tuple[int, int]]) -> Iterator[byt
         The file cannot be read, or a message does not match, because the file was replaced.
     """
     with CommonRoadFile(path) as recording:
-        for offset, length in places:
+        for _, offset, length in places:
             try:
                 data = recording.message(offset) if offset >= 0 else b""
             except IndexError:

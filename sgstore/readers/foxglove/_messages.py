@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from bisect import bisect_left, bisect_right, insort
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -85,16 +85,12 @@ class Axes:
             self.parents[child] = parent
         if track.parent != parent:
             return False
-        if not track.times or time_ns > track.times[-1]:
-            track.times.append(time_ns)
-            track.poses.append(pose)
+        at = bisect_left(track.times, time_ns)
+        if at < len(track.times) and track.times[at] == time_ns:
+            track.poses[at] = pose
         else:
-            at = bisect_left(track.times, time_ns)
-            if at < len(track.times) and track.times[at] == time_ns:
-                track.poses[at] = pose
-            else:
-                insort(track.times, time_ns)
-                track.poses.insert(at, pose)
+            track.times.insert(at, time_ns)
+            track.poses.insert(at, pose)
         if len(track.times) > MAX_KEPT:
             del track.times[: MAX_KEPT // 2], track.poses[: MAX_KEPT // 2]
         return True

@@ -33,17 +33,18 @@ from sgstore.readers.osi._schema import (
     GROUND_TRUTH,
     LATEST_NS,
     SENSOR_VIEW,
+    TRAFFIC_LIGHT,
     descriptors,
     fields_of,
-    light_class,
     lights_of,
     message_class,
     object_class,
     parse,
+    part_class,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
     from typing import BinaryIO
 
@@ -144,24 +145,26 @@ def _frame(file: BinaryIO, place: int) -> Iterator[bytes]:
         raise TraceError(f"cannot be decompressed (zstd): {error}", offset=place) from error
 
 
-def read_message(path: Path, *, chunk_offset: int, offset: int, length: int) -> bytes:
-    """Return the raw bytes of one message of an OSI file, from its position.
+def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
+    """Yield the raw bytes of messages of an OSI file, from their positions.
 
     Parameters
     ----------
     path : Path
-    chunk_offset : int
-        Byte offset of the zstd frame with the start of the message, -1 for an uncompressed file.
-    offset : int
-        Byte offset of the message's head in the decompressed data from this frame on, or in the file.
-    length : int
-        Bytes of its data.
+    places : iterable of (chunk_offset, offset, length)
+        Byte offset of the zstd frame with the start of the message, -1 for an uncompressed file. Byte offset of
+        the message's head in the decompressed data from this frame on, or in the file. Bytes of its data.
 
     Raises
     ------
     TraceError
         The file cannot be opened or decompressed, or the message does not match, because the file was replaced.
     """
+    for place in places:
+        yield _message_at(path, *place)
+
+
+def _message_at(path: Path, chunk_offset: int, offset: int, length: int) -> bytes:
     missing = TraceError(
         f"no message of {length} bytes at {offset} there: the file was replaced", path=path
     )
@@ -466,7 +469,7 @@ def _likeness(name: str, data: bytes) -> int:
 def _classes_of(name: str) -> tuple[type[Any], type[Any], type[Any] | None]:
     schema = Schema(id=1, data=descriptors(), encoding="protobuf", name=name)
     message = message_class(schema)
-    return message, object_class(message), light_class(message)
+    return message, object_class(message), part_class(message, TRAFFIC_LIGHT)
 
 
 def _things(placed: list[Any], lanes: Any) -> int:

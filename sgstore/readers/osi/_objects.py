@@ -57,14 +57,14 @@ if TYPE_CHECKING:
 
 
 BASE: Final = {
-    "position": ("x", "y", "z"),
-    "orientation": ("yaw", "pitch", "roll"),
-    "velocity": ("x", "y", "z"),
-    "acceleration": ("x", "y", "z"),
-    "orientation_rate": ("yaw",),
-    "dimension": ("length", "width", "height"),
+    "position": {axis: axis for axis in "xyz"},
+    "orientation": {"yaw": "heading", "pitch": "pitch", "roll": "roll"},
+    "velocity": {axis: f"v{axis}" for axis in "xyz"},
+    "acceleration": {axis: f"a{axis}" for axis in "xyz"},
+    "orientation_rate": {"yaw": "yaw_rate"},
+    "dimension": {name: name for name in ("length", "width", "height")},
 }
-"""Sub-messages of ``BaseMoving`` and their used fields."""
+"""Sub-messages of ``BaseMoving``: their used fields → columns of a pose."""
 _INDICATORS: Final = {3: 0b01, 4: 0b10, 5: 0b11}
 """``IndicatorState`` LEFT, RIGHT, WARNING → bits ``light_left`` and ``light_right``."""
 _LIT: Final = 3
@@ -210,7 +210,7 @@ class MovingObjects:
         parts: dict[str, Any] = {}
         inner: Tree = {}
         column = {name: i for i, name in enumerate(POSE)}
-        for part, names in BASE.items():
+        for part, targets in BASE.items():
             told = base.message_type.fields_by_name.get(part)
             if told is None or told.message_type is None:
                 continue
@@ -219,7 +219,7 @@ class MovingObjects:
             within = told.message_type.fields_by_name
             inner[told.number] = {
                 within[name].number: column[target]
-                for name, target in zip(names, _TARGETS[part], strict=True)
+                for name, target in targets.items()
                 if name in within
             }
         tree: Tree = {base.number: inner}
@@ -316,24 +316,14 @@ class MovingObjects:
             thing = self._message.FromString(content)
         except DECODE_ERRORS:
             return values, False, -1, 0
-        for part, names in BASE.items():
+        for part, targets in BASE.items():
             if part in self._base and thing.base.HasField(part):
                 told = getattr(thing.base, part)
-                for name, target in zip(names, _TARGETS[part], strict=True):
+                for name, target in targets.items():
                     values[POSE.index(target)] = getattr(told, name, 0.0)
         oriented = thing.base.HasField("orientation")
         near = thing.base.HasField("position") and bool(_near(values[None], oriented=oriented)[0])
         return values, near, light_bits(thing), code_of(thing)
-
-
-_TARGETS: Final = {
-    "position": ("x", "y", "z"),
-    "orientation": ("heading", "pitch", "roll"),
-    "velocity": ("vx", "vy", "vz"),
-    "acceleration": ("ax", "ay", "az"),
-    "orientation_rate": ("yaw_rate",),
-    "dimension": ("length", "width", "height"),
-}
 
 
 def _meanings(told: Any, bit: int) -> NDArray[np.int64]:

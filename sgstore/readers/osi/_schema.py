@@ -380,6 +380,7 @@ SENSOR_VIEW: Final = "osi3.SensorView"
 HOST_DATA: Final = "osi3.HostVehicleData"
 MOVING_OBJECT: Final = "osi3.MovingObject"
 TRAFFIC_LIGHT: Final = "osi3.TrafficLight"
+CONDITIONS: Final = "osi3.EnvironmentalConditions"
 ROAD_MAP: Final = "osi3.MapAsamOpenDrive"
 
 MAX_DESCRIPTORS: Final = 4 << 20
@@ -401,25 +402,22 @@ NO_VECTOR: Final = (NAN, NAN, NAN)
 LATEST_NS: Final = 1 << 62
 """Limit of valid times; ns."""
 _GROUND_TRUTH_NEEDS: Final = ("timestamp.seconds", "moving_object")
+_STATIC_NEEDS: Final = (
+    "id.value",
+    *(f"base.{part}.{name}" for part, names in _STATIC_BASE.items() for name in names),
+)
 _MOVING_OBJECT_NEEDS: Final = (
-    "id.value",
-    "type",
-    "vehicle_classification.type",
-    *(f"base.dimension.{name}" for name in ("length", "width", "height")),
-    *(f"base.orientation.{name}" for name in ("roll", "pitch", "yaw")),
-    *(
-        f"base.{vector}.{name}"
-        for vector in ("position", "velocity", "acceleration")
-        for name in ("x", "y", "z")
+    *_STATIC_NEEDS,
+    *("type", "vehicle_classification.type"),
+    *(f"base.{vector}.{name}" for vector in ("velocity", "acceleration") for name in "xyz"),
+)
+_PART_NEEDS: Final = {
+    TRAFFIC_LIGHT: (
+        *_STATIC_NEEDS,
+        *(f"classification.{name}" for name in ("color", "icon", "mode")),
     ),
-)
-_TRAFFIC_LIGHT_NEEDS: Final = (
-    "id.value",
-    *(f"classification.{name}" for name in ("color", "icon", "mode")),
-    *(f"base.dimension.{name}" for name in ("length", "width", "height")),
-    *(f"base.orientation.{name}" for name in ("roll", "pitch", "yaw")),
-    *(f"base.position.{name}" for name in ("x", "y", "z")),
-)
+    CONDITIONS: (),
+}
 _FIELDS: Final = {
     GROUND_TRUTH: GROUND_TRUTH_FIELDS,
     SENSOR_VIEW: SENSOR_VIEW_FIELDS,
@@ -506,26 +504,28 @@ def object_class(message: type[Any]) -> type[Any]:
         The descriptors lack the type, or a field that every version of OSI has.
     """
     try:
-        found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(MOVING_OBJECT)
-        _require(found, _MOVING_OBJECT_NEEDS)
-        return message_factory.GetMessageClass(found)
+        return _class_beside(message, MOVING_OBJECT, _MOVING_OBJECT_NEEDS)
     except DECODE_ERRORS as error:
         raise TraceError(
             f"schema {MOVING_OBJECT}: its protobuf descriptors are malformed: {error}"
         ) from error
 
 
-def light_class(message: type[Any]) -> type[Any] | None:
-    """Return the protobuf class of traffic lights for an OSI message class, or ``None`` if unreadable.
+def part_class(message: type[Any], name: str) -> type[Any] | None:
+    """Return the protobuf class of a type that an OSI message class uses, or ``None`` if unreadable.
 
-    Messages contain these lights as bytes.
+    Messages contain these parts as bytes: traffic lights, and the conditions of the environment.
     """
     try:
-        found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(TRAFFIC_LIGHT)
-        _require(found, _TRAFFIC_LIGHT_NEEDS)
-        return message_factory.GetMessageClass(found)
+        return _class_beside(message, name, _PART_NEEDS[name])
     except DECODE_ERRORS:
         return None
+
+
+def _class_beside(message: type[Any], name: str, needs: tuple[str, ...]) -> type[Any]:
+    found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(name)
+    _require(found, needs)
+    return message_factory.GetMessageClass(found)
 
 
 def lights_of(ground: Any) -> list[bytes]:

@@ -30,13 +30,14 @@ from sgstore.readers.osi._schema import (
     HOST_DATA,
     ROAD_MAP,
     SENSOR_VIEW,
+    TRAFFIC_LIGHT,
     has_field,
     identifiers,
-    light_class,
     lights_of,
     message_class,
     object_class,
     parse,
+    part_class,
     time_of,
 )
 
@@ -420,7 +421,7 @@ class OsiSurvey(Survey[OsiLead]):
         except TraceError as error:
             lanes = None
             self.notes.append(f"its lanes cannot be read: {error.reason}")
-        bulbs = light_class(message)
+        bulbs = part_class(message, TRAFFIC_LIGHT)
         self._lights[channel] = TrafficLights(EntityTable(TraceReport()), bulbs)
         self.leads[channel] = OsiLead(
             schema=schema.name,

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
-from google.protobuf import message_factory
 
 from sgstore.mcap import Loss
 from sgstore.model.vocabulary import KINDS, TypeMeaning, type_meanings
@@ -27,14 +26,16 @@ from sgstore.readers._blocks import NAN, NO_INPUTS, FrameRows, LossTally
 from sgstore.readers._stamps import NO_TIME
 from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights, code_of
 from sgstore.readers.osi._schema import (
+    CONDITIONS,
     DECODE_ERRORS,
     GROUND_TRUTH,
     SENSOR_VIEW,
+    TRAFFIC_LIGHT,
     enum_name,
     has_field,
-    light_class,
     lights_of,
     parse,
+    part_class,
     time_of,
 )
 from sgstore.readers.osi._survey import OsiSurvey, is_key, keys_of, schema_name
@@ -72,11 +73,7 @@ class Environment:
         self._told = b""
         self._state = ""
         self._unread = 0
-        try:
-            found = message.DESCRIPTOR.file.pool.FindMessageTypeByName(TYPE)
-            self._class = message_factory.GetMessageClass(found)
-        except DECODE_ERRORS:
-            self._class = None
+        self._class = part_class(message, CONDITIONS)
 
     def look(self, ground: Any, time_ns: int, log_time_ns: int, seq: int) -> None:
         """Update the weather and light conditions from an OSI message, and report changes as events.
@@ -220,7 +217,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         self._codes: dict[int, int] = {}
         self._kinds: dict[int, str] = {}
         names = {bulb: one.name for bulb, one in survey.signals.items()}
-        self._lights = TrafficLights(self.roster, light_class(lead.message), names)
+        self._lights = TrafficLights(self.roster, part_class(lead.message, TRAFFIC_LIGHT), names)
         self._environment = Environment(lead.message, self.roster)
         self._has_controls = any(
             has_field(one.message, "host_vehicle_data") for one in survey.leads.values()

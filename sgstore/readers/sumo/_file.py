@@ -162,7 +162,7 @@ class SumoFile(MessageFile):
             yield _messages(held, times, number)
 
 
-def read_messages(path: Path, places: Iterable[tuple[int, int]]) -> Iterator[bytes]:
+def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
     """Yield the bytes of time steps of a SUMO file, by their offsets and lengths.
 
     See :meth:`SumoFile.walk`.
@@ -173,7 +173,7 @@ def read_messages(path: Path, places: Iterable[tuple[int, int]]) -> Iterator[byt
         The file cannot be read, or a step does not match, because the file was replaced.
     """
     with opened(path) as file:
-        for offset, length in places:
+        for _, offset, length in places:
             try:
                 file.seek(max(offset, 0))
                 data = file.read(length) if 0 < length <= MAX_STEP and offset >= 0 else b""

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, ClassVar, Final
 from sgstore.base.markup import MarkupError, MarkupParser
 from sgstore.graphs.online import Frame
 from sgstore.mcap import digest_of
-from sgstore.model.vocabulary import KINDS, TypeMeaning, type_meanings
+from sgstore.model.vocabulary import TypeMeaning, type_meanings
 from sgstore.model.world import LARGEST
-from sgstore.readers._base import FramesTrace, TraceMessage
+from sgstore.readers._base import FramesTrace, TraceMessage, light_places
 from sgstore.readers.sumo._file import STEP, time_ns
 from sgstore.readers.sumo._lights import LightStates, lights_beside
 
@@ -94,15 +94,8 @@ class SumoTrace(FramesTrace):
 
     def on_map(self, road_map: RoadMap | None) -> None:
         """Find the positions of the traffic lights in the road map."""
-        if road_map is None or self._lights is None:
-            return
-        nodes = road_map.nodes
-        places = zip(nodes.x.tolist(), nodes.y.tolist(), nodes.z.tolist(), strict=True)
-        self._signals = {
-            name: place
-            for name, place, kind in zip(nodes.name, places, nodes.kind.tolist(), strict=True)
-            if KINDS[kind] == "traffic_light"
-        }
+        if road_map is not None and self._lights is not None:
+            self._signals = light_places(road_map)
 
     @staticmethod
     def role(channel: Channel) -> str:
