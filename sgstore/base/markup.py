@@ -10,6 +10,8 @@ import math
 from typing import TYPE_CHECKING, Final
 from xml.parsers import expat
 
+from sgstore.errors import MapError
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -39,9 +41,9 @@ class MarkupParser:
     Parameters
     ----------
     start : callable
-        Called with tag and attributes at the start of each element.
-    end : callable
-        Called with the tag at the end of each element.
+        Called with tag, attributes and depth at the start of each element. The root has depth 1.
+    end : callable, optional
+        Called at the end of each element.
     text : callable, optional
         Called with pieces of element text, in order.
     most : int or None
@@ -52,8 +54,8 @@ class MarkupParser:
 
     def __init__(
         self,
-        start: Callable[[str, dict[str, str]], None],
-        end: Callable[[str], None],
+        start: Callable[[str, dict[str, str], int], None],
+        end: Callable[[], None] = lambda: None,
         *,
         text: Callable[[str], None] | None = None,
         most: int | None,
@@ -97,11 +99,25 @@ class MarkupParser:
             raise MarkupError(reason, tag[:80])
         if self._most is not None and self._elements > self._most:
             raise MarkupError(f"more than {self._most:,} elements", tag[:80])
-        self._start(tag, attributes)
+        self._start(tag, attributes, self._depth)
 
-    def _ends(self, tag: str) -> None:
+    def _ends(self, _tag: str) -> None:
         self._depth -= 1
-        self._end(tag)
+        self._end()
 
     def _doctype(self, *_: object) -> None:
         raise MarkupError(f"a document type declaration is refused: {self._whose} need none")
+
+
+def read_markup(parser: MarkupParser, text: str) -> None:
+    """Parse the whole text of a map.
+
+    Raises
+    ------
+    MapError
+        The text is not XML, or exceeds a limit.
+    """
+    try:
+        parser.feed(text, last=True)
+    except MarkupError as error:
+        raise MapError(str(error), element=error.element or None) from error

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base.markup import MarkupError, MarkupParser
+from sgstore.base.markup import MarkupParser, number, read_markup
 from sgstore.errors import MapError
 from sgstore.maps.roads import (
     MAX_LANES,
@@ -80,17 +80,14 @@ class _SumoNet:
     roundabouts: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
     beside: dict[str, str] = field(default_factory=dict[str, str])
     """Lane → its left neighbour with the opposite direction."""
-    depth: int = 0
-    """Depth of the present XML element."""
     logic: str = ""
     """Traffic light of the present phases."""
 
-    def start(self, tag: str, attributes: dict[str, str]) -> None:
+    def start(self, tag: str, attributes: dict[str, str], depth: int) -> None:
         """Handle the start tag of an XML element."""
-        self.depth += 1
-        if self.depth == 1 and tag != "net":
+        if depth == 1 and tag != "net":
             raise MapError(f"the root element is <{tag[:80]}>, expected <net>")
-        match self.depth, tag:
+        match depth, tag:
             case 2, "edge":
                 names = (attributes.get(key, "") for key in ("id", "function", "from", "to"))
                 ident, function, source, target = names
@@ -110,10 +107,6 @@ class _SumoNet:
             case _:
                 pass
 
-    def end(self, _tag: str) -> None:
-        """Handle the end tag of an XML element."""
-        self.depth -= 1
-
 
 def is_sumo_net(text: str) -> bool:
     """Return True if a text is a SUMO network, by its first XML elements."""
@@ -130,10 +123,7 @@ def sumo_net_text(text: str) -> str:
         The text is not XML or not a network, exceeds a limit, or has no usable lane.
     """
     net = _SumoNet()
-    try:
-        MarkupParser(net.start, net.end, most=MAX_ELEMENTS).feed(text, last=True)
-    except MarkupError as error:
-        raise MapError(str(error), element=error.element or None) from error
+    read_markup(MarkupParser(net.start, most=MAX_ELEMENTS), text)
     broken: list[str] = []
     lines, crosswalks = _lines(net, broken)
     _add_opposites(net, lines)
@@ -161,7 +151,7 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
             points += len(centre)
             if points > MAX_POINTS:
                 raise MapError(f"lanes of more than {MAX_POINTS:,} points", element="lane")
-            width = _number(lane.get("width", ""), CROSSING_WIDTH if is_crossing else WIDTH)
+            width = number(lane.get("width", ""), CROSSING_WIDTH if is_crossing else WIDTH)
             if not ident or len(ident) > MAX_NAME or len(centre) < 2 or not 0 < width < 1000:
                 broken.append(ident or edge.ident)
                 continue
@@ -194,7 +184,7 @@ def _lane_line(
         lefts=(_side(sections, left=True),),
         rights=(_side(sections, left=False),),
         road=edge.ident,
-        number=int(_number(lane.get("index", ""), 0.0)) + 1,
+        number=int(number(lane.get("index", ""), 0.0)) + 1,
         junction=junction,
         speed_limit=_speed(lane),
         roundabout=roundabouts.get(("node", junction) if in_junction else ("edge", edge.ident), ""),
@@ -284,10 +274,10 @@ def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -
     """Return the traffic lights of a SUMO network: one for all lanes of a junction with equal states."""
     links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
     for connection in net.connections:
-        name, number = connection.get("tl", ""), connection.get("linkIndex", "0")
+        name, index = connection.get("tl", ""), connection.get("linkIndex", "0")
         lane = connection.get("via") or _from_lane(connection)
-        if name and len(name) <= MAX_NAME and lane in row_of and number.isdecimal():
-            link = int(number)
+        if name and len(name) <= MAX_NAME and lane in row_of and index.isdecimal():
+            link = int(index)
             states = tuple(state[link : link + 1] for state in net.phases.get(name, ()))
             links[name].setdefault(states, {})[link] = lane
     signals: list[PlainSignal] = []
@@ -317,7 +307,7 @@ def _lane_type(lane: dict[str, str]) -> str:
 def _centre_line(text: str) -> Floats:
     """Parse the points (n, 3) of a SUMO line; empty for an invalid line."""
     try:
-        points = [[float(number) for number in point.split(",")] for point in text.split()]
+        points = [[float(value) for value in point.split(",")] for point in text.split()]
         line = np.array([(*point, 0.0)[:3] for point in points], np.float64).reshape(-1, 3)
     except ValueError:
         return np.zeros((0, 3))
@@ -327,12 +317,5 @@ def _centre_line(text: str) -> Floats:
 
 
 def _speed(lane: dict[str, str]) -> float:
-    speed = _number(lane.get("speed", ""), np.nan)
+    speed = number(lane.get("speed", ""), np.nan)
     return speed if 0 < speed < 1000 else np.nan
-
-
-def _number(text: str, otherwise: float) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return otherwise

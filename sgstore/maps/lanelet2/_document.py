@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.base.display import first_of
-from sgstore.base.markup import MarkupError, MarkupParser, number
+from sgstore.base.markup import MarkupParser, number, read_markup
 from sgstore.errors import MapError
 from sgstore.maps.roads import MAX_POINTS
 
@@ -60,10 +60,7 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
     if len(text) > MAX_CHARACTERS:
         raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
     builder = _OsmBuilder()
-    try:
-        MarkupParser(builder.start, builder.end, most=MAX_ELEMENTS).feed(text, last=True)
-    except MarkupError as error:
-        raise MapError(str(error), element=error.element or None) from error
+    read_markup(MarkupParser(builder.start, most=MAX_ELEMENTS), text)
     ways = [one for one in builder.elements if one.kind == "way"]
     points = sum(len(way.members) for way in ways)
     if points > MAX_POINTS:
@@ -121,22 +118,20 @@ class _OsmBuilder:
 
     def __init__(self) -> None:
         self.elements: list[OsmElement] = []
-        self._depth = 0
         self._open: OsmElement | None = None
 
-    def start(self, tag: str, attributes: dict[str, Any]) -> None:
+    def start(self, tag: str, attributes: dict[str, Any], depth: int) -> None:
         """Handle the start tag of an XML element."""
-        self._depth += 1
-        if self._depth == 1 and tag != "osm":
+        if depth == 1 and tag != "osm":
             raise MapError(f"the root element is <{tag[:80]}>, expected <osm>")
-        if self._depth == 2:
+        if depth == 2:
             self._open = None
             wanted = tag in {"node", "way", "relation"} and attributes.get("action") != "delete"
             if wanted and "id" in attributes:
                 place = attributes.get("lat", ""), attributes.get("lon", "")
                 self._open = OsmElement(tag, attributes["id"], place=place)
                 self.elements.append(self._open)
-        elif self._depth == 3 and self._open is not None:
+        elif depth == 3 and self._open is not None:
             if tag == "tag":
                 self._open.tags[attributes.get("k", "")] = attributes.get("v", "")
             elif tag == "nd":
@@ -145,7 +140,3 @@ class _OsmBuilder:
                 member = (attributes.get(key, "") for key in ("type", "ref", "role"))
                 kind, ref, role = member
                 self._open.members.append((kind, ref, role))
-
-    def end(self, _tag: str) -> None:
-        """Handle the end tag of an XML element."""
-        self._depth -= 1

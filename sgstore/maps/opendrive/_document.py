@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.markup import MarkupError, MarkupParser, number
+from sgstore.base.markup import MarkupParser, number, read_markup
 from sgstore.errors import MapError
 
 if TYPE_CHECKING:
@@ -294,7 +294,7 @@ class _Builder:
         self._rows: list[int] = [-1]
         self._roads = 0
 
-    def start(self, tag: str, attributes: dict[str, str]) -> None:
+    def start(self, tag: str, attributes: dict[str, str], _depth: int) -> None:
         """Handle the start tag of an XML element: add a table row, enter the element, or skip it."""
         levels, rows = self._levels, self._rows
         node = levels[-1].get(tag)
@@ -316,7 +316,7 @@ class _Builder:
             rows.append(len(table.parent) - 1)
         levels.append(below)
 
-    def end(self, _tag: str) -> None:
+    def end(self) -> None:
         """Handle the end tag of an XML element."""
         self._levels.pop()
         self._rows.pop()
@@ -332,10 +332,7 @@ class _Builder:
 
 def _parse(text: str, skip: frozenset[int]) -> tuple[dict[str, ElementTable], list[int]]:
     builder = _Builder(skip)
-    try:
-        MarkupParser(builder.start, builder.end, most=MAX_ELEMENTS).feed(text, last=True)
-    except MarkupError as error:
-        raise MapError(str(error), element=error.element or None) from error
+    read_markup(MarkupParser(builder.start, builder.end, most=MAX_ELEMENTS), text)
     return builder.tables, builder.ordinals
 
 

@@ -84,15 +84,7 @@ def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) ->
 
 def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_Stretch]]:
     """Return a function that finds the road marks on the common border of two neighbouring lanes."""
-    kind = "road/laneSection/lane/roadMark"
-    table = document[kind]
-    offsets = document.rough_numbers(kind, "sOffset").tolist()
-    columns = table.parent, offsets, table.texts("type", "none"), table.texts("laneChange")
-    records: dict[int, list[tuple[float, str, str]]] = {}
-    for raw, offset, mark, attribute in zip(*columns, strict=True):
-        if np.isfinite(offset):
-            record = (offset, mark.strip().lower(), attribute.strip().lower())
-            records.setdefault(raw, []).append(record)
+    records = _records(document, "laneChange")
     of_lane = {int(lanes.row[raw]): marks for raw, marks in records.items()}
     centres = {raw: int(lanes.centre[raw]) for raw in records}
     of_centre = {centre: records[raw] for raw, centre in centres.items() if centre >= 0}
@@ -117,20 +109,26 @@ def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_S
     return between
 
 
-def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:
-    """Return the parts of lanes with a ``bold`` (broad) marking at their border."""
+def _records(document: Document, name: str) -> dict[int, list[tuple[float, str, str]]]:
+    """Return the road marks of each lane in the text: offset, type, and one more attribute."""
     kind = "road/laneSection/lane/roadMark"
     table, offsets = document[kind], document.rough_numbers(kind, "sOffset").tolist()
-    columns = table.parent, offsets, table.texts("type", "none"), table.texts("weight")
-    records: dict[int, list[tuple[float, bool]]] = {}
-    for raw, offset, mark, weight in zip(*columns, strict=True):
+    columns = table.parent, offsets, table.texts("type", "none"), table.texts(name)
+    records: dict[int, list[tuple[float, str, str]]] = {}
+    for raw, offset, mark, attribute in zip(*columns, strict=True):
         if np.isfinite(offset):
-            bold = weight.strip().lower() == "bold" and mark.strip().lower() != "none"
-            records.setdefault(int(raw), []).append((offset, bold))
+            record = (offset, mark.strip().lower(), attribute.strip().lower())
+            records.setdefault(raw, []).append(record)
+    return records
+
+
+def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:
+    """Return the parts of lanes with a ``bold`` (broad) marking at their border."""
     names = zip(lanes.section.tolist(), lanes.ident.tolist(), strict=True)
     row_of = {name: row for row, name in enumerate(names)}
     rows: list[tuple[int, bool, float, float]] = []
-    for raw, marks in records.items():
+    for raw, records in _records(document, "weight").items():
+        marks = sorted((at, weight == "bold" and mark != "none") for at, mark, weight in records)
         own, centre = int(lanes.row[raw]), int(lanes.centre[raw])
         section = centre if own < 0 else int(lanes.section[own])
         ident = 0 if own < 0 else int(lanes.ident[own])
@@ -138,8 +136,8 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
         beside = [(own, False)] * (own >= 0)
         beside += [(row_of[section, one], True) for one in outer if (section, one) in row_of]
         start, end = float(lanes.sections.start[section]), float(lanes.sections.end[section])
-        cuts = [min(max(start + offset, start), end) for offset, _ in sorted(marks)] + [end]
-        for (_, bold), first, last in zip(sorted(marks), cuts, cuts[1:], strict=False):
+        cuts = [min(max(start + offset, start), end) for offset, _ in marks] + [end]
+        for (_, bold), first, last in zip(marks, cuts, cuts[1:], strict=False):
             for row, inner in beside if bold and last > first else ():
                 # Inside is left for a lane on the right of its road's direction.
                 left = inner == ((lanes.ident[row] < 0) == lanes.forward[row])

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sgstore.base.tables import spread
+
 if TYPE_CHECKING:
     from sgstore.model.world import Floats, Ints
 
@@ -21,8 +23,7 @@ def ragged(counts: Ints) -> tuple[Ints, Ints]:
     >>> ragged(np.array([2, 0, 3]))
     (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))
     """
-    group = np.repeat(np.arange(len(counts)), counts)
-    return group, np.arange(len(group)) - starts_of(counts)[group]
+    return spread(np.zeros_like(counts), counts)
 
 
 def last_before(group: Ints, at: Floats, asked_group: Ints, asked_at: Floats) -> Ints:

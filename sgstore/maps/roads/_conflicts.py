@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import shapely
 
+from sgstore.base.tables import spread
 from sgstore.errors import MapError
 from sgstore.maps.roads._map import STOREY
 from sgstore.maps.roads._ribbons import Ribbons, centre_lines, wrapped
@@ -71,8 +72,7 @@ def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
     if later.sum() > MOST_PAIRS:
         reason = f"{later.sum():,} pairs of lanes in junctions; there may be {MOST_PAIRS:,}"
         raise MapError(reason, element="junction")
-    first = np.repeat(np.arange(len(lanes)), later)
-    second = first + 1 + np.arange(len(first)) - (np.cumsum(later) - later)[first]
+    first, second = spread(np.arange(len(lanes)) + 1, later)
     return lanes[first], lanes[second]
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base.tables import taken
+from sgstore.base.tables import begins, spread, taken
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -86,8 +86,7 @@ class LaneCourses:
         wanted = np.clip(np.rint(lengths / STRETCH), 1, _MOST)
         wanted = np.maximum(wanted // max(wanted.sum() / _MOST_IN_ALL, 1), 1)
         counts = np.where(lengths > 0, wanted, 0).astype(np.int64)
-        lane = np.repeat(np.arange(len(ribbons)), counts)
-        number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
+        lane, number = spread(np.zeros_like(counts), counts)
         step = lengths[lane] / counts[lane]
         start, end = number * step, (number + 1) * step
         # A stretch ends where the next one begins: the places are all starts, and the end of each lane.
@@ -111,10 +110,7 @@ def _joined(every: LaneCourses) -> LaneCourses:
     """Join consecutive lane intervals that have the same curvature and slope."""
     if not len(every):
         return every
-    slope = np.nan_to_num(every.slope)
-    change = np.flatnonzero(
-        (np.diff(every.lane) != 0) | (np.diff(every.curvature) != 0) | (np.diff(slope) != 0)
-    )
-    first, last = np.append(0, change + 1), np.append(change, len(every) - 1)
+    first = np.flatnonzero(begins(every.lane, every.curvature, np.nan_to_num(every.slope)))
+    last = np.append(first[1:] - 1, len(every) - 1)
     found = taken(every, first)
     return LaneCourses(found.lane, found.start, every.end[last], found.curvature, found.slope)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.base.numba_loops import worth
-from sgstore.base.tables import chained
+from sgstore.base.tables import chained, spread
 from sgstore.maps.roads._ribbons import Ribbons, wrapped
 
 if TYPE_CHECKING:
@@ -180,8 +180,7 @@ class _Grid:
         held = np.flatnonzero(self.keys[place] == key)
         row, x, y, place = row[held], x[held], y[held], place[held]
         sizes = self.begin[place + 1] - self.begin[place]
-        cell = np.repeat(np.arange(len(place)), sizes)
-        at = np.arange(len(cell)) + (self.begin[place] - np.cumsum(sizes) + sizes)[cell]
+        cell, at = spread(self.begin[place], sizes)
         quad = self.quad[at]
         # In the first cell of the rectangle all quadrangles count; in the others only those that
         # begin there.
@@ -196,8 +195,7 @@ def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
     """List the cells in rectangles of a grid, as pairs (rectangle, cell)."""
     spans = np.maximum(last - first + 1, 0)
     sizes = spans[0] * spans[1]
-    row = np.repeat(np.arange(len(sizes)), sizes)
-    number = np.arange(len(row)) - (np.cumsum(sizes) - sizes)[row]
+    row, number = spread(np.zeros_like(sizes), sizes)
     x, y = np.divmod(number, np.maximum(spans[1], 1)[row])
     return row, first[0][row] + x, first[1][row] + y
 

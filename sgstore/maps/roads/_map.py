@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sgstore.base.tables import taken
+from sgstore.base.tables import spread, taken
 from sgstore.maps.roads._courses import LaneCourses
 from sgstore.maps.roads._footprints import LaneIndex
 from sgstore.maps.roads._places import (
@@ -60,10 +60,8 @@ def _downstream(
         best = np.full((len(lanes), len(lengths)), np.inf)
         source, at, distance = np.arange(len(lanes)), lanes, np.zeros(len(lanes))
         while len(source):
-            counts = first[at + 1] - first[at]
-            of = np.repeat(np.arange(len(at)), counts)
-            number = np.arange(len(of)) - (np.cumsum(counts) - counts)[of]
-            source, at, distance = source[of], onward[first[at[of]] + number], distance[of]
+            of, place = spread(first[at], first[at + 1] - first[at])
+            source, at, distance = source[of], onward[place], distance[of]
             better = np.flatnonzero((distance <= limit) & (distance < best[source, at]))
             source, at, distance = source[better], at[better], distance[better]
             np.minimum.at(best, (source, at), distance)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from sgstore.base.tables import chained
+from sgstore.base.tables import chained, spread
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -237,8 +237,7 @@ def waypoints(ribbons: Ribbons, spacing: float) -> LanePoints:
     if not spacing > 0:
         raise ValueError(f"spacing is {spacing}; expected a length above 0, in metres")
     counts = np.floor(ribbons.lengths / spacing + 1e-9).astype(np.int64) + 1
-    lane = np.repeat(np.arange(len(ribbons)), counts)
-    number = np.arange(len(lane)) - (np.cumsum(counts) - counts)[lane]
+    lane, number = spread(np.zeros_like(counts), counts)
     return ribbons.at(lane, number.astype(np.float64) * spacing)
 
 

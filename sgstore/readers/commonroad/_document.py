@@ -239,7 +239,7 @@ class _Reader:
         self._open: list[_Node] = []
         self._part = 0
 
-    def start(self, tag: str, attributes: dict[str, str]) -> None:
+    def start(self, tag: str, attributes: dict[str, str], _depth: int) -> None:
         """Handle the start tag of an XML element."""
         self._part += 1
         if self._part > MAX_PART:
@@ -253,7 +253,7 @@ class _Reader:
             self._part = 1
         self._open.append(node)
 
-    def end(self, _tag: str) -> None:
+    def end(self) -> None:
         """Handle the end tag of an XML element."""
         node = self._open.pop()
         if len(self._open) == 1:

@@ -65,8 +65,8 @@ class LightStates:
     def __init__(self, path: Path) -> None:
         self._times: dict[str, list[int]] = {}
         self._states: dict[str, list[str]] = {}
-        self._changes = self._depth = 0
-        parser = MarkupParser(self._start, self._end, most=None, whose="recordings")
+        self._changes = 0
+        parser = MarkupParser(self._start, most=None, whose="recordings")
         try:
             with opened(path) as file:
                 while piece := file.read(_PIECE):
@@ -75,9 +75,8 @@ class LightStates:
         except (MarkupError, OSError, EOFError, zlib.error) as error:
             raise TraceError(f"states of lights cannot be read: {error}", path=path) from error
 
-    def _start(self, tag: str, told: dict[str, str]) -> None:
-        self._depth += 1
-        if self._depth == 1 and tag != "tlsStates":
+    def _start(self, tag: str, told: dict[str, str], depth: int) -> None:
+        if depth == 1 and tag != "tlsStates":
             raise MarkupError(f"the root element is <{tag[:80]}>, expected <tlsStates>")
         if tag != "tlsState":
             return
@@ -93,9 +92,6 @@ class LightStates:
             raise MarkupError(f"more than {MAX_CHANGES:,} changes of state")
         times.append(max(round(time * 1e9), times[-1] if times else 0))
         known.append(state)
-
-    def _end(self, _tag: str) -> None:
-        self._depth -= 1
 
     def of(self, signal: str, time_ns: int) -> str | None:
         """Return the state of a traffic light (map signal) at a time; ``None`` means unknown."""

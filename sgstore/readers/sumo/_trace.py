@@ -108,7 +108,7 @@ class SumoTrace(FramesTrace):
         frame = Frame(message.log_time_ns if time is None else time)
         step = _TimeStep(frame, self._owners)
         try:
-            parser = MarkupParser(step.start, step.end, most=MAX_ENTITIES, whose="recordings")
+            parser = MarkupParser(step.start, most=MAX_ENTITIES, whose="recordings")
             parser.feed(message.data, last=True)
         except MarkupError as error:
             raise ValueError(str(error)) from error
@@ -138,7 +138,7 @@ class _TimeStep:
         self._frame, self._owners = frame, owners
         self._idents: set[str] = set()
 
-    def start(self, tag: str, told: dict[str, str]) -> None:
+    def start(self, tag: str, told: dict[str, str], _depth: int) -> None:
         """Handle the start tag of an XML element."""
         if tag not in {"vehicle", "person", "container"} or "x" not in told:
             return
@@ -183,9 +183,6 @@ class _TimeStep:
             subkind=meaning.subkind,
             type_name=type_name,
         )
-
-    def end(self, _tag: str) -> None:
-        """Handle the end tag of an XML element."""
 
 
 def _lights(told: dict[str, str]) -> list[str] | None:
