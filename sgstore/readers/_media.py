@@ -43,7 +43,7 @@ from sgstore.mcap import (
 )
 from sgstore.readers._registry import open_recording, read_message
 from sgstore.readers._ros2 import decode, parse_definition
-from sgstore.readers.osi._schema import DECODE_ERRORS, SENSOR_VIEW, message_class
+from sgstore.readers.osi._schema import DECODE_ERRORS, SENSOR_VIEW, fields_read, message_class
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -165,7 +165,7 @@ def record_reader(
             return lambda message: decode(kind, message)
         if encoding == "protobuf" and schema:
             view = schema.name == SENSOR_VIEW
-            made = message_class(schema, _CAMERA_FIELDS if view else None)
+            made = message_class(schema, fields_read()["cameras"] if view else None)
             return partial(_of_sensor_view if view else _of_protobuf, made)
     except TraceError:  # The schema is unreadable, so its messages are unknown.
         return lambda _message: None
@@ -234,19 +234,6 @@ def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[b
 #
 # Source: open-simulation-interface 3.8.0 (osi_sensorview.proto, osi_sensorviewconfiguration.proto).
 
-_CAMERA_FIELDS: Final[dict[str, Any]] = {
-    "camera_sensor_view": {
-        "view_configuration": dict.fromkeys(
-            (
-                "number_of_pixels_horizontal",
-                "number_of_pixels_vertical",
-                "channel_format",
-                "pixel_order",
-            )
-        ),
-        "image_data": None,
-    }
-}
 _PIXELS: Final = {
     "CHANNEL_FORMAT_MONO_U8_LIN": (1, "u1"),
     "CHANNEL_FORMAT_MONO_U16_LIN": (1, "<u2"),

@@ -44,6 +44,7 @@ from sgstore.readers.osi._schema import (
     DECODE_ERRORS,
     SENSOR_VIEW,
     enum_name,
+    fields_read,
     ground_truth_of,
     has_field,
     identifiers,
@@ -64,56 +65,6 @@ FIELDS: Final = ("lane", "lane_boundary", "logical_lane", "logical_lane_boundary
 OWN: Final = "osi:"
 """Prefix of the OSI id of a light or sign without a map reference, as its name in the map."""
 
-_PLACE: Final = dict.fromkeys(("x", "y", "z"))
-_ID: Final = {"value": None}
-_REFERENCES: Final = {"type": None, "identifier": None}
-_RELATION: Final = {"other_lane_id": _ID}
-_CONNECTION: Final = {"other_lane_id": _ID, "at_begin_of_other_lane": None}
-_GROUND_TRUTH: Final[dict[str, Any]] = {
-    "map_reference": None,
-    "lane": {
-        "id": _ID,
-        "source_reference": _REFERENCES,
-        "classification": {
-            "type": None,
-            "subtype": None,
-            "centerline": _PLACE,
-            "centerline_is_driving_direction": None,
-            "left_adjacent_lane_id": _ID,
-            "right_adjacent_lane_id": _ID,
-            "left_lane_boundary_id": _ID,
-            "right_lane_boundary_id": _ID,
-            "lane_pairing": {"antecessor_lane_id": _ID, "successor_lane_id": _ID},
-        },
-    },
-    "lane_boundary": {
-        "id": _ID,
-        "boundary_line": {"position": _PLACE},
-        "classification": {"type": None},
-    },
-    "logical_lane": {
-        "id": _ID,
-        "type": None,
-        "source_reference": _REFERENCES,
-        "physical_lane_reference": {"physical_lane_id": _ID},
-        "start_s": None,
-        "end_s": None,
-        "move_direction": None,
-        "left_adjacent_lane": _RELATION,
-        "right_adjacent_lane": _RELATION,
-        "left_boundary_id": _ID,
-        "right_boundary_id": _ID,
-        "predecessor_lane": _CONNECTION,
-        "successor_lane": _CONNECTION,
-    },
-    "logical_lane_boundary": {
-        "id": _ID,
-        "boundary_line": {"position": _PLACE, "s_position": None},
-        "physical_boundary_id": _ID,
-        "passing_rule": None,
-    },
-}
-_SENSOR_VIEW: Final = {"global_ground_truth": _GROUND_TRUTH}
 _MAY_LACK: Final = {"subtype", "source_reference", "physical_lane_reference"}
 """Optional fields of a lane, missing in older versions of OSI."""
 
@@ -193,13 +144,13 @@ class OsiLanes:
     """
 
     def __init__(self, schema: Schema) -> None:
-        fields = _SENSOR_VIEW if schema.name == SENSOR_VIEW else _GROUND_TRUTH
-        self._class = message_class(schema, fields)
-        prefix = "global_ground_truth." if schema.name == SENSOR_VIEW else ""
+        fields, in_view = fields_read()["lanes"], schema.name == SENSOR_VIEW
+        self._class = message_class(schema, {"global_ground_truth": fields} if in_view else fields)
+        prefix = "global_ground_truth." if in_view else ""
         self._lacks = {
             name: [
                 path
-                for path in _paths(_GROUND_TRUTH[name])
+                for path in _paths(fields[name])
                 if not has_field(self._class, f"{prefix}{name}.{path}")
             ]
             for name in FIELDS

@@ -45,101 +45,23 @@ SMALL: Final = 64 << 10
 OPAQUE: Final = "opaque"
 """Mark of a message field that is read as bytes, one item per message."""
 
-_VECTOR: Final = dict.fromkeys(("x", "y", "z"))
-_ANGLES: Final = dict.fromkeys(("roll", "pitch", "yaw"))
-_EXTENTS: Final = dict.fromkeys(("length", "width", "height"))
-_ID: Final = {"id": {"value": None}}
-_ASSIGNED: Final = {
-    "assigned_lane_id": {"value": None},
-    "logical_lane_assignment": {"assigned_lane_id": {"value": None}},
-}
-_REFERENCES: Final = {"source_reference": {"type": None, "identifier": None}}
-_STATIC_BASE: Final = {"dimension": _EXTENTS, "position": _VECTOR, "orientation": _ANGLES}
-_LIGHT_STATE: Final = dict.fromkeys(
-    (
-        "indicator_state",
-        "front_fog_light",
-        "rear_fog_light",
-        "head_light",
-        "high_beam",
-        "reversing_light",
-        "brake_light_state",
-        "emergency_vehicle_illumination",
-        "service_vehicle_illumination",
-    )
-)
-_TIME: Final = {"seconds": None, "nanos": None}
 
-MOVING_OBJECT_FIELDS: Final[dict[str, Any]] = {
-    **_ID,
-    "base": {
-        **_STATIC_BASE,
-        "velocity": _VECTOR,
-        "acceleration": _VECTOR,
-        "orientation_rate": _ANGLES,
-    },
-    "type": None,
-    "vehicle_classification": {"type": None, "light_state": _LIGHT_STATE, "role": None},
-    **_REFERENCES,
-}
-"""Used fields of ``osi3.MovingObject``."""
+@cache
+def fields_read() -> dict[str, dict[str, Any]]:
+    """Return the tables of ``osi_fields.toml``: the fields that are read, with the fields of their messages.
 
-TRAFFIC_LIGHT_FIELDS: Final[dict[str, Any]] = {
-    **_ID,
-    "base": _STATIC_BASE,
-    "classification": {
-        **dict.fromkeys(("color", "icon", "mode", "is_out_of_service")),
-        **_ASSIGNED,
-    },
-    **_REFERENCES,
-}
-"""Used fields of ``osi3.TrafficLight``."""
+    ``None`` means all fields, and :data:`OPAQUE` a message that is read as bytes.
+    """
+    text = resources.files("sgstore.readers").joinpath("osi_fields.toml").read_text("utf-8")
+    return _fields_in(tomllib.loads(text))
 
-GROUND_TRUTH_FIELDS: Final[dict[str, Any]] = {
-    "timestamp": _TIME,
-    "host_vehicle_id": {"value": None},
-    "moving_object": OPAQUE,
-    "stationary_object": {
-        **_ID,
-        "base": _STATIC_BASE,
-        "classification": {"type": None},
-        **_REFERENCES,
-    },
-    "traffic_sign": {
-        **_ID,
-        "main_sign": {
-            "base": _STATIC_BASE,
-            "classification": {
-                "type": None,
-                "value": {"value": None, "value_unit": None},
-                **_ASSIGNED,
-            },
-        },
-        **_REFERENCES,
-    },
-    "traffic_light": OPAQUE,
-    "environmental_conditions": OPAQUE,
-    "road_marking": _ID,
-    "lane_boundary": _ID,
-    "lane": _ID,
-    "reference_line": _ID,
-    "logical_lane_boundary": _ID,
-    "logical_lane": _ID,
-}
-"""Used fields of ``osi3.GroundTruth`` and their fields. ``None``: all fields; :data:`OPAQUE`: as bytes."""
 
-HOST_DATA_FIELDS: Final[dict[str, Any]] = {
-    "host_vehicle_id": {"value": None},
-    "vehicle_powertrain": {"pedal_position_acceleration": None, "gear_transmission": None},
-    "vehicle_brake_system": {"pedal_position_brake": None},
-}
-
-SENSOR_VIEW_FIELDS: Final[dict[str, Any]] = {
-    "timestamp": _TIME,
-    "host_vehicle_id": {"value": None},
-    "host_vehicle_data": HOST_DATA_FIELDS,
-    "global_ground_truth": GROUND_TRUTH_FIELDS,
-}
+def _fields_in(told: Any) -> Any:
+    if isinstance(told, dict):
+        return {name: _fields_in(part) for name, part in told.items()}
+    if isinstance(told, list):
+        return dict.fromkeys(told)
+    return told if told == OPAQUE else None
 
 
 def prune(
@@ -404,7 +326,9 @@ LATEST_NS: Final = 1 << 62
 _GROUND_TRUTH_NEEDS: Final = ("timestamp.seconds", "moving_object")
 _STATIC_NEEDS: Final = (
     "id.value",
-    *(f"base.{part}.{name}" for part, names in _STATIC_BASE.items() for name in names),
+    *(f"base.dimension.{name}" for name in ("length", "width", "height")),
+    *(f"base.position.{name}" for name in "xyz"),
+    *(f"base.orientation.{name}" for name in ("roll", "pitch", "yaw")),
 )
 _MOVING_OBJECT_NEEDS: Final = (
     *_STATIC_NEEDS,
@@ -418,10 +342,12 @@ _PART_NEEDS: Final = {
     ),
     CONDITIONS: (),
 }
-_FIELDS: Final = {
-    GROUND_TRUTH: GROUND_TRUTH_FIELDS,
-    SENSOR_VIEW: SENSOR_VIEW_FIELDS,
-    HOST_DATA: HOST_DATA_FIELDS,
+_NEEDS: Final = {
+    TRAFFIC_LIGHT: (
+        *_STATIC_NEEDS,
+        *(f"classification.{name}" for name in ("color", "icon", "mode")),
+    ),
+    CONDITIONS: (),
 }
 _NEEDS: Final = {
     GROUND_TRUTH: _GROUND_TRUTH_NEEDS,
@@ -451,9 +377,9 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
         raise TraceError(f"{reason}; at most {MAX_DESCRIPTORS} are read")
     try:
         files = list(descriptor_pb2.FileDescriptorSet.FromString(schema.data).file)
-        wanted = _FIELDS.get(schema.name) if fields is None else fields
+        wanted = _fields_of_frames(schema.name) if fields is None else fields
         if wanted is not None:
-            parts = {MOVING_OBJECT: MOVING_OBJECT_FIELDS, TRAFFIC_LIGHT: TRAFFIC_LIGHT_FIELDS}
+            parts = {name: fields_read()[_short(name)] for name in (MOVING_OBJECT, TRAFFIC_LIGHT)}
             prune(files, parts | {schema.name: wanted})
         pool = descriptor_pool.DescriptorPool()
         _add(pool, {file.name: file for file in files})
@@ -463,6 +389,19 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
     except DECODE_ERRORS as error:
         reason = f"schema {schema.name}: its protobuf descriptors are malformed: {error}"
         raise TraceError(reason) from error
+
+
+def _fields_of_frames(name: str) -> dict[str, Any] | None:
+    """Return the fields of a message type that frames need; ``None`` means all fields."""
+    if name not in {GROUND_TRUTH, SENSOR_VIEW, HOST_DATA}:
+        return None
+    inner = {"host_vehicle_data": HOST_DATA, "global_ground_truth": GROUND_TRUTH}
+    more = {field: fields_read()[_short(of)] for field, of in inner.items()}
+    return fields_read()[_short(name)] | (more if name == SENSOR_VIEW else {})
+
+
+def _short(name: str) -> str:
+    return name.rpartition(".")[2]
 
 
 def _add(
