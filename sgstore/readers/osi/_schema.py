@@ -53,15 +53,16 @@ def fields_read() -> dict[str, dict[str, Any]]:
     ``None`` means all fields, and :data:`OPAQUE` a message that is read as bytes.
     """
     text = resources.files("sgstore.readers").joinpath("osi_fields.toml").read_text("utf-8")
-    return _fields_in(tomllib.loads(text))
+    tables = tomllib.loads(text)
 
+    def fields_in(told: Any) -> Any:
+        if isinstance(told, str) and told != OPAQUE:
+            return fields_in(tables[told])
+        if isinstance(told, dict):
+            return {name: fields_in(part) for name, part in told.items()}
+        return dict.fromkeys(told) if isinstance(told, list) else told if told == OPAQUE else None
 
-def _fields_in(told: Any) -> Any:
-    if isinstance(told, dict):
-        return {name: _fields_in(part) for name, part in told.items()}
-    if isinstance(told, list):
-        return dict.fromkeys(told)
-    return told if told == OPAQUE else None
+    return fields_in(tables)
 
 
 def prune(
@@ -377,9 +378,9 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
         raise TraceError(f"{reason}; at most {MAX_DESCRIPTORS} are read")
     try:
         files = list(descriptor_pb2.FileDescriptorSet.FromString(schema.data).file)
-        wanted = _fields_of_frames(schema.name) if fields is None else fields
+        wanted = fields_read().get(schema.name) if fields is None else fields
         if wanted is not None:
-            parts = {name: fields_read()[_short(name)] for name in (MOVING_OBJECT, TRAFFIC_LIGHT)}
+            parts = {name: fields_read()[name] for name in (MOVING_OBJECT, TRAFFIC_LIGHT)}
             prune(files, parts | {schema.name: wanted})
         pool = descriptor_pool.DescriptorPool()
         _add(pool, {file.name: file for file in files})
@@ -389,19 +390,6 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
     except DECODE_ERRORS as error:
         reason = f"schema {schema.name}: its protobuf descriptors are malformed: {error}"
         raise TraceError(reason) from error
-
-
-def _fields_of_frames(name: str) -> dict[str, Any] | None:
-    """Return the fields of a message type that frames need; ``None`` means all fields."""
-    if name not in {GROUND_TRUTH, SENSOR_VIEW, HOST_DATA}:
-        return None
-    inner = {"host_vehicle_data": HOST_DATA, "global_ground_truth": GROUND_TRUTH}
-    more = {field: fields_read()[_short(of)] for field, of in inner.items()}
-    return fields_read()[_short(name)] | (more if name == SENSOR_VIEW else {})
-
-
-def _short(name: str) -> str:
-    return name.rpartition(".")[2]
 
 
 def _add(
