@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.model.vocabulary import LIGHT_STATE_CODE, VEHICLE_LIGHTS, TypeMeaning
+from sgstore.model.vocabulary import LIGHT_STATE_CODE, VEHICLE_LIGHTS, TypeMeaning, type_meanings
 from sgstore.model.world import POSE
 from sgstore.readers._base import SurveyedDecoder, SurveyedTrace, light_places
 from sgstore.readers._blocks import FAR, NAN, FrameRows
@@ -60,14 +60,6 @@ if TYPE_CHECKING:
     from sgstore.mcap import Messages, Recording
     from sgstore.model.world import Bools, Floats, Ints, TraceReport
     from sgstore.readers._blocks import Called
-
-_KINDS: Final = {
-    "pedestrian": TypeMeaning("person"),
-    **{one: TypeMeaning(one) for one in ("car", "truck", "bus", "trailer", "motorcycle")},
-    **{one: TypeMeaning(one) for one in ("bicycle", "animal")},
-    **{one: TypeMeaning("prop", "", one) for one in ("hazard", "over_drivable", "under_drivable")},
-}
-"""Class of an object → its meaning."""
 
 SAMPLE_VEHICLE: Final = Ego(
     type="sample_vehicle", length=4.89, width=1.896, height=2.5, offset=(1.345, 0.0, 1.25)
@@ -374,7 +366,8 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return self._nodes[ident]
 
     def _meaning(self, label: str) -> TypeMeaning:
-        return self._types.get(label) or _KINDS.get(label) or TypeMeaning("unknown")
+        known = self._types.get(label) or type_meanings().get(f"autoware_{label}")
+        return known or TypeMeaning("unknown")
 
     def _state_now(self, node: int, stamp: int) -> int:
         told, state = self._shown[node]

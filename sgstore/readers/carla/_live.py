@@ -34,7 +34,7 @@ import numpy as np
 from sgstore.errors import ConfigError, MissingExtraError, TraceError
 from sgstore.graphs.online import Frame
 from sgstore.maps.opendrive import read_map
-from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, SIGNALS, VEHICLES
+from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, SIGNALS, VEHICLES, type_meanings
 from sgstore.readers.carla._signals import AtOnce, Light, light_state, shared_signals, signals_of
 from sgstore.readers.carla._survey import EGO_ROLES, meaning_of
 
@@ -50,30 +50,6 @@ if TYPE_CHECKING:
 
 ENTITIES: Final = ("vehicle.", "walker.", "traffic.", "static.")
 """Prefixes of actor types that are entities. Others are sensors, controllers and the spectator."""
-
-SCENERY: Final[Mapping[str, tuple[str, str]]] = {
-    "Buildings": ("building", ""),
-    "Bridge": ("building", "bridge"),
-    "Fences": ("barrier", "fence"),
-    "Walls": ("barrier", "wall"),
-    "GuardRail": ("barrier", "guard_rail"),
-    "Poles": ("pole", ""),
-    "Vegetation": ("vegetation", ""),
-    "TrafficSigns": ("sign", ""),
-    "Static": ("prop", ""),
-    "Dynamic": ("prop", ""),
-    "Other": ("prop", ""),
-    "Car": ("car", ""),
-    "Truck": ("truck", ""),
-    "Bus": ("bus", ""),
-    "Train": ("train", ""),
-    "Vehicles": ("vehicle", ""),
-    "Motorcycle": ("motorcycle", ""),
-    "Bicycle": ("bicycle", ""),
-    "Pedestrians": ("person", ""),
-}
-"""``CityObjectLabel`` of an environment object → kind and subkind. Missing labels are ground, sky, water and
-road markings, or traffic lights, which are also actors."""
 
 MOVING: Final = (*VEHICLES, "person", "animal")
 """Kinds that can move. A parked car of the level therefore has a state in every frame."""
@@ -356,9 +332,10 @@ class LiveWorld:
         found: list[tuple[str, str, tuple[float, float, float], dict[str, Any]]] = []
         for thing in self.world.get_environment_objects():
             label = str(thing.type)
-            if label not in SCENERY:
+            meaning = type_meanings().get(f"level_{label}".lower())
+            if meaning is None:
                 continue
-            kind, subkind = SCENERY[label]
+            kind, subkind = meaning.kind, meaning.subkind
             box, half = thing.bounding_box, thing.bounding_box.extent
             place = (box.location.x, 0.0 - box.location.y, box.location.z)
             more: dict[str, Any] = {

@@ -235,22 +235,11 @@ CONTENTS: Final = {
 LASTING: Final = frozenset({ACTORS, LIGHT_PLACES, LIGHT_STATES, WORLD, VEHICLE})
 """Content types with lasting facts, valid until the next message."""
 
-FOR_FRAMES: Final = frozenset(
-    {
-        OBJECTS,
-        LIGHT_STATES,
-        STATUS,
-        COMMANDS,
-        ODOMETRY,
-        COLLISION,
-        LANE_INVASION,
-        VEHICLE_LIGHTS,
-    }
-)
-"""Content types that are read with the frames."""
-
 OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISION, LANE_INVASION})
 """Content types that the bridge publishes under the role name of a vehicle."""
+
+FOR_FRAMES: Final = (OF_ONE_VEHICLE - {VEHICLE}) | {OBJECTS, LIGHT_STATES, VEHICLE_LIGHTS}
+"""Content types that are read with the frames."""
 
 NEVER: Final = -(1 << 62)
 """Time value for missing messages; ns."""

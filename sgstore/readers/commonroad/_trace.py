@@ -12,32 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.graphs.online import Frame
 from sgstore.maps.roads import OF_LANES
+from sgstore.model.vocabulary import TypeMeaning, type_meanings
 from sgstore.readers._base import FramesTrace, TraceMessage
 from sgstore.readers.commonroad._file import MAP, NAME, STEP
 
 if TYPE_CHECKING:
     from sgstore.mcap import Recording
     from sgstore.model.world import Channel
-
-_KINDS: Final[dict[str, dict[str, str]]] = {
-    "car": {"kind": "car"},
-    "truck": {"kind": "truck"},
-    "bus": {"kind": "bus"},
-    "motorcycle": {"kind": "motorcycle"},
-    "bicycle": {"kind": "bicycle"},
-    "pedestrian": {"kind": "person"},
-    "train": {"kind": "train"},
-    "taxi": {"kind": "car", "special": "taxi"},
-    "priorityVehicle": {"kind": "vehicle", "special": "emergency"},
-    "parkedVehicle": {"kind": "vehicle", "subkind": "parked"},
-    "constructionZone": {"kind": "prop", "subkind": "construction"},
-    "roadBoundary": {"kind": "barrier", "subkind": "road_boundary"},
-    "medianStrip": {"kind": "barrier", "subkind": "median_strip"},
-    "median_strip": {"kind": "barrier", "subkind": "median_strip"},
-    "building": {"kind": "building"},
-    "pillar": {"kind": "pole", "subkind": "pillar"},
-}
-"""Type of an obstacle → kind; others are ``unknown``."""
 
 _STATES: Final = {
     "red": "red",
@@ -92,7 +73,8 @@ class CommonRoadTrace(FramesTrace):
 
 
 def _add(frame: Frame, one: dict[str, Any], **more: Any) -> None:
-    kind: dict[str, Any] = _KINDS.get(one["type"], {"kind": "unknown"})
+    meaning = type_meanings().get(f"commonroad_{one['type']}".lower(), TypeMeaning("unknown"))
     numbers = {name: one[name] for name in _POSE if name in one}
     numbers |= {name: math.degrees(one[name]) for name in ("heading", "yaw_rate") if name in one}
-    frame.add(one["id"], **kind, type_name=one["type"], **numbers, **more)
+    about = {"special": meaning.special, "subkind": meaning.subkind, "type_name": one["type"]}
+    frame.add(one["id"], meaning.kind, **about, **numbers, **more)
