@@ -507,7 +507,7 @@ class Records:
     def stand(self, known: EntityConstants, states: States, row: int) -> None:
         """Store the attributes of a static object, because its pose is given only once."""
         numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
-        numbers["heading"] = _degrees(states.heading[row : row + 1])[0]
+        numbers["heading"] = float(np.degrees(wrapped(states.heading[row])))
         about = known.attributes(is_ego=False, is_static=True)
         self._standing[known.node] = about | _numbers(numbers) | _STILL
 
@@ -664,11 +664,6 @@ def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attribut
 def _outward(nodes: Whole, outer: Ints) -> Ints:
     """Convert node ids of a block to the node ids of the returned scene graphs."""
     return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
-
-
-def _degrees(heading: Floats) -> list[float]:
-    """Convert headings from radians to degrees, in (-180, 180]."""
-    return np.degrees(wrapped(heading)).tolist()
 
 
 def _numbers(values: dict[str, float]) -> Attributes:

@@ -403,7 +403,7 @@ class TimeOrder:
         if len(messages) != count:
             raise TraceError("the file was changed while it was read", offset=place)
         self._cache[number] = messages
-        while len(self._cache) > 1 and self._cached() > CACHED:
+        while len(self._cache) > 1 and sum(map(self._memory, self._cache)) > CACHED:
             self._cache.popitem(last=False)
         if self._memory(number) > CACHED:
             self._cache.clear()
@@ -415,9 +415,6 @@ class TimeOrder:
     def _memory(self, number: int) -> int:
         """Return the memory needed for the messages of a group; bytes."""
         return self._bytes[number] + COLUMN_BYTES * self._count(number)
-
-    def _cached(self) -> int:
-        return sum(map(self._memory, self._cache))
 
     def _fetch(self, place: int, offset: int, length: int) -> memoryview:
         """Return the bytes of a message without a copy."""

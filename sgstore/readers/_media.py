@@ -379,36 +379,21 @@ _Row = tuple[int, int, int, "Callable[[], bytes]"]
 """Log time; offset of the chunk or, outside chunks, of the message; offset; data. Sorted by the first three."""
 
 
-@dataclass(frozen=True, slots=True)
-class _FilmSource:
-    """Part of a file with video messages: one chunk, or all messages outside chunks.
+def _rows(path: Path, base: int, channel: int, chunk: int) -> list[_Row]:
+    """Return time and position of each video message in a chunk of a file, or outside chunks (-1).
 
-    ``base``: position of the file in its bag. ``chunk``: byte offset, -1 outside chunks. ``end_ns``: maximum
-    log time of the messages.
+    ``base`` is the position of the file in its bag.
     """
-
-    path: Path
-    base: int
-    channel: int
-    chunk: int
-    end_ns: int
-
-    def rows(self) -> list[_Row]:
-        """Return time and position of each video message in this part of the file."""
-        if self.chunk < 0:
-            return _outside_chunks(self.path, self.channel, self.base)
-        with open_regular(self.path) as file:
-            records = read_records(file, read_chunk_head(file, self.chunk))
-        messages, _ = parse_records(records, self.chunk)
-        return [
-            (
-                int(messages.log_time_ns[row]),
-                self.base + self.chunk,
-                int(messages.offset[row]),
-                partial(_copied, messages, row),
-            )
-            for row in np.flatnonzero(messages.channel == self.channel).tolist()
-        ]
+    if chunk < 0:
+        return _outside_chunks(path, channel, base)
+    with open_regular(path) as file:
+        records = read_records(file, read_chunk_head(file, chunk))
+    messages, _ = parse_records(records, chunk)
+    columns = messages.log_time_ns.tolist(), messages.offset.tolist()
+    return [
+        (columns[0][row], base + chunk, columns[1][row], partial(_copied, messages, row))
+        for row in np.flatnonzero(messages.channel == channel).tolist()
+    ]
 
 
 def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterator[bytes]:
@@ -417,24 +402,25 @@ def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterato
     at = chunk_offset if chunked else offset
     parts = [*_parts(path, channel)]
     own, base, number = next(one for one in reversed(parts) if one[1] <= at)
-    rows = _FilmSource(own, base, number, chunk_offset - base if chunked else -1, 0).rows()
+    rows = _rows(own, base, number, chunk_offset - base if chunked else -1)
     wanted = at, offset if chunked else offset - base
     last = next((row[:3] for row in rows if row[1:3] == wanted), None)
     if last is None:
         raise TraceError("the recording has changed", path=path, offset=at)
-    sources: list[_FilmSource] = []
+    sources: list[tuple[int, int, Callable[[], list[_Row]]]] = []
     for own, base, number in parts:
         spans = _chunks(own) if chunked else [(-1, 0, last[0])]
         sources += [
-            _FilmSource(own, base, number, chunk, min(end, last[0]))
+            (min(end, last[0]), base + chunk, partial(_rows, own, base, number, chunk))
             for chunk, start, end in spans
             if start <= last[0]
         ]
-    sources.sort(key=lambda source: (source.end_ns, source.base + source.chunk))
+    sources.sort(key=itemgetter(0, 1))
     waiting: list[_Row] = []
     while sources or waiting:
-        while sources and (not waiting or waiting[-1][0] <= sources[-1].end_ns):
-            waiting += (row for row in sources.pop().rows() if row[:3] < last)
+        while sources and (not waiting or waiting[-1][0] <= sources[-1][0]):
+            _, _, read = sources.pop()
+            waiting += (row for row in read() if row[:3] < last)
             waiting.sort(key=itemgetter(0, 1, 2))
         if waiting:
             yield waiting.pop()[3]()

@@ -135,11 +135,7 @@ class Hitches:
     ) -> Ints:
         """Return the carriers in a block of frames, without pairs that separate in the block."""
         states, frame = frames.states, frames.frame_of
-        count = len(self._seen)
-        key = frame * count + states.node
-        order = np.argsort(key, kind="stable")
-        one, place = joined(key[order], frame[rows] * count + carrier[rows])
-        a, b = rows[one], order[place]
+        a, b = _carried(frame, states.node, rows, carrier[rows])
         parted = gap(bodies(a).boxes, bodies(b).boxes) > APART
         for row in a[parted].tolist():
             node = states.node[row]
@@ -170,11 +166,17 @@ def _edges(scene: BlockScene) -> Edges:
     pulled = np.flatnonzero((bodies.carrier >= 0) & (bodies.kind != _PERSON))
     if not len(pulled):
         return edges_between(scene, "tows", pulled, pulled)
-    count = int(max(bodies.node.max(), bodies.carrier.max())) + 1
-    key = bodies.frame * count + bodies.node
+    pulled, pulling = _carried(bodies.frame, bodies.node, pulled, bodies.carrier[pulled])
+    return edges_between(scene, "tows", pulling, pulled)
+
+
+def _carried(frame: Ints, node: Ints, rows: Rows, carrier: Ints) -> tuple[Rows, Rows]:
+    """Return the rows of carried bodies and of their carriers in the same frame."""
+    count = int(max(node.max(), carrier.max())) + 1
+    key = frame * count + node
     order = np.argsort(key, kind="stable")
-    one, place = joined(key[order], bodies.frame[pulled] * count + bodies.carrier[pulled])
-    return edges_between(scene, "tows", order[place], pulled[one])
+    one, place = joined(key[order], frame[rows] * count + carrier)
+    return rows[one], order[place]
 
 
 TOWS = Relation(

@@ -254,7 +254,7 @@ class BodyPairs:
         levels = of.low_and_high
         if plain and all_level(*levels):
             return np.zeros(0, np.bool_)
-        return meet_as_bodies(of, *self._halves)
+        return solid_pairs(of, *self._halves) & on_one_level(of, *self._halves)
 
     @property
     def in_loops(self) -> bool:
@@ -345,11 +345,6 @@ def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
     away = np.hypot(bodies.x[b] - bodies.x[a], bodies.y[b] - bodies.y[a])
     level[rest] = np.abs(low[b] - low[a]) <= climb(away, bodies.pitch[a], bodies.pitch[b])
     return level
-
-
-def meet_as_bodies(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the pairs of solid objects on the same storey."""
-    return solid_pairs(bodies, a, b) & on_one_level(bodies, a, b)
 
 
 def solid_pairs(bodies: Bodies, a: Rows, b: Rows) -> Bools:

@@ -201,7 +201,9 @@ def _junctions(document: Document, network: Network) -> dict[tuple[str, str], li
     ways: dict[tuple[str, str], list[_Connection]] = defaultdict(list)
     junctions = document["junction"]
     links = _lane_pairs(document)
-    road_ends = _junction_ends(document)
+    road_ends: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for road, contact, name in junction_ends(document):
+        road_ends[name, document.road_ids[road]].append(contact)
     table = document["junction/connection"]
     for row, (parent, attributes) in enumerate(zip(table.parent, table.attributes, strict=True)):
         junction = junctions.attributes[parent].get("id", "")
@@ -232,15 +234,12 @@ def _lane_pairs(document: Document) -> dict[int, tuple[tuple[int, int], ...]]:
     return pairs
 
 
-def _junction_ends(document: Document) -> dict[tuple[str, str], list[str]]:
-    """Return the ends (start or end) of roads at junctions: (junction, road) → ends."""
-    ends: dict[tuple[str, str], list[str]] = defaultdict(list)
+def junction_ends(document: Document) -> Iterator[tuple[int, str, str]]:
+    """Yield the ends of roads at junctions: row of the road, start or end, and id of the junction."""
     for kind, contact in (("road/predecessor", START), ("road/successor", END)):
         for row, attributes in _road_links(document[kind]).items():
             if attributes.get("elementType") == "junction":
-                key = (attributes.get("elementId", ""), document.road_ids[row])
-                ends[key].append(contact)
-    return ends
+                yield row, contact, attributes.get("elementId", "")
 
 
 def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.maps.opendrive._network import junction_ends
 from sgstore.maps.opendrive._piecewise import last_before
 from sgstore.maps.roads import MapNodes, conflicts, turn_words
 from sgstore.model.vocabulary import DRIVING, TRAFFIC
@@ -195,11 +196,8 @@ def _roundabouts(document: Document) -> dict[str, set[str]]:
 def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
     """Yield pairs of row numbers: a road, and the roundabout that contains it."""
     ends: list[list[str]] = [[] for _ in range(len(document["road"]))]
-    for kind in ("road/predecessor", "road/successor"):
-        table = document[kind]
-        for road, link in zip(table.parent, table.attributes, strict=True):
-            if link.get("elementType") == "junction":
-                ends[road].append(link.get("elementId", ""))
+    for road, _, junction in junction_ends(document):
+        ends[road].append(junction)
     for row, junctions in enumerate(_roundabouts(document).values()):
         for road, at in enumerate(ends):
             between = len(at) == 2 and junctions.issuperset(at)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from sgstore.maps.opendrive._plan_view import PlanView, poses
 if TYPE_CHECKING:
     from sgstore.maps.opendrive._document import Document
     from sgstore.model.world import Floats, Ints
+
+
+_PLACE: Final = ("s", "t", "zOffset", "hdg", "hOffset")
 
 
 def places(
@@ -43,7 +46,7 @@ def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> 
     """Return the rows of signals or objects with a valid position. Other rows cause warnings."""
     table = document[kind]
     placed = np.ones(len(table), bool)
-    for name in ("s", "t", "zOffset", "hdg", "hOffset"):
+    for name in _PLACE:
         placed &= np.isfinite(document.rough_numbers(kind, name))
     warnings.extend(
         f"road {document.road_ids[table.road[row]]!r}, <{table.element}>"
@@ -66,10 +69,7 @@ def node_columns(
     the road's and the element's heading.
     """
     table = document[kind]
-    own = {
-        name: document.rough_numbers(kind, name)[rows]
-        for name in ("s", "t", "zOffset", "hdg", "hOffset")
-    }
+    own = {name: document.rough_numbers(kind, name)[rows] for name in _PLACE}
     s, t, up = at or (own["s"], own["t"], own["zOffset"])
     road = table.road[rows]
     x, y, z, heading = places(document, plan, road, s, t)

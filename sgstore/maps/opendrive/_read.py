@@ -157,9 +157,10 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
     shapes[len(nodes) - len(beside) :] = beside
     document.settle()
     signal, lane, s = signals.places(first_signal)
+    header_name = next(iter(document["header"].texts("name")), "").strip()
     every = ribbons.followed_by(spaces)
     return RoadMap(
-        name=name or _header_name(document) or _short_digest(text),
+        name=name or header_name or _short_digest(text),
         text=text,
         nodes=nodes,
         edges=edges_of(edges),
@@ -176,10 +177,6 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         broad_lines=read_broad_lines(document, lanes, ribbons),
         variant=signals.told,
     )
-
-
-def _header_name(document: Document) -> str:
-    return next(iter(document["header"].texts("name")), "").strip()
 
 
 def _short_digest(text: str) -> str:

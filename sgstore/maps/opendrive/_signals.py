@@ -17,7 +17,7 @@ import numpy as np
 
 from sgstore.base.display import first_of
 from sgstore.base.tables import chained
-from sgstore.maps.opendrive._network import END, START
+from sgstore.maps.opendrive._network import END, START, junction_ends
 from sgstore.maps.opendrive._nodes import FIRST_LANE, speed
 from sgstore.maps.opendrive._positions import node_columns, standing
 from sgstore.maps.roads import MapNodes
@@ -121,16 +121,9 @@ class Doubts:
         """Return the end of the road with a junction near a position, or an empty text."""
         if not self._junctions:
             self._lengths = self.document.rough_numbers("road", "length").tolist()
+            ends = [(road, at) for road, at, _ in junction_ends(self.document)]
             self._junctions = {
-                contact: frozenset(
-                    table.parent[row]
-                    for row, attributes in enumerate(table.attributes)
-                    if attributes.get("elementType") == "junction"
-                )
-                for contact, table in (
-                    (START, self.document["road/predecessor"]),
-                    (END, self.document["road/successor"]),
-                )
+                end: frozenset(road for road, at in ends if at == end) for end in (START, END)
             }
         length = self._lengths[road]
         end, away = (START, s) if s < length / 2 else (END, length - s)

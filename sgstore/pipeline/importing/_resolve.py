@@ -222,11 +222,6 @@ class LabelMeaning:
     special: str = ""
     subkind: str = ""
 
-    @property
-    def is_part(self) -> bool:
-        """True if a label means a part of the map, such as a lane, not an entity."""
-        return self.kind in MAP_KINDS
-
 
 @dataclass(frozen=True)
 class Words:
@@ -664,7 +659,7 @@ class Understanding:
             meaning = self._meaning(node)
             told = node.attributes.get("is_ego")
             is_ego = meaning.is_ego if told is None else bool(told)
-            if not meaning.is_part:
+            if meaning.kind not in MAP_KINDS:
                 meant.entities[node.name] = (node, meaning)
                 if is_ego:
                     self._check_ego(meant, node)

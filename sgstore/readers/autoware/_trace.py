@@ -185,9 +185,8 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
     ) -> None:
         super().__init__(survey, report)
         self._box, self._types, self._places = ego, types, places
-        self._table = ColumnReader(
-            survey.structures[survey.leading], _columns(self._is_predicted()), "objects"
-        )
+        structure = survey.structures[survey.leading]
+        self._table = ColumnReader(structure, _columns("Predicted" in structure.name), "objects")
         self._take = self._takers()
         self.channels = self._leading | {*self._take}
         self._axes = Axes()
@@ -235,9 +234,6 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
             )
         if self._followed:
             warn("detected objects have no ids; they were tracked by position and class")
-
-    def _is_predicted(self) -> bool:
-        return "Predicted" in self._survey.structures[self._survey.leading].name
 
     def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
         """Return the function that processes messages, for each channel other than the frame channel."""

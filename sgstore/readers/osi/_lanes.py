@@ -45,7 +45,6 @@ from sgstore.readers.osi._schema import (
     SENSOR_VIEW,
     enum_name,
     fields_read,
-    ground_truth_of,
     has_field,
     identifiers,
     message_class,
@@ -165,7 +164,8 @@ class OsiLanes:
     def take(self, data: bytes) -> None:
         """Add the new lanes and lane boundaries of an OSI message."""
         try:
-            truth = ground_truth_of(self._class.FromString(data))
+            message = self._class.FromString(data)
+            truth = getattr(message, "global_ground_truth", message)
         except DECODE_ERRORS as error:
             self.warnings.append(f"lanes of a message cannot be read: {error}")
             return

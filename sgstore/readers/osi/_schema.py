@@ -504,11 +504,6 @@ def _truth_in(message: type[Any]) -> int:
     return truth.number if truth is not None else 0
 
 
-def ground_truth_of(message: Any) -> Any:
-    """Return the ground truth part of an OSI message, or the message itself if it is a ground truth."""
-    return message.global_ground_truth if hasattr(message, "global_ground_truth") else message
-
-
 def enum_name(message: Any, field: str) -> str:
     """Return the name of an enumeration value in a protobuf message, such as ``TYPE_CAR``.
 
