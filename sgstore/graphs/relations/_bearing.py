@@ -81,7 +81,7 @@ def _direction_edges(scene: BlockScene) -> Edges:
         from sgstore.graphs.relations import _loops
 
         columns, unsure = scene.room.rest(len(pairs)), np.empty(len(pairs), np.intp)
-        many, doubtful = _loops.sectors(*pairs.for_loops, bounds, names, DOUBT, columns, unsure)
+        many, doubtful = _loops.sectors(pairs.for_loops, bounds, names, DOUBT, columns, unsure)
         doubtful = unsure[:doubtful]
     else:
         columns, many, doubtful = _sectors(scene, bounds, names)
@@ -164,7 +164,7 @@ def _side_edges(scene: BlockScene) -> Edges:
 
         columns, unsure = scene.room.rest(len(pairs)), np.empty(len(pairs), np.intp)
         beside = BESIDE if is_open else -1.0
-        many, doubtful = _loops.sides(*pairs.for_loops, beside, names, DOUBT, columns, unsure)
+        many, doubtful = _loops.sides(pairs.for_loops, beside, names, DOUBT, columns, unsure)
         doubtful = unsure[:doubtful]
     else:
         columns, many, doubtful = _sides(scene, names, is_open=is_open)

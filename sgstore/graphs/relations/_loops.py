@@ -5,8 +5,6 @@ Arrays come in tuples: positions ``x, y, z``, turns ``cos, sin`` of headings, si
 height``.
 """
 
-# ruff: noqa: PLR0913, PLR0917
-
 from __future__ import annotations
 
 import math
@@ -23,6 +21,10 @@ if TYPE_CHECKING:
 
     Nodes = NDArray[np.int32]
     Columns = tuple[Nodes, Codes, Nodes, Nodes]
+    Places = tuple[Floats, Floats, Floats]
+    Turns = tuple[Floats, Floats]
+    Looped = tuple[Ints, Ints, tuple[Nodes, Nodes], Places, Turns]
+    Seen = tuple[Places, Turns, Places, Bools]
 
 
 @compiled
@@ -60,10 +62,7 @@ def near_pairs(
 
 @compiled
 def rungs(
-    a: Ints,
-    b: Ints,
-    ends: tuple[Nodes, Nodes],
-    place: tuple[Floats, Floats, Floats],
+    pairs: Looped,
     wanted: Bools,
     bounds: Floats,
     codes: Codes,
@@ -73,8 +72,7 @@ def rungs(
 
     ``wanted``: mask of pairs; empty means all pairs.
     """
-    x, y, z = place
-    frame, node = ends
+    a, b, (frame, node), (x, y, z), _ = pairs
     of, relation, src, dst = columns
     at = 0
     for i in range(len(a)):
@@ -99,11 +97,7 @@ def rungs(
 
 @compiled
 def sectors(
-    a: Ints,
-    b: Ints,
-    ends: tuple[Nodes, Nodes],
-    place: tuple[Floats, Floats, Floats],
-    turn: tuple[Floats, Floats],
+    pairs: Looped,
     bounds: tuple[Floats, Floats],
     codes: Codes,
     doubt: float,
@@ -114,9 +108,7 @@ def sectors(
 
     ``bounds`` are sines and cosines. Pairs from ``len(a)`` on are mirror images.
     """
-    x, y, _ = place
-    cos, sin = turn
-    frame, node = ends
+    a, b, (frame, node), (x, y, _), (cos, sin) = pairs
     of, relation, src, dst = columns
     bound_sin, bound_cos = bounds
     at, unsure = 0, 0
@@ -146,11 +138,7 @@ def sectors(
 
 @compiled
 def sides(
-    a: Ints,
-    b: Ints,
-    ends: tuple[Nodes, Nodes],
-    place: tuple[Floats, Floats, Floats],
-    turn: tuple[Floats, Floats],
+    pairs: Looped,
     least: float,
     codes: Codes,
     doubt: float,
@@ -158,9 +146,7 @@ def sides(
     doubtful: Ints,
 ) -> tuple[int, int]:
     """Write the left and right edges of object pairs, and return their number."""
-    x, y, _ = place
-    cos, sin = turn
-    frame, node = ends
+    a, b, (frame, node), (x, y, _), (cos, sin) = pairs
     of, relation, src, dst = columns
     at, unsure = 0, 0
     for i in range(len(a)):
@@ -214,18 +200,15 @@ def sight(
     order: Ints,
     starts: Ints,
     ego: Ints,
-    place: tuple[Floats, Floats, Floats],
-    turn: tuple[Floats, Floats],
-    size: tuple[Floats, Floats, Floats],
-    signal: Bools,
+    bodies: Seen,
     graze: float,
 ) -> Bools:
     """Return a mask of the objects that the ego of their frame can see."""
-    seen = np.zeros(len(place[0]), np.bool_)
+    seen = np.zeros(len(bodies[0][0]), np.bool_)
     for f in range(len(starts) - 1):
         rows = order[starts[f] : starts[f + 1]]
         if ego[f] >= 0 and len(rows):
-            _seen_from(ego[f], rows, place, turn, size, signal, graze, seen)
+            _seen_from(ego[f], rows, bodies, graze, seen)
     return seen
 
 
@@ -233,14 +216,11 @@ def sight(
 def _seen_from(
     eye: int,
     rows: Ints,
-    place: tuple[Floats, Floats, Floats],
-    turn: tuple[Floats, Floats],
-    size: tuple[Floats, Floats, Floats],
-    signal: Bools,
+    bodies: Seen,
     graze: float,
     seen: Bools,
 ) -> None:
-    row, x, y, box, hides = _views(eye, rows, place, turn, size, signal, graze)
+    row, x, y, box, hides = _views(eye, rows, bodies, graze)
     away = np.sqrt(x[:, 0] ** 2 + y[:, 0] ** 2)
     radius = box[:, 7]
     near = away - radius
@@ -277,10 +257,7 @@ def _seen_from(
 def _views(
     eye: int,
     rows: Ints,
-    place: tuple[Floats, Floats, Floats],
-    turn: tuple[Floats, Floats],
-    size: tuple[Floats, Floats, Floats],
-    signal: Bools,
+    bodies: Seen,
     graze: float,
 ) -> tuple[Ints, Floats, Floats, Floats, Bools]:
     """Return objects relative to the ego's eye: rows, points, boxes, and a mask of opaque objects.
@@ -288,7 +265,7 @@ def _views(
     A box is ``cos, sin``, half of length and width, height of points, lower and upper side, and a
     radius.
     """
-    length, width, height = size
+    place, turn, (length, width, height), signal = bodies
     row = np.empty(len(rows), np.int64)
     x, y = np.empty((len(rows), 5)), np.empty((len(rows), 5))
     box, hides = np.empty((len(rows), 8)), np.empty(len(rows), np.bool_)

@@ -37,7 +37,7 @@ def _edges(scene: BlockScene) -> Edges:
         from sgstore.graphs.relations import _loops
 
         columns = scene.room.rest(len(pairs))
-        many = _loops.rungs(*pairs.for_loops[:4], pairs.of_bodies, np.array(bounds), codes, columns)
+        many = _loops.rungs(pairs.for_loops, pairs.of_bodies, np.array(bounds), codes, columns)
         return scene.room.filled(columns, many)
     found, holds = np.zeros(len(pairs.span), np.int8), np.zeros(len(pairs.span), np.bool_)
     for part in even_parts(len(found) if bounds else 0):

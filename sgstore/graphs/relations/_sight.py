@@ -88,10 +88,8 @@ def _seen_in_loops(bodies: Bodies, ego: Rows) -> Rows:
 
     order, starts = by_frame(bodies.frame, len(ego))
     place, size = (bodies.x, bodies.y, bodies.z), (bodies.length, bodies.width, bodies.height)
-    signal = IS_SIGNAL[bodies.kind]
-    return np.flatnonzero(
-        _loops.sight(order, starts, ego, place, turns(bodies), size, signal, GRAZE)
-    )
+    views = place, turns(bodies), size, IS_SIGNAL[bodies.kind]
+    return np.flatnonzero(_loops.sight(order, starts, ego, views, GRAZE))
 
 
 @dataclass(frozen=True, slots=True)
