@@ -469,11 +469,7 @@ class EntityConstants(NamedTuple):
 
     def attributes(self, *, is_ego: bool, is_static: bool) -> Attributes:
         """Return the constant attributes of an object as node attributes of a scene graph."""
-        texts = {
-            "type_name": self.type_name,
-            "special": self.special,
-            "subkind": self.subkind,
-        }
+        texts = {name: getattr(self, name) for name in ("type_name", "special", "subkind")}
         return {
             "kind": self.kind,
             "name": f"{self.kind} {self.node}",
@@ -923,14 +919,10 @@ class GcPaused:
 
 
 def _entities(first: int, new: list[Entity]) -> Entities:
+    names = ("ident", "special", "subkind", "type_name", "map_ref", "trailer")
     return Entities(
         first=first,
-        ident=tuple(e.ident for e in new),
         kind=np.array([e.kind for e in new], np.int8),
-        special=tuple(e.special for e in new),
-        subkind=tuple(e.subkind for e in new),
-        type_name=tuple(e.type_name for e in new),
         static=np.array([e.static for e in new], np.bool_),
-        map_ref=tuple(e.map_ref for e in new),
-        trailer=tuple(e.trailer for e in new),
+        **{name: tuple(getattr(e, name) for e in new) for name in names},
     )

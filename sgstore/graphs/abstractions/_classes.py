@@ -413,16 +413,12 @@ class _Block:
         place[nodes] = np.arange(len(nodes))
         edges = np.flatnonzero(number[self.edge_graph] >= 0)
         return _Block(
-            len(rows),
-            number[self.graph[nodes]],
-            self.node[nodes],
-            self.node_low[nodes],
-            self.node_high[nodes],
-            number[self.edge_graph[edges]],
-            place[self.src[edges]],
-            place[self.dst[edges]],
-            self.low[edges],
-            self.high[edges],
+            graphs=len(rows),
+            graph=number[self.graph[nodes]],
+            **{name: getattr(self, name)[nodes] for name in ("node", "node_low", "node_high")},
+            edge_graph=number[self.edge_graph[edges]],
+            **{name: place[getattr(self, name)[edges]] for name in ("src", "dst")},
+            **{name: getattr(self, name)[edges] for name in ("low", "high")},
         )
 
     def classes(self, work: int) -> list[str]:

@@ -87,21 +87,10 @@ class MapColumns:
         if (known := _MAPS.get(road_map)) is not None:
             return known
         nodes, edges = road_map.nodes, road_map.edges
-        name, lane_type, road, junction = (
-            np.array(column, object)
-            for column in (nodes.name, nodes.lane_type, nodes.road, nodes.junction)
-        )
-        _MAPS[road_map] = columns = cls(
-            nodes.kind,
-            name,
-            lane_type,
-            road,
-            junction,
-            nodes.lane,
-            edges.relation,
-            edges.src,
-            edges.dst,
-        )
+        names = ("name", "lane_type", "road", "junction")
+        texts = {name: np.array(getattr(nodes, name), object) for name in names}
+        links = {name: getattr(edges, name) for name in ("relation", "src", "dst")}
+        _MAPS[road_map] = columns = cls(kind=nodes.kind, lane=nodes.lane, **texts, **links)
         return columns
 
     @cached_property

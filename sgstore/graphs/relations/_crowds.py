@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.base.tables import taken
 from sgstore.graphs.relations._pairs import AT_ONCE, MOST_PAIRS
 from sgstore.graphs.relations._scene import IS_SIGNAL
 from sgstore.mcap import Loss
-from sgstore.model.world import Entities, MessageRefs
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -100,16 +101,10 @@ def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
     entities, scenery, messages = frames.entities, frames.scenery, frames.messages
     events = frames.events
     if start:
-        none = slice(0, 0)
-        entities = Entities(
-            entities.first + len(entities),
-            *((), entities.kind[none], (), (), (), entities.static[none], ()),
-        )
-        scenery = scenery.take(np.zeros(0, np.intp))
-        columns = (messages.channel, messages.log_time_ns, messages.chunk_offset)
-        columns += (messages.offset, messages.length)
-        messages = MessageRefs(*(column[none] for column in columns))
-        events = ()
+        none = np.zeros(0, np.intp)
+        first_new = entities.first + len(entities)
+        entities = replace(taken(entities, none), first=first_new)
+        scenery, messages, events = scenery.take(none), taken(messages, none), ()
     return type(frames)(
         seq=frames.seq[start:stop],
         time_ns=frames.time_ns[start:stop],

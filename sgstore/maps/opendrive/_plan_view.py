@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -87,9 +87,11 @@ def read_plan_view(document: Document) -> PlanView:
     """Read the reference lines of all OpenDRIVE roads, and record defective roads."""
     table = document["road/geometry"]
     n = len(table)
-    s, x, y, heading, length = (
-        document.numbers("road/geometry", name) for name in ("s", "x", "y", "hdg", "length")
-    )
+    names = {"s": "s", "x": "x", "y": "y", "heading": "hdg", "length": "length"}
+    columns: dict[str, Any] = {
+        column: document.numbers("road/geometry", name) for column, name in names.items()
+    }
+    length = columns["length"]
     document.accuse("road/geometry", length < 0, "attribute 'length' is negative")
     kind = np.full(n, -1, np.int8)
     kind[document["road/geometry/line"].of] = LINE
@@ -100,24 +102,13 @@ def read_plan_view(document: Document) -> PlanView:
     _read_spirals(document, kind, curvature, rate, length)
     u, v, span = _read_cubics(document, kind, length)
     document.accuse("road/geometry", kind < 0, "has no line, arc, spiral, poly3 or paramPoly3")
-    order = np.lexsort((s, table.road))
+    order = np.lexsort((columns["s"], table.road))
     cubics = order[kind[order] == CUBIC]
     u, v, span = u[cubics], v[cubics], span[cubics]
     measure = _measured(u, v, span, length[cubics])
-    return PlanView(
-        road=table.road[order],
-        s=s[order],
-        x=x[order],
-        y=y[order],
-        heading=heading[order],
-        length=length[order],
-        kind=kind[order],
-        curvature=curvature[order],
-        rate=rate[order],
-        u=u,
-        v=v,
-        measure=measure,
-    )
+    columns |= {"road": table.road, "kind": kind, "curvature": curvature, "rate": rate}
+    columns = {name: column[order] for name, column in columns.items()}
+    return PlanView(**columns, u=u, v=v, measure=measure)
 
 
 def _read_spirals(
