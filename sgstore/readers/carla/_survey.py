@@ -34,7 +34,7 @@ from sgstore.readers._stamps import Stamps
 from sgstore.readers.carla._signals import read_places
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable
 
     from sgstore.mcap import Messages, Recording
     from sgstore.model.world import Floats
@@ -178,22 +178,14 @@ class Egos:
 
 
 def _listing(egos: Egos) -> str:
-    """Return a text that lists the possible egos of a CARLA recording, for an error message."""
+    """Return the vehicles and pedestrians that can be the ego, for an error message."""
+    actors = sorted(egos.actors.items(), key=lambda item: (item[1].role == "autopilot", item[0]))
     things = [
         f"{ident} ({actor.role or actor.type_name})"
-        for ident, actor in _vehicles(egos.actors).items()
+        for ident, actor in actors
+        if actor.type_name.startswith(("vehicle.", "walker."))
     ]
     return listing(things or [str(ident) for ident in sorted(egos.seen)])
-
-
-def _vehicles(actors: Mapping[int, Actor]) -> dict[int, Actor]:
-    """Return the moving actors of a CARLA recording; actors with a special role come first."""
-    moving = {
-        ident: actor
-        for ident, actor in actors.items()
-        if actor.type_name.startswith(("vehicle.", "walker."))
-    }
-    return dict(sorted(moving.items(), key=lambda item: (item[1].role == "autopilot", item[0])))
 
 
 # Contents of the channels of CARLA's ROS bridge, by their schemas. Topics are arbitrary, with one exception: a

@@ -11,7 +11,6 @@ the OpenSCENARIO type of the entity (``Vehicle``, ``cutter``).
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -74,23 +73,10 @@ def _names_or_none(moving_object: Any) -> list[str]:
 
 def hosts_of(message: Any) -> list[int]:
     """Return the possible ids of the host vehicle (ego) in an OSI message, best first; 0 is a valid id."""
-    told = [getattr(message, part) if part else message for part in _telling(type(message))]
+    inner = (getattr(message, name, None) for name in ("global_ground_truth", "host_vehicle_data"))
+    parts = [message, *(part for part in inner if hasattr(part, "DESCRIPTOR"))]
+    told = [part for part in parts if "host_vehicle_id" in part.DESCRIPTOR.fields_by_name]
     return [part.host_vehicle_id.value for part in told if part.HasField("host_vehicle_id")]
-
-
-@lru_cache(maxsize=64)
-def _telling(message: type[Any]) -> tuple[str, ...]:
-    """Return the parts of an OSI message that can contain the id of the host vehicle (ego)."""
-    inner = [
-        (part, found.message_type)
-        for part in ("global_ground_truth", "host_vehicle_data")
-        if (found := message.DESCRIPTOR.fields_by_name.get(part)) is not None
-    ]
-    return tuple(
-        part
-        for part, told in [("", message.DESCRIPTOR), *inner]
-        if told is not None and "host_vehicle_id" in told.fields_by_name
-    )
 
 
 def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
