@@ -114,11 +114,12 @@ class LaneSignal:
     lanes: tuple[int, ...]
 
 
-def _paths(fields: dict[str, Any]) -> Iterator[str]:
+def _paths(fields: Any) -> Iterator[str]:
     """Yield the dotted paths of all fields of an OSI lane that the reader needs."""
-    for name, inner in fields.items():
+    for name in fields:
+        inner = fields[name] if isinstance(fields, dict) else True
         if name not in _MAY_LACK:
-            yield from (f"{name}.{path}" for path in _paths(inner)) if inner else (name,)
+            yield from (name,) if inner is True else (f"{name}.{path}" for path in _paths(inner))
 
 
 class OsiLanes:

@@ -47,27 +47,13 @@ OPAQUE: Final = "opaque"
 
 
 @cache
-def fields_read() -> dict[str, dict[str, Any]]:
-    """Return the tables of ``osi_fields.toml``: the fields that are read, with the fields of their messages.
-
-    ``None`` means all fields, and :data:`OPAQUE` a message that is read as bytes.
-    """
+def fields_read() -> dict[str, Any]:
+    """Return the tables of ``osi_fields.toml``: the fields that are read, with the fields of their messages."""
     text = resources.files("sgstore.readers").joinpath("osi_fields.toml").read_text("utf-8")
-    tables = tomllib.loads(text)
-
-    def fields_in(told: Any) -> Any:
-        if isinstance(told, str) and told != OPAQUE:
-            return fields_in(tables[told])
-        if isinstance(told, dict):
-            return {name: fields_in(part) for name, part in told.items()}
-        return dict.fromkeys(told) if isinstance(told, list) else told if told == OPAQUE else None
-
-    return fields_in(tables)
+    return tomllib.loads(text)
 
 
-def prune(
-    files: list[descriptor_pb2.FileDescriptorProto], roots: dict[str, dict[str, Any]]
-) -> None:
+def prune(files: list[descriptor_pb2.FileDescriptorProto], roots: dict[str, Any]) -> None:
     """Remove the unused fields from protobuf descriptors, for faster parsing.
 
     Parameters
@@ -75,7 +61,7 @@ def prune(
     files : list of FileDescriptorProto
         Modified in place.
     roots : dict
-        Full names of types → the fields to read → the fields of their messages. A type that is used in several
+        Full names of types → the fields to read, as in :func:`fields_read`. A type that is used in several
         places keeps the fields of all of them.
     """
     types = {
@@ -87,10 +73,11 @@ def prune(
     waiting = list(roots.items())
     while waiting:
         name, wanted = waiting.pop()
+        wanted = fields_read()[wanted] if isinstance(wanted, str) else wanted
         kept.setdefault(name, set()).update(wanted)
         for field in types[name].field if name in types else ():
-            inner = wanted.get(field.name)
-            if not field.type_name or field.type != field.TYPE_MESSAGE or inner is None:
+            inner = wanted.get(field.name, True) if isinstance(wanted, dict) else True
+            if not field.type_name or field.type != field.TYPE_MESSAGE or inner is True:
                 continue
             if inner == OPAQUE:
                 field.type = field.TYPE_BYTES
