@@ -155,7 +155,8 @@ class Maps:
             warnings.append(f"its road map cannot be read: {own}")
             own = None
         road_map = own
-        if own is None or not _is_opendrive(info.map_text):
+        is_opendrive = info.map_text[:100].lstrip("\ufeff \t\r\n").startswith("<")
+        if own is None or not is_opendrive:
             road_map = self._given or self._named(info.map_name, warnings) or own
         if road_map is None:
             return None, [*warnings, NO_MAP]
@@ -208,8 +209,3 @@ def lost_lanes(info: TraceInfo, road_map: RoadMap | None) -> list[Loss]:
     if road_map is not None and road_map.text != info.map_text:
         return []
     return [Loss(reason, 0, 0) for reason in info.lost_lanes]
-
-
-def _is_opendrive(text: str) -> bool:
-    """Return True if a map text is XML, so OpenDRIVE; the lane text format is JSON."""
-    return text[:100].lstrip("\ufeff \t\r\n").startswith("<")

@@ -256,8 +256,9 @@ def read_document(text: str, skip: frozenset[int] = frozenset()) -> Document:
     """
     if len(text) > MAX_CHARACTERS:
         raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
-    tables, ordinals = _parse(text, skip)
-    return Document(tables, ordinals, len(text))
+    builder = _Builder(skip)
+    read_markup(MarkupParser(builder.start, builder.end, most=MAX_ELEMENTS), text)
+    return Document(builder.tables, builder.ordinals, len(text))
 
 
 _Node = tuple["ElementTable | None", dict[str, "_Node"]]
@@ -328,12 +329,6 @@ class _Builder:
             return False
         self.ordinals.append(number)
         return True
-
-
-def _parse(text: str, skip: frozenset[int]) -> tuple[dict[str, ElementTable], list[int]]:
-    builder = _Builder(skip)
-    read_markup(MarkupParser(builder.start, builder.end, most=MAX_ELEMENTS), text)
-    return builder.tables, builder.ordinals
 
 
 def _floats(texts: list[str]) -> Floats:

@@ -13,14 +13,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sgstore.base.tables import spread, taken
+from sgstore.base.tables import chained, spread, taken
 from sgstore.maps.roads._courses import LaneCourses
 from sgstore.maps.roads._footprints import LaneIndex
 from sgstore.maps.roads._places import (
     STOP_LINE,
     MapPlaces,
     crosswalk_places,
-    joined_places,
     signal_places,
     whole_lanes,
 )
@@ -619,7 +618,8 @@ class RoadMap:
         applies = -1 - self.edges.src[control], _FIRST_LANE - self.edges.dst[control]
         signals = signal_places(self.ribbons, names["junction"], what, applies, self._stops)
         crossed = crosswalk_places(self.ribbons, crosswalks, shapes, z, STOREY)
-        return joined_places([*wholes, crossed, signals])
+        table = chained([*wholes, crossed, signals])
+        return MapPlaces.of(table.part, table.what, table.lane, table.start, table.end)
 
     def _on_roundabouts(self) -> MapPlaces:
         """Return the lanes of each roundabout as intervals along these lanes."""

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import shapely
 
-from sgstore.base.tables import chained
 from sgstore.maps.roads._ribbons import centre_lines
 
 if TYPE_CHECKING:
@@ -200,9 +199,3 @@ def signal_places(
     part, lane = np.array([row[:2] for row in rows], np.int64).reshape(-1, 2).T
     along = np.array([row[2] for row in rows], np.float64)
     return MapPlaces.of(part, [what[int(column)] for column in part], lane, along, along)
-
-
-def joined_places(tables: Sequence[MapPlaces]) -> MapPlaces:
-    """Concatenate several tables of lane intervals, and sort the rows."""
-    table = chained(tables)
-    return MapPlaces.of(table.part, table.what, table.lane, table.start, table.end)
