@@ -44,7 +44,7 @@ def as_told(road_map: RoadMap) -> dict[str, Any]:
     for code, src, dst in zip(*columns, strict=True):
         told.setdefault(RELATIONS[code], []).append([names[-1 - src], names[-1 - dst]])
     outlines = road_map.outlines()
-    stop_lines = {int(part) for part in road_map._stop_lines}
+    stop_lines = {int(part) for part in road_map.stop_lines}
     return {
         "lanes": {
             names[row]: [

@@ -247,7 +247,7 @@ class PaperMap(RoadMap):
         )
         lanes = [p for p in patches if p.kind == "lane"]
         self.ribbons = _ribbons(lanes, at)
-        self._lanes, self._variant = len(lanes), ""
+        self._lanes, self.variant, self._ways = len(lanes), "", None
         self.courses = LaneCourses.none()
         self.places = MapPlaces.none()  # along its lanes; a map that was read has them
         self.asked = 0

@@ -97,12 +97,12 @@ class Motion:
                 z=ribbons.z + self.shift[2],
                 heading=self.heading(ribbons.heading),
             ),
-            shapes=np.array([self._shape(shape) for shape in road_map._shapes], np.object_),
+            shapes=np.array([self._shape(shape) for shape in road_map.shapes], np.object_),
             lane_changes=road_map.lane_changes,
             road_types=road_map.road_types,
             junction_types=road_map.junction_types,
             controllers=road_map.controllers,
-            stops=road_map._stops,
+            stops=road_map.stops,
             courses=replace(courses, curvature=self.side * courses.curvature),
         )
 

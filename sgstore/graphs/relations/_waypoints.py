@@ -10,7 +10,7 @@ import numpy as np
 
 from sgstore.base.tables import chained, spread, taken
 from sgstore.errors import ConfigError
-from sgstore.maps.roads import LaneHits, MapEdges, MapNodes, RoadMap
+from sgstore.maps.roads import LaneCourses, LaneHits, MapEdges, MapNodes, MapPlaces, RoadMap
 from sgstore.model.vocabulary import DRIVING, KIND_CODE, RELATION_CODE
 
 if TYPE_CHECKING:
@@ -80,18 +80,16 @@ class Waypoints:
             code = np.full(len(src), RELATION_CODE[name], np.int8)
             parts.append((code, -1 - src, -1 - dst))
         shapes = RoadMap.point_shapes(points.x, points.y)
-        return RoadMap(
-            name=road_map.name,
-            text=road_map.text,
+        no_signals = np.zeros(0, np.int64)
+        return replace(
+            road_map,
             nodes=chained([road_map.nodes, self._nodes(road_map.nodes, points)]),
             edges=MapEdges(*(np.concatenate(column) for column in zip(*parts, strict=True))),
-            ribbons=road_map.ribbons,
             shapes=np.concatenate([road_map.outlines(), shapes]),
-            lane_changes=road_map.lane_changes,
-            road_types=road_map.road_types,
-            junction_types=road_map.junction_types,
-            controllers=road_map.controllers,
-            warnings=road_map.warnings,
+            stops=(no_signals, no_signals, np.zeros(0)),
+            stop_lines=no_signals,
+            courses=LaneCourses.none(),
+            broad_lines=MapPlaces.none(),
             variant=f" {road_map.digest} waypoints {self._spacing} {sorted(set(points.lane.tolist()))}",
         )
 

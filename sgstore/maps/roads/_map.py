@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Final
@@ -260,31 +260,9 @@ class LaneChanges:
         return cls(no_lanes, no_lanes, nowhere, nowhere)
 
 
+@dataclass(eq=False, kw_only=True, repr=False)
 class RoadMap:
     """Road map: lanes, roads, junctions and signals with edges and lane surfaces, and geometric look-ups.
-
-    Parameters
-    ----------
-    name, text : str
-    nodes : MapNodes
-    edges : MapEdges
-    ribbons : Ribbons
-        The surface of the lanes, in the order of their nodes.
-    shapes : (K,) object
-        Geometries of the nodes, or ``None`` for lanes and for nodes that consist of lanes.
-    lane_changes : LaneChanges, optional
-    road_types, junction_types, controllers : mapping, optional
-    warnings : iterable of str, optional
-    stops : (m,) int64, int64 and float64, optional
-        Signals (columns of the nodes), lanes that they apply to (from 0), and the place along
-        these; m.
-    stop_lines : (n,) int64, optional
-        Columns of the signals that are painted stop lines.
-    courses : LaneCourses, optional
-    broad_lines : MapPlaces, optional
-        Broad markings at the sides of lanes.
-    variant : str, optional
-        Difference from the map that the text describes.
 
     Attributes
     ----------
@@ -300,11 +278,12 @@ class RoadMap:
         ``toLeftOf``, ``toRightOf``, ``laneChange``, ``conflictsWith`` among lanes, ``controlsTrafficOf``
         (signal → lane).
     ribbons : Ribbons
-        The surface of the lanes. Lane i (wherever lanes are counted from 0) has node id -2 - i.
+        The surface of the lanes, in the order of their nodes. Lane i (wherever lanes are counted from 0) has
+        node id -2 - i.
+    shapes : (K,) object
+        Geometries of the nodes, or ``None`` for lanes and for nodes that consist of lanes.
     lane_changes : LaneChanges
         Stretches of the ``laneChange`` edges along their lanes.
-    courses : LaneCourses
-        Curvature and slope of the lanes, metre by metre. Empty for a map without sections.
     road_types : mapping of str to tuple of (float, str)
         Id of a road → its types (``town``, ``motorway``, …) and the start of each along its
         reference line; m.
@@ -312,52 +291,49 @@ class RoadMap:
         Id of a junction → ``default``, ``direct``, ``virtual``, …
     controllers : mapping of str to tuple of str
         Id of a controller → ids of the signals that it switches.
-    warnings : tuple of str
+    warnings : sequence of str
         Tolerated defects of the map, each with its road.
+    stops : (m,) int64, int64 and float64
+        Signals (columns of the nodes), lanes that they apply to (from 0), and the place along
+        these; m.
+    stop_lines : (n,) int64
+        Columns of the signals that are painted stop lines.
+    courses : LaneCourses
+        Curvature and slope of the lanes, metre by metre. Empty for a map without sections.
+    broad_lines : MapPlaces
+        Broad markings at the sides of lanes.
+    variant : str
+        Difference from the map that the text describes.
     """
 
-    _ways: tuple[float, tuple[Ints, Ints, Floats]] | None = None
-    """Limit and last result of :meth:`downstream`."""
+    name: str
+    text: str
+    nodes: MapNodes
+    edges: MapEdges
+    ribbons: Ribbons
+    shapes: Geometries
+    lane_changes: LaneChanges = field(default_factory=LaneChanges.none)
+    road_types: Mapping[str, tuple[tuple[float, str], ...]] = field(
+        default_factory=dict[str, tuple[tuple[float, str], ...]]
+    )
+    junction_types: Mapping[str, str] = field(default_factory=dict[str, str])
+    controllers: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+    warnings: Sequence[str] = ()
+    stops: tuple[Ints, Ints, Floats] = field(
+        default_factory=lambda: (*np.zeros((2, 0), np.int64), np.zeros(0))
+    )
+    stop_lines: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
+    courses: LaneCourses = field(default_factory=LaneCourses.none)
+    broad_lines: MapPlaces = field(default_factory=MapPlaces.none)
+    variant: str = ""
 
-    def __init__(  # noqa: PLR0913 (a map is all of this)
-        self,
-        *,
-        name: str,
-        text: str,
-        nodes: MapNodes,
-        edges: MapEdges,
-        ribbons: Ribbons,
-        shapes: Geometries,
-        lane_changes: LaneChanges | None = None,
-        road_types: Mapping[str, tuple[tuple[float, str], ...]] | None = None,
-        junction_types: Mapping[str, str] | None = None,
-        controllers: Mapping[str, tuple[str, ...]] | None = None,
-        warnings: Iterable[str] = (),
-        stops: tuple[Ints, Ints, Floats] | None = None,
-        stop_lines: Ints | None = None,
-        courses: LaneCourses | None = None,
-        broad_lines: MapPlaces | None = None,
-        variant: str = "",
-    ) -> None:
-        self.name = name
-        self.text = text
-        self._broad_lines = broad_lines or MapPlaces.none()
-        self.digest = hashlib.sha256((text + variant).encode("utf-8", "surrogatepass")).hexdigest()
-        self.nodes = nodes
-        self.edges = edges
-        self.ribbons = ribbons
-        self.lane_changes = lane_changes or LaneChanges.none()
-        self.road_types = dict(road_types or {})
-        self.junction_types = dict(junction_types or {})
-        self.controllers = dict(controllers or {})
-        self.warnings = tuple(warnings)
-        self._shapes = shapes
-        nothing = np.zeros(0, np.int64)
-        self._stops = stops or (nothing, nothing, np.zeros(0))
-        self._stop_lines = nothing if stop_lines is None else stop_lines
-        self.courses = courses or LaneCourses.none()
-        self._variant = variant
-        self._lanes = len(ribbons.offsets) - 1
+    def __post_init__(self) -> None:
+        told = (self.text + self.variant).encode("utf-8", "surrogatepass")
+        self.digest = hashlib.sha256(told).hexdigest()
+        self.warnings = tuple(self.warnings)
+        self._lanes = len(self.ribbons)
+        # Limit and last result of :meth:`downstream`.
+        self._ways: tuple[float, tuple[Ints, Ints, Floats]] | None = None
 
     def outlines(self) -> Geometries:
         """Return shapely polygons, lines or points of all map parts (K,); ``None`` for parts without a shape.
@@ -525,21 +501,13 @@ class RoadMap:
             )
         )
         length = np.bincount(same, np.nan_to_num(nodes.length), len(nodes))
-        return RoadMap(
-            name=self.name,
-            text=self.text,
+        return replace(
+            self,
             nodes=replace(nodes, name=name, length=np.where(lane & first, length, nodes.length)),
             edges=merged_edges(self.edges, same),
-            ribbons=self.ribbons,
-            shapes=self._shapes,
-            lane_changes=self.lane_changes,
-            road_types=self.road_types,
-            junction_types=self.junction_types,
-            controllers=self.controllers,
-            warnings=self.warnings,
-            stops=self._stops,
-            stop_lines=self._stop_lines,
-            variant=f"{self._variant}{_MERGED}",
+            courses=LaneCourses.none(),
+            broad_lines=MapPlaces.none(),
+            variant=f"{self.variant}{_MERGED}",
         )
 
     def downstream(self, limit: float) -> tuple[Ints, Ints, Floats]:
@@ -581,7 +549,7 @@ class RoadMap:
         -----
         Empty for a map without sections: places along its lanes refer to sections.
         """
-        if _MERGED in self._variant:
+        if _MERGED in self.variant:
             return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
         begun, reached, distance = self.downstream(FARTHEST)
         every, start = np.arange(self._lanes), self.ribbons.lengths[begun] + distance
@@ -598,7 +566,7 @@ class RoadMap:
         Empty for a map without sections, as :attr:`reach`.
         """
         nodes, lanes = self.nodes, slice(1, 1 + self._lanes)
-        if not self._lanes or _MERGED in self._variant:
+        if not self._lanes or _MERGED in self.variant:
             return MapPlaces.none()
         what = [KINDS[int(code)] for code in nodes.kind]
         columns = {
@@ -609,14 +577,14 @@ class RoadMap:
         names = {"lane": list(columns["lane"]), "road": nodes.road[lanes]}
         names["junction"] = nodes.junction[lanes]
         wholes = [whole_lanes(self.ribbons, of, names[of], columns[of]) for of in columns]
-        wholes += [self._on_roundabouts(), self._on_zones(), self._broad_lines]
-        for column in self._stop_lines.tolist():
+        wholes += [self._on_roundabouts(), self._on_zones(), self.broad_lines]
+        for column in self.stop_lines.tolist():
             what[column] = STOP_LINE
         crosswalks, *_ = self._crosswalks
-        shapes, z = self._shapes[crosswalks], nodes.z[crosswalks]
+        shapes, z = self.shapes[crosswalks], nodes.z[crosswalks]
         control = self.edges.relation == RELATION_CODE["controlsTrafficOf"]
         applies = -1 - self.edges.src[control], _FIRST_LANE - self.edges.dst[control]
-        signals = signal_places(self.ribbons, names["junction"], what, applies, self._stops)
+        signals = signal_places(self.ribbons, names["junction"], what, applies, self.stops)
         crossed = crosswalk_places(self.ribbons, crosswalks, shapes, z, STOREY)
         table = chained([*wholes, crossed, signals])
         return MapPlaces.of(table.part, table.what, table.lane, table.start, table.end)
@@ -663,7 +631,7 @@ class RoadMap:
 
     @cached_property
     def _outlines(self) -> Geometries:
-        shapes = self._shapes.copy()
+        shapes = self.shapes.copy()
         shapes[1 : 1 + self._lanes] = lane_polygons(self.ribbons)
         folded = ~shapely.is_missing(shapes) & ~shapely.is_valid(shapes)
         shapes[folded] = shapely.make_valid(
@@ -678,7 +646,7 @@ class RoadMap:
         The cells are ``None`` if there are too many.
         """
         columns = np.flatnonzero(self.nodes.kind == KIND_CODE["crosswalk"])
-        shapes = self._shapes[columns]
+        shapes = self.shapes[columns]
         tree = shapely.STRtree(shapes)
         low, high = np.split(shapely.bounds(shapes).reshape(-1, 4) / _CELL, 2, axis=1)
         if not np.prod(high - low + 4, axis=1).sum() < _MOST_CELLS:
