@@ -36,22 +36,23 @@ if TYPE_CHECKING:
 
 
 class Recording(Protocol):
-    """Interface of an open log of messages: an MCAP file, or a file of another format."""
+    """Interface of an open log of messages: an MCAP file, or a file of another format.
 
-    @property
-    def path(self) -> Path:
-        """Path of the recording."""
-        ...
+    Attributes
+    ----------
+    path : Path
+    size : int
+        Bytes.
+    mtime_ns : int
+        Modification time; ns.
+    has_log_times : bool
+        True if messages have log times, in addition to the times in their data.
+    """
 
-    @property
-    def size(self) -> int:
-        """Size of the recording; bytes."""
-        ...
-
-    @property
-    def mtime_ns(self) -> int:
-        """Modification time of the recording; ns."""
-        ...
+    path: Path
+    size: int
+    mtime_ns: int
+    has_log_times: bool
 
     @property
     def schemas(self) -> Mapping[int, Schema]:
@@ -66,11 +67,6 @@ class Recording(Protocol):
     @property
     def counts(self) -> Mapping[int, int] | None:
         """Number of messages by channel id, as declared in the recording."""
-        ...
-
-    @property
-    def has_log_times(self) -> bool:
-        """True if messages have log times, in addition to the times in their data."""
         ...
 
     @property
