@@ -467,7 +467,9 @@ def test_an_earlier_end_violates_nothing_more(first: int) -> None:
         whole = scene.judged(rules)
         for rule, verdict in cut.judged(rules).items():
             ended[verdict.verdict] += 1
-            if verdict.verdict == "false":
+            # The wait for an entity that comes later is unbounded: FORSOME is false without it.
+            newcomer = rule.startswith("FORSOME") and whole[rule].absent_frames
+            if verdict.verdict == "false" and not newcomer:
                 assert whole[rule].verdict == "false", (seed, rule)
 
     assert min(ended["true"], ended["false"], ended["pending"]) > 3

@@ -245,30 +245,33 @@ class _Looking:
         return found
 
     def place(  # noqa: PLR0911 - a case each
-        self, formula: Bound, key: str, *, wanted: bool
+        self, formula: Bound, key: str, *, wanted: bool, later: bool = False
     ) -> _Place:
         """Return bounds on the distance between ego and entity that follow from a formula.
 
-        The formula is true or false, as ``wanted``.
+        The formula is true or false, as ``wanted``. ``later``: true if the frame is not the last one.
         """
+        later = later or _goes_on(formula, wanted=wanted)
         match formula:
             case b.Operation("NOT", (one,)):
-                return self.place(one, key, wanted=not wanted)
+                return self.place(one, key, wanted=not wanted, later=later)
             case b.Operation("IMPLIES", (one, other)):
                 parts = [
-                    self.place(one, key, wanted=not wanted),
-                    self.place(other, key, wanted=wanted),
+                    self.place(one, key, wanted=not wanted, later=later),
+                    self.place(other, key, wanted=wanted, later=later),
                 ]
                 return _any(parts) if wanted else _all(parts)
             case b.Operation("AND" | "OR" as word, operands):
-                parts = [self.place(one, key, wanted=wanted) for one in operands]
+                parts = [self.place(one, key, wanted=wanted, later=later) for one in operands]
                 return _all(parts) if (word == "AND") == wanted else _any(parts)
-            case b.Tense(operands=operands):
-                return _any([self.place(one, key, wanted=wanted) for one in operands])
-            case b.Operation(">" | ">=", (b.SignalCall(word="run_length", operand=one), _)):
+            case b.Tense(word="NEXT" | "WEAKNEXT", operands=(one,)) if later:
                 return self.place(one, key, wanted=wanted)
-            case b.Operation("<" | "<=", (b.SignalCall(word="run_length", operand=one), _)):
-                return self.place(one, key, wanted=not wanted)
+            case b.Tense(operands=operands) if not _may_be_empty(formula, wanted=wanted):
+                return _any([self.place(one, key, wanted=wanted) for one in operands])
+            case b.Operation(">" | ">=" | "<" | "<=", (b.SignalCall(word="run_length") as run, _)):
+                # A run is also short if it began with the trace.
+                is_long = wanted == formula.word.startswith(">")
+                return self.place(run.operand, key, wanted=True) if is_long else _Place()
             case b.Operation(word, (one, other)) if word in MIRRORED:
                 return self._compared(word if wanted else _COMPLEMENT[word], one, other, key)
             case b.BlockValue(word="EXISTS", scope=scope) if wanted and key in scope.outer:
@@ -304,6 +307,31 @@ class _Looking:
         if braking is None or word not in wanted or least <= 0:
             return _Place()
         return _Place(from_ + (2 * self.speed) ** 2 / (2 * least * abs(braking)) + BODY)
+
+
+def _goes_on(formula: Bound, *, wanted: bool) -> bool:
+    """True if a formula can have a value only in a frame before the last one."""
+    match formula:
+        case b.Tense(word="NEXT" | "WEAKNEXT"):
+            return wanted == (formula.word == "NEXT")
+        case b.Operation("NOT", (one,)):
+            return _goes_on(one, wanted=not wanted)
+        case b.Operation("IMPLIES", (one, other)) if not wanted:
+            return _goes_on(one, wanted=True) or _goes_on(other, wanted=False)
+        case b.Operation("AND" | "OR" as word, operands) if wanted == (word == "AND"):
+            return any(_goes_on(one, wanted=wanted) for one in operands)
+        case _:
+            return False
+
+
+def _may_be_empty(tense: b.Tense, *, wanted: bool) -> bool:
+    """True if a temporal operator can have a value without any frame in its window.
+
+    Examples: ``NEXT`` in the last frame is false, ``HISTORICALLY[1s, 2s]`` in the first frame is true.
+    """
+    if tense.word in {"NEXT", "WEAKNEXT", "PREVIOUS"}:
+        return wanted == (tense.word == "WEAKNEXT")
+    return tense.low > 0 and wanted == (tense.word in {"ALWAYS", "HISTORICALLY", "RELEASE"})
 
 
 def _all(places: list[_Place]) -> _Place:
