@@ -48,7 +48,7 @@ TESTS = {
     "json_text": "serve export_mcap",
     "markup": "opendrive_document lanelet2",
     "matches": "query query_recordings api rows",
-    "mcap": "mcap_* spool ahead order",
+    "mcap": "mcap_* ahead order",
     "numba_loops": "compiled",
     "opendrive": "opendrive_*",
     "pair_numbers": "pair_numbers ttc criticality lane_dist lane_places lane_courses roundabouts",
