@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-pytestmark = pytest.mark.seconds(14)
+pytestmark = pytest.mark.seconds(5)
 
 NUMBERS = {name: one.column or name for name, one in PAIR_FUNCTIONS.items() if one.sql}
 """Functions of pairs, and what the view ``criticality`` calls them; ``lane_dist`` has tests of its own."""
