@@ -8,9 +8,7 @@ statements that name them.
 
 from __future__ import annotations
 
-import math
 import re
-import threading
 from collections import OrderedDict
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -21,17 +19,10 @@ import duckdb
 from duckdb.func import FunctionNullHandling
 
 from sgstore.errors import ConfigError
-from sgstore.model.criticality import (
-    FIXED_KINDS,
-    KNOWN,
-    OF_AREAS,
-    RECORDED,
-    TRACKS,
-    tracks_of,
-)
-from sgstore.store._conflict_areas import BoundedCache, ConflictAreas
+from sgstore.model.criticality import FIXED_KINDS, KNOWN, RECORDED
 from sgstore.store._interrupts import interrupted
 from sgstore.store._lease import stamp_of
+from sgstore.store._meetings import RecordedValues
 from sgstore.store._schema import INSIDE
 
 if TYPE_CHECKING:
@@ -40,15 +31,8 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.model.criticality import Track
     from sgstore.store._lease import Stamp
 
-MOST_BYTES: Final = 64 << 20
-"""Largest size of the cached object tracks. For a longer trace, only the states of the pair are read."""
-_STATE_BYTES: Final = 11 * 8
-"""Size of a state in a track: its time, and the columns of ``TRACKS``."""
-_MOST_PAIRS: Final = 1 << 18
-"""Number of pairs with cached measures, about 64 MiB."""
 _MOST_CALLS: Final = 1 << 16
 """Number of calls whose values are returned without a look-up: a pair is measured again in each frame."""
 _FILES: Final = 4
@@ -75,16 +59,6 @@ FROM (
 """
 
 
-class _Known:
-    """Cache of a store file: object tracks that were read, and criticality measures of object pairs."""
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.tracks: BoundedCache[dict[int, Track]] = BoundedCache(MOST_BYTES)
-        self.values: OrderedDict[tuple[str, int, int, int], float | None] = OrderedDict()
-        self.areas = ConflictAreas()
-
-
 class _MeasuredQuestion:
     """Database connection whose SQL statement uses criticality measures of object pairs.
 
@@ -92,10 +66,10 @@ class _MeasuredQuestion:
     ----------
     connection : DuckDBPyConnection
         Connection of the statement. Another connection of the same instance reads the tracks.
-    known : _Known
+    known : RecordedValues
     """
 
-    def __init__(self, connection: DuckDBPyConnection, known: _Known) -> None:
+    def __init__(self, connection: DuckDBPyConnection, known: RecordedValues) -> None:
         self.asking = connection
         self._known = known
         self._reader = connection.cursor()
@@ -104,57 +78,14 @@ class _MeasuredQuestion:
 
     def value(self, measure: str, trace: int, src: int, dst: int) -> float | None:
         """Return a criticality measure of an object pair in a trace. ``None`` means unknown or undefined."""
-        if measure.removeprefix(KNOWN) not in RECORDED:
+        name = measure.removeprefix(KNOWN)
+        if name not in RECORDED:
             raise ConfigError(f"no recorded measure: {measure!r}; expected {', '.join(RECORDED)}")
+        scope = "known_" if measure.startswith(KNOWN) else ""
         with self._known.lock:
-            if measure.removeprefix(KNOWN) in OF_AREAS:
-                return self._of_area(measure, trace, src, dst)
-            key, values = (measure, trace, src, dst), self._known.values
-            if key not in values:
-                if id(self.asking) in interrupted:
-                    return None
-                if len(values) >= _MOST_PAIRS:
-                    values.popitem(last=False)
-                values[key] = self._worked_out(measure, trace, src, dst)
-            return values[key]
-
-    def _of_area(self, measure: str, trace: int, src: int, dst: int) -> float | None:
-        """Return a measure of a conflict area. Those of all pairs of the first object are computed together."""
-        scope, areas = "known_" if measure.startswith(KNOWN) else "", self._known.areas
-        if id(self.asking) in interrupted and not areas.known(scope, trace, src):
-            return None
-        return areas.value(self._reader, scope, measure.removeprefix(KNOWN), (trace, src, dst))
-
-    def _worked_out(self, measure: str, trace: int, src: int, dst: int) -> float | None:
-        if src == dst:
-            return None
-        nodes = "world_nodes" if measure.startswith(KNOWN) else "nodes"
-        a, b = (self._track(nodes, trace, node) for node in (src, dst))
-        if a is None or b is None:
-            return None
-        from sgstore.model.criticality import Encounter  # imports numpy
-
-        value = RECORDED[measure.removeprefix(KNOWN)].value(Encounter(a, b))
-        return None if math.isnan(value) else value
-
-    def _track(self, nodes: str, trace: int, node: int) -> Track | None:
-        known = self._known.tracks
-        for key in ((nodes, trace), (nodes, trace, node)):
-            if key in known:
-                known.move_to_end(key)
-                return known[key].get(node)
-        first, last = trace << 24, ((trace + 1) << 24) - 1
-        sql = "SELECT count(*) FROM known_state WHERE frame_id BETWEEN ? AND ?"
-        ((many,),) = self._reader.execute(sql, [first, last]).fetchall()
-        tracks = TRACKS.format(nodes=nodes)
-        if many * _STATE_BYTES <= MOST_BYTES:
-            key, found = (nodes, trace), self._reader.execute(tracks, [trace])
-        else:
-            key = nodes, trace, node
-            found = self._reader.execute(f"{tracks} AND n.node_id = $2", [trace, node])
-        read = {other: track for other, _, _, track in tracks_of(found.fetchnumpy())}
-        known.keep(key, read, sum(map(len, read.values())) * _STATE_BYTES)
-        return read.get(node)
+            if id(self.asking) in interrupted and not self._known.known(scope, name, trace, src):
+                return None
+            return self._known.value(self._reader, scope, name, (trace, src, dst))
 
     def close(self) -> None:
         self._reader.close()
@@ -163,7 +94,7 @@ class _MeasuredQuestion:
 _tokens = count()
 _questions: Final[dict[int, _MeasuredQuestion]] = {}
 _paths: Final[dict[int, Path]] = {}
-_known: Final[OrderedDict[tuple[Path, Stamp], _Known]] = OrderedDict()
+_known: Final[OrderedDict[tuple[Path, Stamp], RecordedValues]] = OrderedDict()
 
 
 @lru_cache(_MOST_CALLS)
@@ -206,7 +137,7 @@ def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
     if any(asked.asking is connection for asked in list(_questions.values())):
         return
     place = path, stamp_of(path)
-    known = _known.setdefault(place, _Known())
+    known = _known.setdefault(place, RecordedValues())
     _known.move_to_end(place)
     while len(_known) > _FILES:
         _known.popitem(last=False)

@@ -14,11 +14,10 @@ from thorough import LONG
 import sgstore
 from sgstore.ingest import ingest
 from sgstore.model.criticality import (
-    OF_AREAS,
     RECORDED,
     Encounter,
+    Meetings,
     Track,
-    crossings_of,
     encounters,
     encroachment,
 )
@@ -73,7 +72,7 @@ def test_all_pairs_of_an_object_are_those_of_each_pair(
     rng = np.random.default_rng(seed)
     if seed % 2:
         monkeypatch.setattr("sgstore.model.criticality._footprints._TOGETHER", 3)
-    ids = (-5, 0, 3, *range(900, 930), 2**30)
+    ids = (-5, 0, 3, *range(900, 930), 2**16)
     sources = {7: 3, 8: -5, 1 << 38: 4}  # the last one is absent
     drives = {
         (trace, node): drive(rng, known=node == src)
@@ -91,21 +90,24 @@ def test_all_pairs_of_an_object_are_those_of_each_pair(
         )
     )
     mixed = rng.permutation(len(frames))
-    boxes = [states[mixed, column] for column in (0, 1, 3, 4, 5)]
+    instants = np.unique(frames)
+    times = instants, (instants & 0xFFFFFF).astype(np.float64)
 
-    traces, others, crossed = crossings_of(frames[mixed], nodes[mixed], boxes, sources)
+    together = Meetings(frames[mixed], nodes[mixed], mixed, states, sources, times)
 
-    pairs = zip(traces.tolist(), others.tolist(), strict=True)
-    times = np.where(crossed < 0, math.nan, crossed & 0xFFFFFF)
-    found = dict(zip(pairs, times.tolist(), strict=True))
+    pairs = [*zip(together.traces.tolist(), together.nodes.tolist(), strict=True)]
+    values = np.array([together.values(name) for name in RECORDED]).T.tolist()
+    found = dict(zip(pairs, zip(together.encroachments.tolist(), values, strict=True), strict=True))
     known = 0
     for (trace, node), other in drives.items():
         if node != sources[trace] and (trace, sources[trace]) in drives:
             of = Encounter(drives[trace, sources[trace]], other)
             wanted = frame_by_frame(of)
             alone = encroachment(of)
-            together = found.pop((trace, node), [math.nan] * 4)
-            assert together == pytest.approx(wanted, nan_ok=True)
+            areas, measures = found.pop((trace, node))
+            assert areas == pytest.approx(wanted, nan_ok=True)
+            every = [one.value(of) for one in RECORDED.values()]
+            np.testing.assert_array_equal(measures, every)
             assert [*astuple(alone)] == pytest.approx(wanted, nan_ok=True)
             known += sum(not math.isnan(one) for one in wanted)
     assert not found
@@ -142,7 +144,7 @@ def alone(many: Path) -> dict[tuple[int, int, int], tuple[float | None, ...]]:
         for src in dict.fromkeys([met[0][0], *tracks][:3]):
             for dst in tracks.keys() - {src}:
                 of = Encounter(tracks[src], tracks[dst])
-                told = [RECORDED[name].value(of) for name in OF_AREAS]
+                told = [RECORDED[name].value(of) for name in RECORDED]
                 values[trace.trace_id, src, dst] = tuple(None if math.isnan(v) else v for v in told)
     return values
 
@@ -166,9 +168,9 @@ def test_values_depend_on_no_order_and_no_cache_size(
     most_bytes: int,
     most_states: int,
 ) -> None:
-    monkeypatch.setattr("sgstore.store._conflict_areas.MOST_BYTES", most_bytes)
-    monkeypatch.setattr("sgstore.store._conflict_areas.MOST_STATES", most_states)
-    told = ", ".join(f"recorded('known {name}', trace_id, src, dst)" for name in OF_AREAS)
+    monkeypatch.setattr("sgstore.store._meetings.MOST_BYTES", most_bytes)
+    monkeypatch.setattr("sgstore.store._meetings.MOST_STATES", most_states)
+    told = ", ".join(f"recorded('known {name}', trace_id, src, dst)" for name in RECORDED)
     pairs = ", ".join(map(str, alone))
     columns = "pair(trace_id, src, dst)"
 

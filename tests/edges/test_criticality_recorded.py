@@ -24,6 +24,7 @@ from sgstore.errors import ConfigError, QueryError, SqlError, StoreError
 from sgstore.model.criticality import (
     RECORDED,
     Encounter,
+    Meetings,
     Track,
     cpi,
     crash_probability,
@@ -433,36 +434,22 @@ def copied(town_store: Path, tmp_path: Path) -> Store:
     return sgstore.open(shutil.copy(town_store, tmp_path / "copy.sgstore"))
 
 
-def test_no_pair_is_worked_out_that_the_rest_of_a_question_excludes(
-    copied: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Encounter] = []
-    monkeypatch.setattr(sgstore.model.criticality, "tet", lambda of: asked.append(of) or 1.5)
-    query = "MATCH (e:Ego), (v:Vehicle) WHERE {} dist(e, v) < 8 RETURN DISTINCT v.id"
-    near = copied.find(query.format("")).rows()
-
-    found = copied.find(query.format("tet(e, v) < 2 AND")).rows()
-
-    assert {*found} == {*near}
-    assert 0 < len(asked) == len(near) < len(recorded(copied, ["dce_recorded"]).values)
-
-
-def test_a_long_trace_is_read_pair_by_pair(
+def test_windows_of_any_size_have_the_same_values(
     copied: Store, open_town: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sgstore.store._encounters.MOST_BYTES", 100)
-    monkeypatch.setattr("sgstore.store._conflict_areas.MOST_STATES", 1000)
-    monkeypatch.setattr("sgstore.model.criticality._encounter._CIRCLES", 3)
+    monkeypatch.setattr("sgstore.store._meetings.MOST_STATES", 1000)
+    monkeypatch.setattr("sgstore.model.criticality._meetings._TOGETHER", 7)
+    monkeypatch.setattr("sgstore.model.criticality._footprints._TOGETHER", 3)
 
     assert recorded(copied).values == recorded(open_town).values
 
 
 def test_measures_end_with_their_statement(copied: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    def slow(_: Encounter) -> float:
+    def slow(of: Meetings, _: str) -> Floats:
         time.sleep(0.05)
-        return 1.0
+        return np.ones(len(of))
 
-    monkeypatch.setattr(sgstore.model.criticality, "cpi", slow)
+    monkeypatch.setattr(Meetings, "values", slow)
     begin = time.monotonic()
     sql = "SELECT sum(recorded('cpi', trace_id, dst, src)) FROM encounters"
     with pytest.raises(SqlError, match="stopped after"):

@@ -6,8 +6,7 @@ patterns and the monitor. The measures here need the complete drive: the tracks 
 frames.
 """
 
-from sgstore.model.criticality._closest import dce_recorded, ttce_recorded
-from sgstore.model.criticality._collision import ttc_recorded
+from sgstore.model.criticality._closest import dce_recorded, ttc_recorded, ttce_recorded
 from sgstore.model.criticality._encounter import Encounter, Track
 from sgstore.model.criticality._encroachment import (
     OF_AREAS,
@@ -17,18 +16,16 @@ from sgstore.model.criticality._encroachment import (
     pet,
 )
 from sgstore.model.criticality._exposure import tet, tit
-from sgstore.model.criticality._footprints import crossings_of
 from sgstore.model.criticality._headway import headway_recorded
+from sgstore.model.criticality._meetings import Meetings
 from sgstore.model.criticality._potential import cpi, crash_probability
 from sgstore.model.criticality._recorded import (
     FIXED_KINDS,
     KNOWN,
     RECORDED,
-    TRACKS,
     RecordedMeasure,
     encounters,
     recorded,
-    tracks_of,
 )
 
 __all__ = [
@@ -36,14 +33,13 @@ __all__ = [
     "KNOWN",
     "OF_AREAS",
     "RECORDED",
-    "TRACKS",
     "Encounter",
     "Encroachment",
+    "Meetings",
     "RecordedMeasure",
     "Track",
     "cpi",
     "crash_probability",
-    "crossings_of",
     "dce_recorded",
     "encounters",
     "encroachment",
@@ -53,7 +49,6 @@ __all__ = [
     "recorded",
     "tet",
     "tit",
-    "tracks_of",
     "ttc_recorded",
     "ttce_recorded",
 ]

@@ -1,7 +1,10 @@
-"""Closest encounter of two objects in the recording, seen from each frame on.
+"""Closest encounter and first contact of two objects in the recording, seen from each frame on.
 
 dce_recorded(t) (m) = min { gap(t′) : t′ ≥ t }, ttce_recorded(t) (s) = the first such t′ minus t.
 Source: Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014.
+
+ttc_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprints of both at t′ overlap or touch }.
+Source: Lin and Althoff, CommonRoad-CriMe, IV 2023. There the road's edge counts too; here it does not.
 """
 
 from __future__ import annotations
@@ -32,3 +35,11 @@ def ttce_recorded(of: Encounter) -> Floats:
             when = times[row]
         found[row] = when - times[row]
     return found
+
+
+def ttc_recorded(of: Encounter) -> Floats:
+    """Return the time until two objects touch in the recording, for each frame, (T,); s. NaN for never."""
+    times = of.times
+    met = np.where(of.numbers["gap"] <= 0, times, np.inf)
+    first = np.minimum.accumulate(met[::-1])[::-1]
+    return np.where(np.isfinite(first), first - times, np.nan)

@@ -16,12 +16,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.pair_numbers import COLUMNS, PairNumbers
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from sgstore.model.world import Bools, Floats, Ints
 
 _FAN: Final = 8
@@ -32,8 +29,6 @@ FOOTPRINT: Final = [COLUMNS.index(name) for name in ("x", "y", "heading", "lengt
 """Columns of a state that form the footprint of an object."""
 _MARGIN: Final = 1e-6
 """Enlargement of bounding boxes, more than their rounding errors; m."""
-_NODES: Final = 1 << 31
-"""Number of negative node ids."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +125,7 @@ class Footprints:
             State in which a enters, first state after a has left, and the same of b. -1 means unknown or
             no common area: the first state of the object is in the area, or its last one.
         """
-        search = _Search(self, len(a))
+        search = AreaSearch(self, len(a))
         known = np.flatnonzero(self.known[a] & self.known[b])
         search.run(known, a[known], b[known])
         crossed = np.full((len(a), 4), -1)
@@ -143,7 +138,7 @@ class Footprints:
         return crossed
 
 
-class _Search:
+class AreaSearch:
     """Search for the first and last rows of pairs of objects in their common areas.
 
     Attributes
@@ -178,9 +173,7 @@ class _Search:
     def _near(self, level: int, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:
         """Return the pairs of bounding boxes that overlap, and may have a new first or last row."""
         boxes = self._of.levels[level]
-        low_x, low_y, high_x, high_y = boxes.sides  # the high sides are negative
-        on = (low_x[a] <= -high_x[b]) & (low_x[b] <= -high_x[a])
-        on &= (low_y[a] <= -high_y[b]) & (low_y[b] <= -high_y[a])
+        on = self._boxes_overlap(level, a, b)
         pair, a, b = pair[on], a[on], b[on]
         middle_a, middle_b = ((boxes.rows[one] + boxes.rows[one + 1]) // 2 for one in (a, b))
         sure = self._apart(middle_a, middle_b) < self._sure(middle_a, middle_b)
@@ -189,15 +182,25 @@ class _Search:
         new = self._new(pair, (boxes.rows[a], boxes.rows[b]), (ends_a, ends_b))
         return pair[new], a[new], b[new]
 
+    def _boxes_overlap(self, level: int, a: Ints, b: Ints) -> Bools:
+        low_x, low_y, high_x, high_y = self._of.levels[level].sides  # the high sides are negative
+        on = (low_x[a] <= -high_x[b]) & (low_x[b] <= -high_x[a])
+        on &= (low_y[a] <= -high_y[b]) & (low_y[b] <= -high_y[a])
+        return on
+
     def _rows(self, pair: Ints, a: Ints, b: Ints) -> None:
         """Compare the footprints of pairs of rows."""
-        apart, of = self._apart(a, b), self._of
-        sure = apart < self._sure(a, b)
+        sure = self._apart(a, b) < self._sure(a, b)
         self._found(pair[sure], a[sure], b[sure])
-        near = np.flatnonzero(~sure & (apart <= ((of.reach[a] + of.reach[b]) * (1 + 1e-9)) ** 2))
+        near = np.flatnonzero(~sure & self._circles_overlap(a, b))
         near = near[self._new(pair[near], (a[near], b[near]), (a[near], b[near]))]
         on = near[self._overlap(a[near], b[near])]
         self._found(pair[on], a[on], b[on])
+
+    def _circles_overlap(self, a: Ints, b: Ints) -> Bools:
+        reach = self._of.reach
+        found: Bools = self._apart(a, b) <= ((reach[a] + reach[b]) * (1 + 1e-9)) ** 2
+        return found
 
     def _overlap(self, a: Ints, b: Ints) -> Bools:
         """Return a mask of the pairs of rows whose footprints touch or overlap, (K,)."""
@@ -244,60 +247,3 @@ def _divided(below: Ints, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Int
     place = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
     part_a, part_b = np.divmod(place, count_b[of])
     return pair[of], below[a][of] + part_a, below[b][of] + part_b
-
-
-def crossings_of(
-    frames: Ints, nodes: Ints, boxes: Sequence[Floats], sources: Mapping[int, int]
-) -> tuple[Ints, Ints, Ints]:
-    """Return the frames in which an object of each trace and the others cross their common areas.
-
-    Parameters
-    ----------
-    frames, nodes : (K,) int64
-        Frame id and node id of each state, in any order. The upper bits of a frame id are the trace id.
-    boxes : sequence of (K,) float64
-        ``x, y, heading, length, width``; m, m, rad, m, m.
-    sources : mapping of int to int
-        Node id of the object by trace id; at most 64 traces, all that occur.
-
-    Returns
-    -------
-    traces, nodes : (P,) int64
-        Other objects that come near the object of their trace.
-    crossed : (P, 4) int64
-        Frame in which the object enters, first frame after it has left, and the same of the other
-        object. -1 means unknown or no common area.
-    """
-    traces = np.array(sorted(sources))
-    rank = traces.searchsorted(trace_of(frames))
-    objects = (rank << 32) + nodes + _NODES
-    order = np.argsort(objects << SEQ_BITS | frames & (1 << SEQ_BITS) - 1, kind="stable")
-    wanted = (np.arange(len(traces)) << 32) + np.array([sources[one] for one in traces]) + _NODES
-    objects = objects[order]
-    x, y, _, length, width = boxes
-    near = np.flatnonzero(_near(objects, x[order], y[order], (length + width)[order], wanted))
-    order = order[near]
-    footprints = Footprints(objects[near], np.stack([one[order] for one in boxes]))
-    objects = footprints.objects
-    source = objects.searchsorted(wanted)[objects >> 32]
-    others = np.flatnonzero(objects != wanted[objects >> 32])
-    crossed = footprints.crossed(source[others], others)
-    rows = np.append(frames[order], -1)  # -1 is the last one
-    found = objects[others]
-    return traces[found >> 32], (found & (1 << 32) - 1) - _NODES, rows[crossed]
-
-
-def _near(objects: Ints, x: Floats, y: Floats, size: Floats, wanted: Ints) -> Bools:
-    """Return a mask of the states of objects whose surroundings overlap those of their trace's object, (K,)."""
-    if not len(objects):
-        return np.zeros(0, np.bool_)
-    starts = np.flatnonzero(np.append(True, objects[1:] != objects[:-1]))
-    of = objects[starts]
-    reach = np.maximum.reduceat(size, starts) / 2 + _MARGIN
-    place = np.minimum(of.searchsorted(wanted), len(of) - 1)
-    on, own = (of[place] == wanted)[of >> 32], place[of >> 32]
-    for one in (x, y):
-        low = np.minimum.reduceat(one, starts) - reach
-        high = np.maximum.reduceat(one, starts) + reach
-        on &= (low <= high[own]) & (low[own] <= high)
-    return np.repeat(on, np.diff(np.append(starts, len(objects))))

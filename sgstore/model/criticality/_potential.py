@@ -15,6 +15,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from sgstore.model.criticality._encounter import Encounter
+    from sgstore.model.pair_numbers import PairNumbers
     from sgstore.model.world import Floats
 
 _MEAN: Final = 8.45
@@ -43,10 +44,14 @@ def cpi(of: Encounter) -> float:
     Frames without b ahead in a's path count as 0, frames with contact and without separation as 1;
     frames with an unknown required deceleration do not count. NaN if no frame counts.
     """
-    numbers = of.numbers
+    chance = crash_chances(of.numbers)
+    return float(np.nanmean(chance)) if (~np.isnan(chance)).any() else math.nan
+
+
+def crash_chances(numbers: PairNumbers) -> Floats:
+    """Return the probability per frame that braking is not enough, (K,). Frames with NaN do not count."""
     needed = -numbers["a_long_req"]
     placed = ~np.isnan(numbers["lon"] + numbers["reach1"] + numbers["reach2"])
     lost = (numbers["lead"] == 0) & (numbers["closing"] > 0)
     free = placed & np.isnan(numbers["lead"])
-    chance = np.where(lost, 1.0, np.where(free, 0.0, crash_probability(needed)))
-    return float(np.nanmean(chance)) if (~np.isnan(chance)).any() else math.nan
+    return np.where(lost, 1.0, np.where(free, 0.0, crash_probability(needed)))

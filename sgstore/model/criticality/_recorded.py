@@ -147,7 +147,7 @@ class _Asked(Protocol):
     """Interface of a store file: the methods that the recorded measures use."""
 
     def arrays(self, sql: str, parameters: Sequence[object] | None = None) -> Mapping[str, Any]: ...
-    def rows(self, sql: str) -> Any: ...
+    def recorded_encounters(self, measures: Sequence[str]) -> Any: ...
     def trace(self, ref: int | str) -> Any: ...
 
 
@@ -180,7 +180,7 @@ def encounters(store: _Store, trace: str) -> Iterator[tuple[int, int, str, Encou
 def recorded(store: _Store, measures: Sequence[str] = tuple(RECORDED)) -> Any:
     """Return a table of recorded criticality measures: one row per trace, ego and other object.
 
-    The values come from the view ``encounters``.
+    The pairs are those of the view ``encounters``.
 
     Parameters
     ----------
@@ -202,5 +202,4 @@ def recorded(store: _Store, measures: Sequence[str] = tuple(RECORDED)) -> Any:
     wrong = next((name for name in measures if name not in RECORDED), None)
     if wrong is not None:
         raise ConfigError(f"no recorded measure: {wrong!r}; expected some of {', '.join(RECORDED)}")
-    columns = ", ".join(("trace", "src", "dst", "kind", *measures))
-    return store.file.rows(f"SELECT {columns} FROM encounters ORDER BY trace_id, src, dst")  # noqa: S608  names of ours
+    return store.file.recorded_encounters(measures)

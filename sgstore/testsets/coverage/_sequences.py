@@ -11,7 +11,6 @@ twice; here it may.)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -97,13 +96,6 @@ class ManoeuvreEvents:
         place = {name: i for i, name in enumerate(names)}
         moved = np.array([place[name] for name in self.names] or [0], np.int64)
         return replace(self, names=names, code=moved[self.code])
-
-    @cached_property
-    def traces(self) -> list[tuple[int, slice]]:
-        """Return the trace ids, each with the slice of its manoeuvre events."""
-        traces, first = np.unique(trace_of(self.frame_id), return_index=True)
-        ends = np.append(first[1:], len(self.code))
-        return list(zip(traces.tolist(), map(slice, first.tolist(), ends.tolist()), strict=True))
 
 
 def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> ManoeuvreEvents:
@@ -200,15 +192,21 @@ def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) 
     dict of int to int
         A sequence a, b, c has the number ``(a · names + b) · names + c``.
     """
+    found = _starts(code, time_ns, names, k, within_ns)
+    return {number: int(starts[0]) for number, starts in found.items()}
+
+
+def _starts(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> dict[int, Ints]:
+    """Return the indices of the events that begin each sequence, ascending."""
     time_ns = np.maximum.accumulate(time_ns)  # clocks that run backwards stay constant
     following = _following(code, time_ns, names)
     latest = time_ns + np.minimum(within_ns, np.iinfo(np.int64).max - time_ns)
     first = np.arange(len(code))
-    found: dict[int, int] = {}
+    found: dict[int, Ints] = {}
 
     def go_on(number: int, starts: Ints, ends: Ints, left: int) -> None:
         if not left:
-            found[number] = int(starts[0])
+            found[number] = starts
             return
         for name in range(names):
             onward = following[name][ends]
@@ -330,14 +328,19 @@ def check_sequences(names: int, k: int) -> None:
 
 def _in_traces(of: ManoeuvreEvents, k: int, within_ns: int) -> dict[int, tuple[int, int]]:
     """Return, for each sequence of manoeuvres, its number of traces and the frame of its first occurrence."""
-    found: dict[int, tuple[int, int]] = {}
-    for _, rows in of.traces:
-        here = sequences_in(of.code[rows], of.time_ns[rows], len(of.names), k, within_ns)
-        frames = of.frame_id[rows]
-        for one, place in here.items():
-            many, frame = found.get(one, (0, int(frames[place])))
-            found[one] = many + 1, frame
-    return found
+    traces, first, rank = np.unique(trace_of(of.frame_id), return_index=True, return_inverse=True)
+    if not len(traces):
+        return {}
+    # One run of all traces, so far apart that no sequence spans two of them.
+    low = np.minimum.reduceat(of.time_ns, first)
+    spans = np.maximum.reduceat(of.time_ns, first) - low
+    within_ns = min(within_ns, int(spans.max()))
+    offsets = np.cumsum(spans + within_ns + 1) - spans
+    time_ns = of.time_ns + (offsets - low)[rank]
+    return {
+        number: (len(np.unique(rank[starts])), int(of.frame_id[starts[0]]))
+        for number, starts in _starts(of.code, time_ns, len(of.names), k, within_ns).items()
+    }
 
 
 def _text(number: int, names: Sequence[str], k: int) -> str:

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import ConfigError
-from sgstore.model.criticality import RECORDED, encounters
+from sgstore.model.criticality import RECORDED
 from sgstore.model.frame_ids import trace_of
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.testsets.coverage import UNKNOWN, ReportTable, classed, told_outcomes
@@ -483,20 +483,18 @@ def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, Wor
     if not measures:
         return {}
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
-    store = units.chosen.one_store
-    sql = "SELECT frame_id, t FROM frames WHERE trace = ? ORDER BY t"
-    here = set(trace_of(units.frame_id[units.asked]).tolist())
-    for trace in [one for one in store.file.traces() if one.trace_id in here]:
-        frames = store.file.arrays(sql, [trace.name])
-        ids, times = frames["frame_id"].astype(np.int64), frames["t"].astype(np.float64)
-        for _, met, _, encounter in encounters(store, trace.name):
-            both = ids[np.searchsorted(times, encounter.times)]
-            rows = np.minimum(np.searchsorted(units.frame_id, both), len(units.frame_id) - 1)
-            rows = rows[(units.frame_id[rows] == both) & units.asked[rows]]
-            for i, name in enumerate(measures):
-                signed = _sign(name) * LATER[name].value(encounter)
-                worse = rows[signed < value[i, rows]]
-                value[i, worse], other[i, worse] = signed, met
+    for met in units.chosen.one_store.file.meetings():
+        rows = np.minimum(np.searchsorted(units.frame_id, met.frame_id), len(units.frame_id) - 1)
+        here = (units.frame_id[rows] == met.frame_id) & units.asked[rows]
+        rows, pair = rows[here], met.pair[here]
+        for i, name in enumerate(measures):
+            signed = np.nan_to_num(_sign(name) * met.values(name), nan=np.inf)[pair]
+            before = value[i, rows]
+            np.minimum.at(value[i], rows, signed)
+            worst = np.flatnonzero((signed == value[i, rows]) & (signed < before))
+            # Of equal values, the smallest node id counts.
+            order = worst[np.argsort(-met.nodes[pair[worst]], kind="stable")]
+            other[i, rows[order]] = met.nodes[pair[order]]
     return {
         name: _worst_of(units, name, value[i], other[i].astype(np.int64))
         for i, name in enumerate(measures)
