@@ -177,7 +177,7 @@ def _type_of(traces: list[tuple[Type, bool, bool]]) -> Type:
     return Type.whole if kind is Type.number and exact else kind
 
 
-_STATED: Final = ("heading", "length", "width", "height", "speed")
+_STATED: Final = ("heading", "length", "width", "height", "speed", "vx")
 """Attributes whose missing values are looked up in the states."""
 
 _HOLDERS: Final = {

@@ -44,12 +44,20 @@ from sgstore.temporal._check_verdict import (
     verdict_rows,
     within_range,
 )
-from sgstore.temporal._formula import Formula, Proposition, formula_text, propositions, tolerant
+from sgstore.temporal._formula import (
+    Formula,
+    Proposition,
+    formula_text,
+    looks_ahead,
+    propositions,
+    tolerant,
+)
 from sgstore.temporal._known_range import ShortRange, short_ranges
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
-from sgstore.temporal._offline import PlanValues, TraceReader, frame_times, traces
+from sgstore.temporal._offline import PlanValues, Premises, TraceReader, frame_times, traces
 from sgstore.temporal._plan import kept_throughout, needs_text, plan_of_returned, plan_text
+from sgstore.temporal._premises import bindings_of, premises_of
 from sgstore.temporal._quantifiers import (
     HOLDS,
     PENDING,
@@ -59,6 +67,7 @@ from sgstore.temporal._quantifiers import (
     folded_margins,
     folded_values,
     innermost,
+    levels_among,
     levels_of,
     may_wait,
     newcomers,
@@ -77,6 +86,8 @@ from sgstore.temporal._verdicts import (
     PRESUMABLY_TRUE,
     Settled,
     Violation,
+    always_true,
+    violations_of_always,
     within_bounds,
 )
 
@@ -398,15 +409,29 @@ class StoreCheck:
 
     def verdicts(self) -> Iterator[Verdict]:
         """Yield the verdict of the check on each trace, in the order of trace names."""
-        known = (self._verdict(trace) for trace in self.readers() if len(trace))
+        known = (
+            self._verdict(trace) for trace in self.readers(premises=self._premises) if len(trace)
+        )
         yield from merge(known, self.unknown(), key=lambda verdict: natural(verdict.trace))
 
-    def readers(self, within: Window | None = None) -> Iterator[TraceReader]:
-        """Yield the traces with data for the check, loaded into memory. ``within`` limits them to a window."""
+    @cached_property
+    def _premises(self) -> Premises | None:
+        asks = self._plan.asks | self._values.asks
+        found = premises_of(self._check, self._plan, self._formula, asks)
+        return None if self._want_status else found
+
+    def readers(
+        self, within: Window | None = None, *, premises: Premises | None = None
+    ) -> Iterator[TraceReader]:
+        """Yield the traces with data for the check, loaded into memory.
+
+        ``within`` limits the traces to a window, ``premises`` the data to what the verdicts need.
+        """
         gaps = "bridge" if self._check.gaps == "bridge" else "break"
         self._read_people()
         asks = self._plan.asks | self._values.asks
-        yield from traces(self._file, self._knowing, self._whole, asks, gaps=gaps, within=within)
+        about = self._file, self._knowing, self._whole, asks
+        yield from traces(*about, gaps=gaps, within=within, premises=premises)
 
     def unknown(self) -> Iterator[Verdict]:
         """Yield the unknown verdicts of the traces that lack data for the check."""
@@ -457,7 +482,7 @@ class StoreCheck:
         """Return the number of frames in which an entity of the check is absent: trace id → number."""
         frames = frame_times(self._file, None)["frame_id"]
         full = np.ones(len(frames), np.bool_)
-        owners = trace_of(frames)
+        traces, owners = np.unique(trace_of(frames), return_inverse=True)
         plan = empty_plan(self._check)
         for node in self._check.scope.nodes:
             ask = plan.atoms[plan.presence(node)]
@@ -467,12 +492,10 @@ class StoreCheck:
             found = self._file.arrays(counted, values, given=before, plain=True)
             there = np.zeros(len(frames), np.int64)
             ids, many = (np.ma.getdata(found[name]) for name in ("frame_id", "there"))
-            order = np.argsort(frames)
-            there[order[np.searchsorted(frames, ids, sorter=order)]] = many
-            sizes = {t: len(some.get(node, ())) for t, some in self._people.items()}
-            wanted = np.array([sizes.get(t, 0) for t in owners.tolist()])
-            full &= there >= wanted
-        traces, number = np.unique(owners[~full], return_counts=True)
+            there[np.searchsorted(frames, ids)] = many
+            people = (self._people.get(trace, {}) for trace in traces.tolist())
+            full &= there >= np.array([len(some.get(node, ())) for some in people])[owners]
+        number = np.bincount(owners[~full], minlength=len(traces))
         return dict(zip(traces.tolist(), number.tolist(), strict=True))
 
     def _read_people(self) -> None:
@@ -482,6 +505,11 @@ class StoreCheck:
                 self._people.setdefault(trace, {}).setdefault(node, {})[number] = name
 
     def _verdict(self, trace: TraceReader) -> Verdict:
+        short = self._short.get(trace.trace_id, ShortRange())
+        if self._premises is not None and not self._premises.left(trace.relations):
+            absent = self._absences.get(trace.trace_id, 0)
+            found = Verdict(self._check.name, trace.name, "true", absent_frames=absent)
+            return within_range(found, short)
         levels = self._levels(trace, FAVOURABLE)
         judged = self._judged(trace, levels)
         strict, other = levels, judged
@@ -508,7 +536,7 @@ class StoreCheck:
             found = replace(found, reason=self._reason(trace, strict, other))
         if word == "true":
             found = replace(found, absent_frames=self._absences.get(trace.trace_id, 0))
-        found = within_range(found, self._short.get(trace.trace_id, ShortRange()))
+        found = within_range(found, short)
         if self._quantity is None:
             return found
         robustness = self._robustness(self._quantity, trace, levels)
@@ -690,10 +718,15 @@ class StoreCheck:
             parts = [PlanValues(*about, part, counted).formula(guard) for part in some]
             return np.concatenate([part.any(axis=1) for part in parts])
 
-        injective = self._check.injective
-        return levels_of(
-            self._check.quantifiers, domains, apart=apart if injective else None, counts=counts
-        )
+        injective, quantifiers = self._check.injective, self._check.quantifiers
+        if self._premises is not None:
+            free = {
+                name: ids[~np.isin(ids, apart)] if injective else ids
+                for name, ids in domains.items()
+            }
+            few = bindings_of(self._premises, trace, self._variables, free, injective=injective)
+            return levels_among(quantifiers, few, counts=counts)
+        return levels_of(quantifiers, domains, apart=apart if injective else None, counts=counts)
 
     def _alike(self, trace: TraceReader, bindings: Keys) -> tuple[Keys, Ints]:
         """Group combinations of entities with equal truth values in all frames, to evaluate each group once.
@@ -741,6 +774,13 @@ class StoreCheck:
         codes = np.where(truths, HOLDS, VIOLATED).astype(np.int8)
         told: list[_BindingVerdict] = [((), None)] * rows
         lenient = tolerant(self._formula, trace.clock.tolerance)
+        kept = always_true(self._formula)
+        if kept is not None and not (looks_ahead(kept) or self._compat or self._want_status):
+            held = values.formula(kept)
+            for row in np.flatnonzero(~truths if among is None else ~truths & among).tolist():
+                reset = None if resets is None else resets[row]
+                told[row] = tuple(violations_of_always(held[row], reset)), None
+            return codes, told
         for row in range(rows):
             needed = not truths[row] or self._compat or self._want_status
             if not needed or (among is not None and not among[row]):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import QueryError
+from sgstore.lang import ir as b
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import (
     BUCKETS,
@@ -363,6 +364,69 @@ class PlanValues(SignalValues):
         return self._bindings[:, [self._variables.index(name) for name in variables]]
 
 
+Alternatives = frozenset[frozenset[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class Premises:
+    """Alternative sets of queries: a check is true unless all queries of one set have matches.
+
+    Attributes
+    ----------
+    alternatives : frozenset of frozenset of str
+    asks : mapping of str to Ask
+        All queries of the check by name.
+    """
+
+    alternatives: Alternatives
+    asks: Mapping[str, Ask]
+
+    @property
+    def order(self) -> list[str]:
+        """Names of the queries in the order of reading: those with few matches and low cost first."""
+        named = {name for one in self.alternatives for name in one}
+
+        def rank(name: str) -> tuple[bool, bool, int]:
+            ask = self.asks[name]
+            return name not in named, _is_dense(ask), len(ask.variables)
+
+        return sorted(self.asks, key=rank)
+
+    def left(self, relations: Mapping[str, TimedRelation]) -> list[frozenset[str]]:
+        """Return the alternatives whose queries have matches in a trace, as far as they were read."""
+        empty = {name for name, one in relations.items() if not len(one.keys)}
+        return [one for one in self.alternatives if not one & empty]
+
+    def nodes(self, ask: Ask, traces: Iterable[TraceReader]) -> dict[str, Ints]:
+        """Return the only nodes that a query needs in some traces, by variable. Others need all."""
+        found: dict[str, list[Ints] | None] = {name: [] for name in ask.variables}
+        for trace in traces:
+            for one in self.left(trace.relations):
+                for name, sofar in found.items():
+                    held = [
+                        trace.relations[other].keys[:, self.asks[other].variables.index(name)]
+                        for other in one
+                        if other in trace.relations and name in self.asks[other].variables
+                    ]
+                    if not held:
+                        found[name] = None
+                    elif sofar is not None:
+                        few = held[0]
+                        for more in held[1:]:
+                            few = few[np.isin(few, more)]
+                        sofar.append(few)
+        return {
+            name: np.unique(np.concatenate([np.zeros(0, np.int64), *ids]))
+            for name, ids in found.items()
+            if ids is not None
+        }
+
+
+def _is_dense(ask: Ask) -> bool:
+    """True if a query asks for the absence of something, which mostly has many matches."""
+    return all(isinstance(c, b.Operation) and c.word == "NOT" for c in ask.query.scope.where)
+
+
 def traces(
     file: StoreFile,
     catalog: Catalog,
@@ -371,6 +435,7 @@ def traces(
     *,
     gaps: str = "break",
     within: Window | None = None,
+    premises: Premises | None = None,
 ) -> Iterator[TraceReader]:
     """Yield the traces that have the data of a query, loaded into memory, in catalog order.
 
@@ -390,6 +455,8 @@ def traces(
         Effect of a gap on a run: ``break`` or ``bridge``.
     within : Window, optional
         Buckets of whole traces; by default all.
+    premises : Premises, optional
+        Premises of a check, to read only what its evaluation needs.
 
     Raises
     ------
@@ -398,7 +465,7 @@ def traces(
     """
     asked = [one for one in extents(catalog) if within is None or one[0] in within]
     steps = Windows(asked, whole_traces=True)
-    ask = partial(read, file, catalog, whole, asks, gaps=gaps)
+    ask = partial(read, file, catalog, whole, asks, gaps=gaps, premises=premises)
     for window in steps:
         for found, rows in steps.parts(window or within, ask):
             steps.rows += rows
@@ -414,6 +481,7 @@ def read(
     window: Window | None,
     *,
     gaps: str,
+    premises: Premises | None = None,
 ) -> tuple[list[TraceReader], int]:
     """Return the traces of a window, loaded into memory, and the number of rows read. :func:`traces` calls it.
 
@@ -425,31 +493,33 @@ def read(
     about = chosen_traces(file, whole, catalog)
     found = _clocks(about, frame_times(file, window), gaps)
     rows, memory = 0, file.memory
-    for name, ask in asks.items():
-        narrower = _narrowed(ask, found.values())
-        if narrower is None:
-            for trace in found.values():
-                trace.relations[name] = _no_rows(ask)
-        else:
+    for name in asks if premises is None else premises.order:
+        ask = asks[name]
+        left = _left(ask, found, premises)
+        narrower = _narrowed(ask, left.values(), premises)
+        for trace in found.values():
+            if narrower is None or trace.trace_id not in left:
+                trace.relations[name] = no_rows(ask)
+        if narrower is not None:
             size = ROW_BYTES + EDGE_BYTES * len(ask.edges)
-            where = _window_left(ask, catalog, window, found)
-            many = _relate(file, catalog, name, narrower, where, found, memory // size)
+            where = window if len(left) == len(found) else _window_of(left, catalog)
+            many = _relate(file, catalog, name, narrower, where, left, memory // size)
             rows, memory = rows + many, memory - many * size
     ordered = (trace.trace_id for trace in catalog.traces)
     return [found[trace] for trace in ordered if trace in found], rows
 
 
-def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
-    """Return a single-frame query limited to the nodes that earlier steps matched.
+def _narrowed(ask: Ask, traces: Collection[TraceReader], premises: Premises | None) -> Ask | None:
+    """Return a single-frame query limited to the nodes that earlier queries matched.
 
     ``None`` means that they matched no nodes.
     """
-    ids: dict[str, Ints] = {}
+    if not traces:
+        return None
+    ids = {} if premises is None else premises.nodes(ask, traces)
     narrow = ask.loose or ask.value is not None
     for before in ask.after:
         keys = [trace.relations[before.name].keys for trace in traces]
-        if not sum(map(len, keys)):
-            return None
         for node in set(before.variables) & set(ask.variables) if narrow else ():
             held = np.unique(np.concatenate([k[:, before.variables.index(node)] for k in keys]))
             ids[node] = np.intersect1d(ids[node], held) if node in ids else held
@@ -457,23 +527,27 @@ def _narrowed(ask: Ask, traces: Collection[TraceReader]) -> Ask | None:
     return ask.among(few) if few else ask
 
 
-def _window_left(
-    ask: Ask, catalog: Catalog, window: Window | None, traces: Mapping[int, TraceReader]
-) -> Window | None:
-    """Return a window limited to the traces in which all earlier steps have matches."""
-    left = {
-        trace_id
+def _left(
+    ask: Ask, traces: Mapping[int, TraceReader], premises: Premises | None
+) -> dict[int, TraceReader]:
+    """Return the traces in which all earlier steps, or the queries of a premise, have matches."""
+    return {
+        trace_id: trace
         for trace_id, trace in traces.items()
         if all(len(trace.relations[before.name].keys) for before in ask.after)
+        and (premises is None or premises.left(trace.relations))
     }
-    if len(left) == len(traces):
-        return window
-    return Window.of([one.extent for one in catalog.traces if one.trace_id in left] or [(0, 0)])
 
 
-def _no_rows(ask: Ask) -> TimedRelation:
+def _window_of(traces: Mapping[int, TraceReader], catalog: Catalog) -> Window:
+    return Window.of([one.extent for one in catalog.traces if one.trace_id in traces])
+
+
+def no_rows(ask: Ask) -> TimedRelation:
+    """Return the table of a query without matches."""
     keys = np.zeros((0, len(ask.columns)), np.int64)
-    return TimedRelation.of(np.zeros(0, np.int64), keys)
+    values = () if ask.value is None else (np.ma.masked_all(0),)
+    return TimedRelation.of(np.zeros(0, np.int64), keys, values)
 
 
 def chosen_traces(file: StoreFile, query: Query, catalog: Catalog) -> dict[int, tuple[Any, ...]]:

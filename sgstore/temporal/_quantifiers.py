@@ -107,6 +107,40 @@ def levels_of(
     return levels
 
 
+def levels_among(
+    quantifiers: Sequence[BoundQuantifier],
+    bindings: Keys,
+    *,
+    counts: Callable[[BoundQuantifier, tuple[str, ...], Keys], Bools],
+) -> list[Level]:
+    """Return the combinations of entities for each quantifier, limited to some combinations of all variables.
+
+    Parameters
+    ----------
+    quantifiers : sequence of BoundQuantifier
+    bindings : (B, n) int64
+        Ascending.
+    counts : function
+        See :func:`levels_of`.
+    """
+    variables: tuple[str, ...] = ()
+    for quantifier in quantifiers:
+        variables = (*variables, *quantifier.nodes)
+        head, members = np.unique(bindings[:, : len(variables)], axis=0, return_inverse=True)
+        bindings = bindings[counts(quantifier, variables, head)[members.reshape(-1)]]
+    levels = list[Level]()
+    many = 0
+    outer = np.zeros(len(bindings), np.int64)
+    for quantifier in quantifiers:
+        many += len(quantifier.nodes)
+        head, first, members = np.unique(
+            bindings[:, :many], axis=0, return_index=True, return_inverse=True
+        )
+        levels.append(Level(quantifier.word, head, outer[first]))
+        outer = members.reshape(-1)
+    return levels
+
+
 def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]:
     """Return the entities of each check variable, with an extra future entity for ``FORSOME`` variables."""
     some = [node for q in check.quantifiers if q.word == "FORSOME" for node in q.nodes]

@@ -339,6 +339,28 @@ class Settled:
         return found, False
 
 
+def violations_of_always(held: Bools, reset: Bools | None) -> list[Violation]:
+    """Return the violations of ``ALWAYS p`` as frame ranges, where each frame decides p.
+
+    Parameters
+    ----------
+    held : (F,) bool
+        Value of p at each frame.
+    reset : (F,) bool, optional
+        See :meth:`Settled.violations`.
+    """
+    broken = np.flatnonzero(~held)
+    if reset is None:
+        return [(int(broken[0]), len(held) - 1, False)] if len(broken) else []
+    ends = np.append(np.flatnonzero(reset), len(held) - 1)
+    ends = ends[np.searchsorted(ends[:-1], broken)]
+    new = np.diff(ends, prepend=-1) != 0
+    return [
+        (first, last, False)
+        for first, last in zip(broken[new].tolist(), ends[new].tolist(), strict=True)
+    ]
+
+
 def within_bounds(
     formula: Formula, columns: Mapping[str, Bools], times: Ints, gaps: Bools, rows: int
 ) -> tuple[Bools, Bools]:
