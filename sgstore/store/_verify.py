@@ -6,28 +6,42 @@ Reading a table also verifies DuckDB's block checksums.
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
+from sgstore.base.quoting import quoted
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.config import from_dict
+from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS, SEQ_BITS
 from sgstore.model.world import BUCKET_FRAMES
-from sgstore.store._checksums import Checksum, expressions
+from sgstore.store._checksums import Checksum, columns_of, expressions, row_words
 from sgstore.store._engine_errors import translated
-from sgstore.store._locking import Access
-from sgstore.store._publish import SHARED, checksum_of, owned
+from sgstore.store._locking import Access, default_memory
+from sgstore.store._publish import SHARED, owned
 from sgstore.store._schema import schema_faults
 from sgstore.store._traces import stored_traces
 from sgstore.store._verify_rules import RULES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from duckdb import DuckDBPyConnection
+    from numpy.typing import NDArray
 
+    from sgstore.model.world import Ints
     from sgstore.store._traces import StoredTrace
+
+    Words = NDArray[np.uint64]
+
+
+_MEMORY: Final = 1 << 29
+"""Memory limit of the database; bytes. All of the file is read once, so a larger cache has no use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +83,12 @@ class Verification:
     others: tuple[str, ...] = ()
 
 
-def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
+def verify_file(
+    path: str | Path,
+    *,
+    recordings: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Verification:
     """Verify the content of a store file. The schema may be too altered for normal opening.
 
     If the schema was altered, only that fault is returned, and the tables are not read.
@@ -79,6 +98,8 @@ def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
     path : str or Path
     recordings : bool
         See :meth:`StoreFile.verify`.
+    progress : callable, optional
+        Called with the number of rows that were read, and the number of all rows.
 
     Raises
     ------
@@ -91,24 +112,33 @@ def verify_file(path: str | Path, *, recordings: bool = False) -> Verification:
         altered, others = schema_faults(connection, place)
     if altered:
         return Verification(faults=[Fault("", "schema", text) for text in altered], others=others)
-    result = verify_store(Access(place, diagnose=damage), recordings=recordings)
+    result = verify_store(Access(place, diagnose=damage), recordings=recordings, progress=progress)
     result.others = others
     return result
 
 
-def verify_store(access: Access, *, recordings: bool = False) -> Verification:
+def verify_store(
+    access: Access,
+    *,
+    recordings: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Verification:
     """Verify the content of an open store, and return the faults."""
     with access.reading() as connection:
-        result = verify(connection, access.path)
+        result = verify(connection, access.path, progress)
         if recordings:
             _verify_recordings(connection, access, result)
     return result
 
 
-def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
+def verify(
+    connection: DuckDBPyConnection,
+    path: Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> Verification:
     """Verify the content of an open store, and return the faults.
 
-    An unreadable table becomes a fault.
+    An unreadable table becomes a fault. ``progress`` receives the number of rows that were read, and of all.
 
     Raises
     ------
@@ -128,9 +158,25 @@ def verify(connection: DuckDBPyConnection, path: Path) -> Verification:
     result.traces = len(traces)
     published = _published(connection)
     result.faults += attempt(partial(_content_faults, connection))
-    for trace in traces.values():
-        result.faults += attempt(partial(_trace_faults, connection, trace, published, result))
-    result.faults += attempt(partial(_shared_faults, connection, published, result))
+    total = sum(one.rows for tables in published.values() for one in tables.values())
+
+    def count(rows: int) -> None:
+        result.rows += rows
+        if progress is not None:
+            progress(result.rows, max(result.rows, total))
+
+    faults = [
+        Fault(trace.name, "rows", "its record of publication is missing")
+        for trace_id, trace in traces.items()
+        if not published.get(("trace", trace_id))
+    ]
+    read = partial(_checksums, connection, count)
+    for table in _trace_tables(connection, published):
+        faults += attempt(partial(_trace_faults, read, table, traces, published))
+    places = {trace.name: place for place, trace in enumerate(traces.values())}
+    result.faults += sorted(faults, key=lambda fault: places.get(fault.trace, -1))
+    for owner in SHARED:
+        result.faults += attempt(partial(_shared_faults, connection, read, owner, published))
     names = {trace_id: trace.name for trace_id, trace in traces.items()}
     for rule in RULES:
         result.faults += attempt(partial(_rule_faults, connection, names, *rule))
@@ -200,21 +246,81 @@ def _published(connection: DuckDBPyConnection) -> _Published:
     return published
 
 
-def _trace_faults(
-    connection: DuckDBPyConnection, trace: StoredTrace, published: _Published, result: Verification
-) -> Iterator[Fault]:
-    """Yield faults of a trace: tables whose rows differ from the published rows."""
-    manifest = published.get(("trace", trace.trace_id), {})
-    if not manifest:
-        yield Fault(trace.name, "rows", "its record of publication is missing")
+def _trace_tables(connection: DuckDBPyConnection, published: _Published) -> list[str]:
     tables = {table for (owner, _), of in published.items() if owner == "trace" for table in of}
+    return [table for table, _ in owned(connection, _database(connection)) if table in tables]
+
+
+_ALL: Final = (1 << 63) - 1
+_ROWS_TOGETHER: Final = 500_000
+
+
+def _checksums(
+    connection: DuckDBPyConnection,
+    count: Callable[[int], None],
+    table: str,
+    owner: str,
+    cuts: Iterable[int] = (),
+) -> dict[int, Checksum]:
+    """Return the checksums of a table by owner id. The rows are read in ranges, and counted.
+
+    ``cuts``: buckets between the ranges.
+    """
     database = _database(connection)
-    for table, _ in list(owned(connection, database)):
-        if table in tables:
-            checksum = checksum_of(connection, database, table, trace.trace_id, trace.frames)
-            result.rows += checksum.rows
-            if checksum != manifest.get(table, Checksum()):
-                yield Fault(trace.name, "rows", _difference(table, checksum, manifest.get(table)))
+    names = {name for name, _ in columns_of(connection, table, database)}
+    keys = {"bucket": (0, BUCKET_BITS), "frame_id": (FRAME_BITS, SEQ_BITS)}
+    key = next((name for name in keys if name in names), f"{owner}_id")
+    low, high = keys.get(key, (-BUCKET_BITS, 0))
+    bounds = sorted({cut << low if low >= 0 else cut >> -low for cut in cuts})
+    select = expressions(connection, table, database)
+    sql = f"SELECT {select} FROM {quoted(database)}.inside.{table} WHERE {key} >= ? AND {key} < ?"
+    found: dict[int, Checksum] = defaultdict(Checksum)
+    for bound in pairwise((-_ALL, *bounds, _ALL)):
+        rows = connection.execute(sql, bound).fetchnumpy()
+        _add(found, np.ma.getdata(rows[key]).astype(np.int64) >> high, row_words(rows))
+        count(len(rows[key]))
+    return found
+
+
+def _add(found: dict[int, Checksum], owner: Ints, hashes: Words) -> None:
+    """Add row hashes to the checksums of their owners. Rows of one owner often lie together."""
+    starts = np.flatnonzero(np.diff(owner, prepend=owner[:1] - 1))
+    ids, place = np.unique(owner[starts], return_inverse=True)
+    sums, counts = np.zeros(len(ids), np.uint64), np.zeros(len(ids), np.int64)
+    np.add.at(counts, place, np.diff(starts, append=len(owner)))
+    if len(starts):
+        np.add.at(sums, place, np.add.reduceat(hashes, starts))
+    for one, value, count in zip(ids.tolist(), sums.tolist(), counts.tolist(), strict=True):
+        found[one].value = (found[one].value + value) & _ALL
+        found[one].rows += count
+
+
+def _cuts(traces: Mapping[int, StoredTrace], published: _Published, table: str) -> Iterator[int]:
+    """Yield buckets that split the rows of a table into ranges that fit into memory."""
+    together = 0
+    for trace_id, trace in sorted(traces.items()):
+        rows = published.get(("trace", trace_id), {}).get(table, Checksum()).rows
+        if together + rows > _ROWS_TOGETHER:
+            buckets = -(-trace.frames // BUCKET_FRAMES)
+            step = max(buckets * _ROWS_TOGETHER // rows, 1)
+            yield from ((trace_id << BUCKET_BITS) + at for at in range(0, buckets, step))
+            together = 0
+        together += rows
+
+
+def _trace_faults(
+    read: Callable[..., dict[int, Checksum]],
+    table: str,
+    traces: Mapping[int, StoredTrace],
+    published: _Published,
+) -> Iterator[Fault]:
+    """Yield faults of the traces in a table: rows that differ from the published rows."""
+    found = read(table, "trace", _cuts(traces, published, table))
+    for trace_id, trace in traces.items():
+        then = published.get(("trace", trace_id), {}).get(table)
+        now = found.get(trace_id, Checksum())
+        if now != (then or Checksum()):
+            yield Fault(trace.name, "rows", _difference(table, now, then))
 
 
 def _difference(table: str, now: Checksum, then: Checksum | None) -> str:
@@ -228,24 +334,22 @@ _NAME_COLUMNS: Final = {"recording": "uri", "config": "config_id", "map": "name"
 
 
 def _shared_faults(
-    connection: DuckDBPyConnection, published: _Published, result: Verification
+    connection: DuckDBPyConnection,
+    read: Callable[..., dict[int, Checksum]],
+    owner: str,
+    published: _Published,
 ) -> Iterator[Fault]:
-    """Yield faults of a store: recordings, settings and road maps that differ from the published ones."""
-    database = _database(connection)
-    for owner, tables in SHARED.items():
-        sql = f"SELECT {owner}_id, {_NAME_COLUMNS[owner]} FROM {owner}"
-        for number, name in connection.execute(sql).fetchall():
-            manifest = published.get((owner, number), {})
-            for table in tables:
-                checksum = Checksum()
-                select = expressions(connection, table, database)
-                sql = f"SELECT {select} FROM {table} WHERE {owner}_id = ?"
-                checksum.add(connection.execute(sql, [number]).fetchnumpy())
-                result.rows += checksum.rows
-                if checksum != manifest.get(table, Checksum()):
-                    difference = _difference(table, checksum, manifest.get(table))
-                    check = "map" if owner == "map" else "rows"
-                    yield Fault("", check, f"{owner} {name!r}: {difference}")
+    """Yield faults of recordings, settings or road maps that differ from the published ones."""
+    sql = f"SELECT {owner}_id, {_NAME_COLUMNS[owner]} FROM {owner}"
+    names = connection.execute(sql).fetchall()
+    for table in SHARED[owner]:
+        found = read(table, owner)
+        for number, name in names:
+            then = published.get((owner, number), {}).get(table)
+            now = found.get(number, Checksum())
+            if now != (then or Checksum()):
+                check = "map" if owner == "map" else "rows"
+                yield Fault("", check, f"{owner} {name!r}: {_difference(table, now, then)}")
 
 
 def _rule_faults(

@@ -11,7 +11,7 @@ from graph_blocks import RandomTrace, map_stub, publish
 from recordings import drive
 from thorough import some
 
-import sgstore.store._publish as publishing
+import sgstore.store._verify as verifying
 from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 from sgstore.store import StoreFile
@@ -190,11 +190,11 @@ def test_a_fault_is_told_of_the_trace_that_has_it(store: Any) -> None:
     ]
 
 
-@pytest.mark.parametrize("step", [1, 2])
+@pytest.mark.parametrize("rows", [1, 30])
 def test_it_does_not_matter_in_what_pieces_a_store_is_read(
-    store: Any, monkeypatch: pytest.MonkeyPatch, step: Any
+    store: Any, monkeypatch: pytest.MonkeyPatch, rows: Any
 ) -> None:
-    monkeypatch.setattr(publishing, "STEP", step)
+    monkeypatch.setattr(verifying, "_ROWS_TOGETHER", rows)
 
     assert faults(store) == []
 

@@ -24,7 +24,7 @@ from sgstore.apps.cli._options import (
     Verbs,
     jobs_of,
 )
-from sgstore.apps.cli._output import say
+from sgstore.apps.cli._output import count_bar, say
 from sgstore.base.output_files import write_bytes
 from sgstore.errors import ExportError
 
@@ -54,7 +54,8 @@ def verify(
     """
     from sgstore.store import verify_file
 
-    found = verify_file(store, recordings=payloads)
+    with count_bar("verifying", "rows") as progress:
+        found = verify_file(store, recordings=payloads, progress=progress)
     rows = [(fault.trace, fault.check, fault.detail) for fault in found.faults]
     out.write(("trace", "check", "detail"), rows)
     hashed = f", {found.recordings} recordings" if payloads else ""
