@@ -5,6 +5,7 @@ Each function is part of one transaction on the store.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from itertools import chain, pairwise
@@ -15,10 +16,10 @@ import numpy as np
 import sgstore.store._schema as shape
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import SgstoreError, StoreError
-from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS
+from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS, SEQ_BITS
 from sgstore.model.vocabulary import NAMES
 from sgstore.model.world import BUCKET_FRAMES
-from sgstore.store._checksums import Checksum, columns_of, expressions
+from sgstore.store._checksums import Checksum, columns_of, expressions, row_words
 from sgstore.store._columns import (
     MASKS,
     ORDERS,
@@ -43,15 +44,18 @@ from sgstore.store._traces import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
+    from sgstore.model.world import Ints
     from sgstore.store._locking import Access
     from sgstore.store._packing import Columns
     from sgstore.store._staging import Sealed
+
+    Words = NDArray[np.uint64]
 
 
 SHARED: Final = {
@@ -132,7 +136,8 @@ def _put(
     values = ", ".join(f"${column} AS {column}" for column in row)
     connection.execute(f"INSERT INTO store.inside.trace BY NAME SELECT {values}", row)
     noted = {table: sealed.checksums[table] for table in own}
-    noted["trace"] = checksum_of(connection, "store", "trace", identity.trace_id, 0)
+    own_row = checksums(connection, "store", "trace", "trace", only=identity.trace_id)
+    noted["trace"] = own_row[identity.trace_id]
     _note(connection, "trace", identity.trace_id, noted)
     if known:
         connection.execute(ORPHANS)
@@ -375,41 +380,70 @@ def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -
     """Update the stored checksums of a trace for tables that changed after its publication."""
     sql = "SELECT frames FROM store.inside.trace WHERE trace_id = ?"
     frames = sum(n for (n,) in connection.execute(sql, [trace_id]).fetchall())
+    first = trace_id << BUCKET_BITS
+    cuts = range(first, first + -(-frames // BUCKET_FRAMES), STEP)
     for table in tables:
-        checksum = checksum_of(connection, "store", table, trace_id, frames)
+        found = checksums(connection, "store", table, "trace", cuts, only=trace_id)
         connection.execute(
             """DELETE FROM store.inside.manifest WHERE owner = 'trace' AND id = ? AND "table" = ?""",
             [trace_id, table],
         )
-        _note(connection, "trace", trace_id, {table: checksum})
+        _note(connection, "trace", trace_id, {table: found.get(trace_id, Checksum())})
 
 
-def checksum_of(
-    connection: DuckDBPyConnection, database: str, table: str, trace_id: int, frames: int
-) -> Checksum:
-    """Return the checksum of a trace's rows in a table. The rows are read in small ranges."""
-    checksum = Checksum()
-    select = expressions(connection, table, database)
-    for condition, values in _ranges(connection, database, table, trace_id, frames):
-        rows = connection.execute(
-            f"SELECT {select} FROM {quoted(database)}.inside.{table} WHERE {condition}", values
-        )
-        checksum.add(rows.fetchnumpy())
-    return checksum
+_ALL: Final = (1 << 63) - 1
 
 
-def _ranges(
-    connection: DuckDBPyConnection, database: str, table: str, trace_id: int, frames: int
-) -> Iterator[tuple[str, list[int]]]:
-    """Yield SQL conditions that split the rows of a trace into ranges that fit into memory."""
+def checksums(
+    connection: DuckDBPyConnection,
+    database: str,
+    table: str,
+    owner: str,
+    cuts: Iterable[int] = (),
+    *,
+    only: int | None = None,
+    count: Callable[[int], None] | None = None,
+) -> dict[int, Checksum]:
+    """Return the checksums of the rows of a table, by trace or by another owner.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+    database, table : str
+    owner : str
+        ``trace``, or a key of :data:`SHARED`.
+    cuts : iterable of int
+        Buckets at which the rows are cut into ranges that fit into memory.
+    only : int, optional
+        The only trace to read.
+    count : callable, optional
+        Called with the number of rows of each range.
+    """
     names = {name for name, _ in columns_of(connection, table, database)}
-    bits = {"bucket": 0, "frame_id": FRAME_BITS}
-    column = next((name for name in bits if name in names), None)
-    if column is None:
-        yield "trace_id = ?", [trace_id]
-        return
-    first = trace_id << BUCKET_BITS
-    behind = first + -(-frames // BUCKET_FRAMES)
-    # The last range, after the last frame, should be empty.
-    for low, high in pairwise([*range(first, behind, STEP), behind, (trace_id + 1) << BUCKET_BITS]):
-        yield f"{column} >= ? AND {column} < ?", [low << bits[column], high << bits[column]]
+    keys = {"bucket": (0, BUCKET_BITS), "frame_id": (FRAME_BITS, SEQ_BITS)}
+    key = next((name for name in keys if name in names), f"{owner}_id")
+    low, high = keys.get(key, (-BUCKET_BITS, 0))
+    ends = {-_ALL, _ALL} if only is None else {only << high, (only + 1) << high}
+    bounds = sorted({cut << low if low >= 0 else cut >> -low for cut in cuts} | ends)
+    select = expressions(connection, table, database)
+    sql = f"SELECT {select} FROM {quoted(database)}.inside.{table} WHERE {key} >= ? AND {key} < ?"
+    found: dict[int, Checksum] = defaultdict(Checksum)
+    for bound in pairwise(bounds):
+        rows = connection.execute(sql, bound).fetchnumpy()
+        _add(found, np.ma.getdata(rows[key]).astype(np.int64) >> high, row_words(rows))
+        if count is not None:
+            count(len(rows[key]))
+    return found
+
+
+def _add(found: dict[int, Checksum], owner: Ints, hashes: Words) -> None:
+    """Add row hashes to the checksums of their owners. Rows of one owner often lie together."""
+    starts = np.flatnonzero(np.diff(owner, prepend=owner[:1] - 1))
+    ids, place = np.unique(owner[starts], return_inverse=True)
+    sums, counts = np.zeros(len(ids), np.uint64), np.zeros(len(ids), np.int64)
+    if len(starts):
+        np.add.at(sums, place, np.add.reduceat(hashes, starts))
+        np.add.at(counts, place, np.diff(starts, append=len(owner)))
+    for one, value, rows in zip(ids.tolist(), sums.tolist(), counts.tolist(), strict=True):
+        found[one].value = (found[one].value + value) & _ALL
+        found[one].rows += rows

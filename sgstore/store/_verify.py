@@ -6,24 +6,19 @@ Reading a table also verifies DuckDB's block checksums.
 from __future__ import annotations
 
 import json
-from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
-from sgstore.base.quoting import quoted
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.config import from_dict
-from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS, SEQ_BITS
+from sgstore.model.frame_ids import BUCKET_BITS
 from sgstore.model.world import BUCKET_FRAMES
-from sgstore.store._checksums import Checksum, columns_of, expressions, row_words
+from sgstore.store._checksums import Checksum
 from sgstore.store._engine_errors import translated
 from sgstore.store._locking import Access, default_memory
-from sgstore.store._publish import SHARED, owned
+from sgstore.store._publish import SHARED, checksums, owned
 from sgstore.store._schema import schema_faults
 from sgstore.store._traces import stored_traces
 from sgstore.store._verify_rules import RULES
@@ -32,12 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
     from duckdb import DuckDBPyConnection
-    from numpy.typing import NDArray
 
-    from sgstore.model.world import Ints
     from sgstore.store._traces import StoredTrace
-
-    Words = NDArray[np.uint64]
 
 
 _MEMORY: Final = 1 << 29
@@ -112,7 +103,11 @@ def verify_file(
         altered, others = schema_faults(connection, place)
     if altered:
         return Verification(faults=[Fault("", "schema", text) for text in altered], others=others)
-    result = verify_store(Access(place, diagnose=damage), recordings=recordings, progress=progress)
+    result = verify_store(
+        Access(place, diagnose=damage, memory=min(default_memory(), _MEMORY)),
+        recordings=recordings,
+        progress=progress,
+    )
     result.others = others
     return result
 
@@ -170,7 +165,7 @@ def verify(
         for trace_id, trace in traces.items()
         if not published.get(("trace", trace_id))
     ]
-    read = partial(_checksums, connection, count)
+    read = partial(checksums, connection, _database(connection), count=count)
     for table in _trace_tables(connection, published):
         faults += attempt(partial(_trace_faults, read, table, traces, published))
     places = {trace.name: place for place, trace in enumerate(traces.values())}
@@ -251,48 +246,7 @@ def _trace_tables(connection: DuckDBPyConnection, published: _Published) -> list
     return [table for table, _ in owned(connection, _database(connection)) if table in tables]
 
 
-_ALL: Final = (1 << 63) - 1
 _ROWS_TOGETHER: Final = 500_000
-
-
-def _checksums(
-    connection: DuckDBPyConnection,
-    count: Callable[[int], None],
-    table: str,
-    owner: str,
-    cuts: Iterable[int] = (),
-) -> dict[int, Checksum]:
-    """Return the checksums of a table by owner id. The rows are read in ranges, and counted.
-
-    ``cuts``: buckets between the ranges.
-    """
-    database = _database(connection)
-    names = {name for name, _ in columns_of(connection, table, database)}
-    keys = {"bucket": (0, BUCKET_BITS), "frame_id": (FRAME_BITS, SEQ_BITS)}
-    key = next((name for name in keys if name in names), f"{owner}_id")
-    low, high = keys.get(key, (-BUCKET_BITS, 0))
-    bounds = sorted({cut << low if low >= 0 else cut >> -low for cut in cuts})
-    select = expressions(connection, table, database)
-    sql = f"SELECT {select} FROM {quoted(database)}.inside.{table} WHERE {key} >= ? AND {key} < ?"
-    found: dict[int, Checksum] = defaultdict(Checksum)
-    for bound in pairwise((-_ALL, *bounds, _ALL)):
-        rows = connection.execute(sql, bound).fetchnumpy()
-        _add(found, np.ma.getdata(rows[key]).astype(np.int64) >> high, row_words(rows))
-        count(len(rows[key]))
-    return found
-
-
-def _add(found: dict[int, Checksum], owner: Ints, hashes: Words) -> None:
-    """Add row hashes to the checksums of their owners. Rows of one owner often lie together."""
-    starts = np.flatnonzero(np.diff(owner, prepend=owner[:1] - 1))
-    ids, place = np.unique(owner[starts], return_inverse=True)
-    sums, counts = np.zeros(len(ids), np.uint64), np.zeros(len(ids), np.int64)
-    np.add.at(counts, place, np.diff(starts, append=len(owner)))
-    if len(starts):
-        np.add.at(sums, place, np.add.reduceat(hashes, starts))
-    for one, value, count in zip(ids.tolist(), sums.tolist(), counts.tolist(), strict=True):
-        found[one].value = (found[one].value + value) & _ALL
-        found[one].rows += count
 
 
 def _cuts(traces: Mapping[int, StoredTrace], published: _Published, table: str) -> Iterator[int]:
