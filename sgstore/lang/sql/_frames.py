@@ -70,6 +70,7 @@ from sgstore.lang.sql._masks import (
     in_which,
     merged,
     stands_text,
+    stored_rows,
     told_kinds,
     with_blocks,
 )
@@ -628,13 +629,22 @@ def _of_edge(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttr
     if _is_own(leaf):
         to = join.edges[key], join.nodes[edge.dst]
         return own_text(leaf.attribute, join.frame, join.nodes[edge.src], to)
-    if alias not in join.lanes:
-        join.lanes.add(alias)
-        table, ends = edge_table(edge, join.nodes[edge.src], join.nodes[edge.dst])
-        on = [f'{alias}."frame_id" = {join.frame}']
-        on += [f"{alias}.{quoted(column)} = {node}" for column, node in ends.items()]
-        join.select.join(f"{quoted(table)} AS {alias}", on, "LEFT JOIN")
-    return lane_text(leaf, alias)
+    table, ends = edge_table(edge, join.nodes[edge.src], join.nodes[edge.dst])
+    parts = stored_rows(sql.catalog, table, alias)
+    names = (
+        {part: quoted(f"{key}:in {part}") for part in parts} if len(parts) > 1 else {table: alias}
+    )
+    for part, name in names.items() if alias not in join.lanes else ():
+        on = [f"{name}.{quoted(column)} = {node}" for column, node in ends.items()]
+        on.append(f'{name}."bucket" = {join.frame} >> 6')
+        if part.endswith("_repeated"):
+            on.append(in_mask(name, join.frame))
+        else:
+            on.append(f'{name}."bit" = {join.frame} & 63')
+        join.select.join(f"{quoted(part)} AS {name}", on, "LEFT JOIN")
+    join.lanes.add(alias)
+    texts = [lane_text(leaf, name) for name in names.values()]
+    return texts[0] if len(texts) == 1 else f"coalesce({', '.join(texts)})"
 
 
 def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str:

@@ -20,8 +20,9 @@ from sgstore.base.quoting import quoted
 from sgstore.lang.bind import Profile, alias_of, edge_conditions, homes_of, kind_conditions
 from sgstore.lang.catalog import Home
 from sgstore.lang.ir import Bound, Edge, Happened, Node, NodeAttribute, Scope, ego_kinds
-from sgstore.lang.sql._attributes import Aliases, among
+from sgstore.lang.sql._attributes import Aliases, among, attribute_text
 from sgstore.lang.sql._expressions import (
+    Leaf,
     bound_text,
     columns_of,
     edge_table,
@@ -88,6 +89,12 @@ BUCKET: Final = '":bucket"'
 _MANY: Final = 5
 """Largest number of masks that are compared in pairs, so that each join removes rows early."""
 
+_FEW: Final = 2
+"""Largest number of edges that are joined at once, in an order that the database chooses."""
+
+_EDGES: Final = 2
+"""Number of edges that each further step joins."""
+
 _BRANCHES: Final = 8
 """Largest number of joins of a pattern with paths, one for each combination of path lengths."""
 
@@ -120,6 +127,8 @@ class Base:
         Edges with several relations. If their relation is not a column, a binding may have several rows.
     kinds : dict of str to str
         Column of the kind by node.
+    apart : set of str
+        Nodes that are known to differ where they must.
     """
 
     select: Select = field(default_factory=Select)
@@ -133,6 +142,7 @@ class Base:
     stops: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
     several: set[str] = field(default_factory=set[str])
     kinds: dict[str, str] = field(default_factory=dict[str, str])
+    apart: set[str] = field(default_factory=set[str])
 
     def join(
         self, table: str, alias: str, ends: Mapping[str, str], conditions: Iterable[str] = ()
@@ -337,7 +347,7 @@ def with_blocks(
     return select.text()
 
 
-def base_rows(  # noqa: C901 - a step each
+def base_rows(
     sql: SqlBuilder,
     scope: Scope,
     parts: Phases,
@@ -353,25 +363,28 @@ def base_rows(  # noqa: C901 - a step each
     base = Base()
     if given is not None and scope.outer:
         _join_given(sql, base, scope, given)
-    for edge in scope.edges:
+    single, lane = dict(parts.single), dict(parts.lane)
+    order, steps = _from_ego(sql, scope, base)
+    for number, edge in enumerate(order, start=1):
         _join_edge(sql, base, scope, edge)
-    single = dict(parts.single)
+        if edge.key in lane:
+            _join_lane(sql, base, edge, lane.pop(edge.key))
+        if number in steps:
+            later = {end for one in order[number:] for end in (one.src, one.dst)}
+            _join_tests(sql, base, scope, set(base.nodes) - later - parts.late, single)
+            _begin_anew(sql, base, scope)
     for block in parts.alone:
         _join_alone(sql, base, scope, block)
     for number, happened in enumerate(parts.happened):
         _join_happened(sql, base, happened, f":happened {number}")
-    for key in scope.nodes:
-        if key not in parts.late and key not in base.present:
-            _join_presence(sql, base, key, scope.kinds(key), single.pop(key, []))
-    for key, conditions in single.items():
+    _join_tests(sql, base, scope, set(scope.nodes) - parts.late, single)
+    for key, conditions in single.items():  # of nodes of an outer pattern
         _join_conditions(sql, base, key, _kinds_to_test(scope, key), conditions)
-    for key, conditions in parts.lane.items():
-        _join_lane(sql, base, next(e for e in scope.edges if e.key == key), conditions)
     if not base.masks:  # all nodes are bound in the second phase
         base.need_bucket()
         base.masks.append(f'{BUCKET}."valid"')
-    where, bound = base.select.where, set(base.nodes)
-    where += [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in apart(scope, bound, bound)]
+    where = base.select.where
+    where += _differences(base, scope)
     where += [bound_text(c, base.nodes, base.edges, sql.values) for c in parts.direct]
     where += sql.within(base.bucket)
     where += sql.of_traces(f"{base.bucket} >> 18", scope)
@@ -381,6 +394,77 @@ def base_rows(  # noqa: C901 - a step each
     keep |= {quoted(f"{key}.kind"): base.kinds[key] for key in sorted(kinds)}
     base.repeats |= bool(base.several - edges) or set(base.nodes) > nodes
     return _masked(sql, base, keep)
+
+
+def _from_ego(sql: SqlBuilder, scope: Scope, base: Base) -> tuple[tuple[Edge, ...], range]:
+    """Return the edges in the order of their joins, and the numbers of edges after which a step ends.
+
+    The database misjudges joins of many tables of masks. So the few rows of the ego, or of the outer pattern,
+    come first, and each step begins with a table of the rows found so far.
+    """
+    egos = {key for key in scope.nodes if scope.kinds(key).one_a_frame}
+    begin = set(base.nodes) or egos
+    edges = scope.edges
+    if len(edges) <= _FEW or not any({edge.src, edge.dst} & begin for edge in edges):
+        return edges, range(0)
+    edges = ordered(scope, sql.catalog, begin).edges
+    seen, connected = set(begin), 0
+    for edge in edges:
+        if not {edge.src, edge.dst} & seen:
+            break
+        seen |= {edge.src, edge.dst}
+        connected += 1
+    return edges, range(_EDGES if base.nodes else 1, min(connected, len(edges) - 1) + 1, _EDGES)
+
+
+def _join_tests(
+    sql: SqlBuilder, base: Base, scope: Scope, nodes: set[str], single: dict[str, list[Bound]]
+) -> None:
+    """Join the presence and the conditions of nodes. Each condition is removed from ``single``."""
+    for key in scope.nodes:
+        if key in nodes and key not in base.present:
+            _join_presence(sql, base, key, scope.kinds(key), single.pop(key, []))
+    for key in sorted(nodes & single.keys()):
+        _join_conditions(sql, base, key, _kinds_to_test(scope, key), single.pop(key))
+
+
+def _begin_anew(sql: SqlBuilder, base: Base, scope: Scope) -> None:
+    """Put the rows of a join into a shared table, and begin the next join with it."""
+    base.need_bucket()
+    base.select.where += [*_differences(base, scope), *sql.within(base.bucket)]
+    keep = {"map_id": f'{BUCKET}."map_id"'}
+    keep |= {f"{key}.id": column for key, column in base.nodes.items()}
+    keep |= {f"{key}.type": column for key, column in base.edges.items()}
+    keep |= {f"{key}.kind": column for key, column in base.kinds.items()}
+    keep |= {f"stop {n}": column for n, (column, _) in enumerate(base.stops)}
+    base.select.columns = [f'{base.bucket} AS "bucket"']
+    base.select.columns += [f"{column} AS {quoted(name)}" for name, column in keep.items()]
+    base.select.columns.append(f'{_common(base)} AS "mask"')
+    name = quoted(sql.share(base.select.text(), "step"))
+    base.select, base.bucket, base.masks = Select(), f'{BUCKET}."bucket"', [f'{BUCKET}."mask"']
+    base.select.join(f"{name} AS {BUCKET}", [])
+    base.apart = set(base.nodes)
+    base.nodes = {key: f"{BUCKET}.{quoted(f'{key}.id')}" for key in base.nodes}
+    base.edges = {key: f"{BUCKET}.{quoted(f'{key}.type')}" for key in base.edges}
+    base.kinds = {key: f"{BUCKET}.{quoted(f'{key}.kind')}" for key in base.kinds}
+    base.stops = [(f'{BUCKET}."stop {n}"', table) for n, (_, table) in enumerate(base.stops)]
+
+
+def _differences(base: Base, scope: Scope) -> list[str]:
+    """Return SQL conditions that nodes differ. Earlier steps have compared the nodes that they bound."""
+    bound = set(base.nodes)
+    pairs = apart(scope, bound, bound - base.apart)
+    return [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in pairs]
+
+
+def _common(base: Base) -> str:
+    """Return the SQL of the common bits of all masks of a join, and require that there are some."""
+    mask = " & ".join(base.masks)
+    if len(base.masks) <= _MANY:
+        base.select.where += [f"({a} & {b}) <> 0" for a, b in combinations(base.masks, 2)]
+    if len(base.masks) > 2:
+        base.select.where.append(f"({mask}) <> 0")
+    return mask
 
 
 def _join_given(sql: SqlBuilder, base: Base, scope: Scope, given: SharedRelation) -> None:
@@ -663,23 +747,44 @@ def _join_conditions(
 
 
 def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound]) -> None:
-    """Join the bit masks of the frames in which an edge meets conditions on its attributes."""
-    bucket, bit = '"l"."bucket"', f'"l".{_BIT}'
+    """Join the bit masks of the frames in which an edge meets conditions on its attributes, and on its lane."""
     table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
-    ends = [f'"l".{quoted(column)}' for column in nodes]
-    select = Select(
-        [bucket, *ends, f'bit_or({bit_of(bit)}) AS "mask"'],
-        [f'{quoted(table)} AS "l"'],
-        sql.within(bucket),
-        [bucket, *ends],
-    )
-    select.where += [
-        expression_text(c, lambda leaf: lane_text(leaf, '"l"'), sql.values) for c in conditions
-    ]
+    keys = [f'"l".{quoted(column)}' for column in ("bucket", *nodes)]
+    on_map = any(isinstance(leaf, NodeAttribute) for c in conditions for leaf in leaves(c))
+
+    def leaf_text(leaf: Leaf) -> str:
+        if isinstance(leaf, NodeAttribute):
+            return attribute_text(leaf.attribute, Aliases(map='"n"'))
+        return lane_text(leaf, '"l"')
+
+    where = [expression_text(c, leaf_text, sql.values) for c in conditions]
+    rows: list[str] = []
+    for part, mask in stored_rows(sql.catalog, table, '"l"').items():
+        select = Select([*keys, f'{mask} AS "mask"'], [f'{quoted(part)} AS "l"'])
+        select.where = [*sql.within('"l"."bucket"'), *where]
+        if on_map:
+            select.join('"bucket" AS "b"', ['"b"."bucket" = "l"."bucket"'])
+            select.join(
+                '"map_node" AS "n"', ['"n"."map_id" = "b"."map_id"', '"n"."node_id" = "l"."lane"']
+            )
+        rows.append(select.text())
     name = f"{edge.key}:in"
     alias = quoted(name)
+    text = merged("\nUNION ALL\n".join(rows), {quoted(column): quoted(column) for column in nodes})
     on = [f"{alias}.{quoted(column)} = {node}" for column, node in nodes.items()]
-    base.join(nested(select.text(), name), alias, {}, on)
+    base.join(nested(text, name), alias, {}, on)
+
+
+def stored_rows(catalog: Catalog, view: str, alias: str) -> dict[str, str]:
+    """Return the tables behind a view of edge attributes, each with the SQL of the bit mask of its rows.
+
+    The view has a row for each frame. A table has one row for many frames with equal values.
+    """
+    bit = bit_of(f"{alias}.{_BIT}")
+    if view in dict(catalog.shadows):
+        return {view: bit}
+    stem = view.removesuffix("_state").removeprefix("lane_")
+    return {f"{stem}_single": bit, f"{stem}_repeated": f'{alias}."mask"'}
 
 
 def _present(sql: SqlBuilder, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
@@ -766,13 +871,8 @@ def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bo
 
 def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
     """Return SQL that combines the bit masks of a join, with the given columns and without duplicates."""
-    select, masks = base.select, base.masks
-    mask = " & ".join(masks)
+    select, mask = base.select, _common(base)
     named = [f"{column} AS {name}" for name, column in keep.items()]
-    if len(masks) <= _MANY:
-        select.where += [f"({a} & {b}) <> 0" for a, b in combinations(masks, 2)]
-    if len(masks) > 2:
-        select.where.append(f"({mask}) <> 0")
     select.columns = [f'{base.bucket} AS "bucket"', *named, f'{mask} AS "mask"']
     if base.stops:
         return _on_the_way(sql, select, base.stops, list(keep))

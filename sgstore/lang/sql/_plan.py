@@ -134,7 +134,7 @@ def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
         if stands_alone(condition, catalog):
             parts.alone.append(condition)
         else:
-            _file(condition, parts)
+            _file(condition, parts, scope, catalog)
     parts.late = set(_late(scope, parts, query, catalog))
     for key in parts.late & set(parts.single):
         parts.rest += parts.single.pop(key)
@@ -149,7 +149,7 @@ def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
     return parts
 
 
-def _file(condition: Bound, parts: Phases) -> None:
+def _file(condition: Bound, parts: Phases, scope: Scope, catalog: Catalog) -> None:
     if is_masked(condition):
         parts.blocks.append(condition)
         return
@@ -169,7 +169,7 @@ def _file(condition: Bound, parts: Phases) -> None:
         parts.single.setdefault(next(iter(nodes_of(condition))), []).append(condition)
     elif all(isinstance(leaf, TraceAttribute) for leaf in found):
         parts.trace.append(condition)
-    elif (edge := _edge_alone(found)) is not None and not _of_null(condition):
+    elif (edge := _edge_alone(found, scope, catalog)) is not None and not _of_null(condition):
         parts.lane.setdefault(edge, []).append(condition)
     else:
         parts.rest.append(condition)
@@ -194,9 +194,24 @@ def _is_direct(leaf: Leaf) -> bool:
             return False
 
 
-def _edge_alone(found: set[Leaf]) -> str | None:
-    edges = {leaf.edge if isinstance(leaf, EdgeAttribute) else None for leaf in found}
-    return edges.pop() if len(edges) == 1 else None
+def _edge_alone(found: set[Leaf], scope: Scope, catalog: Catalog) -> str | None:
+    """Return the edge of a condition on the attributes of one edge, and on its lane; or None."""
+    edges = {leaf.edge for leaf in found if isinstance(leaf, EdgeAttribute)}
+    if len(edges) != 1:
+        return None
+    (key,) = edges
+    ends = {
+        edge.dst for edge in scope.edges if edge.key == key and edge.high == 1 and not edge.both
+    }
+    for leaf in found:
+        if isinstance(leaf, EdgeAttribute):
+            continue
+        if not isinstance(leaf, NodeAttribute) or leaf.node not in ends or _is_direct(leaf):
+            return None
+        profile = Profile.of(scope.kinds(leaf.node), catalog)
+        if not (profile.mapped and profile.places == 1):
+            return None
+    return key
 
 
 def _of_null(condition: Bound) -> bool:

@@ -585,8 +585,11 @@ def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> I
             yield relation, other, one
 
 
-def ordered(scope: Scope, catalog: Catalog) -> Scope:
-    """Sort the edges of a pattern, rarest first. Each is connected to an earlier edge if possible."""
+def ordered(scope: Scope, catalog: Catalog, begin: Iterable[str] = ()) -> Scope:
+    """Sort the edges of a pattern, rarest first. Each is connected to an earlier edge if possible.
+
+    ``begin`` are nodes to begin at, beside those of an outer pattern.
+    """
     counts = {**catalog.map_edges, **catalog.edges}
 
     def rows(edge: Edge) -> int:
@@ -594,7 +597,7 @@ def ordered(scope: Scope, catalog: Catalog) -> Scope:
         return sum(counts.get(triple, 0) for triple in set(found))
 
     waiting, result = list(scope.edges), list[Edge]()
-    seen = set(scope.outer)
+    seen = {*scope.outer, *begin}
     while waiting:
         connected = [e for e in waiting if {e.src, e.dst} & seen] or waiting
         rarest = min(connected, key=rows)
