@@ -59,15 +59,20 @@ class Answer(NamedTuple):
 def answered(path: str, name: str) -> str:
     """Return time, memory and number of answers of an entry, or of the reference, as JSON."""
     resource.setrlimit(resource.RLIMIT_CPU, (MOST_S, MOST_S))
+    return json.dumps(answer(Path(path), name))
+
+
+def answer(path: Path, name: str) -> Answer:
+    """Ask a store for one entry of the library, or for the reference, in this process."""
     store = Store(path)
     with store.file.snapshot():
         if not name:
-            return json.dumps([reference(store), 0, 0])
+            return Answer(reference(store), 0, 0)
         entry = patterns()[name]
         before = _spent()
         found = list(store.check(entry.text)) if entry.is_check else store.find(entry.text).rows()
         used = resource.getrusage(resource.RUSAGE_SELF)
-        return json.dumps([_spent() - before, used.ru_maxrss / 1000, len(found)])
+        return Answer(_spent() - before, used.ru_maxrss / 1000, len(found))
 
 
 def _spent() -> float:

@@ -130,6 +130,7 @@ class StoreFile:
         self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
         self._known: tuple[Stamp, Catalog] | None = None
+        self._answers: dict[str, dict[str, NDArray[np.generic]]] | None = None
         if not made:
             with self.access.reading():  # rejects an invalid store
                 pass
@@ -169,6 +170,16 @@ class StoreFile:
         """Keep the store open for several queries. The queries see the same state and run faster."""
         return self.access.reading(idle=True)
 
+    @contextmanager
+    def shared(self) -> Generator[None]:
+        """Keep the store open as in :meth:`snapshot`, and the arrays of queries that several patterns need."""
+        with self.snapshot():
+            self._answers = {}
+            try:
+                yield
+            finally:
+                self._answers = None
+
     def close(self) -> None:
         """Close the store file if no query is running. The next query opens it again."""
         self.access.close()
@@ -207,8 +218,17 @@ class StoreFile:
 
         ``plain``: the result has no enumerations. This saves one planning of the statement.
         """
+        given = list(given)
+        key, kept = repr((sql, parameters, given)), self._answers
+        if kept is not None and key in kept:
+            return kept[key]
         ask = partial(rows.arrays, sql=sql, parameters=parameters, plain=plain)
         with self.answered(lambda at, _: ask(at), sql, given) as found:
+            if kept is not None and plain and all(isinstance(one, tuple) for one in given):
+                kept[key] = found
+                size = sum(one.nbytes for held in kept.values() for one in held.values())
+                while size > self.memory // 4:  # the oldest ones are dropped
+                    size -= sum(one.nbytes for one in kept.pop(next(iter(kept))).values())
             return found
 
     def table(

@@ -154,3 +154,46 @@ def test_wrong_usage_is_told(
 ) -> None:
     assert run(["patterns", *(a.format(store) for a in arguments)]) == USAGE
     assert reason in " ".join(capsys.readouterr().err.replace("│", " ").split())
+
+
+def some(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Let the library have only some patterns."""
+    found = {name: pattern_named(name) for name in names}
+    monkeypatch.setattr("sgstore.lang.library.patterns", lambda: found)
+
+
+def test_run_all_counts_the_matches_of_each_pattern(
+    capsys: pytest.CaptureFixture[str], store: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("jaywalking", "brakes_hard", "turns_left", "turns_right", "ControlLoss")
+    some(monkeypatch, "stopped", *names, "rss_distance")
+
+    rows = json.loads(said(capsys, "run", store, "--all", "--json"))
+
+    for row, name in zip(rows, names, strict=True):
+        matches = Store(store).find(pattern_named(name).text)
+        traces = [one.trace for one in matches.intervals()]
+        counts = len(traces), len({*traces}), len(matches.left_out)
+        assert [*row.values()] == [name, pattern_named(name).kind, *counts]
+
+
+def test_run_all_ends_as_run_without_matches(store: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    some(monkeypatch, "ControlLoss")
+
+    assert run(["patterns", "run", store, "--all", "--require"]) == NO_MATCH
+    assert run(["patterns", "run", store, "--all"]) == OK
+    assert run(["patterns", "run", store, "--all", "--clips"]) == USAGE
+    assert run(["patterns", "run", store, "cut_in", "--all"]) == USAGE
+    assert run(["patterns", "run", store]) == USAGE
+
+
+def test_check_library_checks_each_property(
+    capsys: pytest.CaptureFixture[str], store: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    some(monkeypatch, "cut_in", "phi2", "phi4")
+
+    assert run(["check", store, "--library", "--json"]) == OK
+    together = json.loads(capsys.readouterr().out)
+    assert run(["check", store, "-p", "phi2", "-p", "phi4", "--json"]) == OK
+    assert together == json.loads(capsys.readouterr().out)
+    assert {one["check"] for one in together} == {"phi2", "phi4"}

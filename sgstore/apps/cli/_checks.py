@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -44,6 +44,7 @@ def check(
     explain: bool = False,
     require: bool = False,
     junit: Path | None = None,
+    library: bool = False,
     *,
     whole: CollectionOptions,
     statements: Statements,
@@ -64,9 +65,15 @@ def check(
         End with exit code 4 if a trace violates a check.
     junit : FILE
         Also write the verdicts as JUnit XML, for build servers.
+    library
+        Check all properties of the library, in one run.
     """
+    from sgstore.lang.library import patterns
     from sgstore.lang.syntax import joined
 
+    if library:
+        every = [one.name for one in patterns().values() if one.is_check]
+        statements = replace(statements, names=[*(statements.names or ()), *every])
     asked, values = statements.asked(files)
     text = joined([*chain.from_iterable(asked.values())])
     if (url := url_of(store)) is not None:

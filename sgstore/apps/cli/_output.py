@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from sgstore.base.output_files import without_controls, written_text
 from sgstore.base.temporary_folders import working_folder
@@ -26,6 +26,19 @@ if TYPE_CHECKING:
     from typing import TextIO
 
     from sgstore.pipeline.recording_ingest import Progress
+
+T = TypeVar("T")
+
+
+def progress(items: Sequence[T], noun: str) -> Iterator[T]:
+    """Yield the items, and show the number of finished ones on stderr, on a terminal."""
+    if quiet() or not sys.stderr.isatty():
+        yield from items
+        return
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(items, noun, console=Console(stderr=True), transient=True)
 
 
 @contextmanager

@@ -41,6 +41,7 @@ from sgstore.apps.cli._output import (
     BINARY,
     Format,
     number_of,
+    progress,
     say,
     write_binary,
     write_document,
@@ -510,8 +511,9 @@ def show_pattern(name: LibraryName, as_json: AsJson = False, output: Output = No
 @library.command("run")
 def run_pattern(
     store: StorePath,
-    name: LibraryName,
+    name: Annotated[str, Argument(autocompletion=completion.patterns)] = "",
     chosen: Annotated[list[str] | None, Argument()] = None,
+    every: Annotated[bool, Option("--all")] = False,
     clips: bool = False,
     before: str = "0s",
     after: str = "0s",
@@ -525,8 +527,12 @@ def run_pattern(
 
     Parameters
     ----------
+    name : NAME
+        Name of a pattern, such as cut_in or ParkingExit.
     chosen : NAME=VALUE
         Parameters of the pattern, such as within=2s.
+    every
+        Count the matches of all concepts and scenarios, in one run.
     clips
         Print clips (trace, start_ns, end_ns) in log time.
     before : TIME
@@ -538,6 +544,10 @@ def run_pattern(
     """
     from sgstore.lang.library import pattern_named
 
+    if every == bool(name) or (every and clips):
+        raise typer.BadParameter("add the name of a pattern, or --all without a name and --clips")
+    if every:
+        return _run_all(store, ask, require=require)
     found = pattern_named(name)
     if found.kind == "predicate":
         hint = f"a condition: ask 'sgstore find STORE \"MATCH … WHERE {found.name}(…)\"'"
@@ -557,6 +567,26 @@ def run_pattern(
     else:
         number = _write_intervals(matches.intervals(), ask)
     return _ended(number, ask, require=require)
+
+
+def _run_all(store: Path, ask: AskOptions, *, require: bool) -> int:
+    """Print the number of matches of each concept and scenario of the library, and return the exit code."""
+    from sgstore.lang.library import patterns
+
+    opened, total = ask.opened(store), 0
+    asked = [one for one in patterns().values() if one.kind in {"concept", "scenario"}]
+
+    def rows() -> Iterator[tuple[Any, ...]]:
+        nonlocal total
+        with opened.file.shared():
+            for one in progress(asked, "patterns"):
+                matches = opened.find(one.text)
+                traces = [found.trace for found in matches.intervals()]
+                total += len(traces)
+                yield one.name, one.kind, len(traces), len({*traces}), len(matches.left_out)
+
+    ask.write(("name", "kind", "matches", "traces", "left_out"), rows())
+    return _ended(total, ask, require=require)
 
 
 def _check(store: Path, **options: Any) -> int:

@@ -262,13 +262,19 @@ def values_lacking(scope: Scope, catalog: Catalog) -> Scope:
             case _:
                 return _folded(with_operands(value, told))
 
-    where = tuple(map(told, scope.where))
+    where = tuple(one for one in map(told, scope.where) if one != TRUE)
     return replace(scope, where=(FALSE,) if FALSE in where else where)
 
 
 def _folded(value: Bound) -> Bound:
-    """Return an equal condition without constants among the operands of AND, OR and NOT."""
+    """Return an equal condition without constants among the operands of AND, OR, NOT and CASE."""
     match value:
+        case Operation("=", (Value(value=one, type=kind), Value(value=other, type=same))) if (
+            kind is same and one is not None and other is not None
+        ):
+            return TRUE if one == other else FALSE
+        case Operation("case", operands):
+            return _branch(value, operands)
         case Operation("NOT", (operand,)) if operand == FALSE:
             return TRUE
         case Operation("AND" | "OR" as word, operands):
@@ -277,6 +283,15 @@ def _folded(value: Bound) -> Bound:
             return FALSE
         case _:
             return value
+
+
+def _branch(value: Operation, operands: tuple[Bound, ...]) -> Bound:
+    """Return an equal ``CASE`` without the branches before its first condition that is no constant."""
+    while len(operands) > 1 and operands[0] == FALSE:
+        operands = operands[2:]
+    if len(operands) == 1:
+        return operands[0]
+    return operands[1] if operands[0] == TRUE else replace(value, operands=operands)
 
 
 def _joined(word: str, operands: tuple[Bound, ...]) -> Bound:
