@@ -93,6 +93,7 @@ PARTS_OF = {"apps", "base", "graphs", "maps", "model", "pipeline", "testsets"}
 WHOLE = {
     *(
         "architecture",
+        "bench_rows",
         "docstrings",
         "frozen",
         "house",

@@ -128,7 +128,7 @@ class Base:
     kinds : dict of str to str
         Column of the kind by node.
     apart : set of str
-        Nodes that are known to differ where they must.
+        Nodes whose differences earlier steps have tested.
     """
 
     select: Select = field(default_factory=Select)

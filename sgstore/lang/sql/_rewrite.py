@@ -286,7 +286,7 @@ def _folded(value: Bound) -> Bound:
 
 
 def _branch(value: Operation, operands: tuple[Bound, ...]) -> Bound:
-    """Return an equal ``CASE`` without the branches before its first condition that is no constant."""
+    """Return an equal ``CASE`` without leading branches whose condition is a constant."""
     while len(operands) > 1 and operands[0] == FALSE:
         operands = operands[2:]
     if len(operands) == 1:
@@ -603,7 +603,7 @@ def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> I
 def ordered(scope: Scope, catalog: Catalog, begin: Iterable[str] = ()) -> Scope:
     """Sort the edges of a pattern, rarest first. Each is connected to an earlier edge if possible.
 
-    ``begin`` are nodes to begin at, beside those of an outer pattern.
+    ``begin`` are additional nodes to begin at.
     """
     counts = {**catalog.map_edges, **catalog.edges}
 
