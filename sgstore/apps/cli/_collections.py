@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-from typer import Argument, Option
+from typer import Option
 
 from sgstore.apps.cli._collection_options import url_of
 from sgstore.apps.cli._options import (
     ERROR,
     Jobs,
-    LookIn,
     PrintedRows,
     StorePath,
     Verbs,
@@ -25,10 +24,6 @@ if TYPE_CHECKING:
     from sgstore.collection import Commit
 
 PANEL: Final = "More than one machine"
-
-Place = Annotated[
-    Path, Argument(metavar="URL", help="The collection: a folder, or s3://bucket/prefix.")
-]
 
 
 def _place_of(url: Path) -> str | Path:
@@ -63,7 +58,7 @@ collection = Verbs(
 @collection.command()
 def pack(
     store: StorePath,
-    url: Place,
+    url: Path,
     bundle_traces: Annotated[int | None, Option(min=1, show_default="1000")] = None,
     *,
     out: PrintedRows,
@@ -87,7 +82,7 @@ def pack(
 
 
 @collection.command()
-def commit(url: Place, *, out: PrintedRows) -> int:
+def commit(url: Path, *, out: PrintedRows) -> int:
     """Commit the traces of 'ingest URL … --shard' to a collection: new bundles, and a new snapshot."""
     from sgstore.collection import commit as commit_landed
 
@@ -101,7 +96,7 @@ def commit(url: Place, *, out: PrintedRows) -> int:
 
 @collection.command()
 def unpack(
-    url: Place,
+    url: Path,
     store: Path,
 ) -> int:
     """Copy all traces of a collection into one new store.
@@ -119,7 +114,7 @@ def unpack(
 
 
 @collection.command()
-def verify(url: Place, *, out: PrintedRows) -> int:
+def verify(url: Path, *, out: PrintedRows) -> int:
     """Verify the bundles and the catalogue of a collection; list every fault."""
     from sgstore.collection import verify as verify_all
 
@@ -133,8 +128,8 @@ def verify(url: Place, *, out: PrintedRows) -> int:
 
 @collection.command()
 def rebuild(
-    url: Place,
-    look_in: LookIn = None,
+    url: Path,
+    look_in: list[Path] | None = None,
     everything: Annotated[bool, Option("--all")] = False,
     jobs: Jobs = 1,
     *,
@@ -164,7 +159,7 @@ def rebuild(
 
 @collection.command()
 def gc(
-    url: Place,
+    url: Path,
     keep: Annotated[int, Option(min=1)] = 1,
     older: str = "86400s",
     dry_run: bool = False,

@@ -14,7 +14,6 @@ from sgstore.apps.cli._collection_options import CollectionOptions, note_collect
 from sgstore.apps.cli._options import (
     Abstraction,
     AskOptions,
-    Picture,
     Verbs,
     say_left_out,
     say_scope,
@@ -36,56 +35,14 @@ coverage = Verbs(
     no_args_is_help=True,
 )
 
-A = Annotated[
-    str,
-    Argument(
-        metavar="A",
-        help="Frames: a store or a collection, STORE:QUERY for matching frames, STORE:TESTS.lock for the"
-        " frames of a lock; TESTS.lock alone uses the store in its folder with its recordings.",
-    ),
-]
-B = Annotated[str, Argument(metavar="B", help="Frames, written like A.")]
-Limit = Annotated[
-    int | None,
-    Option("--limit", min=0, help="Maximum rows; 0: all.", show_default="40 in a table"),
-]
-Unit = Annotated[
-    Literal["frame", "run", "trace"],
-    Option("--unit", help="Count frames, runs of frames of one class, or traces with it."),
-]
-Window = Annotated[
-    int, Option("--window", "-t", min=1, help="Number of frames that form one class together.")
-]
-Incomplete = Annotated[
-    Literal["equal", "distinct", "drop"],
-    Option("--incomplete", help="Windows with missing frames: equal, distinct, or dropped."),
-]
-Slots = Annotated[
-    Path | None, Option("--slots", metavar="FILE", help="TOML file with declared slots.")
-]
-Missing = Annotated[
-    bool, Option("--missing", help="List the missing items, each with a query for it.")
-]
-Covered = Annotated[bool, Option("--covered", help="List the covered items, with their frames.")]
+Limit = Annotated[int | None, Option("--limit", min=0, show_default="40 in a table")]
+Unit = Annotated[Literal["frame", "run", "trace"], Option("--unit")]
+Window = Annotated[int, Option("--window", "-t", min=1)]
+Incomplete = Annotated[Literal["equal", "distinct", "drop"], Option("--incomplete")]
 Manoeuvres = Annotated[
-    list[str] | None,
-    Option(
-        "--manoeuvre",
-        "-m",
-        metavar="NAME",
-        help="A manoeuvre of sequences: a pattern of the library, or NAME=QUERY; may be repeated.",
-        show_default="the manoeuvres of the library",
-    ),
+    list[str] | None, Option("--manoeuvre", "-m", show_default="the manoeuvres of the library")
 ]
-Within = Annotated[
-    str | None,
-    Option(
-        "--within",
-        metavar="TIME",
-        help="Longest time from the first manoeuvre of a sequence to the last.",
-        show_default="10s",
-    ),
-]
+Within = Annotated[str | None, Option("--within", show_default="10s")]
 
 
 @dataclass(frozen=True)
@@ -134,14 +91,14 @@ class WindowOptions:
 class SceneOptions(WindowOptions):
     """Command line options that define the classes of frames, by their graphs or by declared slots."""
 
-    slots: Slots = None
+    slots: Path | None = None
 
 
 @coverage.command("classes")
 def classes_(
-    a: A,
+    a: str,
     unit: Unit = "frame",
-    picture: Picture = None,
+    picture: Path | None = None,
     limit: Limit = None,
     *,
     scenes: SceneOptions,
@@ -164,7 +121,7 @@ def classes_(
 
 @coverage.command("of")
 def of_(
-    a: A,
+    a: str,
     by: Annotated[str, Option()],
     *,
     scenes: SceneOptions,
@@ -184,7 +141,7 @@ def of_(
 
 @coverage.command("novel")
 def novel_(
-    a: A,
+    a: str,
     than: Annotated[str, Option("--not-in")],
     listing: Annotated[Literal["classes", "frames", "clips"], Option("--list")] = "classes",
     limit: Limit = None,
@@ -208,7 +165,7 @@ def novel_(
 
 
 @coverage.command("venn")
-def venn_(a: A, b: B, *, scenes: SceneOptions, ask: FrameAskOptions) -> None:
+def venn_(a: str, b: str, *, scenes: SceneOptions, ask: FrameAskOptions) -> None:
     """Count the classes of scenes that occur in A and B, only in A, and only in B."""
     from sgstore.testsets.coverage import venn
 
@@ -217,10 +174,10 @@ def venn_(a: A, b: B, *, scenes: SceneOptions, ask: FrameAskOptions) -> None:
 
 @coverage.command("growth")
 def growth_(
-    a: A,
+    a: str,
     unit: Unit = "frame",
     points: Annotated[int, Option(min=2)] = 40,
-    picture: Picture = None,
+    picture: Path | None = None,
     *,
     scenes: SceneOptions,
     ask: FrameAskOptions,
@@ -248,15 +205,15 @@ def growth_(
 
 @coverage.command("combos")
 def combos_(
-    a: A,
+    a: str,
     k: Annotated[int, Option(min=1)] = 2,
     by: str | None = None,
     abstraction: Abstraction = "RSV",
     of_ego: Annotated[bool, Option("--ego")] = False,
-    slots: Slots = None,
-    missing: Missing = False,
-    covered: Covered = False,
-    picture: Picture = None,
+    slots: Path | None = None,
+    missing: bool = False,
+    covered: bool = False,
+    picture: Path | None = None,
     top: Annotated[int, Option(min=2)] = 40,
     limit: Limit = None,
     *,
@@ -280,16 +237,12 @@ def combos_(
     if slots is not None:
         if by or of_ego:
             raise typer.BadParameter("--slots cannot be combined with --by or --ego")
-        ask.report(_slot_table(a, slots, k, ask, covered=covered, missing=missing), limit)
-        if picture is not None:
-            _slot_picture(a, slots, ask, picture)
+        _report_slots(a, slots, k, ask, (1 if covered else 2 if missing else 0, limit), picture)
         return
     ours, *others = WindowOptions(abstraction).of(ask, a, *([] if by is None else [by]))
     found = combos(ours, abstraction, k, *others, of_ego=of_ego)
     listed = found.missing if missing else found.covered() if covered else found.shares
-    for text in found.shares.said if listed is not found.shares else ():
-        say(text)
-    ask.report(listed, limit)
+    _report_below(found.shares, listed, ask, limit)
     if picture is not None:
         from sgstore.draw import draw_matrix
 
@@ -301,7 +254,7 @@ def combos_(
 
 @coverage.command("sequences")
 def sequences_(
-    a: A,
+    a: str,
     k: Annotated[int, Option(min=1)] = 2,
     by: str | None = None,
     manoeuvres: Manoeuvres = None,
@@ -333,9 +286,7 @@ def sequences_(
     say_scope(ours.scope(world=False), ask.chosen)
     found = sequences(ours, k, others[0] if others else None, named, within_seconds(within))
     listed = found.missing if missing else found.covered if covered else found.shares
-    for text in found.shares.said if listed is not found.shares else ():
-        say(text)
-    ask.report(listed, limit)
+    _report_below(found.shares, listed, ask, limit)
 
 
 def within_seconds(text: str | None) -> float:
@@ -346,14 +297,14 @@ def within_seconds(text: str | None) -> float:
 
 @coverage.command("spec")
 def spec_(
-    a: A,
+    a: str,
     query: Annotated[str | None, Argument()] = None,
-    slots: Slots = None,
+    slots: Path | None = None,
     cells: Annotated[int, Option(min=0)] = 0,
     by: str | None = None,
-    missing: Missing = False,
-    covered: Covered = False,
-    picture: Picture = None,
+    missing: bool = False,
+    covered: bool = False,
+    picture: Path | None = None,
     limit: Limit = None,
     *,
     ask: FrameAskOptions,
@@ -376,10 +327,8 @@ def spec_(
     if query is None or slots is not None:
         if by or cells:
             raise typer.BadParameter("--slots cannot be combined with --by or --cells")
-        declared = slots or Path()
-        ask.report(_slot_table(a, declared, 0, ask, covered=covered, missing=missing), limit)
-        if picture is not None:
-            _slot_picture(a, declared, ask, picture)
+        which = 1 if covered else 2 if missing else 0
+        _report_slots(a, slots or Path(), 0, ask, (which, limit), picture)
         return
     if picture is not None:
         raise typer.BadParameter("--picture draws pairs of values of declared slots; add --slots")
@@ -393,7 +342,7 @@ def spec_(
 
 @coverage.command("windows")
 def windows_(
-    a: A,
+    a: str,
     limit: Limit = None,
     abstraction: Abstraction = "RSV",
     window: Window = 10,
@@ -410,7 +359,7 @@ def windows_(
 
 @coverage.command("explain")
 def explain_(
-    b: B,
+    b: str,
     versus: Annotated[str, Option("--vs")],
     abstraction: Abstraction = "RSV",
     tree: bool = False,
@@ -437,9 +386,7 @@ def explain_(
 
     ours, theirs = WindowOptions(abstraction).of(ask, b, versus)
     tables = explain(ours, theirs, abstraction, by_frame=frames, depth=depth)
-    for text in tables[0].said if tree else ():
-        say(text)
-    ask.report(tables[1] if tree else tables[0], limit)
+    _report_below(tables[0], tables[1] if tree else tables[0], ask, limit)
 
 
 @coverage.command("failures")
@@ -475,9 +422,7 @@ def failures_(
     told = read_outcomes(outcomes, limits)
     known, tested = windows.of(ask, train, test)
     shares, listed = failures(known, tested, told)
-    for text in shares.said if novel else ():
-        say(text)
-    ask.report(listed if novel else shares, limit)
+    _report_below(shares, listed if novel else shares, ask, limit)
 
 
 def _fraction(text: str) -> float:
@@ -490,28 +435,38 @@ def _fraction(text: str) -> float:
     return value
 
 
-def _slot_table(
-    text: str, slots: Path, k: int, ask: FrameAskOptions, *, covered: bool, missing: bool
-) -> ReportTable:
+def _report_below(
+    shares: ReportTable, listed: ReportTable, ask: FrameAskOptions, limit: int | None
+) -> None:
+    """Print a table, and the notes of a table of shares that it replaces."""
+    for text in shares.said if listed is not shares else ():
+        say(text)
+    ask.report(listed, limit)
+
+
+def _report_slots(
+    text: str,
+    slots: Path,
+    k: int,
+    ask: FrameAskOptions,
+    table: tuple[int, int | None],
+    picture: Path | None,
+) -> None:
+    """Print a table of declared slots (its number and rows), and draw the covered and missing pairs of values."""
     from sgstore.testsets.coverage import Specification, slot_coverage
 
     (chosen,) = ask.frames(text)
     say_scope(chosen.scope(world=False), ask.chosen)
-    tables = slot_coverage(chosen, Specification.read(slots), k)
-    return tables[1 if covered else 2 if missing else 0]
+    ask.report(slot_coverage(chosen, Specification.read(slots), k)[table[0]], table[1])
+    if picture is not None:
+        from sgstore.draw import draw_matrix
 
-
-def _slot_picture(text: str, slots: Path, ask: FrameAskOptions, to: Path) -> None:
-    """Draw a picture of the covered and missing pairs of slot values, for the slots declared in a file."""
-    from sgstore.draw import draw_matrix
-
-    (chosen,) = ask.frames(text)
-    declared = _one_specification(slots)
-    items, frames, wanted = declared.matrix(chosen)
-    names = [f"{slot}: {value}" for slot, value in items]
-    title = f"Pairs of {declared.name} in {_short(text)}"
-    draw_matrix(names, frames, wanted, to, title=title, groups=[slot for slot, _ in items])
-    say(f"drawn: {to}")
+        declared = _one_specification(slots)
+        items, frames, wanted = declared.matrix(chosen)
+        names = [f"{slot}: {value}" for slot, value in items]
+        title = f"Pairs of {declared.name} in {_short(text)}"
+        draw_matrix(names, frames, wanted, picture, title=title, groups=[slot for slot, _ in items])
+        say(f"drawn: {picture}")
 
 
 def _one_specification(slots: Path) -> Specification:

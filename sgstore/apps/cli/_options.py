@@ -1,4 +1,82 @@
-"""Shared arguments and options of the commands, and their typer classes."""
+"""Shared arguments and options of the commands, and their typer classes.
+
+A command describes its options in its docstring. This docstring describes options of several commands.
+
+Parameters
+----------
+store : STORE
+    The store: one DuckDB file.
+frame : FRAME
+    A frame_id, TRACE#SEQ, or TRACE@12.3s.
+parameters : NAME=VALUE
+    Value of $NAME in the query; write a list as [1, 2]; repeatable.
+tables : [NAME=]FILE
+    Join a table of your own (Parquet, CSV, JSON): by frame_id, or by trace and seq, time_ns or t;
+    repeatable.
+query : QUERY
+    A pattern: 'MATCH (e:Ego) …'.
+file
+    Read the query from a file; - reads stdin.
+budget
+    At most 600s, 10min, 5GB, 1000frames or 40units.
+clip : TIME
+    Longest clip of --unit clip.
+abstraction : NAME
+    Abstraction: E, EL, ER, RSV, …
+picture : FILE
+    Picture to draw: .png or .svg.
+trace
+    Use only this trace; repeatable.
+traces
+    Use only this trace; repeatable.
+look_in : FOLDER
+    Folder with recordings that were moved; repeatable.
+jobs
+    Recordings to read at a time; 0: one per core.
+as_json
+    Short for --format json.
+output
+    Write to this file instead of stdout.
+url : URL
+    The collection: a folder, or s3://bucket/prefix.
+a : A
+    Frames: a store or a collection, STORE:QUERY for matching frames, STORE:TESTS.lock for the
+    frames of a lock; TESTS.lock alone uses the store in its folder with its recordings.
+b : B
+    Frames, written like A.
+limit
+    Maximum rows; 0: all.
+unit
+    Count frames, runs of frames of one class, or traces with it.
+window
+    Number of frames that form one class together.
+incomplete
+    Windows with missing frames: equal, distinct, or dropped.
+slots : FILE
+    TOML file with declared slots.
+missing
+    List the missing items, each with a query for it.
+covered
+    List the covered items, with their frames.
+manoeuvres : NAME
+    A manoeuvre of sequences: a pattern of the library, or NAME=QUERY; may be repeated.
+within : TIME
+    Longest time from the first manoeuvre of a sequence to the last.
+safe
+    Run in a separate process with bounded time (5s), memory and rows.
+max_rows
+    Maximum number of rows, with --safe.
+name : NAME
+    Name of a pattern, such as cut_in or ParkingExit.
+kinds
+    Only this kind; repeatable.
+force
+    Read again and replace traces of the store.
+path : LOCK
+    A lock that select wrote.
+no_payloads
+    Skip sensor messages: recordings are not read.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +86,7 @@ import re
 import sys
 import tomllib
 from collections import Counter
+from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, partial, wraps
 from importlib import resources
@@ -247,16 +326,19 @@ def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _described(parameter: inspect.Parameter, hint: Any, *documented: Any) -> inspect.Parameter:
-    """Return a parameter of a command with the placeholder and the help of the first docstring that has it."""
-    known = next(
-        (d for one in documented if (d := split_docstring(one)[1].get(parameter.name))), None
-    )
-    if known is not None:
-        kind, *infos = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    """Return a parameter of a command with its placeholder and its help.
+
+    They are those of its first description in docstrings, else of its type, else of this module.
+    """
+    name, module = parameter.name, sys.modules[__name__]
+    kind, *infos = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    shared = [] if infos and infos[0].help else [module]
+    known = (split_docstring(one)[1].get(name) for one in (*documented, *shared))
+    if (found := next(filter(None, known), None)) is not None:
         required = parameter.default is parameter.empty
-        flag = [f"--{parameter.name.replace('_', '-')}"] * (kind is bool)
-        info = infos[0] if infos else Argument() if required else Option(*flag)
-        info.metavar, info.help = known[0] or None, known[1]
+        flag = [f"--{name.replace('_', '-')}"] * (kind is bool)
+        info = copy(infos[0]) if infos else Argument() if required else Option(*flag)
+        info.metavar, info.help = found[0] or None, found[1]
         hint = Annotated[kind, info]
     return parameter.replace(annotation=hint, kind=parameter.KEYWORD_ONLY)
 
@@ -270,15 +352,7 @@ IN_TABLE: Final = 40
 COLLECTION_FILE: Final = "COLLECTION.json"
 """The file that marks a folder as a collection."""
 
-StorePath = Annotated[
-    Path,
-    Argument(
-        metavar="STORE",
-        envvar=STORE,
-        help="The store: one DuckDB file.",
-        autocompletion=completion.stores,
-    ),
-]
+StorePath = Annotated[Path, Argument(envvar=STORE, autocompletion=completion.stores)]
 AskedPath = Annotated[
     Path,
     Argument(
@@ -288,35 +362,11 @@ AskedPath = Annotated[
         autocompletion=completion.stores,
     ),
 ]
-FrameName = Annotated[
-    str,
-    Argument(
-        metavar="FRAME",
-        help="A frame_id, TRACE#SEQ, or TRACE@12.3s.",
-        autocompletion=completion.frames,
-    ),
-]
-Parameters = Annotated[
-    list[str] | None,
-    Option(
-        "--param",
-        metavar="NAME=VALUE",
-        help="Value of $NAME in the query; write a list as [1, 2]; repeatable.",
-    ),
-]
-With = Annotated[
-    list[str] | None,
-    Option(
-        "--with",
-        metavar="[NAME=]FILE",
-        help="Join a table of your own (Parquet, CSV, JSON): by frame_id, or by trace and seq, time_ns"
-        " or t; repeatable.",
-    ),
-]
-QueryText = Annotated[str | None, Argument(metavar="QUERY", help="A pattern: 'MATCH (e:Ego) …'.")]
-QueryFile = Annotated[
-    Path | None, Option("--file", "-f", help="Read the query from a file; - reads stdin.")
-]
+FrameName = Annotated[str, Argument(autocompletion=completion.frames)]
+Parameters = Annotated[list[str] | None, Option("--param")]
+With = Annotated[list[str] | None, Option("--with")]
+QueryText = Annotated[str | None, Argument()]
+QueryFile = Annotated[Path | None, Option("--file", "-f")]
 
 
 def pattern_option(about: str) -> Any:
@@ -326,56 +376,25 @@ def pattern_option(about: str) -> Any:
 
 
 PatternNames = Annotated[list[str] | None, pattern_option("One of the library; repeatable.")]
-Budget = Annotated[str, Option("--budget", help="At most 600s, 10min, 5GB, 1000frames or 40units.")]
 CaseUnit = Annotated[
     Literal["frame", "clip", "trace"], Option("--unit", help="Frames, clips, or whole traces.")
 ]
-LongestClip = Annotated[str, Option("--clip", metavar="TIME", help="Longest clip of --unit clip.")]
-Abstraction = Annotated[
-    str,
-    Option(
-        "--abstraction",
-        metavar="NAME",
-        help="Abstraction: E, EL, ER, RSV, …",
-        autocompletion=completion.abstractions,
-    ),
-]
-Picture = Annotated[
-    Path | None, Option("--picture", metavar="FILE", help="Picture to draw: .png or .svg.")
-]
-Traces = Annotated[
-    list[str] | None,
-    Option("--trace", help="Use only this trace; repeatable.", autocompletion=completion.traces),
-]
-LookIn = Annotated[
-    list[Path] | None,
-    Option(
-        "--look-in",
-        metavar="FOLDER",
-        help="Folder with recordings that were moved; repeatable.",
-    ),
-]
-Jobs = Annotated[
-    int, Option("--jobs", "-j", min=0, help="Recordings to read at a time; 0: one per core.")
-]
+Abstraction = Annotated[str, Option("--abstraction", autocompletion=completion.abstractions)]
+Traces = Annotated[list[str] | None, Option("--trace", autocompletion=completion.traces)]
+Jobs = Annotated[int, Option("--jobs", "-j", min=0)]
 ROWS: Final = "Rows"
 LIMITS: Final = "Limits"
 MESSAGES: Final = "Messages"
 Quiet = Annotated[
-    bool,
-    Option("--quiet", help="Print only results and errors.", rich_help_panel=MESSAGES),
+    bool, Option("--quiet", help="Print only results and errors.", rich_help_panel=MESSAGES)
 ]
 Verbose = Annotated[
-    bool,
-    Option("--verbose", help="Also log steps and times on stderr.", rich_help_panel=MESSAGES),
+    bool, Option("--verbose", help="Also log steps and times on stderr.", rich_help_panel=MESSAGES)
 ]
 _VERBOSITY: Final = {"quiet": Quiet, "verbose": Verbose}
 """Options of every verb."""
-AsJson = Annotated[bool, Option("--json", help="Short for --format json.", rich_help_panel=ROWS)]
-Output = Annotated[
-    Path | None,
-    Option("--output", "-o", help="Write to this file instead of stdout.", rich_help_panel=ROWS),
-]
+AsJson = Annotated[bool, Option("--json", rich_help_panel=ROWS)]
+Output = Annotated[Path | None, Option("--output", "-o", rich_help_panel=ROWS)]
 
 
 @dataclass(frozen=True)

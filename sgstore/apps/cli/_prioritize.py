@@ -11,9 +11,7 @@ from typer import Option
 
 from sgstore.apps.cli._coverage import PANEL
 from sgstore.apps.cli._options import (
-    Budget,
     CaseUnit,
-    LongestClip,
     Parameters,
     PrintedRows,
     QueryLimits,
@@ -26,7 +24,7 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import count_bar, say
-from sgstore.apps.cli._testsets import NoPayloads, chosen_frames, say_made
+from sgstore.apps.cli._testsets import chosen_frames, say_made
 
 if TYPE_CHECKING:
     from sgstore.testsets.selection import Prioritized, PrioritySpec
@@ -89,9 +87,9 @@ class OrderOptions:
     measures: Annotated[
         list[str] | None, Option("--measure", "-m", show_default="closing_time, ttc_mild")
     ] = None
-    budget: Budget = ""
+    budget: str = ""
     unit: CaseUnit = "frame"
-    clip: LongestClip = "2s"
+    clip: str = "2s"
     abstraction: str = "situation"
     seed: Annotated[int, Option(min=0, max=(1 << 63) - 1)] = 0
 
@@ -163,7 +161,7 @@ def prioritize(
     query: QueryText = None,
     parameters: Parameters = None,
     output: Annotated[Path | None, Option("--output", "-o")] = None,
-    no_payloads: NoPayloads = False,
+    no_payloads: bool = False,
     *,
     out: PrintedRows,
     bounds: QueryLimits,

@@ -61,11 +61,7 @@ PANEL: Final = "Questions"
 verbs = Verbs()
 
 
-Safe = Annotated[
-    bool,
-    Option("--safe", help="Run in a separate process with bounded time (5s), memory and rows."),
-]
-MaxRows = Annotated[int, Option("--max-rows", min=0, help="Maximum number of rows, with --safe.")]
+MaxRows = Annotated[int, Option("--max-rows", min=0)]
 
 
 @verbs.command(rich_help_panel=PANEL)
@@ -75,7 +71,7 @@ def find(
     count: bool = False,
     explain: bool = False,
     require: bool = False,
-    safe: Safe = False,
+    safe: bool = False,
     max_rows: MaxRows = 10_000,
     tables: With = None,
     each_frame: Annotated[bool, Option("--rows")] = False,
@@ -350,7 +346,7 @@ def sql(
     store: AskedPath,
     statement: Annotated[str | None, Argument()] = None,
     file: QueryFile = None,
-    safe: Safe = False,
+    safe: bool = False,
     max_rows: MaxRows = 10_000,
     tables: With = None,
     each: Annotated[bool, Option("--each", rich_help_panel=COLLECTIONS)] = False,
@@ -423,14 +419,7 @@ library = Verbs(
     no_args_is_help=True,
 )
 
-LibraryName = Annotated[
-    str,
-    Argument(
-        metavar="NAME",
-        help="Name of a pattern, such as cut_in or ParkingExit.",
-        autocompletion=completion.patterns,
-    ),
-]
+LibraryName = Annotated[str, Argument(autocompletion=completion.patterns)]
 
 
 class Kind(StrEnum):
@@ -442,7 +431,7 @@ class Kind(StrEnum):
     property = "property"
 
 
-PatternKinds = Annotated[list[Kind] | None, Option("--kind", help="Only this kind; repeatable.")]
+PatternKinds = Annotated[list[Kind] | None, Option("--kind")]
 
 
 @library.command("list")

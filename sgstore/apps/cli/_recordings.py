@@ -50,7 +50,6 @@ Recordings = Annotated[
         help="Recordings, folders of them, patterns ('drives/**/day?.mcap'); - reads a list from stdin.",
     ),
 ]
-Force = Annotated[bool, Option("--force", help="Read again and replace traces of the store.")]
 
 
 @verbs.command(rich_help_panel=PANEL)
@@ -63,7 +62,7 @@ def ingest(
     since: str | None = None,
     until: str | None = None,
     rate: Annotated[float | None, Option(min=0)] = None,
-    force: Force = False,
+    force: bool = False,
     dry_run: bool = False,
     shard: str | None = None,
     *,
@@ -428,7 +427,7 @@ def import_(
     store: StorePath,
     files: list[Path],
     form_of_graphs: Annotated[Literal["s3c", "nodelink", "csv", "openlabel"], Option("--format")],
-    force: Force = False,
+    force: bool = False,
     form: Annotated[Format, Option("--rows")] = Format.table,
     as_json: AsJson = False,
     *,

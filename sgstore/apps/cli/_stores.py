@@ -16,7 +16,6 @@ from sgstore.apps.cli._options import (
     FrameName,
     GraphOptions,
     Jobs,
-    LookIn,
     Output,
     PrintedRows,
     StorePath,
@@ -101,7 +100,7 @@ def remove(
 @verbs.command(rich_help_panel=PANEL)
 def rebuild(
     store: StorePath,
-    look_in: LookIn = None,
+    look_in: list[Path] | None = None,
     leave_out: Annotated[list[str] | None, Option(autocompletion=completion.traces)] = None,
     jobs: Jobs = 1,
     *,

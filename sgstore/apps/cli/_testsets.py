@@ -23,9 +23,7 @@ from sgstore.apps.cli._options import (
     Abstraction,
     AskedPath,
     AskOptions,
-    Budget,
     CaseUnit,
-    LongestClip,
     Parameters,
     PrintedRows,
     QueryLimits,
@@ -55,13 +53,9 @@ lock = Verbs(
     help="Locks of test sets: verify, list, unite, intersect, subtract.",
     no_args_is_help=True,
 )
-LockPath = Annotated[Path, Argument(metavar="LOCK", help="A lock that select wrote.")]
 LockA = Annotated[Path, Argument(metavar="A", help="A lock.")]
 LockB = Annotated[Path, Argument(metavar="B", help="A lock.")]
 LockOut = Annotated[Path, Option("--output", "-o", metavar="FILE", help="The lock to write.")]
-NoPayloads = Annotated[
-    bool, Option("--no-payloads", help="Skip sensor messages: recordings are not read.")
-]
 Objective = Literal["units", "frames", "seconds", "bytes"]
 
 
@@ -102,9 +96,9 @@ class ChoiceOptions:
     rarest: bool = False
     stratify: str = ""
     weakest: str = ""
-    budget: Budget = ""
+    budget: str = ""
     unit: CaseUnit = "frame"
-    clip: LongestClip = "2s"
+    clip: str = "2s"
     stride: Annotated[str, Option(show_default="--clip")] = ""
     abstraction: Abstraction = "RSV"
     combos: Annotated[int, Option(min=0)] = 0
@@ -167,7 +161,7 @@ def select(
     parameters: Parameters = None,
     split: str = "",
     output: Annotated[Path | None, Option("--output", "-o")] = None,
-    no_payloads: NoPayloads = False,
+    no_payloads: bool = False,
     curve: bool = False,
     picture: Path | None = None,
     *,
@@ -278,9 +272,9 @@ def _lock(
 
 @lock.command("verify")
 def verify_(
-    path: LockPath,
+    path: Path,
     store: AskedPath,
-    no_payloads: NoPayloads = False,
+    no_payloads: bool = False,
     strict: bool = False,
     *,
     whole: CollectionOptions,
@@ -312,7 +306,7 @@ def verify_(
 
 
 @lock.command("list")
-def list_(path: LockPath, out: RowOptions) -> None:
+def list_(path: Path, out: RowOptions) -> None:
     """List the test cases of a lock."""
     from sgstore.testsets.locks import read_lock
 
