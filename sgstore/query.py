@@ -101,7 +101,7 @@ class StoreFrame:
         """
         from sgstore.draw import camera_of
 
-        return self._store.picture(self.ref, channel or camera_of(self._store, self.ref.trace))
+        return self._store.picture(self.ref, channel or camera_of(self._store.file, self.ref.trace))
 
     def points(self, channel: str | None = None) -> NDArray[Any]:
         """Return the points of a lidar or radar, by default of the first one; see :meth:`Store.points`.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -69,7 +70,7 @@ class FilmPage(Page):
         self._renderer.clear()
         self._figure.patch.draw(self._renderer)
         for axes, drawn in self._shown.items():
-            for _, draw in sorted(drawn, key=_z_of):
+            for _, draw in sorted(drawn, key=itemgetter(0)):
                 draw()
             for image in axes.images:
                 image.draw(self._renderer)
@@ -258,7 +259,3 @@ def _dashes(linestyle: Any, width: float) -> tuple[float, list[float] | None]:
         return 0.0, None
     start, dashes = linestyle
     return start * width, [part * width for part in dashes]
-
-
-def _z_of(drawn: tuple[float, Draw]) -> float:
-    return drawn[0]

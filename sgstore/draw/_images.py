@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.draw._page import PICTURE_PIXELS
 from sgstore.draw._picture import check_installed, draw_frame, title_of
-from sgstore.draw._stored import Bindings, camera_in, draw_stored, map_in
+from sgstore.draw._stored import Bindings, camera_of, draw_stored, map_of
 from sgstore.errors import ExportError, StoreError
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
         The packages for drawing are not installed.
     """
     check_installed()
-    topic = camera_in(file, frame.trace)
+    topic = camera_of(file, frame.trace)
     data = b""
     if topic:
         with suppress(StoreError):  # cameras are slower than frames: a frame may have no picture
@@ -101,7 +101,7 @@ def thumbnail(file: StoreFile, frame: FrameRef, side: int = THUMBNAIL) -> bytes:
     if not data:
         graph = file.graph(frame.frame_id)
         title = title_of(graph, file.trace(frame.trace_id).start_ns)
-        data = graph_picture(graph, map_in(file, frame.trace), title=title)
+        data = graph_picture(graph, map_of(file, frame.trace), title=title)
     image = _opened(data, topic).convert("RGB")
     image.thumbnail((side, side))
     small = io.BytesIO()

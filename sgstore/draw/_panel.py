@@ -141,7 +141,8 @@ def paint_surroundings(panel: Panel, scene: DrawnFrame, bottom: float) -> None:
 
 def legend_height(entries: Sequence[Entry]) -> float:
     """Return the height of a legend in the side panel, in points."""
-    return HEAD + ROW * _legend_rows(entries)
+    short = sum(not e.is_long for e in entries)
+    return HEAD + ROW * (math.ceil(short / 2) + len(entries) - short)
 
 
 def paint_legend(panel: Panel, entries: Sequence[Entry]) -> None:
@@ -180,8 +181,3 @@ def paint_key(page: Page, entries: Sequence[Entry], box: Rect) -> None:
 def _paint_entry(panel: Panel, entry: Entry, x: float, y: float) -> None:
     paint_swatch(panel.page, entry, (x + _SWATCH / 2 - 2, y + 4.2))
     panel.page.text(x + _SWATCH, y + 2, entry.text, fontsize=_SMALL)
-
-
-def _legend_rows(entries: Sequence[Entry]) -> int:
-    short = sum(not e.is_long for e in entries)
-    return math.ceil(short / 2) + len(entries) - short

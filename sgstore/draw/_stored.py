@@ -211,7 +211,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
         graph = called(store.file.graph(ref.frame_id), names)
         draw_frame(
             graph,
-            map_of(store, ref.trace),
+            map_of(store.file, ref.trace),
             to,
             title=title_of(graph, store.file.trace(ref.trace_id).start_ns),
             highlight=bindings[0] if bindings else {},
@@ -288,8 +288,8 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     with store.file.snapshot():
         chosen = _chosen(store, frames, fps)
         trace = chosen[0].trace
-        road_map = map_of(store, trace)
-        usual = camera_of(store, trace)
+        road_map = map_of(store.file, trace)
+        usual = camera_of(store.file, trace)
         if camera is None and not usual:
             camera = NO_CAMERA
     spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
@@ -326,12 +326,8 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
     return chosen
 
 
-def map_of(store: Store, trace: str) -> RoadMap | None:
+def map_of(file: StoreFile, trace: str) -> RoadMap | None:
     """Return the road map of a trace of a store; ``None`` without a map."""
-    return map_in(store.file, trace)
-
-
-def map_in(file: StoreFile, trace: str) -> RoadMap | None:
     found = file.road_map_text(trace)
     return read_map(found[1], found[0]) if found else None
 
@@ -346,7 +342,7 @@ def _picture(
     if camera == NO_CAMERA:
         return None
     try:
-        topic = camera or (camera_of(store, frame.trace) if usual is None else usual)
+        topic = camera or (camera_of(store.file, frame.trace) if usual is None else usual)
         message = store.payload(frame, topic)
     except StoreError:
         if camera:
@@ -360,11 +356,7 @@ def _picture(
     return message[start.start() :]
 
 
-def camera_of(store: Store, trace: str) -> str:
+def camera_of(file: StoreFile, trace: str) -> str:
     """Return the name of the first recorded channel with camera pictures; empty without such a channel."""
-    return camera_in(store.file, trace)
-
-
-def camera_in(file: StoreFile, trace: str) -> str:
     topics = (c.topic for c in file.channels(trace) if c.schema.endswith("CompressedImage"))
     return min(topics, default="")

@@ -37,6 +37,13 @@ ORDER BY frame_id
 """
 
 
+_TYPES: Final[dict[str, Any]] = {
+    **dict.fromkeys(("frame_id", "seq", "time_ns", "log_time_ns"), np.int64),
+    "t": np.float64,
+}
+"""Columns of :class:`ClipFrames`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Export:
     """Export from a store: the clips, the labels of their frames, and the options.
@@ -200,23 +207,14 @@ class ClipFrames:
                 "end": reach.end_ns,
             },
         )
-        return cls(
-            number,
-            clip,
-            frame_id=found["frame_id"].astype(np.int64),
-            seq=found["seq"].astype(np.int64),
-            time_ns=found["time_ns"].astype(np.int64),
-            log_time_ns=found["log_time_ns"].astype(np.int64),
-            t=found["t"].astype(np.float64),
-        )
+        return cls(number, clip, **{name: found[name].astype(of) for name, of in _TYPES.items()})
 
     def __len__(self) -> int:
         return len(self.frame_id)
 
     def take(self, rows: slice | Ints) -> ClipFrames:
         """Return the frames at some indices."""
-        columns = ("frame_id", "seq", "time_ns", "log_time_ns", "t")
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
+        return replace(self, **{name: getattr(self, name)[rows] for name in _TYPES})
 
     def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
         """Yield the frames of the clip in groups of ``size`` frames."""

@@ -14,8 +14,10 @@ from __future__ import annotations
 import json
 import math
 import re
+import tomllib
 from dataclasses import dataclass
 from functools import cache
+from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
 
 from google.protobuf import (
@@ -40,48 +42,11 @@ if TYPE_CHECKING:
 
 
 _GOOGLE: Final = {"Timestamp": timestamp_pb2.DESCRIPTOR, "Duration": duration_pb2.DESCRIPTOR}
-_TYPES: Final = {
-    "Vector3": "x=1:double y=2:double z=3:double",
-    "Quaternion": "x=1:double y=2:double z=3:double w=4:double",
-    "Pose": "position=1:Vector3 orientation=2:Quaternion",
-    "PackedElementField": "name=1:string offset=2:fixed32 type=3:PackedElementField.NumericType",
-    "CompressedImage": "timestamp=1:Timestamp data=2:bytes format=3:string frame_id=4:string",
-    "CameraCalibration": "timestamp=1:Timestamp width=2:fixed32 height=3:fixed32"
-    " distortion_model=4:string D=5:double* K=6:double* R=7:double* P=8:double* frame_id=9:string",
-    "PointCloud": "timestamp=1:Timestamp frame_id=2:string pose=3:Pose point_stride=4:fixed32"
-    " fields=5:PackedElementField* data=6:bytes",
-    "Point3": "x=1:double y=2:double z=3:double",
-    "Color": "r=1:double g=2:double b=3:double a=4:double",
-    "KeyValuePair": "key=1:string value=2:string",
-    "ArrowPrimitive": "pose=1:Pose shaft_length=2:double shaft_diameter=3:double head_length=4:double"
-    " head_diameter=5:double color=6:Color",
-    "CubePrimitive": "pose=1:Pose size=2:Vector3 color=3:Color",
-    "SpherePrimitive": "pose=1:Pose size=2:Vector3 color=3:Color",
-    "CylinderPrimitive": "pose=1:Pose size=2:Vector3 bottom_scale=3:double top_scale=4:double color=5:Color",
-    "LinePrimitive": "type=1:LinePrimitive.Type pose=2:Pose thickness=3:double scale_invariant=4:bool"
-    " points=5:Point3* color=6:Color colors=7:Color* indices=8:fixed32*",
-    "TriangleListPrimitive": "pose=1:Pose points=2:Point3* color=3:Color colors=4:Color* indices=5:fixed32*",
-    "TextPrimitive": "pose=1:Pose billboard=2:bool font_size=3:double scale_invariant=4:bool color=5:Color"
-    " text=6:string",
-    "ModelPrimitive": "pose=1:Pose scale=2:Vector3 color=3:Color override_color=4:bool url=5:string"
-    " media_type=6:string data=7:bytes",
-    "SceneEntityDeletion": "timestamp=1:Timestamp type=2:SceneEntityDeletion.Type id=3:string",
-    "SceneEntity": "timestamp=1:Timestamp frame_id=2:string id=3:string lifetime=4:Duration"
-    " frame_locked=5:bool metadata=6:KeyValuePair* arrows=7:ArrowPrimitive* cubes=8:CubePrimitive*"
-    " spheres=9:SpherePrimitive* cylinders=10:CylinderPrimitive* lines=11:LinePrimitive*"
-    " triangles=12:TriangleListPrimitive* texts=13:TextPrimitive* models=14:ModelPrimitive*",
-    "SceneUpdate": "deletions=1:SceneEntityDeletion* entities=2:SceneEntity*",
-    "FrameTransform": "timestamp=1:Timestamp parent_frame_id=2:string child_frame_id=3:string"
-    " translation=4:Vector3 rotation=5:Quaternion",
-    "FrameTransforms": "transforms=1:FrameTransform*",
-}
-"""Fields of the messages, ``name=number:type``, with * if repeated; dependencies first."""
-_ENUMS: Final = {
-    "PackedElementField.NumericType": "UNKNOWN UINT8 INT8 UINT16 INT16 UINT32 INT32 FLOAT32 FLOAT64",
-    "LinePrimitive.Type": "LINE_STRIP LINE_LOOP LINE_LIST",
-    "SceneEntityDeletion.Type": "MATCHING_ID ALL",
-}
-"""Their enumerations, by owner and name, numbered from 0."""
+_TABLES: Final = tomllib.loads(
+    resources.files("sgstore.exporters").joinpath("foxglove.toml").read_text(encoding="utf-8")
+)
+_TYPES: Final[dict[str, str]] = _TABLES["types"]
+_ENUMS: Final[dict[str, str]] = _TABLES["enums"]
 _NUMERIC_OF: Final = {"f4": 7, "f8": 8, "u4": 5, "i4": 6, "u1": 1}
 
 IMAGE, CALIBRATION, CLOUD = "CompressedImage", "CameraCalibration", "PointCloud"

@@ -12,6 +12,8 @@ The metadata of these channels has ``sgstore: derived``: they are not part of th
 
 from __future__ import annotations
 
+import json
+from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
 
 from mcap.records import Channel, Schema
@@ -36,71 +38,10 @@ SCENE: Final = "/sgstore/scene"
 TRANSFORMS: Final = "/sgstore/tf"
 LABELS: Final = "/sgstore/labels"
 
-_LABEL_VALUES: Final[dict[str, Any]] = {
-    "type": "object",
-    "description": "Values of the labels that were asked for; null where one is not known.",
-    "additionalProperties": {"type": ["boolean", "number", "string", "null"]},
-}
-_FRAME: Final[dict[str, Any]] = {
-    "timestamp": {
-        "type": "object",
-        "title": "time",
-        "description": "Log time of the frame.",
-        "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-    },
-    "trace": {"type": "string", "description": "Name of the trace in its store."},
-    "frame_id": {"type": "string", "description": "64-bit id of the frame in its store."},
-    "seq": {"type": "integer", "description": "Number of the frame in its trace, from 0."},
-    "time_ns": {"type": "string", "description": "Simulation time; ns."},
-    "labels": _LABEL_VALUES,
-}
-GRAPH_SCHEMA: Final[dict[str, Any]] = {
-    "$schema": "https://json-schema.org/draft/2020-12/schema",
-    "title": "sgstore.SceneGraph",
-    "description": "The scene graph of a frame. Metres, seconds, m/s, degrees; axes of the road map.",
-    "type": "object",
-    "properties": {
-        **_FRAME,
-        "ego": {"type": ["integer", "null"], "description": "Id of the ego's node."},
-        "nodes": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "description": "What is known of a node; ids below zero are parts of the map.",
-                "properties": {
-                    "id": {"type": "integer"},
-                    "kind": {"type": "string"},
-                    "name": {"type": "string"},
-                    "ident": {"type": "string", "description": "The simulator's id."},
-                    "type_name": {"type": "string", "description": "The simulator's type."},
-                    "is_ego": {"type": "boolean"},
-                    "is_static": {"type": "boolean"},
-                },
-                "required": ["id", "kind", "name"],
-            },
-        },
-        "edges": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "properties": {
-                    "src": {"type": "integer"},
-                    "relation": {"type": "string"},
-                    "dst": {"type": "integer"},
-                },
-                "required": ["src", "relation", "dst"],
-            },
-        },
-    },
-    "required": ["timestamp", "trace", "frame_id", "seq", "nodes", "edges"],
-}
-LABEL_SCHEMA: Final[dict[str, Any]] = {
-    "$schema": "https://json-schema.org/draft/2020-12/schema",
-    "title": "sgstore.Labels",
-    "type": "object",
-    "properties": _FRAME,
-    "required": ["timestamp", "trace", "frame_id", "seq", "labels"],
-}
+_SCHEMAS: Final[dict[str, Any]] = json.loads(
+    resources.files("sgstore.exporters").joinpath("graph_schemas.json").read_text(encoding="utf-8")
+)
+"""JSON schemas of the messages ``graph`` and ``labels``."""
 
 ClipMessage = tuple[int, int, int, int, bytes | memoryview]
 """Channel, sequence number, log time and time of publication in ns, data."""
@@ -121,7 +62,7 @@ class Added:
 
     def __init__(self, export: Export) -> None:
         self._export = export
-        schema = ("jsonschema", _as_json(LABEL_SCHEMA), "json")
+        schema = ("jsonschema", _as_json(_SCHEMAS["labels"]), "json")
         self._kinds = [(LABELS, "sgstore.Labels", *schema)]
         if export.with_graph:
             scene, tree = (
@@ -129,7 +70,7 @@ class Added:
                 for name in (foxglove_scene.SCENE, foxglove_scene.TRANSFORMS)
             )
             self._kinds = [
-                (GRAPH, "sgstore.SceneGraph", "jsonschema", _as_json(GRAPH_SCHEMA), "json"),
+                (GRAPH, "sgstore.SceneGraph", "jsonschema", _as_json(_SCHEMAS["graph"]), "json"),
                 (SCENE, "foxglove.SceneUpdate", "protobuf", scene, "protobuf"),
                 (TRANSFORMS, "foxglove.FrameTransforms", "protobuf", tree, "protobuf"),
             ]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.exporters._mcap_graphs import GRAPH, SCENE
+from sgstore.exporters._mcap_graphs import SCENE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,14 +38,16 @@ def layout(channels: Sequence[ChannelCount], ego: str) -> str:
     ego : str
         Axes for the view from above.
     """
+    known = resources.files("sgstore.exporters").joinpath("viewer_panels.json")
+    usual: dict[str, Any] = json.loads(known.read_text(encoding="utf-8"))
     clouds, images = _topics(channels, CLOUDS), _topics(channels, IMAGES)
-    panels: dict[str, Any] = {"3D!scene": _above(clouds, ego)}
+    topics = usual["scene"]["topics"] | dict.fromkeys(clouds, usual["cloud"])
+    panels = {"3D!scene": usual["scene"] | {"followTf": ego, "topics": topics}}
     beside: Any = "RawMessages!graph"
     if images:
         panels["Image!camera"] = _camera(images[0], _topics(channels, CALIBRATIONS))
         beside = _split("column", "Image!camera", beside, 45)
-    panels["RawMessages!graph"] = {"topicPath": GRAPH, "diffEnabled": False, "expansion": {}}
-    panels["Plot!speed"] = _plot()
+    panels |= {"RawMessages!graph": usual["graph"], "Plot!speed": usual["speed"]}
     above = _split("row", "3D!scene", beside, 65)
     told = {
         "configById": panels,
@@ -70,63 +73,9 @@ def _split(direction: str, first: Any, second: Any, share: int) -> dict[str, Any
     return {"direction": direction, "first": first, "second": second, "splitPercentage": share}
 
 
-def _above(clouds: Sequence[str], ego: str) -> dict[str, Any]:
-    cloud = {"visible": True, "colorField": "z", "colorMode": "colormap", "colorMap": "turbo"}
-    return {
-        "cameraState": {
-            "distance": 70,
-            "perspective": True,
-            "phi": 35,
-            "thetaOffset": 90,
-            "targetOffset": [0, 0, 0],
-            "target": [0, 0, 0],
-            "targetOrientation": [0, 0, 0, 1],
-            "fovy": 45,
-            "near": 0.5,
-            "far": 5000,
-        },
-        "followMode": "follow-pose",
-        "followTf": ego,
-        "scene": {},
-        "transforms": {},
-        "topics": {SCENE: {"visible": True}, **dict.fromkeys(clouds, cloud)},
-        "layers": {
-            "grid": {
-                "visible": True,
-                "label": "Grid",
-                "instanceId": "grid",
-                "layerId": "foxglove.Grid",
-                "size": 100,
-                "divisions": 20,
-                "lineWidth": 1,
-                "color": "#7f7f7f55",
-                "position": [0, 0, 0],
-                "rotation": [0, 0, 0],
-            }
-        },
-        "publish": {},
-        "imageMode": {},
-    }
-
-
 def _camera(image: str, calibrations: Sequence[str]) -> dict[str, Any]:
     """Return the viewer panel of a camera, with a calibration topic of the same namespace."""
     place = image.rpartition("/")[0]
     beside = [topic for topic in calibrations if topic.rpartition("/")[0] == place]
     mode = {"imageTopic": image} | ({"calibrationTopic": beside[0]} if beside else {})
     return {"imageMode": mode, "topics": {SCENE: {"visible": True}}, "layers": {}, "transforms": {}}
-
-
-def _plot() -> dict[str, Any]:
-    speed = f"{GRAPH}.nodes[:]{{is_ego==true}}.speed"
-    return {
-        "title": "speed of the ego (m/s)",
-        "paths": [
-            {"value": speed, "enabled": True, "timestampMethod": "receiveTime", "label": "speed"}
-        ],
-        "showXAxisLabels": True,
-        "showYAxisLabels": True,
-        "showLegend": False,
-        "isSynced": True,
-        "xAxisVal": "timestamp",
-    }

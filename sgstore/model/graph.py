@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import starmap
 from operator import eq, itemgetter
-from typing import TYPE_CHECKING, Any, Final, overload
+from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 
 import numpy as np
 
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     Whole = NDArray[np.signedinteger[Any]]
     Attributes = dict[str, Any]
     EdgeRecord = tuple[int, str, int, Attributes]
+
+K = TypeVar("K")
+V = TypeVar("V")
 
 IS_IN, LEADS, FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
 """Codes of the relations whose edges can have attributes."""
@@ -327,6 +330,14 @@ def named_graph(
     return graph
 
 
+def _grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
+    """Return the values of each key, in the order of the pairs."""
+    found: dict[K, list[V]] = {}
+    for key, value in pairs:
+        found.setdefault(key, []).append(value)
+    return found
+
+
 class LaneDistances:
     """Distances along the lanes of a map: between lanes, to map parts, with curvature and slope.
 
@@ -360,32 +371,22 @@ class LaneDistances:
 
     @cached_property
     def _starts(self) -> dict[tuple[int, int], list[float]]:
-        found: dict[tuple[int, int], list[float]] = {}
         rows = zip(*(column.tolist() for column in self._columns), strict=True)
-        for lane, other, start in rows:
-            found.setdefault((lane, other), []).append(start)
-        return found
+        return _grouped(((lane, other), start) for lane, other, start in rows)
 
     @cached_property
     def _onward(self) -> dict[int, list[tuple[int, float]]]:
-        found: dict[int, list[tuple[int, float]]] = {}
-        for (lane, other), starts in self._starts.items():
-            found.setdefault(lane, []).extend((other, start) for start in starts if start >= 0)
-        return found
+        every = self._starts.items()
+        ways = ((lane, (other, start)) for (lane, other), starts in every for start in starts)
+        return _grouped(way for way in ways if way[1][1] >= 0)
 
     @cached_property
     def _of_parts(self) -> dict[int, list[tuple[int, float, float]]]:
-        found: dict[int, list[tuple[int, float, float]]] = {}
-        for node, _, lane, start, end in self._parts:
-            found.setdefault(node, []).append((lane, start, end))
-        return found
+        return _grouped((node, (lane, start, end)) for node, _, lane, start, end in self._parts)
 
     @cached_property
     def _on_lanes(self) -> dict[tuple[str, int], list[tuple[float, float]]]:
-        found: dict[tuple[str, int], list[tuple[float, float]]] = {}
-        for _, what, lane, start, end in self._parts:
-            found.setdefault((what, lane), []).append((start, end))
-        return found
+        return _grouped(((what, lane), (start, end)) for _, what, lane, start, end in self._parts)
 
     @cached_property
     def _of_lanes(self) -> dict[int, list[tuple[float, float, float | None]]]:

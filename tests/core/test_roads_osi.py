@@ -477,7 +477,7 @@ def test_a_recording_without_a_map_has_the_roads_of_its_lanes_and_a_store_keeps_
 
     assert (outcome.status, outcome.error) == ("added", None)
     store = sgstore.open(tmp_path / "s.sgstore")
-    kept = map_of(store, outcome.name)
+    kept = map_of(store.file, outcome.name)
     assert kept is not None
     assert kept.name == "Harbour (lanes)"
     with open_trace(path) as trace:

@@ -7,13 +7,15 @@ import inspect
 import sys
 from functools import wraps
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcp.server.mcpserver import MCPServer
 from mcp.server.mcpserver.tools import Tool
 from mcp.types import CallToolResult, ImageContent, TextContent, ToolAnnotations
+from pydantic import Field
 
 from sgstore.apps.assistant._vocabulary import TOPICS
+from sgstore.base.docstrings import split_docstring
 from sgstore.errors import QueryNameError, SgstoreError
 
 if TYPE_CHECKING:
@@ -67,7 +69,7 @@ def _tool(name: str, tool: Callable[..., ToolAnswer]) -> Tool:
         read_only_hint=not writes, destructive_hint=False, open_world_hint=False
     )
     made = Tool.from_function(
-        _told(tool), name, description=inspect.getdoc(tool), annotations=hints
+        _told(tool), name, description=split_docstring(tool)[0], annotations=hints
     )
     made.parameters = _untitled(made.parameters)
     return made
@@ -102,10 +104,16 @@ def _told(tool: Callable[..., ToolAnswer]) -> Callable[..., CallToolResult]:
         return CallToolResult(content=content, structured_content=answer.data)
 
     signature = inspect.signature(tool, eval_str=True)
-    vars(told)["__signature__"] = signature.replace(return_annotation=CallToolResult)
-    told.__annotations__ = {name: one.annotation for name, one in signature.parameters.items()} | {
-        "return": CallToolResult
-    }
+    about = split_docstring(tool)[1]
+    parameters = [
+        one.replace(annotation=Annotated[one.annotation, Field(description=about[one.name][1])])
+        if one.name in about
+        else one
+        for one in signature.parameters.values()
+    ]
+    vars(told)["__signature__"] = inspect.Signature(parameters, return_annotation=CallToolResult)
+    told.__annotations__ = {one.name: one.annotation for one in parameters}
+    told.__annotations__["return"] = CallToolResult
     return told
 
 

@@ -4,7 +4,7 @@ Patterns, rules and SQL of an assistant run only in the sandbox: a process that 
 and has a deadline. This process itself draws named frames, reads camera pictures, and, with a
 folder for it, exports clips found by the sandbox.
 
-The docstring of a tool is its description for the assistant.
+The docstring of a tool is its description for the assistant, with those of its parameters.
 """
 
 from __future__ import annotations
@@ -173,15 +173,16 @@ class StoreTools:
 
     def vocabulary(
         self,
-        about: Annotated[
-            Topic,
-            Field(
-                description="here: kinds and relations in this store; language: how to write a query, in one"
-                " page; others: what a query may name"
-            ),
-        ] = "here",
+        about: Topic = "here",
     ) -> ToolAnswer:
-        """Describe the words of queries. Read 'language' once before your first query."""
+        """Describe the words of queries. Read 'language' once before your first query.
+
+        Parameters
+        ----------
+        about
+            here: kinds and relations in this store; language: how to write a query, in one page;
+            others: what a query may name
+        """
         text = self.topic(about)
         return ToolAnswer(text, {"about": about, "text": text})
 
@@ -198,14 +199,19 @@ class StoreTools:
 
     def patterns_search(
         self,
-        words: Annotated[str, Field(description="such as 'pedestrian crossing'; empty: all")] = "",
-        kind: Annotated[
-            Literal["", "predicate", "concept", "scenario", "property"],
-            Field(description="property: a rule for check; predicate: a condition for WHERE"),
-        ] = "",
+        words: str = "",
+        kind: Literal["", "predicate", "concept", "scenario", "property"] = "",
         limit: Limit = 8,
     ) -> ToolAnswer:
-        """Search the library of named patterns and rules: try this before writing a query."""
+        """Search the library of named patterns and rules: try this before writing a query.
+
+        Parameters
+        ----------
+        words
+            such as 'pedestrian crossing'; empty: all
+        kind
+            property: a rule for check; predicate: a condition for WHERE
+        """
         from sgstore.lang.library import patterns, search
 
         every = [one for one in patterns().values() if not kind or one.kind == kind]
@@ -235,17 +241,18 @@ class StoreTools:
     def find(
         self,
         query: Pattern,
-        form: Annotated[
-            Literal["intervals", "rows", "frames", "count"],
-            Field(
-                description="intervals: when it holds, and who; rows: one a match and frame, or what RETURN"
-                " says; frames: each once; count: number of frames"
-            ),
-        ] = "rows",
+        form: Literal["intervals", "rows", "frames", "count"] = "rows",
         limit: Limit = ROWS,
         parameters: Values = None,
     ) -> ToolAnswer:
-        """Find scenes by a pattern of their scene graphs."""
+        """Find scenes by a pattern of their scene graphs.
+
+        Parameters
+        ----------
+        form
+            intervals: when it holds, and who; rows: one a match and frame, or what RETURN says;
+            frames: each once; count: number of frames
+        """
         return self._rows("find", query=query, form=form, limit=limit, parameters=parameters or {})
 
     def why_not(self, frame: FrameName, query: Pattern, parameters: Values = None) -> ToolAnswer:
@@ -255,36 +262,52 @@ class StoreTools:
 
     def sql(
         self,
-        statement: Annotated[str, Field(description="SELECT … FROM frames, nodes, edges, …")],
+        statement: str,
         limit: Limit = ROWS,
     ) -> ToolAnswer:
-        """Run a read-only SQL statement of DuckDB; vocabulary 'views' lists tables and columns."""
+        """Run a read-only SQL statement of DuckDB; vocabulary 'views' lists tables and columns.
+
+        Parameters
+        ----------
+        statement
+            SELECT … FROM frames, nodes, edges, …
+        """
         return self._rows("sql", statement=statement, limit=limit)
 
     def check(
         self,
-        rule: Annotated[
-            str,
-            Field(description="'CHECK name: ALWAYS …', or the name of a property of the library"),
-        ],
+        rule: str,
         limit: Limit = ROWS,
         parameters: Values = None,
     ) -> ToolAnswer:
-        """Check a rule over time: for each trace true, false or unknown, and each violation."""
+        """Check a rule over time: for each trace true, false or unknown, and each violation.
+
+        Parameters
+        ----------
+        rule
+            'CHECK name: ALWAYS …', or the name of a property of the library
+        """
         reply = self._ask("check", text=rule, limit=limit, parameters=parameters or {})
         tally = ", ".join(f"{number} {word}" for word, number in reply["verdicts"].items())
         return ToolAnswer(f"{_rows_text(reply)}\n({tally or 'no trace'})", finite(reply))
 
     def timeline(
         self,
-        queries: Annotated[
-            list[str],
-            Field(min_length=1, description="each MATCH …, CHECK …, or a name of the library"),
-        ],
-        traces: Annotated[list[str] | None, Field(description="only these")] = None,
-        picture: Annotated[bool, Field(description="as a picture, too")] = False,  # noqa: FBT002
+        queries: Annotated[list[str], Field(min_length=1)],
+        traces: list[str] | None = None,
+        picture: bool = False,
     ) -> ToolAnswer:
-        """Show over time when patterns match and rules are violated: one lane per entity."""
+        """Show over time when patterns match and rules are violated: one lane per entity.
+
+        Parameters
+        ----------
+        queries
+            each MATCH …, CHECK …, or a name of the library
+        traces
+            only these
+        picture
+            as a picture, too
+        """
         from sgstore.draw import Lane, Timeline, draw_timelines, lines_of
 
         reply = self._ask("timeline", queries=queries, traces=traces or [], limit=TRACES_DRAWN)
@@ -303,15 +326,27 @@ class StoreTools:
     def show(
         self,
         frame: FrameName,
-        query: Annotated[str, Field(description="query; its matches are marked")] = "",
-        relations: Annotated[
-            Literal["ego", "all", "none"], Field(description="which edges are drawn")
-        ] = "ego",
-        camera: Annotated[bool, Field(description="add the camera image")] = True,  # noqa: FBT002
-        graph: Annotated[bool, Field(description="beside it the graph instead")] = False,  # noqa: FBT002
-        radius: Annotated[float | None, Field(gt=0, description="half the side; m")] = None,
+        query: str = "",
+        relations: Literal["ego", "all", "none"] = "ego",
+        camera: bool = True,
+        graph: bool = False,
+        radius: Annotated[float | None, Field(gt=0)] = None,
     ) -> ToolAnswer:
-        """Draw a frame from above, the ego in the middle."""
+        """Draw a frame from above, the ego in the middle.
+
+        Parameters
+        ----------
+        query
+            query; its matches are marked
+        relations
+            which edges are drawn
+        camera
+            add the camera image
+        graph
+            beside it the graph instead
+        radius
+            half the side; m
+        """
         from sgstore.draw import frame_image
 
         known, text = None, f"{frame} from above"
@@ -336,14 +371,20 @@ class StoreTools:
     def picture(
         self,
         frame: FrameName,
-        channel: Annotated[str, Field(description="topic of a camera; empty: the first")] = "",
+        channel: str = "",
     ) -> ToolAnswer:
-        """Fetch the camera picture of a frame."""
+        """Fetch the camera picture of a frame.
+
+        Parameters
+        ----------
+        channel
+            topic of a camera; empty: the first
+        """
         from sgstore.draw import camera_of
 
         with self._turn:
             ref = self._store.file.frame(frame)
-            topic = channel or camera_of(self._store, ref.trace)
+            topic = channel or camera_of(self._store.file, ref.trace)
             if not topic:
                 topics = ", ".join(one.topic for one in self._store.file.channels(ref.trace_id))
                 raise StoreError(f"{ref.trace} has no camera; its channels: {topics or 'none'}")
@@ -365,22 +406,31 @@ class StoreTools:
 
     def coverage_missing(
         self,
-        frames: Annotated[str, Field(description="MATCH … that chooses frames; empty: all")] = "",
-        reference: Annotated[
-            str, Field(description="MATCH … of the frames to compare with; empty: all frames")
-        ] = "",
-        cells: Annotated[
-            str, Field(description="MATCH … RETURN a, b: each combination of values is a cell")
-        ] = "",
-        abstraction: Annotated[
-            Literal["RSV", "ER", "EL", "E", "junction"],
-            Field(description="without cells: of features"),
-        ] = "RSV",
-        k: Annotated[int, Field(ge=1, le=3, description="features in a combination")] = 2,
-        of_ego: Annotated[bool, Field(description="only features of the ego")] = True,  # noqa: FBT002
+        frames: str = "",
+        reference: str = "",
+        cells: str = "",
+        abstraction: Literal["RSV", "ER", "EL", "E", "junction"] = "RSV",
+        k: Annotated[int, Field(ge=1, le=3)] = 2,
+        of_ego: bool = True,
         limit: Limit = ROWS,
     ) -> ToolAnswer:
-        """List combinations that are missing in some frames: values of a query, or k features."""
+        """List combinations that are missing in some frames: values of a query, or k features.
+
+        Parameters
+        ----------
+        frames
+            MATCH … that chooses frames; empty: all
+        reference
+            MATCH … of the frames to compare with; empty: all frames
+        cells
+            MATCH … RETURN a, b: each combination of values is a cell
+        abstraction
+            without cells: of features
+        k
+            features in a combination
+        of_ego
+            only features of the ego
+        """
         reply = self._ask(
             "missing",
             frames=frames,
@@ -398,17 +448,31 @@ class StoreTools:
     def export_clips(
         self,
         query: Pattern,
-        name: Annotated[str, Field(description="of a new folder for them: letters, digits, - _ .")],
-        before: Annotated[float, Field(ge=0, le=600, description="before each match; s")] = 2.0,
-        after: Annotated[float, Field(ge=0, le=600, description="after each match; s")] = 2.0,
-        form: Annotated[
-            str, Field(description="mcap, parquet, frames, nx, pyg, s3c, xosc, rrd")
-        ] = "mcap",
-        with_graph: Annotated[bool, Field(description="mcap: with the scene graphs")] = False,  # noqa: FBT002
-        limit: Annotated[int, Field(ge=1, description="clips at most")] = ROWS,
+        name: str,
+        before: Annotated[float, Field(ge=0, le=600)] = 2.0,
+        after: Annotated[float, Field(ge=0, le=600)] = 2.0,
+        form: str = "mcap",
+        with_graph: bool = False,
+        limit: Annotated[int, Field(ge=1)] = ROWS,
         parameters: Values = None,
     ) -> ToolAnswer:
-        """Export the matches of a pattern as clips, into the folder of the user."""
+        """Export the matches of a pattern as clips, into the folder of the user.
+
+        Parameters
+        ----------
+        name
+            of a new folder for them: letters, digits, - _ .
+        before
+            before each match; s
+        after
+            after each match; s
+        form
+            mcap, parquet, frames, nx, pyg, s3c, xosc, rrd
+        with_graph
+            mcap: with the scene graphs
+        limit
+            clips at most
+        """
         from sgstore.exporters import Export, exporter_named, write_export
         from sgstore.model.world import Clip
 

@@ -452,7 +452,7 @@ def _report_slots(
     table: tuple[int, int | None],
     picture: Path | None,
 ) -> None:
-    """Print a table of declared slots (its number and rows), and draw the covered and missing pairs of values."""
+    """Print a table of declared slots (its number and rows), and draw the pairs of values."""
     from sgstore.testsets.coverage import Specification, slot_coverage
 
     (chosen,) = ask.frames(text)

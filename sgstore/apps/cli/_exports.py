@@ -84,18 +84,9 @@ class ClipOptions:
         """Return an export of clips from a store, with the settings of the command line."""
         from sgstore.exporters import Export, parse_mounts
 
-        return Export(
-            store,
-            tuple(clips),
-            abstraction=self.abstraction,
-            with_graph=self.with_graph,
-            mounts=parse_mounts(self.mounts or ()),
-            rebase_context=self.rebase_context,
-            graphml=self.graphml,
-            channels=tuple(self.channels or ()),
-            clouds=self.clouds,
-            **about,
-        )
+        own = {k: v for k, v in vars(self).items() if k not in {"before", "after", "labels"}}
+        own |= {"mounts": parse_mounts(self.mounts or ()), "channels": tuple(self.channels or ())}
+        return Export(store, tuple(clips), **own, **about)
 
 
 @verbs.command(rich_help_panel=PANEL)

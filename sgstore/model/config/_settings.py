@@ -312,12 +312,18 @@ class Payloads:
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """Settings for reading the signals of a road map."""
+    """Settings for reading the signals of a road map.
+
+    Attributes
+    ----------
+    kinds : tuple of (str, str)
+        Signal type codes in lower case, with their configured kinds.
+    orientation : str
+        One of :data:`ORIENTATIONS`: meaning of the orientation of a signal without validity.
+    """
 
     kinds: tuple[tuple[str, str], ...] = ()
-    """Signal type codes in lower case, with their configured kinds."""
     orientation: str = "asam"
-    """One of :data:`ORIENTATIONS`: meaning of the orientation of a signal without validity."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
