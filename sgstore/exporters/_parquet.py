@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from importlib import import_module
+from importlib import import_module, resources
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -240,9 +240,8 @@ def _card(export: Export, counts: Mapping[str, int]) -> str:
     files = "\n".join(f"* {_code(name)} (SHA-256 `{digest}`)" for name, digest in sources)
     query = about["provenance"].get("query", "")
     asked = f"\nFound by:\n\n{_quoted(query)}\n" if query else ""
-    return "\n".join(head) + _CARD.format(
-        clips=counts["clips"], asked=asked, rows=rows, files=files
-    )
+    card = resources.files("sgstore.exporters").joinpath("card.md").read_text(encoding="utf-8")
+    return "\n".join(head) + card.format(clips=counts["clips"], asked=asked, rows=rows, files=files)
 
 
 def _code(text: str) -> str:
@@ -252,26 +251,3 @@ def _code(text: str) -> str:
 def _quoted(text: str) -> str:
     """Return a text as an indented literal block for Markdown."""
     return "\n".join(f"    {line}" for line in text.splitlines())
-
-
-_CARD: Final = """
----
-
-# Driving scenes as scene graphs
-
-{clips:,} clips of driving recordings: in each frame, entities and parts of the road map as nodes, and the
-relations among them as edges. `fields.json` says what each column is, and in which unit.
-{asked}
-| table | rows |
-|---|--:|
-{rows}
-
-Rows belong together by `clip` and `frame_id`; `entities` is joined to `nodes` by `clip` and `node_id`.
-
-    from datasets import load_dataset
-    nodes = load_dataset("FOLDER", "nodes", split="train")
-
-Made from:
-
-{files}
-"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass
+from importlib import resources
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final
 
@@ -72,46 +73,12 @@ def _meaning(parts: dict[str, str]) -> str:
     return f"{{ {said} }}"
 
 
-PAGE: Final = """\
-# Settings
-
-Everything that decides what is in a scene graph. A config is a TOML file
-(`sgstore ingest … --config FILE`), or keyword arguments:
-
-```python
-from sgstore.model.config import PairSettings, configured
-
-configured(preset="carlasgg", range={{"front": 80.0}}, pairs=PairSettings(within=0.0), rate=2.0)
-```
-
-What a file does not name keeps its default, or the value of the preset that it names in its first line
-(`preset = "carlasgg"`). A config is validated when it is read, and recorded with every trace.
-`sgstore config [--preset NAME]` prints this:
-
-```toml
-{settings}```
-
-## Table I of the paper
-
-| parameter of CARLASGG | here |
-|---|---|
-| entity classes, special classes, signal classes | `[types]`, before the shipped tables; `kinds` |
-| road granularity: none, lane, waypoints | `lanes.granularity`, `lanes.spacing`, `lanes.types` |
-| distance relationships: none, thresholds | `[proximity]`, with `kinds`; none: `names` and `upper` are `[]` |
-| angular relationships: none, thresholds | `[direction]`, `kinds`, `within`; none: so, and `sides = "none"` |
-| entity relationships: none, pairs | `[pairs]`; none: `ego = false` and `within = 0` |
-| `exclude_ids` | `exclude_ids` |
-| range: the geometry of what is in the graph | `[range]` |
-
-## Presets
-
-{presets}"""
-
-
 def as_markdown(presets: Mapping[str, Preset]) -> str:
     """Return the page ``docs/parameters.md``: all settings with their defaults, and the presets."""
     parts = [_preset_text(name, one) for name, one in presets.items()]
-    return PAGE.format(settings=as_toml(Config()), presets="\n".join(parts))
+    page = resources.files("sgstore.model.config").joinpath("parameters.md")
+    text = page.read_text(encoding="utf-8")
+    return text.format(settings=as_toml(Config()), presets="\n".join(parts))
 
 
 def _preset_text(name: str, one: Preset) -> str:
