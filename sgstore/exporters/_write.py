@@ -18,7 +18,7 @@ from sgstore.exporters._clips import (
     write_manifest,
 )
 from sgstore.exporters._labels import Labels
-from sgstore.exporters._registry import exporter_named
+from sgstore.exporters._registry import EXPORTERS, exporter_named
 from sgstore.matches import merged
 from sgstore.model.vocabulary import natural
 from sgstore.model.world import Clip, tolerance_ns
@@ -29,16 +29,8 @@ if TYPE_CHECKING:
     from sgstore.exporters._registry import Exporter
     from sgstore.query import Store
 
-OPTIONS: Final = {
-    "abstraction": "abstraction",
-    "with_graph": "with-graph",
-    "mounts": "mount",
-    "rebase_context": "rebase-context",
-    "graphml": "graphml",
-    "channels": "channel",
-    "clouds": "clouds",
-}
-"""Options that only some formats support, and their names on the command line."""
+_SEVERAL: Final = {"mounts": "mount", "channels": "channel"}
+"""Options that the command line has several times, with their names there."""
 
 
 def around_frames(
@@ -150,12 +142,11 @@ def _written(exporter: Exporter, export: Export, folder: Path) -> list[WrittenCl
 
 
 def _check(export: Export, exporter: Exporter) -> None:
+    some = frozenset[str]().union(*(one.options for one in EXPORTERS))
     for option in fields(Export):
         name = option.name
-        if name not in OPTIONS or name in exporter.options:
-            continue
-        if getattr(export, name) != option.default:
-            told = f"--{OPTIONS[name]}"
+        if name in some - exporter.options and getattr(export, name) != option.default:
+            told = f"--{_SEVERAL.get(name, name).replace('_', '-')}"
             raise ExportError(f"{told} cannot be used with the format '{exporter.name}'")
     for clip in export.clips:
         if clip.start_ns > clip.end_ns:

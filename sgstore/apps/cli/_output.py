@@ -398,35 +398,28 @@ def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: 
     numeric = [all(_is_number(row[i]) for row in first) for i in range(len(columns))]
     widths = [max(len(name), *(len(row[i]) for row in first)) for i, name in enumerate(columns)]
     rest = ([_cell(value) for value in row] for row in rows)
-    room = _room(stream)
-    if room is None:
-        lines = (_line(row, widths, numeric) for row in chain(first, rest))
-        stream.write(_line(columns, widths, numeric))
-        stream.write(_line(["─" * width for width in widths], widths, numeric))
-        return _count(stream.write(line) for line in lines)
-    kept, fitted = _fitted(columns, widths, numeric, room)
+    room = shutil.get_terminal_size().columns if stream.isatty() else None
+    kept, fitted = [*range(len(columns))], widths
+    if room is not None:
+        kept, fitted = _fitted(columns, widths, numeric, room)
+    keys = [name in _KEYS and fitted[i] == widths[i] for i, name in enumerate(columns)]
     layout = [
-        _TerminalColumn(i, name, fitted[i], numeric[i], name in _KEYS and fitted[i] == widths[i])
-        for i in kept
-        for name in (columns[i],)
+        _TableColumn(i, columns[i], fitted[i], numeric[i], room is None or keys[i]) for i in kept
     ]
-    before_last = sum(one.width + len(GAP) for one in layout[:-1])
-    layout[-1].most = max(layout[-1].width, room - before_last)
-    stream.write(_terminal_line(columns, layout))
-    stream.write(_terminal_line(["─" * width for width in fitted], layout))
-    number = _count(stream.write(_terminal_line(row, layout)) for row in chain(first, rest))
+    if room is not None:
+        before_last = sum(one.width + len(GAP) for one in layout[:-1])
+        layout[-1].most = max(layout[-1].width, room - before_last)
+    stream.write(_line(columns, layout))
+    stream.write(_line(["─" * width for width in fitted], layout))
+    number = _count(stream.write(_line(row, layout)) for row in chain(first, rest))
     if left_out := [name for i, name in enumerate(columns) if i not in kept]:
         say(f"no room for the columns {', '.join(left_out)}; --json has them")
     return number
 
 
-def _room(stream: TextIO) -> int | None:
-    return shutil.get_terminal_size().columns if stream.isatty() else None
-
-
 @dataclass(slots=True)
-class _TerminalColumn:
-    """Column of a text table on a terminal: its index and width, and the way its texts are shortened."""
+class _TableColumn:
+    """Column of a text table: its index and width, and the way its texts are shortened on a terminal."""
 
     place: int
     name: str
@@ -444,7 +437,7 @@ class _TerminalColumn:
         return cell.rjust(self.width) if self.right else cell.ljust(self.width)
 
 
-def _terminal_line(cells: Sequence[str], layout: Sequence[_TerminalColumn]) -> str:
+def _line(cells: Sequence[str], layout: Sequence[_TableColumn]) -> str:
     return f"{GAP.join(one.text(cells[one.place]) for one in layout).rstrip()}\n"
 
 
@@ -476,15 +469,6 @@ def _fitted(
             kept.remove(i)
     narrow([i for i in kept if i in keys])
     return kept, widths
-
-
-def _line(cells: Sequence[str], widths: Sequence[int], numeric: Sequence[bool]) -> str:
-    """Return a table row as one text line with complete cells, for a file or a pipe."""
-    texts = (
-        cell.rjust(width) if right else cell.ljust(width)
-        for cell, width, right in zip(cells, widths, numeric, strict=True)
-    )
-    return f"{GAP.join(texts).rstrip()}\n"
 
 
 def _cell(value: Any) -> str:

@@ -49,10 +49,10 @@ from sgstore.apps.cli._output import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator
 
     from sgstore.apps.sandbox import Answer, Sandbox
-    from sgstore.collection import Collection, CollectionMatches
+    from sgstore.collection import CollectionMatches
     from sgstore.lang.library import NamedPattern
     from sgstore.matches import Interval, Matches
 
@@ -98,9 +98,8 @@ def find(
     text, values = question.asked()
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask, tables, safe=safe) as opened:
-            return _found_in(
-                opened, text, values, ask, count=count, explain=explain, require=require
-            )
+            found = opened.find(text, **values)
+            return _write_parted(found, ask, count=count, explain=explain, require=require)
     if safe:
         if count or explain:
             raise typer.BadParameter("--safe cannot be combined with --count or --explain")
@@ -163,18 +162,10 @@ def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
     return number
 
 
-def _found_in(
-    whole: Collection,
-    text: str,
-    values: Mapping[str, Any],
-    ask: AskOptions,
-    *,
-    count: bool,
-    explain: bool,
-    require: bool,
+def _write_parted(
+    matches: CollectionMatches, ask: AskOptions, *, count: bool, explain: bool, require: bool
 ) -> int:
     """Print the results of a query on a collection, and return the exit code."""
-    matches = whole.find(text, **values)
     if explain:
         typer.echo(matches.explain())
         return 0
@@ -208,14 +199,7 @@ def _as_shown(
 
     if form is Format.table:
         return for_people(answer.columns, rows, graphs=answer.graphs)
-    return _node_link(answer, rows, form) if answer.graphs else (answer.columns, rows)
-
-
-def _node_link(
-    answer: Matches | Answer | CollectionMatches, rows: Iterable[tuple[Any, ...]], form: Format
-) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return the result rows; in JSON their graphs have the node-link form of networkx."""
-    if form not in {Format.json, Format.ndjson}:
+    if not answer.graphs or form not in {Format.json, Format.ndjson}:
         return answer.columns, rows
     columns = ("directed", "multigraph", *answer.columns)
     return columns, (
@@ -545,7 +529,10 @@ def run_pattern(
         if clips:
             raise typer.BadParameter(f"{found.name} is a property, which has verdicts and no clips")
         statements = Statements([found.name], parameters=chosen)
-        return _check(store, statements=statements, require=require, ask=ask)
+        from sgstore.apps.cli._checks import check  # only here: the verb is none of this module's
+
+        whole = CollectionOptions()
+        return check(store, whole=whole, statements=statements, require=require, ask=ask)
     text = found.written(**parameters_of(chosen))
     matches = ask.opened(store).find(text)
     say_left_out(matches)
@@ -576,12 +563,6 @@ def _run_all(store: Path, ask: AskOptions, *, require: bool) -> int:
 
     ask.write(("name", "kind", "matches", "traces", "left_out"), rows())
     return _ended(total, ask, require=require)
-
-
-def _check(store: Path, **options: Any) -> int:
-    from sgstore.apps.cli._checks import check  # only here: the verb is none of this module's
-
-    return check(store, whole=CollectionOptions(), **options)
 
 
 def _write_intervals(intervals: Iterator[Interval], ask: AskOptions) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from typer import Argument, Option
@@ -186,7 +186,7 @@ def select(
         Draw the curve: .png or .svg.
     """
     from sgstore.testsets.locks import ENDING
-    from sgstore.testsets.selection import listed, parse_split, split_table
+    from sgstore.testsets.selection import listed, locked_selection, parse_split, split_table
     from sgstore.testsets.selection import select as choose
     from sgstore.testsets.selection import split as split_up
 
@@ -203,8 +203,16 @@ def select(
         say(text)
     table = split_table(found, parts, shares) if shares else listed(found)
     if output is not None:
-        asked = query or "", parameters_of(parameters)
-        _lock(found, asked, parts, output, payloads=not no_payloads)
+        with count_bar(output.name, "cases") as progress:
+            made = locked_selection(
+                found,
+                query or "",
+                parts,
+                parameters=parameters_of(parameters),
+                payloads=not no_payloads,
+                progress=progress,
+            )
+        say_made(made, output)
     # Last, so that the lock exists even if the reader stops after the first rows.
     if curve or picture is not None:
         _curve(found, picture, out, printed=curve)
@@ -251,23 +259,6 @@ def _curve(found: Selection, picture: Path | None, out: PrintedRows, *, printed:
             below=drawn.table.said[0],
         )
         say(f"drawn: {picture}")
-
-
-def _lock(
-    found: Selection,
-    asked: tuple[str, dict[str, Any]],
-    parts: dict[int, str],
-    output: Path,
-    *,
-    payloads: bool,
-) -> None:
-    from sgstore.testsets.selection import locked_selection
-
-    with count_bar(output.name, "cases") as progress:
-        made = locked_selection(
-            found, asked[0], parts, parameters=asked[1], payloads=payloads, progress=progress
-        )
-    say_made(made, output)
 
 
 @lock.command("verify")
