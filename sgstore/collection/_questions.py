@@ -32,7 +32,6 @@ from sgstore.errors import QueryError, SqlError, StoreError
 from sgstore.lang.bind import CLASSES_GIVEN
 from sgstore.lang.catalog import TableFacts, Type
 from sgstore.lang.sql import (
-    compile_checks,
     joined_rows,
     traces_of,
     union_parts,
@@ -57,7 +56,7 @@ from sgstore.store import (
     Triples,
     UserTables,
 )
-from sgstore.temporal import TemporalMatches, kept_throughout
+from sgstore.temporal import CheckRun, TemporalMatches
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -68,7 +67,6 @@ if TYPE_CHECKING:
 
     from sgstore.collection._catalogue import Snapshot
     from sgstore.collection._engines import Engine
-    from sgstore.lang.bind import CheckInCatalog
     from sgstore.lang.catalog import Catalog, Triple
     from sgstore.lang.sql import Compiled
     from sgstore.lang.sql.collection_pruning import ClassQuestion
@@ -769,7 +767,7 @@ class CollectionUnion(UnionMatches):
             yield tables, snapshot.words, select.text(), [traces] if named else []
 
 
-class CollectionChecks:
+class CollectionChecks(CheckRun):
     """``CHECK`` statements over a collection. Iteration runs them and yields the verdicts."""
 
     def __init__(
@@ -779,36 +777,14 @@ class CollectionChecks:
         parameters: Mapping[str, object],
         about: Mapping[str, bool],
     ) -> None:
-        self._whole, self._text = whole, text
-        self._parameters, self._about = dict(parameters), dict(about)
-        self._checks: Sequence[CheckInCatalog] = compile_checks(text, whole.catalog, parameters)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the checks, in order."""
-        return tuple(one.check.name for one in self._checks)
-
-    @property
-    def quantitative(self) -> bool:
-        """True if at least one check has a robustness margin."""
-        return any(one.check.robustness for one in self._checks)
-
-    @property
-    def lasting(self) -> bool:
-        """True if the check has a robustness margin in each frame, not only one per trace."""
-        return all(kept_throughout(one.check) is not None for one in self._checks)
+        self._whole, self._about = whole, about
+        file = cast("StoreFile", whole.file)
+        super().__init__(file, lambda: whole.catalog, text, dict(parameters), **about)
 
     def margins(self) -> Iterator[tuple[Ints, Floats]]:
         """Yield frame ids with the robustness margins of the only check."""
         question = {"text": self._text, "parameters": self._parameters}
         return self._whole.file.margins(question)
-
-    @property
-    def returned(self) -> dict[str, tuple[str, ...]]:
-        """Return the names of the values that each check returns for its violations."""
-        from sgstore.temporal import returned_by
-
-        return returned_by(one.check for one in self._checks)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -823,8 +799,6 @@ class CollectionChecks:
 
     def explain(self) -> str:
         """Return an explanation of the checks: their formulas, and the query of each condition."""
-        from sgstore.temporal import CheckRun
-
         with working_folder("empty") as folder:
             file = StoreFile.create(folder / "empty.sgstore")
             catalog = self._whole.catalog

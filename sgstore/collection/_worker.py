@@ -9,9 +9,9 @@ from __future__ import annotations
 import base64
 import json
 import secrets
+from collections import OrderedDict
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
-from functools import lru_cache
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
@@ -34,8 +34,11 @@ if TYPE_CHECKING:
     from sgstore.lang.catalog import Catalog
     from sgstore.matches import Matches
 
-KEPT: Final = 128
-"""Number of bundles that a process keeps open."""
+KEPT_BYTES: Final = 256 << 20
+"""Memory for the bundles that a process keeps open; bytes."""
+
+CATALOGS: Final = 128
+"""Number of catalogs of bundles that a process keeps."""
 
 EMPTY: Final = ""
 """Name of the empty bundle, which provides the columns if no other bundle is relevant."""
@@ -117,7 +120,7 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     task : dict
-        ``kind``: a key of ``_KINDS``; ``url`` and ``bundle``; ``whole``: see :class:`Whole`;
+        ``kind``: a method of :class:`BundleTask`; ``url`` and ``bundle``; ``whole``: see :class:`Whole`;
         ``text``, ``parameters``, ``limit``; ``tables``: name → Parquet file, or its bytes as
         base64; ``to``: the folder for result files, or empty to return the rows with the result;
         and values for the kind.
@@ -137,7 +140,7 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
         to = Path(task["to"]) if task["to"] else held
         with _opened(task, held) as file:
             known = _known(file, json.dumps(task["whole"]))
-            found = _KINDS[task["kind"]](task, file, lambda: known, to)
+            found = getattr(BundleTask(task, file, lambda: known, to), task["kind"])()
         if not task["to"]:
             _carry(found)
         return {"bundle": task["bundle"], **found}
@@ -150,7 +153,7 @@ def _known(file: StoreFile, told: str) -> Catalog:
     if held is None or held[0] is not local:
         whole = Whole.from_dict(json.loads(told))
         held = _catalogs[file.path, told] = local, whole.catalog(local)
-        while len(_catalogs) > KEPT:
+        while len(_catalogs) > CATALOGS:
             del _catalogs[next(iter(_catalogs))]
     return held[1]
 
@@ -173,14 +176,24 @@ def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
             yield file
         file.close()
         return
-    with _kept(path).snapshot():
-        yield _kept(path)
+    kept = _kept(path)
+    with kept.snapshot():
+        yield kept
 
 
-@lru_cache(maxsize=KEPT)
+_open: Final[OrderedDict[Path, tuple[StoreFile, int]]] = OrderedDict()
+"""Open bundles with their memory in bytes, the least recently used first."""
+
+
 def _kept(path: Path) -> StoreFile:
-    """Return a bundle (store file) as an open store, from a cache."""
-    return StoreFile.together(path)
+    """Return a bundle (store file) as an open store. Others are closed if all need too much memory."""
+    if path not in _open:
+        memory = (5 << 20) + path.stat().st_size // 25  # measured with 3 and with 110 MB
+        _open[path] = StoreFile.together(path), memory
+    _open.move_to_end(path)
+    while len(_open) > 1 and sum(memory for _, memory in _open.values()) > KEPT_BYTES:
+        _open.popitem(last=False)
+    return _open[path][0]
 
 
 def _tables_of(task: dict[str, Any], held: Path) -> dict[str, Path]:
@@ -201,36 +214,6 @@ def _fresh(folder: Path, ending: str = "parquet") -> Path:
 
 def _part(part: PartFile) -> dict[str, Any]:
     return {"parts": [part.as_dict()], "reasons": {}}
-
-
-def _find(
-    task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
-) -> dict[str, Any]:
-    matches = PartMatches(file, catalog, task["text"], task["parameters"])
-    if task["limit"] is not None:
-        matches = matches.limit(task["limit"])
-    offsets = task["before"], task["after"]
-    parts = matches.written(task["form"], offsets, to)
-    return {"parts": [part.as_dict() for part in parts], "reasons": matches.reasons}
-
-
-def _check(
-    task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
-) -> dict[str, Any]:
-    run = CheckRun(
-        file,
-        catalog,
-        task["text"],
-        task["parameters"],
-        sgsm_compat=task["sgsm_compat"],
-        status=task["status"],
-    )
-    path = _fresh(to, "ndjson")
-    with path.open("w", encoding="utf-8") as lines:
-        for verdict in run:
-            lines.write(json.dumps(_values_of(verdict), default=_plain))
-            lines.write("\n")
-    return {"lines": str(path)}
 
 
 def _plain(value: Any) -> Any:
@@ -278,86 +261,113 @@ def as_verdict(values: list[Any]) -> Verdict:
     )
 
 
-def _classes(
-    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
-) -> dict[str, Any]:
-    """Write the classes of the frames of one bundle (store) to a file."""
-    about = task["abstraction"], task["traces"], task["table"]
-    return _part(PartFile.of_classes(file, *about, _fresh(to)))
+@dataclass(frozen=True, slots=True)
+class BundleTask:
+    """Part of a query on one bundle (store file). Each kind of task has a method, which returns JSON values.
 
+    Attributes
+    ----------
+    task : dict
+        See :func:`answer`.
+    file : StoreFile
+    catalog : function
+        Function that returns the catalog for compiling queries.
+    to : Path
+        Folder for result files.
+    """
 
-def _sql(
-    task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
-) -> dict[str, Any]:
-    """Write the rows of a user's SQL statement on one bundle (store file) to a file, as JSON lines."""
-    path = _fresh(to, "ndjson")
+    task: dict[str, Any]
+    file: StoreFile
+    catalog: Callable[[], Catalog]
+    to: Path
 
-    def find(text: str, **values: object) -> Matches:
-        return matches_of(file, catalog, text, values)
+    def find(self) -> dict[str, Any]:
+        matches = PartMatches(self.file, self.catalog, self.task["text"], self.task["parameters"])
+        if self.task["limit"] is not None:
+            matches = matches.limit(self.task["limit"])
+        offsets = self.task["before"], self.task["after"]
+        parts = matches.written(self.task["form"], offsets, self.to)
+        return {"parts": [part.as_dict() for part in parts], "reasons": matches.reasons}
 
-    asked = UserStatement(find, catalog().tables, task["text"])
-    with path.open("w", encoding="utf-8") as lines, asked.on(file).batches() as batches:
-        columns, types = batches.columns, batches.types
-        for batch in batches:
-            for row in batch.values:
-                lines.write(json.dumps(row, default=str))
+    def check(self) -> dict[str, Any]:
+        run = CheckRun(
+            self.file,
+            self.catalog,
+            self.task["text"],
+            self.task["parameters"],
+            sgsm_compat=self.task["sgsm_compat"],
+            status=self.task["status"],
+        )
+        path = _fresh(self.to, "ndjson")
+        with path.open("w", encoding="utf-8") as lines:
+            for verdict in run:
+                lines.write(json.dumps(_values_of(verdict), default=_plain))
                 lines.write("\n")
-    about = {"columns": list(columns), "types": list(types), "reasons": dict(asked.reasons)}
-    return {"lines": str(path), **about}
+        return {"lines": str(path)}
 
+    def classes(self) -> dict[str, Any]:
+        """Write the classes of the frames of one bundle (store) to a file."""
+        about = self.task["abstraction"], self.task["traces"], self.task["table"]
+        return _part(PartFile.of_classes(self.file, *about, _fresh(self.to)))
 
-def _coded(
-    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
-) -> dict[str, Any]:
-    return _part(PartFile.of_coded(file, task["abstraction"], _fresh(to)))
+    def sql(self) -> dict[str, Any]:
+        """Write the rows of a user's SQL statement on one bundle (store file) to a file, as JSON lines."""
+        path = _fresh(self.to, "ndjson")
 
+        def find(text: str, **values: object) -> Matches:
+            return matches_of(self.file, self.catalog, text, values)
 
-def _features(
-    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
-) -> dict[str, Any]:
-    """Write the features of frames (label counts of their graphs) of one bundle (store) to a file."""
-    import numpy as np
+        asked = UserStatement(find, self.catalog().tables, self.task["text"])
+        with path.open("w", encoding="utf-8") as lines, asked.on(self.file).batches() as batches:
+            columns, types = batches.columns, batches.types
+            for batch in batches:
+                for row in batch.values:
+                    lines.write(json.dumps(row, default=str))
+                    lines.write("\n")
+        about = {"columns": list(columns), "types": list(types), "reasons": dict(asked.reasons)}
+        return {"lines": str(path), **about}
 
-    def rows() -> Iterator[tuple[int, str, int]]:
-        frame_id = np.array(task["frames"], np.int64)
-        for row, some in file.abstracted.features(task["abstraction"], frame_id):
-            names = [json.dumps(name) for name in some.names]
-            of = row[some.frame].tolist(), some.feature.tolist(), some.often.tolist()
-            yield from (
-                (one, names[feature], often) for one, feature, often in zip(*of, strict=True)
-            )
+    def coded(self) -> dict[str, Any]:
+        return _part(PartFile.of_coded(self.file, self.task["abstraction"], _fresh(self.to)))
 
-    columns = {"frame": "BIGINT", "feature": "VARCHAR", "often": "BIGINT"}
-    return _part(PartFile.of_rows(columns, rows(), _fresh(to)))
+    def features(self) -> dict[str, Any]:
+        """Write the features of frames (label counts of their graphs) of one bundle (store) to a file."""
+        import numpy as np
 
+        def rows() -> Iterator[tuple[int, str, int]]:
+            frame_id = np.array(self.task["frames"], np.int64)
+            for row, some in self.file.abstracted.features(self.task["abstraction"], frame_id):
+                names = [json.dumps(name) for name in some.names]
+                of = row[some.frame].tolist(), some.feature.tolist(), some.often.tolist()
+                yield from (
+                    (one, names[feature], often) for one, feature, often in zip(*of, strict=True)
+                )
 
-def _margins(
-    task: dict[str, Any], file: StoreFile, catalog: Callable[[], Catalog], to: Path
-) -> dict[str, Any]:
-    """Write the robustness margins of a check for the frames or traces of one bundle (store) to a file."""
-    import numpy as np
+        columns = {"frame": "BIGINT", "feature": "VARCHAR", "often": "BIGINT"}
+        return _part(PartFile.of_rows(columns, rows(), _fresh(self.to)))
 
-    run = CheckRun(file, catalog, task["text"], task["parameters"])
-    found = ((ids, np.broadcast_to(margins, len(ids))) for ids, margins in run.margins())
-    rows = (row for one in found for row in zip(*(of.tolist() for of in one), strict=True))
-    columns = {"frame_id": "BIGINT", "margin": "DOUBLE"}
-    return _part(PartFile.of_rows(columns, rows, _fresh(to)))
+    def margins(self) -> dict[str, Any]:
+        """Write the robustness margins of a check for the frames or traces of one bundle (store) to a file."""
+        import numpy as np
 
+        run = CheckRun(self.file, self.catalog, self.task["text"], self.task["parameters"])
+        found = ((ids, np.broadcast_to(margins, len(ids))) for ids, margins in run.margins())
+        rows = (row for one in found for row in zip(*(of.tolist() for of in one), strict=True))
+        columns = {"frame_id": "BIGINT", "margin": "DOUBLE"}
+        return _part(PartFile.of_rows(columns, rows, _fresh(self.to)))
 
-def _rows(
-    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], to: Path
-) -> dict[str, Any]:
-    statement = task["sql"], task["values"]
-    columns = [row[0] for row in file.rows(f"DESCRIBE {task['sql']}", task["values"]).values]
-    return _part(PartFile.of_statement(file, statement, columns, (), _fresh(to)))
+    def rows(self) -> dict[str, Any]:
+        statement = self.task["sql"], self.task["values"]
+        columns = [
+            row[0]
+            for row in self.file.rows(f"DESCRIBE {self.task['sql']}", self.task["values"]).values
+        ]
+        return _part(PartFile.of_statement(self.file, statement, columns, (), _fresh(self.to)))
 
-
-def _step(
-    task: dict[str, Any], file: StoreFile, _catalog: Callable[[], Catalog], _to: Path
-) -> dict[str, Any]:
-    module, _, name = task["step"].partition(":")
-    step = attrgetter(name)(import_module(module))
-    return {"value": step(Store.of(file), **task["values"])}
+    def step(self) -> dict[str, Any]:
+        module, _, name = self.task["step"].partition(":")
+        step = attrgetter(name)(import_module(module))
+        return {"value": step(Store.of(self.file), **self.task["values"])}
 
 
 def tables_in(store: Store) -> dict[str, Any]:
@@ -383,19 +393,6 @@ def example_in(store: Store, **asked: Any) -> dict[str, Any]:
 def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str, Any]]:
     """Return the frames of one bundle (store file) that are most similar to an example frame."""
     return [asdict(one) for one in Example.find(store.file, Example(**example), **how)]
-
-
-_KINDS: Final[dict[str, Any]] = {
-    "find": _find,
-    "check": _check,
-    "classes": _classes,
-    "sql": _sql,
-    "coded": _coded,
-    "features": _features,
-    "margins": _margins,
-    "rows": _rows,
-    "step": _step,
-}
 
 
 def _carry(found: dict[str, Any]) -> None:

@@ -322,6 +322,16 @@ MEASURES: list[Callable[..., Any]] = [
 ]
 
 
+def test_a_process_closes_bundles_that_need_too_much_memory(
+    store: Store, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "MATCH (a:Car) WHERE a.speed > 5"
+    monkeypatch.setattr(worker, "KEPT_BYTES", 1)
+    whole = Collection(place, engine="local")
+    assert whole.find(text).rows() == store.find(text).rows()
+    assert len(whole.opened) > 1 == len(worker._open)
+
+
 @pytest.mark.parametrize(("abstraction", "window"), [("E", 3), ("ER", 1)] if LONG else [("ER", 1)])
 def test_what_is_covered_is_told_of_all_bundles_together(
     path: Path, place: Path, tmp_path: Path, abstraction: str, window: int
