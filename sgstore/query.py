@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from sgstore.lang.help import WhyNot, WhyNotSteps
     from sgstore.lang.ir import Query
     from sgstore.lang.memory import FrameView
+    from sgstore.lang.sql import UnionParts
     from sgstore.lang.syntax import Pattern
     from sgstore.matches import Interval, Matches
     from sgstore.model.world import Clip
@@ -363,12 +364,10 @@ class Store:
         >>> store.find(text, least=5).rows()
         [Row(name='bus 3', frames=276)]
         """
-        if not isinstance(query, str):
-            from sgstore.lang.syntax import Pattern
+        from sgstore.temporal import TemporalMatches
 
-            pattern = query if isinstance(query, Pattern) else Pattern.of(query)
-            query, parameters = str(pattern), {**pattern.parameters, **parameters}
-        return matches_of(self.file, self.file.catalog, query, parameters)
+        make = partial(TemporalMatches, self.file, self.file.catalog)
+        return matches_of(make, UnionMatches, query, parameters)
 
     def check(
         self,
@@ -1027,22 +1026,34 @@ class Store:
 
 
 def matches_of(
-    file: StoreFile, catalog: Callable[[], Catalog], text: str, parameters: Mapping[str, object]
-) -> Matches:
-    """Return the matches of a query in a store file. A ``UNION`` combines the matches of its parts.
+    make: Callable[[str, Mapping[str, object]], Any],
+    union: Callable[[str, UnionParts, list[Any]], Any],
+    query: str | Pattern | nx.Graph[Any],
+    parameters: Mapping[str, object],
+) -> Any:
+    """Return the matches of a query. A ``UNION`` combines the matches of its parts.
+
+    Parameters
+    ----------
+    make, union : function
+        Create the matches of one part of the query, and of a ``UNION`` of parts.
+    query, parameters
+        As in :meth:`Store.find`.
 
     Raises
     ------
     QueryError
         The text is not a query, or has an unknown name.
     """
-    from sgstore.temporal import TemporalMatches
+    if not isinstance(query, str):
+        from sgstore.lang.syntax import Pattern
 
-    asked = union_parts(text, parameters)
-    if asked is None:
-        return TemporalMatches(file, catalog, text, parameters)
-    parts = asked.each(partial(TemporalMatches, file, catalog), text)
-    return UnionMatches(text, asked, parts)
+        pattern = query if isinstance(query, Pattern) else Pattern.of(query)
+        query, parameters = str(pattern), {**pattern.parameters, **parameters}
+    asked = union_parts(query, parameters)
+    return (
+        make(query, parameters) if asked is None else union(query, asked, asked.each(make, query))
+    )
 
 
 class UserStatement:

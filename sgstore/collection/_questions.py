@@ -34,7 +34,6 @@ from sgstore.lang.catalog import TableFacts, Type
 from sgstore.lang.sql import (
     joined_rows,
     traces_of,
-    union_parts,
 )
 from sgstore.lang.sql.collection_parts import PARTS, parted
 from sgstore.lang.sql.collection_pruning import Pruning, class_questions
@@ -42,7 +41,7 @@ from sgstore.lang.syntax import pattern_tables
 from sgstore.matches import UnionMatches
 from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.vocabulary import natural
-from sgstore.query import Store
+from sgstore.query import Store, matches_of
 from sgstore.store import (
     Example,
     FrameRef,
@@ -59,7 +58,7 @@ from sgstore.store import (
 from sgstore.temporal import CheckRun, TemporalMatches
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator
     from contextlib import AbstractContextManager
 
     import networkx as nx
@@ -247,16 +246,7 @@ class Collection:
         >>> fleet.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").count()
         108
         """
-        if not isinstance(query, str):
-            from sgstore.lang.syntax import Pattern
-
-            pattern = query if isinstance(query, Pattern) else Pattern.of(query)
-            query, parameters = str(pattern), {**pattern.parameters, **parameters}
-        asked = union_parts(query, parameters)
-        if asked is None:
-            return CollectionMatches(self, query, parameters)
-        parts: list[Any] = asked.each(partial(CollectionMatches, self), query)
-        return CollectionUnion(query, asked, parts)
+        return matches_of(partial(CollectionMatches, self), CollectionUnion, query, parameters)
 
     def check(
         self,

@@ -12,10 +12,11 @@ import secrets
 from collections import OrderedDict
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection._storage import bundle_path, place_at
@@ -23,7 +24,7 @@ from sgstore.errors import StoreError
 from sgstore.lang.catalog import Type
 from sgstore.lang.sql import Compiled
 from sgstore.lang.sql.collection_parts import parted
-from sgstore.matches import Interval
+from sgstore.matches import Interval, UnionMatches
 from sgstore.query import Store, UserStatement, matches_of
 from sgstore.store import Example, PartFile, StoreFile, UserTables
 from sgstore.temporal import CheckRun, Robustness, TemporalMatches, Verdict, Witness
@@ -44,49 +45,31 @@ EMPTY: Final = ""
 """Name of the empty bundle, which provides the columns if no other bundle is relevant."""
 
 
-@dataclass(frozen=True, slots=True)
-class Whole:
-    """Facts about the whole collection that a worker needs to run a query on one bundle.
+def _in_whole(local: Catalog, whole: Mapping[str, Any]) -> Catalog:
+    """Return the catalog of one bundle for compiling queries, with the names of the whole collection.
 
-    Attributes
+    Parameters
     ----------
-    words : dict
-        Enumeration → additional values.
-    own, own_edges : dict
-        Custom attributes → their types.
-    classed : list of str
-        Abstractions with known classes of frames.
-    sets : dict
-        Derived set → its relations; ``None`` means unknown.
+    local : Catalog
+    whole : dict
+        ``words``: enumeration → additional values; ``own``, ``own_edges``: custom attributes → their
+        types; ``classed``: abstractions with known classes of frames; ``sets``: derived set → its
+        relations, ``None`` if unknown.
     """
-
-    words: dict[str, list[str]]
-    own: dict[str, str]
-    own_edges: dict[str, str]
-    classed: list[str]
-    sets: dict[str, list[str] | None]
-
-    def catalog(self, local: Catalog) -> Catalog:
-        """Return the catalog of one bundle for compiling queries, with the names of the whole collection."""
-        sets = dict(local.sets)
-        for name, relations in self.sets.items():
-            if name in sets:
-                sets[name] = _with_relations(sets[name], relations)
-        return replace(
-            local,
-            part=True,
-            names=self.words,
-            own={name: Type(kind) for name, kind in self.own.items()},
-            own_edges={name: Type(kind) for name, kind in self.own_edges.items()},
-            classed=tuple(self.classed),
-            sets=sets,
-            lacks={},
-        )
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Return facts about a collection from their JSON values."""
-        return cls(**values)
+    sets = dict(local.sets)
+    for name, relations in whole["sets"].items():
+        if name in sets:
+            sets[name] = _with_relations(sets[name], relations)
+    return replace(
+        local,
+        part=True,
+        names=whole["words"],
+        own={name: Type(kind) for name, kind in whole["own"].items()},
+        own_edges={name: Type(kind) for name, kind in whole["own_edges"].items()},
+        classed=tuple(whole["classed"]),
+        sets=sets,
+        lacks={},
+    )
 
 
 def _with_relations(
@@ -120,8 +103,8 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     task : dict
-        ``kind``: a method of :class:`BundleTask`; ``url`` and ``bundle``; ``whole``: see :class:`Whole`;
-        ``text``, ``parameters``, ``limit``; ``tables``: name → Parquet file, or its bytes as
+        ``kind``: a method of :class:`BundleTask`; ``url`` and ``bundle``; ``whole``: facts about the whole
+        collection; ``text``, ``parameters``, ``limit``; ``tables``: name → Parquet file, or its bytes as
         base64; ``to``: the folder for result files, or empty to return the rows with the result;
         and values for the kind.
 
@@ -151,8 +134,7 @@ def _known(file: StoreFile, told: str) -> Catalog:
     local = file.catalog()
     held = _catalogs.get((file.path, told))
     if held is None or held[0] is not local:
-        whole = Whole.from_dict(json.loads(told))
-        held = _catalogs[file.path, told] = local, whole.catalog(local)
+        held = _catalogs[file.path, told] = local, _in_whole(local, json.loads(told))
         while len(_catalogs) > CATALOGS:
             del _catalogs[next(iter(_catalogs))]
     return held[1]
@@ -315,7 +297,8 @@ class BundleTask:
         path = _fresh(self.to, "ndjson")
 
         def find(text: str, **values: object) -> Matches:
-            return matches_of(self.file, self.catalog, text, values)
+            make = partial(TemporalMatches, self.file, self.catalog)
+            return matches_of(make, UnionMatches, text, values)
 
         asked = UserStatement(find, self.catalog().tables, self.task["text"])
         with path.open("w", encoding="utf-8") as lines, asked.on(self.file).batches() as batches:

@@ -181,10 +181,6 @@ def _member(parts: Sequence[str]) -> str:
     return f"{operand_text(value)} IN ({', '.join(items)})" if items else "FALSE"
 
 
-def _edges_between(nodes: Sequence[int]) -> int:
-    return len(nodes) - 1
-
-
 def _no_columns(*_: Any) -> Any:
     raise TypeError("a path is not a column")
 
@@ -237,18 +233,18 @@ def _divided(a: float, by: float) -> float | None:
     return a / by if by else None
 
 
-def _divided_columns(a: Any, by: Any) -> tuple[Any, Any]:
-    fits = np.not_equal(by, 0)
-    return np.divide(a, np.where(fits, by, 1)), fits
+def _over_columns(function: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
+    """Return the array form of a division, without a value where the divisor is 0."""
+
+    def of_columns(a: Any, by: Any) -> tuple[Any, Any]:
+        fits = np.not_equal(by, 0)
+        return function(a, np.where(fits, by, 1)), fits
+
+    return of_columns
 
 
 def _remainder(a: float, by: float) -> float | None:
     return math.fmod(a, by) if by else None
-
-
-def _remainder_columns(a: Any, by: Any) -> tuple[Any, Any]:
-    fits = np.not_equal(by, 0)
-    return np.fmod(a, np.where(fits, by, 1)), fits
 
 
 def _root(a: float) -> float | None:
@@ -320,23 +316,6 @@ def microseconds(seconds: float) -> float:
 
 def _microseconds_columns(seconds: Any) -> Any:
     return _rounded_columns(np.multiply(seconds, 1e6)) / 1e6
-
-
-def _least(*values: Any) -> Any:
-    return reduce(np.minimum, values)
-
-
-def _greatest(*values: Any) -> Any:
-    return reduce(np.maximum, values)
-
-
-def _ufunc(name: str) -> Callable[..., Any]:
-    """Return a numpy function by name, imported at its first call because the import is slow."""
-
-    def of_columns(*values: Any) -> Any:
-        return getattr(np, name)(*values)
-
-    return of_columns
 
 
 def _of_texts(name: str) -> Callable[..., Any]:
@@ -528,12 +507,12 @@ def _null_test(word: str, *, null: bool) -> Operator:
 _FINITE: Final = "isfinite(CAST(v AS DOUBLE))"
 
 COMPARISONS: Final[Mapping[str, Operator]] = {
-    "=": _strict("{0} = {1}", operator.eq, _ufunc("equal"), infix=True),
-    "<>": _strict("{0} <> {1}", operator.ne, _ufunc("not_equal"), infix=True),
-    "<": _strict("{0} < {1}", operator.lt, _ufunc("less"), infix=True),
-    "<=": _strict("{0} <= {1}", operator.le, _ufunc("less_equal"), infix=True),
-    ">": _strict("{0} > {1}", operator.gt, _ufunc("greater"), infix=True),
-    ">=": _strict("{0} >= {1}", operator.ge, _ufunc("greater_equal"), infix=True),
+    "=": _strict("{0} = {1}", operator.eq, np.equal, infix=True),
+    "<>": _strict("{0} <> {1}", operator.ne, np.not_equal, infix=True),
+    "<": _strict("{0} < {1}", operator.lt, np.less, infix=True),
+    "<=": _strict("{0} <= {1}", operator.le, np.less_equal, infix=True),
+    ">": _strict("{0} > {1}", operator.gt, np.greater, infix=True),
+    ">=": _strict("{0} >= {1}", operator.ge, np.greater_equal, infix=True),
 }
 TEXT_TESTS: Final[Mapping[str, Operator]] = {
     "STARTS WITH": _strict("starts_with(...)", str.startswith, _of_texts("startswith"), infix=True),
@@ -549,14 +528,14 @@ CONNECTIVES: Final[Mapping[str, Operator]] = {
     "IMPLIES": _ruled("(NOT {0} OR {1})", _implies, _implies_columns, infix=True),
 }
 NUMERIC: Final[Mapping[str, Operator]] = {
-    "abs": _strict("abs(...)", abs, _ufunc("abs")),
+    "abs": _strict("abs(...)", abs, np.abs),
     "sqrt": _strict(f"sqrt({_where('{0}', 'v >= 0')})", _root, _root_columns, partial=True),
-    "floor": _strict("floor(...)", math.floor, _ufunc("floor")),
-    "ceil": _strict("ceil(...)", math.ceil, _ufunc("ceil")),
+    "floor": _strict("floor(...)", math.floor, np.floor),
+    "ceil": _strict("ceil(...)", math.ceil, np.ceil),
     "round": _strict("round(...)", _rounded, _rounded_columns),
-    "sign": _strict("CAST(sign({0}) AS INTEGER)", _sign, _ufunc("sign")),
-    "degrees": _strict("degrees(...)", math.degrees, _ufunc("degrees")),
-    "radians": _strict("radians(...)", math.radians, _ufunc("radians")),
+    "sign": _strict("CAST(sign({0}) AS INTEGER)", _sign, np.sign),
+    "degrees": _strict("degrees(...)", math.degrees, np.degrees),
+    "radians": _strict("radians(...)", math.radians, np.radians),
     "sin": _computed(f"sin({_where('{0}', _FINITE)})", math.sin),
     "cos": _computed(f"cos({_where('{0}', _FINITE)})", math.cos),
     "tan": _computed(f"tan({_where('{0}', _FINITE)})", math.tan),
@@ -566,8 +545,8 @@ NUMERIC: Final[Mapping[str, Operator]] = {
 """Functions of one number."""
 
 EXTREMES: Final[Mapping[str, Operator]] = {
-    "min": _strict(_if_all_known("least"), min, _least),
-    "max": _strict(_if_all_known("greatest"), max, _greatest),
+    "min": _strict(_if_all_known("least"), min, lambda *values: reduce(np.minimum, values)),
+    "max": _strict(_if_all_known("greatest"), max, lambda *values: reduce(np.maximum, values)),
 }
 """Functions of two numbers or more."""
 
@@ -591,19 +570,13 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     **EXTREMES,
     **OF_TWO,
     **OF_TEXT,
-    "+": _strict("(... + ...)", operator.add, _ufunc("add"), infix=True),
-    "-": _strict("(... - ...)", operator.sub, _ufunc("subtract"), infix=True),
-    "*": _strict("(... * ...)", operator.mul, _ufunc("multiply"), infix=True),
-    "/": _strict(_division("/"), _divided, _divided_columns, infix=True, partial=True),
-    "%": _strict(
-        _division("%"),
-        _remainder,
-        _remainder_columns,
-        infix=True,
-        partial=True,
-    ),
-    "negative": _strict("(- {0})", operator.neg, _ufunc("negative")),
-    "length": _strict("(len({0}) - 1)", _edges_between, _no_columns),
+    "+": _strict("(... + ...)", operator.add, np.add, infix=True),
+    "-": _strict("(... - ...)", operator.sub, np.subtract, infix=True),
+    "*": _strict("(... * ...)", operator.mul, np.multiply, infix=True),
+    "/": _strict(_division("/"), _divided, _over_columns(np.divide), infix=True, partial=True),
+    "%": _strict(_division("%"), _remainder, _over_columns(np.fmod), infix=True, partial=True),
+    "negative": _strict("(- {0})", operator.neg, np.negative),
+    "length": _strict("(len({0}) - 1)", lambda nodes: len(nodes) - 1, _no_columns),
     "float32": _strict(
         "CAST(TRY_CAST({0} AS FLOAT) AS DOUBLE)", float32, _float32_columns, partial=True
     ),

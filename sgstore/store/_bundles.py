@@ -16,11 +16,11 @@ from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
 from sgstore.model.frame_ids import BUCKET_BITS, SEQ_BITS
 from sgstore.model.vocabulary import NAMES
-from sgstore.store._columns import MASKS, ORDERS, REPEATED, STATES, types_of
+from sgstore.store._columns import ORDERS, types_of
 from sgstore.store._creation import attach_empty
 from sgstore.store._engine_errors import translated
 from sgstore.store._locking import Access, default_memory, spill_folder
-from sgstore.store._publish import SHARED
+from sgstore.store._publish import SCATTERED, SHARED
 from sgstore.store._rows import run
 from sgstore.store._staging import Sealed, scratch
 from sgstore.store._table_stream import FILE, TableFile
@@ -46,9 +46,6 @@ _TRACE_OF: Final = {
 
 _AS_MADE: Final = frozenset({"store_info", "bits"})
 """Tables with rows in every new store."""
-
-_SORTED: Final = frozenset({*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap"})
-"""Large tables, sorted in a bundle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +176,9 @@ def _copied(
             rows = " UNION ALL BY NAME ".join(_chosen(table, name) for name in sources)
             if table in _ONCE or table == "manifest":
                 rows = f"SELECT DISTINCT * FROM ({rows})"
-            order = f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in _SORTED else " ORDER BY ALL"
+            order = (
+                f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in SCATTERED else " ORDER BY ALL"
+            )
             if table in {"map", "map_node"}:  # map texts are long, and a map has few rows
                 order = f" ORDER BY map_id{', node_id DESC' * (table == 'map_node')}"
             connection.execute(f"INSERT INTO fresh.inside.{table} BY NAME {rows}{order}")

@@ -303,12 +303,13 @@ class Abstracted:
     def times(self) -> tuple[Ints, Ints]:
         """Return the ids of all frames of a store in ascending order, and their simulation times; ns."""
         with self._access.reading() as connection:
-            return times(connection)
+            rows = connection.execute(_TIMES).fetchnumpy()
+        return rows["frame_id"].astype(np.int64), rows["time_ns"].astype(np.int64)
 
     def imported_names(self) -> dict[str, int]:
         """Return the names of the graphs that come from imported files: graph name → frame id."""
         with self._access.reading() as connection:
-            return imported_names(connection)
+            return dict(connection.execute(_IMPORTED).fetchall())
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
         """Yield the counts of node and edge labels in the graphs of given frames, in groups of frames.
@@ -364,14 +365,8 @@ class Abstracted:
         with self._access.reading() as connection:
             frame = frame_named(connection, ref)
             _, seen = self._graphs.of_frames(connection, frame.frame_id, frame.frame_id)
-        about = {
-            "frame_id": frame.frame_id,
-            "trace": frame.trace,
-            "seq": frame.seq,
-            "time_ns": frame.time_ns,
-            "abstraction": abstraction.name,
-        }
-        return abstraction.function(seen), about
+        about = {name: getattr(frame, name) for name in ("frame_id", "trace", "seq", "time_ns")}
+        return abstraction.function(seen), about | {"abstraction": abstraction.name}
 
 
 def _missing(connection: DuckDBPyConnection, name: str, catalog: str = "") -> dict[int, int]:
@@ -440,17 +435,6 @@ def classes_coded(
     code = rows["code"].astype(np.int64)[row]
     order = np.argsort(frame_id, kind="stable")
     return CodedClasses(tuple(names.tolist()), frame_id[order], code[order])
-
-
-def times(connection: DuckDBPyConnection) -> tuple[Ints, Ints]:
-    """Return the ids of all frames of a store in ascending order, and their simulation times; ns."""
-    rows = connection.execute(_TIMES).fetchnumpy()
-    return rows["frame_id"].astype(np.int64), rows["time_ns"].astype(np.int64)
-
-
-def imported_names(connection: DuckDBPyConnection) -> dict[str, int]:
-    """Return the graph names from imported files: name → frame id. Of equal names, the last frame is used."""
-    return dict(connection.execute(_IMPORTED).fetchall())
 
 
 @dataclass(frozen=True, slots=True)

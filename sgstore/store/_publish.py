@@ -336,7 +336,7 @@ def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
         )
 
 
-_SCATTERED: Final = (*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap")
+SCATTERED: Final = (*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "derived_gap")
 """Large tables, sorted across all traces. A scan for one relation or kind can then skip other rows."""
 
 
@@ -348,7 +348,7 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
     words = {enum: shape.labels_of(connection, "store", enum) for enum in NAMES}
     shape.widen(connection, "fresh", words)
     for (table,) in tables:
-        order = f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in _SCATTERED else ""
+        order = f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in SCATTERED else ""
         connection.execute(f"DELETE FROM fresh.inside.{table}")
         connection.execute(
             f"INSERT INTO fresh.inside.{table} BY NAME SELECT * FROM store.inside.{table}{order}"

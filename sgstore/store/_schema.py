@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
     Tokens = tuple[str, ...]
     Objects = tuple[tuple[str, str, str, str | Tokens], ...]
-    Tokens = tuple[str, ...]
-    Objects = tuple[tuple[str, str, str, str | Tokens], ...]
 
 _HEAD: Final = re.compile(r"-- sgstore: what is in a store, version (\d+)\.")
 _SYSTEM: Final = frozenset({"information_schema", "pg_catalog", "system", "temp"})

@@ -9,8 +9,8 @@ import numpy as np
 from oracle_temporal import NAMES, random_formula
 
 from sgstore.temporal import evaluate
+from sgstore.temporal._check_monitor import Automaton
 from sgstore.temporal._formula import looks_ahead
-from sgstore.temporal._obligations import Automaton
 from sgstore.temporal._progression import Tick
 from sgstore.temporal._verdicts import Settled
 

@@ -21,7 +21,7 @@ from sgstore.lang.operators import OPERATORS
 from sgstore.lang.sql import path_ways
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
     from sgstore.lang.ir import BlockValue, Edge, Scope
     from sgstore.lang.memory._evaluate import Test
