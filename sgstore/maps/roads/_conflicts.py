@@ -62,9 +62,7 @@ def conflicts(
 
 def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
     """Return all pairs of lanes in the same junction, each pair once."""
-    names: dict[str, int] = {}
-    for name in junction:
-        names.setdefault(name, len(names))
+    names = {name: number for number, name in enumerate(dict.fromkeys(junction))}
     group = np.array([names[name] for name in junction], np.int64)[lanes]
     order = np.lexsort((lanes, group))
     lanes, group = lanes[order], group[order]

@@ -10,7 +10,7 @@ named in a warning.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -604,9 +604,7 @@ def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float,
 def _names(network: _Network) -> list[str]:
     """Return a unique name for each lane. An ambiguous name gets the lane's id as a suffix."""
     wanted = [line.name or line.ident for line in network.lines]
-    count: dict[str, int] = defaultdict(int)
-    for name in wanted:
-        count[name] += 1
+    count = Counter(wanted)
     return [
         name if count[name] == 1 else f"{name}#{line.ident}"
         for name, line in zip(wanted, network.lines, strict=True)

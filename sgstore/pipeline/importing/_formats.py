@@ -84,25 +84,22 @@ def _lines(path: Path, file: Any, size: int) -> Iterator[str]:
     number = total = 0
     while True:
         number += 1
+        where = f"line {number}"
         try:
             line = file.readline(MAX_LINE + 1)
         except (OSError, EOFError, ValueError, lzma.LZMAError, zlib.error) as error:
-            raise wrong(path, f"line {number}", f"cannot be read: {error}") from error
+            raise wrong(path, where, f"cannot be read: {error}") from error
         if not line:
             return
         if len(line) > MAX_LINE:
-            raise wrong(path, f"line {number}", f"longer than {MAX_LINE >> 20} MiB")
+            raise wrong(path, where, f"longer than {MAX_LINE >> 20} MiB")
         total += len(line)
         if total > MAX_TEXT or total > _FREE + MAX_RATIO * size:
-            raise wrong(
-                path, f"line {number}", f"{total:,} bytes unpacked, from a file of {size:,}"
-            )
+            raise wrong(path, where, f"{total:,} bytes unpacked, from a file of {size:,}")
         try:
             yield line.decode("utf-8-sig" if number == 1 else "utf-8")
         except UnicodeDecodeError as error:
-            raise wrong(
-                path, f"line {number}", f"no UTF-8 at byte {error.start} of the line"
-            ) from error
+            raise wrong(path, where, f"no UTF-8 at byte {error.start} of the line") from error
 
 
 # Tables with one edge per row (node, edge, node): files of S3C, and CSV with a header.

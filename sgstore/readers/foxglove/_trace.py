@@ -59,7 +59,6 @@ if TYPE_CHECKING:
     from sgstore.mcap import Messages, Recording
     from sgstore.model.world import TraceReport
     from sgstore.readers._blocks import Called
-    from sgstore.readers.foxglove._mapping import Ego
     from sgstore.readers.foxglove._messages import Box, Deletion, Pose, SceneUpdate, Transform
 
 
@@ -290,7 +289,9 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
         frame = self._open = FoxgloveRawFrame(time_ns, log_time)
         self._fill(frame)
         if self._ego < 0 and self._ego_axes and self._pose_of_ego(time_ns) is not None:
-            self._ego = self._enter_ego()
+            meaning = self._mapping.meaning(self._mapping.ego.type)
+            self._idents.append(self._ego_axes)
+            self._ego = self.roster.enter(self._ego_axes, meaning, self._mapping.ego.type)
         return frame
 
     def _fill(self, frame: FoxgloveRawFrame) -> None:
@@ -403,11 +404,6 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
             self._ego = node
         return node
 
-    def _enter_ego(self) -> int:
-        ego = self._mapping.ego
-        self._idents.append(self._ego_axes)
-        return self.roster.enter(self._ego_axes, self._mapping.meaning(ego.type), ego.type)
-
     def _rows(self, frame: FoxgloveRawFrame) -> FrameRows:
         nodes: list[int] = []
         rows: list[list[float]] = []
@@ -433,7 +429,8 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
             pose = self._pose_of_ego(frame.time_ns)
             if pose is not None:
                 nodes.append(self._ego)
-                rows.append(_row(pose, _size(self._mapping.ego)))
+                ego = self._mapping.ego
+                rows.append(_row(pose, (ego.length, ego.width, ego.height)))
                 states.append(-1)
         count = len(nodes)
         return FrameRows(
@@ -481,10 +478,6 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
 def _row(pose: Pose, size: tuple[float, float, float]) -> list[float]:
     place, turn = pose
     return [*place.tolist(), *angles(turn), *(NAN,) * 7, *size]
-
-
-def _size(ego: Ego) -> tuple[float, float, float]:
-    return ego.length, ego.width, ego.height
 
 
 class FoxgloveTrace(SurveyedTrace[FoxgloveSurvey]):

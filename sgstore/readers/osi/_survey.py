@@ -10,6 +10,7 @@ the OpenSCENARIO type of the entity (``Vehicle``, ``cutter``).
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -149,10 +150,7 @@ class Cast:
     def idents(self) -> dict[int, str]:
         """Return the name of each moving object if the name is unique, else the object's number."""
         numbers = {str(number) for number in self.names}
-        bearers: dict[str, int] = {}
-        for names in self.names.values():
-            for name in names[:1]:
-                bearers[name] = bearers.get(name, 0) + 1
+        bearers = Counter(names[0] for names in self.names.values() if names)
         return {
             number: names[0]
             if names and bearers[names[0]] == 1 and names[0] not in numbers
