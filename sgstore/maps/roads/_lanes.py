@@ -23,7 +23,7 @@ from sgstore.maps.roads._ribbons import Ribbons, wrapped
 from sgstore.model.vocabulary import DRIVING, RELATION_CODE
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from sgstore.model.world import Bools, Floats, Ints
 
@@ -190,7 +190,7 @@ def road_map_of(
     *,
     name: str,
     text: str,
-    warnings: Iterable[str] = (),
+    warnings: Sequence[str] = (),
 ) -> RoadMap:
     """Build a road map from lanes, signals, crosswalks and objects.
 

@@ -320,7 +320,7 @@ class RoadMap:
     controllers: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     warnings: Sequence[str] = ()
     stops: tuple[Ints, Ints, Floats] = field(
-        default_factory=lambda: (*np.zeros((2, 0), np.int64), np.zeros(0))
+        default_factory=lambda: (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     )
     stop_lines: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     courses: LaneCourses = field(default_factory=LaneCourses.none)

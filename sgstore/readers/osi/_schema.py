@@ -331,13 +331,6 @@ _PART_NEEDS: Final = {
     CONDITIONS: (),
 }
 _NEEDS: Final = {
-    TRAFFIC_LIGHT: (
-        *_STATIC_NEEDS,
-        *(f"classification.{name}" for name in ("color", "icon", "mode")),
-    ),
-    CONDITIONS: (),
-}
-_NEEDS: Final = {
     GROUND_TRUTH: _GROUND_TRUTH_NEEDS,
     SENSOR_VIEW: tuple(f"global_ground_truth.{path}" for path in _GROUND_TRUTH_NEEDS),
     ROAD_MAP: ("map_reference", "open_drive_xml_content"),

@@ -74,7 +74,8 @@ def _names_or_none(moving_object: Any) -> list[str]:
 
 def hosts_of(message: Any) -> list[int]:
     """Return the possible ids of the host vehicle (ego) in an OSI message, best first; 0 is a valid id."""
-    inner = (getattr(message, name, None) for name in ("global_ground_truth", "host_vehicle_data"))
+    names = ("global_ground_truth", "host_vehicle_data")
+    inner: list[Any] = [getattr(message, name, None) for name in names]
     parts = [message, *(part for part in inner if hasattr(part, "DESCRIPTOR"))]
     told = [part for part in parts if "host_vehicle_id" in part.DESCRIPTOR.fields_by_name]
     return [part.host_vehicle_id.value for part in told if part.HasField("host_vehicle_id")]

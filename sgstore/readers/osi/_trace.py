@@ -463,8 +463,9 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _trailer(self, thing: Any) -> str:
         """Return the id of the trailer that a vehicle pulls, or an empty string."""
         vehicle = getattr(thing, "vehicle_classification", None)
-        known = vehicle is not None and has_field(type(vehicle), "trailer_id")
-        if not known or not vehicle.HasField("trailer_id"):
+        if vehicle is None or not has_field(type(vehicle), "trailer_id"):
+            return ""
+        if not vehicle.HasField("trailer_id"):
             return ""
         number = vehicle.trailer_id.value
         return self._idents.get(number, str(number))
