@@ -76,8 +76,8 @@ def prune(files: list[descriptor_pb2.FileDescriptorProto], roots: dict[str, Any]
         wanted = fields_read()[wanted] if isinstance(wanted, str) else wanted
         kept.setdefault(name, set()).update(wanted)
         for field in types[name].field if name in types else ():
-            inner = wanted.get(field.name, True) if isinstance(wanted, dict) else True
-            if not field.type_name or field.type != field.TYPE_MESSAGE or inner is True:
+            inner = wanted.get(field.name) if isinstance(wanted, dict) else None
+            if not field.type_name or field.type != field.TYPE_MESSAGE or inner in (None, True):
                 continue
             if inner == OPAQUE:
                 field.type = field.TYPE_BYTES
