@@ -273,8 +273,8 @@ def _folded(value: Bound) -> Bound:
             kind is same and one is not None and other is not None
         ):
             return TRUE if one == other else FALSE
-        case Operation("case", operands):
-            return _branch(value, operands)
+        case Operation("case"):
+            return _branch(value)
         case Operation("NOT", (operand,)) if operand == FALSE:
             return TRUE
         case Operation("AND" | "OR" as word, operands):
@@ -285,13 +285,17 @@ def _folded(value: Bound) -> Bound:
             return value
 
 
-def _branch(value: Operation, operands: tuple[Bound, ...]) -> Bound:
+def _branch(value: Operation) -> Bound:
     """Return an equal ``CASE`` without leading branches whose condition is a constant."""
-    while len(operands) > 1 and operands[0] == FALSE:
-        operands = operands[2:]
-    if len(operands) == 1:
-        return operands[0]
-    return operands[1] if operands[0] == TRUE else replace(value, operands=operands)
+    match value.operands:
+        case (otherwise,):
+            return otherwise
+        case (first, chosen, *_) if first == TRUE:
+            return chosen
+        case (first, _, *rest) if first == FALSE:
+            return _branch(replace(value, operands=tuple(rest)))
+        case _:
+            return value
 
 
 def _joined(word: str, operands: tuple[Bound, ...]) -> Bound:
