@@ -32,13 +32,11 @@ T = TypeVar("T")
 
 def progress(items: Sequence[T], noun: str) -> Iterator[T]:
     """Yield the items, and show the number of finished ones on stderr, on a terminal."""
-    if quiet() or not sys.stderr.isatty():
-        yield from items
-        return
     from rich.console import Console
     from rich.progress import track
 
-    yield from track(items, noun, console=Console(stderr=True), transient=True)
+    console, hidden = Console(stderr=True), quiet() or not sys.stderr.isatty()
+    yield from track(items, noun, console=console, transient=True, disable=hidden)
 
 
 @contextmanager

@@ -637,10 +637,8 @@ def _of_edge(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttr
     for part, name in names.items() if alias not in join.lanes else ():
         on = [f"{name}.{quoted(column)} = {node}" for column, node in ends.items()]
         on.append(f'{name}."bucket" = {join.frame} >> 6')
-        if part.endswith("_repeated"):
-            on.append(in_mask(name, join.frame))
-        else:
-            on.append(f'{name}."bit" = {join.frame} & 63')
+        of_bit = f'{name}."bit" = {join.frame} & 63'
+        on.append(in_mask(name, join.frame) if part.endswith("_repeated") else of_bit)
         join.select.join(f"{quoted(part)} AS {name}", on, "LEFT JOIN")
     join.lanes.add(alias)
     texts = [lane_text(leaf, name) for name in names.values()]

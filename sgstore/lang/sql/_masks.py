@@ -409,10 +409,8 @@ def _from_ego(sql: SqlBuilder, scope: Scope, base: Base) -> tuple[tuple[Edge, ..
         return edges, range(0)
     edges = ordered(scope, sql.catalog, begin).edges
     seen, connected = set(begin), 0
-    for edge in edges:
-        if not {edge.src, edge.dst} & seen:
-            break
-        seen |= {edge.src, edge.dst}
+    while connected < len(edges) and {edges[connected].src, edges[connected].dst} & seen:
+        seen |= {edges[connected].src, edges[connected].dst}
         connected += 1
     return edges, range(_EDGES if base.nodes else 1, min(connected, len(edges) - 1) + 1, _EDGES)
 
