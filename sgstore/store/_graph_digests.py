@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 FIRST: Final = 50
 """Buckets (of 60 frames) in the first read. Later reads are limited by the number of rows:"""
-_ROWS_TOGETHER: Final = 1_500_000
+_ROWS_TOGETHER: Final = 700_000
 
 _WANTED: Final = (
     "(SELECT unnest($buckets) AS bucket, unnest($masks) AS mask,"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from typing import TYPE_CHECKING, Any
 
 import duckdb
@@ -179,6 +180,25 @@ def test_a_change_is_found_and_named(store: Any, what: Any) -> None:
     else:
         assert check in {fault.check for fault in found}
     assert all(fault.detail for fault in found)
+
+
+def test_a_random_number_that_changes_is_found(store: StoreFile) -> None:
+    numbers = "column_name, table_name FROM duckdb_columns() WHERE schema_name = 'inside'"
+    listed = store.rows(
+        f"SELECT {numbers} AND data_type IN ('FLOAT', 'DOUBLE', 'INTEGER', 'BIGINT')"
+        " AND table_name <> 'manifest' AND table_name IN"
+        " (SELECT table_name FROM duckdb_tables() WHERE estimated_size > 0)"
+    ).values
+    column, table = random.choice(listed)
+    rows = store.rows(f"SELECT rowid FROM inside.{table}").values
+    (row,) = random.choice(rows)
+
+    change(
+        store,
+        f'UPDATE inside.{table} SET "{column}" = coalesce("{column}", 0) + 1 WHERE rowid = {row}',
+    )
+
+    assert faults(store), (table, column, row)
 
 
 def test_a_fault_is_told_of_the_trace_that_has_it(store: Any) -> None:
