@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Ints
 
     Payload = dict[str, str]
+    _Fields = tuple[str, str, int, int, int, int, int, str]
 
 
 WINDOW: Final = 4_000
@@ -90,7 +91,7 @@ def lock_of(
 
 def _cases(
     parts: Sequence[CasePart], known: Mapping[int, StoredTrace]
-) -> tuple[Iterator[tuple[Any, ...]], list[Ints]]:
+) -> tuple[Iterator[_Fields], list[Ints]]:
     """Return the fields of test cases without digests, and their frame ids, by trace name and first frame."""
     if not parts:
         return iter(()), []
@@ -100,7 +101,8 @@ def _cases(
     trace_id = trace_of(ids[starts])
     used = sorted(np.unique(trace_id).tolist(), key=lambda one: natural(known[one].name))
     rank = {one: place for place, one in enumerate(used)}
-    order = np.lexsort((ids[starts], [rank[one] for one in trace_id.tolist()]))
+    ranks = np.array([rank[one] for one in trace_id.tolist()])
+    order = np.lexsort((ids[starts], ranks))
     names = [known[one].name for one in trace_id[order].tolist()]
     first, last = seq_of(ids[starts])[order].tolist(), seq_of(ids[ends - 1])[order].tolist()
     labels = [
