@@ -212,7 +212,7 @@ class Matches(Tabular):
         from sgstore.base.display import html_media
         from sgstore.draw import thumbnail
 
-        if not isinstance(self._file, StoreFile):
+        if not isinstance(self._file, StoreFile):  # pyright: ignore[reportUnnecessaryIsInstance]
             return  # a collection
         before: FrameRef | None = None
         left = PICTURES

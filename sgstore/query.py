@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sgstore.matches import Interval, Matches
     from sgstore.model.world import Clip
     from sgstore.pipeline.recording_ingest import TraceOutcome
-    from sgstore.store import Rows, SimilarFrames, StoredTrace, UserSql
+    from sgstore.store import Rows, SimilarFrames, StoredTrace
     from sgstore.temporal import CheckRun, ShortestClip
     from sgstore.temporal.truth_lanes import TruthLanes
 
@@ -1097,8 +1097,8 @@ class UserStatement:
         if found:
             self._given = lambda: [part for name, of in found for part in of.as_table(name)]
 
-    def on(self, file: StoreFile, timeout_s: float | None = None) -> UserSql:
-        """Return the statement on a store, with the tables of its patterns."""
+    def on(self, file: StoreFile, timeout_s: float | None = None) -> Any:
+        """Return the statement on a store, with the tables of its patterns; see :meth:`StoreFile.user_sql`."""
         return file.user_sql(self._sql, timeout_s, self._given)
 
 

@@ -14,15 +14,12 @@ from sgstore.model.world import tolerance_ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from sgstore.collection import CollectionMatches, CollectionUnion
     from sgstore.exporters._labels import Labels
     from sgstore.exporters._transforms import Mount
-    from sgstore.matches import Matches
     from sgstore.model.world import Clip, Ints
     from sgstore.query import Store
     from sgstore.store import StoredTrace
 
-    AnyMatches = Matches | CollectionMatches | CollectionUnion
 
 WINDOW: Final = 240
 """Frames that are read from the store at once, as columns."""

@@ -23,12 +23,10 @@ from sgstore.model.frame_ids import frame_ids, trace_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from sgstore.collection import Collection, CollectionMatches, CollectionUnion
+    from sgstore.collection import Collection
     from sgstore.matches import Matches
     from sgstore.model.world import Ints
     from sgstore.query import Store
-
-    AnyMatches = Matches | CollectionMatches | CollectionUnion
 
 
 NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,62}")
@@ -151,7 +149,7 @@ def _trace_ids(store: Store | Collection) -> dict[str, int]:
 def _over_matches(
     store: Store | Collection,
     name: str,
-    matches: AnyMatches,
+    matches: Matches,
     wanted: Ints,
 ) -> np.ndarray[Any, np.dtype[np.object_]]:
     """Return a label column: the value of a match in all its frames. Other frames have no value."""
@@ -208,9 +206,7 @@ def _of_expression(error: QueryError, text: str) -> QueryError:
     return QueryError(reason, text=text, span=TextSpan(start, stop), hint=error.hint)
 
 
-def _columns(
-    matches: AnyMatches, wanted: Ints
-) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
+def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
     """Return the indices of the wanted frames that match a query, and the values of the matches."""
     found = matches.numpy()
     of, row = _rows(wanted, found["frame_of_label"].astype(np.int64))

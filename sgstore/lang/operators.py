@@ -181,6 +181,10 @@ def _member(parts: Sequence[str]) -> str:
     return f"{operand_text(value)} IN ({', '.join(items)})" if items else "FALSE"
 
 
+def _edges_between(nodes: Sequence[int]) -> int:
+    return len(nodes) - 1
+
+
 def _no_columns(*_: Any) -> Any:
     raise TypeError("a path is not a column")
 
@@ -576,7 +580,7 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     "/": _strict(_division("/"), _divided, _over_columns(np.divide), infix=True, partial=True),
     "%": _strict(_division("%"), _remainder, _over_columns(np.fmod), infix=True, partial=True),
     "negative": _strict("(- {0})", operator.neg, np.negative),
-    "length": _strict("(len({0}) - 1)", lambda nodes: len(nodes) - 1, _no_columns),
+    "length": _strict("(len({0}) - 1)", _edges_between, _no_columns),
     "float32": _strict(
         "CAST(TRY_CAST({0} AS FLOAT) AS DOUBLE)", float32, _float32_columns, partial=True
     ),

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 
     from sgstore.store._classes import CodedClasses
     from sgstore.store._file import StoreFile
-    from sgstore.store._rows import Given, Parameters
+    from sgstore.store._rows import Parameters
+    from sgstore.store._temporary_tables import Given
 
     Written = tuple[Path | None, tuple[str, ...], int, list[tuple[Any, ...]]]
     """Partial result: file or ``None``, types, number of rows, and the rows if few."""

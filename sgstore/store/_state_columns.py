@@ -85,7 +85,8 @@ class StateColumns:
             " ORDER BY frame_id, node_id",
             _ids(self._file.trace_id(trace), first, last),
         )
-        return {"seq": seq_of(found.pop("frame_id")).astype(np.uint32), **_typed(found, _TYPES)}
+        seq = seq_of(found.pop("frame_id").astype(np.int64)).astype(np.uint32)
+        return {"seq": seq, **_typed(found, _TYPES)}
 
     def states_at(self, frames: Sequence[tuple[int, int]]) -> Columns:
         """Return object states in given frames. Column ``at`` is the index of the frame in the input."""

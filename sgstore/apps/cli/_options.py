@@ -117,7 +117,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.apps.sandbox import Answer
-    from sgstore.collection import CollectionMatches, CollectionRows
+    from sgstore.collection import CollectionRows
     from sgstore.matches import Matches
     from sgstore.model.config import Config
     from sgstore.query import Store, UserStatement
@@ -782,7 +782,7 @@ def bytes_of(text: str, option: str) -> int:
 
 
 def say_left_out(
-    matches: Matches | Answer | ChosenFrames | UserStatement | CollectionMatches | CollectionRows,
+    matches: Matches | Answer | ChosenFrames | UserStatement | CollectionRows,
 ) -> None:
     """Print the traces that cannot answer a query, with reasons, and likely mistakes in the query."""
     of: dict[str, list[str]] = {}

@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from sgstore.apps.sandbox import Answer, Sandbox
-    from sgstore.collection import CollectionMatches
     from sgstore.lang.library import NamedPattern
     from sgstore.matches import Interval, Matches
 
@@ -163,7 +162,7 @@ def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
 
 
 def _write_parted(
-    matches: CollectionMatches, ask: AskOptions, *, count: bool, explain: bool, require: bool
+    matches: Matches, ask: AskOptions, *, count: bool, explain: bool, require: bool
 ) -> int:
     """Print the results of a query on a collection, and return the exit code."""
     if explain:
@@ -189,7 +188,7 @@ def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
 
 
 def _as_shown(
-    answer: Matches | Answer | CollectionMatches, rows: Iterable[tuple[Any, ...]], form: Format
+    answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
     """Return the columns and rows of a query for an output format.
 
