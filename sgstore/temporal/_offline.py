@@ -493,20 +493,45 @@ def read(
     about = chosen_traces(file, whole, catalog)
     found = _clocks(about, frame_times(file, window), gaps)
     rows, memory = 0, file.memory
-    for name in asks if premises is None else premises.order:
-        ask = asks[name]
+    for names in _together(asks, premises):
+        ask = asks[names[0]]
         left = _left(ask, found, premises)
         narrower = _narrowed(ask, left.values(), premises)
         for trace in found.values():
             if narrower is None or trace.trace_id not in left:
-                trace.relations[name] = no_rows(ask)
+                trace.relations |= {name: no_rows(asks[name]) for name in names}
         if narrower is not None:
             size = ROW_BYTES + EDGE_BYTES * len(ask.edges)
             where = window if len(left) == len(found) else _window_of(left, catalog)
-            many = _relate(file, catalog, name, narrower, where, left, memory // size)
+            values = {name: asks[name].value for name in names}
+            many = _relate(file, catalog, values, narrower, where, left, memory // size)
             rows, memory = rows + many, memory - many * size
     ordered = (trace.trace_id for trace in catalog.traces)
     return [found[trace] for trace in ordered if trace in found], rows
+
+
+def _together(asks: Mapping[str, Ask], premises: Premises | None) -> list[list[str]]:
+    """Return groups of names of queries. Queries of one group differ only in the value of their matches."""
+    groups: list[list[str]] = []
+    for name in asks if premises is None else premises.order:
+        ask = asks[name]
+        if groups and _differ_in_value(ask, asks[groups[-1][0]]):
+            groups[-1].append(name)
+        else:
+            groups.append([name])
+    return groups
+
+
+def _differ_in_value(ask: Ask, other: Ask) -> bool:
+    """True if two queries return different values of the same matches."""
+    one, two = ask.query.scope, other.query.scope
+    return (
+        not (ask.value is None or other.value is None or ask.edges or other.edges)
+        and (ask.variables, ask.after) == (other.variables, other.after)
+        and (one.nodes, one.edges, one.where, one.distinct)
+        == (two.nodes, two.edges, two.where, two.distinct)
+        and replace(ask.query, scope=two) == other.query
+    )
 
 
 def _narrowed(ask: Ask, traces: Collection[TraceReader], premises: Premises | None) -> Ask | None:
@@ -654,7 +679,7 @@ def arrays_of(
 def _relate(
     file: StoreFile,
     catalog: Catalog,
-    name: str,
+    named: Mapping[str, Bound | None],
     ask: Ask,
     window: Window | None,
     found: Mapping[int, TraceReader],
@@ -662,14 +687,14 @@ def _relate(
 ) -> int:
     """Run one single-frame query, add its matches to each trace, and return their number.
 
-    ``most`` is the largest number allowed.
+    ``named`` has the value of the matches for each name, ``most`` is the largest number allowed.
     """
     if ask.everywhere:
         for trace in found.values():
-            every = np.arange(len(trace))
-            trace.relations[name] = TimedRelation.of(every, np.zeros((len(trace), 0), np.int64))
+            table = TimedRelation.of(np.arange(len(trace)), np.zeros((len(trace), 0), np.int64))
+            trace.relations |= dict.fromkeys(named, table)
         return 0
-    asked = () if ask.value is None else (ask.value,)
+    asked = [value for value in named.values() if value is not None]
     ids, keys, values = arrays_of(file, catalog, ask, window, asked, most)
     told = len(ask.columns)
     order = np.lexsort((*keys.T[told:][::-1], ids))
@@ -680,9 +705,10 @@ def _relate(
     for trace in found.values():
         rows = parts.get(trace.trace_id, nothing)
         frames = np.searchsorted(trace.frame_ids, ids[rows])
-        trace.relations[name] = TimedRelation.of(
-            frames, keys[rows], [value[rows] for value in values]
-        )
+        table = TimedRelation.of(frames, keys[rows], [value[rows] for value in values])
+        for number, name in enumerate(named):
+            own = replace(table, values=table.values[number : number + 1])
+            trace.relations[name] = own
     return len(ids)
 
 
