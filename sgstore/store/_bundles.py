@@ -44,9 +44,6 @@ _TRACE_OF: Final = {
 }
 """Column → SQL of the trace of a row. The first column present in a table counts."""
 
-_AS_MADE: Final = frozenset({"store_info", "bits"})
-"""Tables with rows in every new store."""
-
 
 @dataclass(frozen=True, slots=True)
 class BundleSource:
@@ -172,7 +169,7 @@ def _copied(
         shape.widen(connection, "fresh", words)
     _choose(connection, traces, maps)
     for table in shape.expected().tables:
-        if table not in _AS_MADE:
+        if table not in {"store_info", "bits"}:  # every new store has their rows
             rows = " UNION ALL BY NAME ".join(_chosen(table, name) for name in sources)
             if table in _ONCE or table == "manifest":
                 rows = f"SELECT DISTINCT * FROM ({rows})"
@@ -358,10 +355,6 @@ def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
         yield bundle, "classed", name, "", 0
 
 
-MAP_TABLES: Final = frozenset(SHARED["map"])
-"""Tables of a segment that belong to its road map."""
-
-
 def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
     """Split an unpublished trace into trace and road map files. Return the map digest; empty without a map.
 
@@ -378,7 +371,7 @@ def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
         The segment is not readable, or a file is not writable.
     """
     told = Sealed.read(sealed)
-    _copy_pieces([sealed], lambda table: of_map if table in MAP_TABLES else to, [to, of_map])
+    _copy_pieces([sealed], lambda table: of_map if table in SHARED["map"] else to, [to, of_map])
     replace(told, folder=to).write()
     return told.identity.map_digest
 

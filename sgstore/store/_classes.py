@@ -303,13 +303,13 @@ class Abstracted:
     def times(self) -> tuple[Ints, Ints]:
         """Return the ids of all frames of a store in ascending order, and their simulation times; ns."""
         with self._access.reading() as connection:
-            rows = connection.execute(_TIMES).fetchnumpy()
+            rows = connection.execute("SELECT frame_id, time_ns FROM frame ORDER BY 1").fetchnumpy()
         return rows["frame_id"].astype(np.int64), rows["time_ns"].astype(np.int64)
 
     def imported_names(self) -> dict[str, int]:
         """Return the names of the graphs that come from imported files: graph name → frame id."""
         with self._access.reading() as connection:
-            return dict(connection.execute(_IMPORTED).fetchall())
+            return dict(connection.execute("SELECT graph, frame_id FROM imports").fetchall())
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
         """Yield the counts of node and edge labels in the graphs of given frames, in groups of frames.
@@ -388,10 +388,6 @@ _MASKS: Final = """WITH kept AS ({})
 SELECT bucket, mask, CASE WHEN class IS NULL THEN -1 ELSE dense_rank() OVER (ORDER BY class NULLS LAST) - 1 END
   AS code FROM kept
 """
-
-_IMPORTED: Final = "SELECT graph, frame_id FROM imports"
-
-_TIMES: Final = "SELECT frame_id, time_ns FROM frame ORDER BY frame_id"
 
 
 @dataclass(frozen=True, slots=True)
