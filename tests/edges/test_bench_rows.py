@@ -18,14 +18,14 @@ from sgstore.lang.library import patterns
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(20)
+pytestmark = pytest.mark.seconds(30)
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three seconds of the bundled recording."""
+    """One second of the bundled recording."""
     path = tmp_path_factory.mktemp("bench") / "small.sgstore"
-    (outcome,) = ingest(path, [RECORDING], until=3)
+    (outcome,) = ingest(path, [RECORDING], until=1)
     assert outcome.error is None
     return path
 
@@ -34,7 +34,7 @@ def test_each_row_of_the_library_has_an_answer(
     small: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(bench.library, "asked", bench.library.answer)
-    monkeypatch.setattr(bench.library, "stores", lambda *_: [(small, 31)])
+    monkeypatch.setattr(bench.library, "stores", lambda *_: [(small, 11)])
     monkeypatch.setattr("os.sched_setaffinity", lambda *_: None)
 
     lines = list(bench.library.run(quick=True))
