@@ -383,19 +383,19 @@ class StoreFile:
         with self.access.reading() as connection:
             return trace_named(connection, str(trace))[0]
 
-    def meetings(self) -> Iterator[Meetings]:
-        """Yield the frames that have both the ego and another known object, for windows of traces."""
+    def meetings(self, measures: Sequence[str]) -> Iterator[Meetings]:
+        """Yield the encounters of the egos with other known objects, in windows, for recorded measures."""
         from sgstore.store._meetings import meetings
 
         with translated(self.path), self.access.reading() as connection:
-            yield from meetings(connection)
+            yield from meetings(connection, measures)
 
     def recorded_encounters(self, measures: Sequence[str]) -> Rows:
         """Return the pairs of the view ``encounters`` with some of their criticality measures."""
         from sgstore.store._meetings import recorded_encounters
 
         pairs = self.arrays("SELECT trace_id, trace, src, dst, kind FROM encounters ORDER BY ALL")
-        return Rows(*recorded_encounters(pairs, self.meetings(), measures))
+        return Rows(*recorded_encounters(pairs, self.meetings(measures), measures))
 
     def road_map_text(self, trace: int | str) -> tuple[str, str] | None:
         """Return name and OpenDRIVE text of a trace's road map, or ``None`` without such a text."""

@@ -40,7 +40,7 @@ _PART: Final = f"k.kind NOT IN {FIXED_KINDS} AND (abs(k.node_id) % $3 = $4 OR k.
 _PLACE: Final = """radians(degrees({0}.heading)) AS heading,
   {0}.length::DOUBLE AS length, {0}.width::DOUBLE AS width"""
 _MOVING: Final = f"""
-SELECT frame_id, node_id, x, y, heading, length, width, vx, vy, ax, ay FROM {{scope}}state k
+SELECT frame_id, node_id, x, y, heading, length, width{{motion}} FROM {{scope}}state k
 WHERE frame_id BETWEEN $1 AND $2 AND {_PART}
 """
 _STANDING: Final = f"""
@@ -183,8 +183,8 @@ def _egos(reader: DuckDBPyConnection) -> dict[int, list[int]]:
     return egos
 
 
-def meetings(reader: DuckDBPyConnection) -> Iterator[Meetings]:
-    """Yield the encounters of the egos and all other known objects, for windows of traces."""
+def meetings(reader: DuckDBPyConnection, measures: Sequence[str]) -> Iterator[Meetings]:
+    """Yield the encounters of the egos and all other known objects, for windows of traces and some measures."""
     egos, traces = _egos(reader), reader.execute(_TRACES).fetchnumpy()
     window = np.cumsum(traces["states"]) // MOST_STATES
     for rows in np.split(np.arange(len(window)), np.flatnonzero(np.diff(window)) + 1):
@@ -192,7 +192,7 @@ def meetings(reader: DuckDBPyConnection) -> Iterator[Meetings]:
         some = [one for one in part["trace_id"].tolist() if one in egos]
         for turn in range(max((len(egos[one]) for one in some), default=0)):
             sources = {one: egos[one][turn] for one in some if turn < len(egos[one])}
-            yield from _meetings(reader, "known_", part, sources)
+            yield from _meetings(reader, "known_", part, sources, measures=measures)
 
 
 def _meetings(
@@ -201,6 +201,7 @@ def _meetings(
     traces: _Traces,
     sources: Mapping[int, int],
     cache: BoundedCache[_States] | None = None,
+    measures: Sequence[str] = (*Meetings.of_motion,),
 ) -> Iterator[Meetings]:
     """Yield the encounters of one object of each trace, in one or more parts of the other objects."""
     ids = traces["trace_id"]
@@ -208,15 +209,16 @@ def _meetings(
     ends = [int(ids[0]) << SEQ_BITS, ((int(ids[-1]) + 1) << SEQ_BITS) - 1]
     found = reader.execute(_TIMES, ends).fetchnumpy()
     times = found["frame_id"].astype(np.int64), found["t"].astype(np.float64)
+    motion = "" if Meetings.of_motion.isdisjoint(measures) else ", vx, vy, ax, ay"
+    sql = [one.format(scope=scope, motion=motion) for one in (_MOVING, _STANDING)]
     wanted = np.array(list(sources))
-    if here := len(sources) == len(ids):
-        wanted = ids
+    here = len(sources) == len(ids)
     for part in range(parts):
         key = scope, *sources
         read = None if cache is None else cache.get(key)
         if read is None:
             limits = [*ends, parts, part, next(iter(sources.values()))]
-            read = _read(reader, scope, traces, limits)
+            read = _read(reader, sql, traces, limits)
             if cache is not None and parts == len(sources) == 1:
                 cache.keep(key, read, read[3].nbytes + 3 * read[0].nbytes)
         *rows, states = read
@@ -227,22 +229,20 @@ def _meetings(
 
 
 def _read(
-    reader: DuckDBPyConnection, scope: str, traces: _Traces, limits: Sequence[int]
+    reader: DuckDBPyConnection, sql: Sequence[str], traces: _Traces, limits: Sequence[int]
 ) -> _States:
     """Return frame, node id and place in the states of all objects in some traces, and these states."""
-    moving, standing = (
-        reader.execute(sql.format(scope=scope), limits).fetchnumpy() for sql in (_MOVING, _STANDING)
-    )
+    moving, standing = (reader.execute(one, limits).fetchnumpy() for one in sql)
     frames, nodes = (
         np.ma.getdata(moving[name]).astype(np.int64) for name in ("frame_id", "node_id")
     )
     many = len(frames)
-    states = np.zeros((many + len(standing["mask"]), 10))
+    states = np.zeros((10, many + len(standing["mask"]))).T  # columns are read more often than rows
     for i, name in enumerate(COLUMNS):
-        if name in moving:
-            states[:many, i] = np.ma.filled(moving[name].astype(np.float64), np.nan)
-        if name in standing:
-            states[many:, i] = np.ma.filled(standing[name].astype(np.float64), np.nan)
+        for part, read in ((states[:many, i], moving), (states[many:, i], standing)):
+            if name in read:
+                part[:] = np.ma.getdata(read[name])
+                part[np.ma.getmask(read[name])] = np.nan
     states[many:, 8:] = np.nan  # without a known acceleration
     of = traces["trace_id"].searchsorted(trace_of(frames))
     states[:many, 0] += traces["origin_x"][of]

@@ -58,11 +58,9 @@ class HeadwaySearch(AreaSearch):
         ends = np.append(of.states, len(when))[1:] - 1
         self._begin, self._end = when[of.states], when[ends]
         # States by object and time, and the last state up to each that has both objects.
-        object_of = np.repeat(np.arange(len(of.objects)), np.diff(of.begins))
-        self._object, self._ends = object_of, ends
-        lengths = ends + 1 - of.states
-        self._keys = np.repeat(object_of, lengths) * len(times) + when
-        self._when = when
+        self._object = np.repeat(np.arange(len(of.objects)), np.diff(of.begins))
+        self._keys = np.repeat(self._object, ends + 1 - of.states) * len(times) + when
+        self._when, self._ends = when, ends
         self._last_both = np.maximum.accumulate(np.where(both, np.arange(len(when)), -1))
 
     def _near(self, level: int, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:

@@ -9,7 +9,7 @@ exact number is needed.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
@@ -55,7 +55,11 @@ class Meetings:
         Pair of each row, its frame, and the place of the frame in the order of time.
     a, b : (R,) int64
         State of the object of the trace, and of the other one.
+    of_motion : frozenset of str
+        Measures that need velocities and accelerations.
     """
+
+    of_motion: ClassVar = frozenset({"tet", "tit", "cpi"})
 
     def __init__(
         self,
@@ -212,7 +216,8 @@ class Meetings:
         """Footprints of the objects of near pairs, and the two objects of each of these pairs."""
         pairs, rows = self._near
         code, _, place, _ = self._tracks
-        found = Footprints(code[rows], self._states[place[rows]][:, FOOTPRINT].T)
+        boxes = [self._states[:, column][place[rows]] for column in FOOTPRINT]
+        found = Footprints(code[rows], np.stack(boxes))
         others, sources = (found.objects.searchsorted(one[pairs]) for one in self._objects)
         return found, sources, others
 
@@ -253,14 +258,6 @@ def _ttc_recorded(of: Meetings) -> Floats:
     return of.least(met, of.times[of.when[met]]) - of.first
 
 
-def _dce_recorded(of: Meetings) -> Floats:
-    return of.closest[0]
-
-
-def _ttce_recorded(of: Meetings) -> Floats:
-    return of.closest[1] - of.first
-
-
 def _summed(of: Meetings, power: int) -> Floats:
     pair, begins, ttc, step = of.exposed
     found = np.zeros(len(of))
@@ -289,8 +286,8 @@ def _cpi(of: Meetings) -> Floats:
 _OF_ROWS: Final[dict[str, Callable[[Meetings], Floats]]] = {
     "ttc_recorded": _ttc_recorded,
     "headway_recorded": Meetings.headways,
-    "dce_recorded": _dce_recorded,
-    "ttce_recorded": _ttce_recorded,
+    "dce_recorded": lambda of: of.closest[0],
+    "ttce_recorded": lambda of: of.closest[1] - of.first,
     "tet": lambda of: _summed(of, 0),
     "tit": lambda of: _summed(of, 1),
     "cpi": _cpi,

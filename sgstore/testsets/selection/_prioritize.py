@@ -483,7 +483,7 @@ def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, Wor
     if not measures:
         return {}
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
-    for met in units.chosen.one_store.file.meetings():
+    for met in units.chosen.one_store.file.meetings(measures):
         rows = np.minimum(np.searchsorted(units.frame_id, met.frame_id), len(units.frame_id) - 1)
         here = (units.frame_id[rows] == met.frame_id) & units.asked[rows]
         rows, pair = rows[here], met.pair[here]
