@@ -28,7 +28,7 @@ from sgstore.collection import _worker as worker
 from sgstore.collection._engines import engine_named, fault_of_question
 from sgstore.collection._pack import refuse_others
 from sgstore.collection._storage import place_at
-from sgstore.errors import QueryError, SqlError, StoreError
+from sgstore.errors import QueryError, SqlError, StoreError, one_store_needed
 from sgstore.lang.bind import CLASSES_GIVEN
 from sgstore.lang.catalog import TableFacts, Type
 from sgstore.lang.sql import (
@@ -73,6 +73,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats, Ints
     from sgstore.store import CodedClasses
     from sgstore.temporal import Verdict
+    from sgstore.temporal.truth_lanes import TruthLanes
 
     Parameters = Sequence[Any] | Mapping[str, Any]
     Words = Mapping[str, Sequence[str]]
@@ -623,6 +624,14 @@ class CollectionMatches(TemporalMatches):
         """Return the data that settings excluded from the queried traces, as JSON values."""
         chosen = (trace.trace_id for trace in self._ready.chosen)
         return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
+
+    def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
+        """Raise an error: bindings are read from one store."""
+        raise one_store_needed(self._whole.place.url, "bindings are read from one store")
+
+    def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
+        """Raise an error: parts of a pattern are read from one store."""
+        raise one_store_needed(self._whole.place.url, "parts of a pattern are read from one store")
 
     def numpy(self) -> dict[str, Any]:
         """Return all columns of the matches as arrays; NULL values are masked."""
