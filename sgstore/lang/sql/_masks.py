@@ -484,7 +484,8 @@ def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
     lasting = any(possible(edge, *ends, sql.catalog.map_edges))
     alias = quoted(alias_of(edge))
     ends = {edge.src: f'{alias}."src"', edge.dst: f'{alias}."dst"'}
-    base.edges[edge.key] = f'{alias}."relation"'
+    if edge.high == 1:
+        base.edges[edge.key] = f'{alias}."relation"'
     if edge.src == edge.dst:
         base.select.where.append(f'{alias}."src" = {alias}."dst"')
     if edge.high > 1 and (ways := _ways(sql, scope, edge)):
