@@ -223,7 +223,8 @@ def _meetings(
                 cache.keep(key, read, read[3].nbytes + 3 * read[0].nbytes)
         *rows, states = read
         if not here:
-            times = tuple(one[np.isin(trace_of(times[0]), wanted)] for one in times)
+            of_wanted = np.isin(trace_of(times[0]), wanted)
+            times = times[0][of_wanted], times[1][of_wanted]
             rows = [one[np.isin(trace_of(rows[0]), wanted)] for one in rows]
         yield Meetings(*rows, states, sources, times)
 

@@ -31,6 +31,16 @@ _MARGIN: Final = 1e-6
 _TOGETHER: Final = 1 << 14
 """Pairs whose exact numbers are computed together."""
 _SEQ: Final = (1 << SEQ_BITS) - 1
+_DENSE: Final = 1 << 16
+"""Range of node ids up to which a table has a place for each."""
+
+
+def _numbered(ids: Ints) -> tuple[Ints, Ints]:
+    """Return ascending ids with all of the given ones, and the place of each given id among them."""
+    low = int(ids.min())
+    if int(ids.max()) - low < _DENSE:
+        return np.arange(low, int(ids.max()) + 1), ids - low
+    return np.unique(ids, return_inverse=True)
 
 
 class Meetings:
@@ -83,23 +93,23 @@ class Meetings:
         own = nodes == egos[rank]
         of_frame = np.full(len(self.times), -1)
         of_frame[when[own]] = place[own]
-        low = int(min(nodes.min(initial=0), egos.min()))
-        width = int(max(nodes.max(initial=0), egos.max())) + 1 - low
-        code = rank * width + nodes - low
+        ids, number = _numbered(np.append(nodes, egos))
+        width = len(ids)
+        code = rank * width + number[: len(nodes)]
         there = np.zeros(len(traces) * width, np.bool_)
         there[code[~own]] = True
         there &= np.repeat(np.bincount(rank[own], minlength=len(traces)) > 0, width)
         others = np.flatnonzero(there)
         ranks, place_of = np.divmod(others, width)
-        self.nodes: Ints = place_of + low
+        self.nodes: Ints = ids[place_of]
         self.traces: Ints = traces[ranks]
         self.sources: Ints = egos[ranks]
-        self._objects = others, ranks * width + self.sources - low
+        self._objects = others, ranks * width + number[len(nodes) :][ranks]
         self._tracks = code, when, place, of_frame[when] >= 0
-        number = np.cumsum(there) - 1
+        of_code = np.cumsum(there) - 1
         a = of_frame[when]
         rows = np.flatnonzero((a >= 0) & ~own)
-        self.pair: Ints = number[code[rows]]
+        self.pair: Ints = of_code[code[rows]]
         self.when: Ints = when[rows]
         self.frame_id: Ints = frames[rows]
         self.a: Ints = a[rows]
@@ -122,7 +132,7 @@ class Meetings:
     @cached_property
     def known(self) -> Bools:
         """Mask of the rows with known positions and sizes of both objects, (R,)."""
-        known = ~np.isnan(self._states[:, FOOTPRINT]).any(axis=1)
+        known: Bools = np.logical_and.reduce(~np.isnan(self._states[:, FOOTPRINT]), axis=1)
         return known[self.a] & known[self.b]
 
     @cached_property
