@@ -198,8 +198,10 @@ def _lacking(
     found: dict[str, frozenset[str]] = {}
     parts: list[str] = []
     for name in _STATED:
-        columns = NODE_ATTRIBUTES[name].columns
-        found[name] = frozenset().union(*(of for home, of in held.items() if home not in columns))
+        columns, kinds = NODE_ATTRIBUTES[name].columns, NODE_ATTRIBUTES[name].kinds
+        found[name] = frozenset().union(
+            *(of - kinds if home in columns else of for home, of in held.items())
+        )
         parts += [
             f"SELECT DISTINCT {literal(name)} AS name, kind FROM {table} AS t WHERE {columns[home]} IS NULL"
             for home in _HOLDERS.keys() & columns.keys()

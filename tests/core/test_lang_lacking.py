@@ -81,6 +81,12 @@ def test_conditions_left_out_change_no_answer(
     assert len({verdict for *_, verdict, _ in ours[: len(CHECKS)]}) > 1
 
 
+@pytest.mark.parametrize("name", ["heading", "length", "width", "height", "speed", "vx"])
+def test_parts_of_the_map_lack_values_too(name: str, open_town: Store) -> None:
+    found = open_town.find(f"MATCH (n) WHERE n.{name} IS NULL RETURN COUNT(*)").rows()
+    assert found == open_town.sql(f"SELECT count(*) FROM nodes WHERE {name} IS NULL").values
+
+
 def test_the_catalog_names_the_kinds_that_lack_a_value(town_store: Path, tmp_path: Path) -> None:
     path = tmp_path / "town.sgstore"
     shutil.copy(town_store, path)
