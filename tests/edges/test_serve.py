@@ -24,6 +24,7 @@ from thorough import LONG
 import sgstore.apps.explorer
 from sgstore.apps.explorer import Explorer, application, serve
 from sgstore.query import Store
+from sgstore.store import StateColumns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -373,7 +374,7 @@ def test_a_trace_that_was_taken_out_meanwhile_has_no_map(
     def nobody(_: object) -> dict[str, Any]:
         return {}
 
-    monkeypatch.setattr(type(page.explorer.stores["a"].file), "places", nobody)
+    monkeypatch.setattr(StateColumns, "places", nobody)
     assert page.get("/api/map", trace="town").status_code == 404
 
 
