@@ -134,8 +134,9 @@ class Lock:
         return "".join(self._pieces())
 
     def _pieces(self) -> Iterator[str]:
-        head = {KEY: self.format, "made_with": self.made_with, "selection": self.selection}
-        yield _indented(head)[:-2]
+        about = {"made_with": dict(self.made_with), "selection": dict(self.selection)}
+        head = {KEY: self.format} | about
+        yield json.dumps(head, ensure_ascii=False, indent=2, sort_keys=True)[:-2]
         traces = (json.dumps(asdict(trace), ensure_ascii=False) for trace in self.traces)
         for name, lines in (("traces", traces), ("cases", map(_case_text, self.cases))):
             before = f',\n  "{name}": [\n    '
@@ -187,23 +188,6 @@ def _case_text(case: LockedCase) -> str:
         f' "split": {encode_basestring(case.split)}, "graph": {encode_basestring(case.graph)},'
         f' "payload": {payload}}}'
     )
-
-
-def _indented(value: Any, pad: str = "\n  ") -> str:
-    """Return JSON text, indented by two spaces and sorted by key. The json module is slow with long lists."""
-    if isinstance(value, str):
-        return encode_basestring(value)
-    if isinstance(value, dict) and value:
-        parts = [
-            f"{encode_basestring(key)}: {_indented(value[key], pad + '  ')}"
-            for key in sorted(value)
-        ]
-    elif isinstance(value, list | tuple) and value:
-        parts = [_indented(one, pad + "  ") for one in value]
-    else:
-        return json.dumps(value, ensure_ascii=False)
-    start, end = "{}" if isinstance(value, dict) else "[]"
-    return f"{start}{pad}{f',{pad}'.join(parts)}{pad[:-2]}{end}"
 
 
 def read_lock(path: str | Path) -> Lock:
