@@ -620,4 +620,6 @@ def _amount(size: int) -> str:
 
 def _shown(text: str) -> str:
     """Return a text with unprintable characters replaced, because they could control the terminal."""
+    if text.isprintable():  # nearly every cell of a long table
+        return text
     return "".join(c if c.isprintable() else "�" for c in text)
