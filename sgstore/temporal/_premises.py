@@ -97,8 +97,8 @@ def premises_of(
     check: BoundCheck, plan: CheckPlan, formula: Formula, asks: Mapping[str, Ask]
 ) -> Premises | None:
     """Return the premises of a check. ``None`` means that all entities in all traces need evaluation."""
-    known = any(q.word != "FORALL" for q in check.quantifiers) or check.gaps == "unknown"
-    if known or check.robustness:
+    for_all = all(quantifier.word == "FORALL" for quantifier in check.quantifiers)
+    if not for_all or check.gaps == "unknown" or check.robustness:
         return None
     found = _Ways(plan).ways(formula, value=False)
     return None if found == _ALWAYS else Premises(found, asks)
