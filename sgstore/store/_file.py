@@ -219,13 +219,16 @@ class StoreFile:
         ``plain``: the result has no enumerations. This saves one planning of the statement.
         """
         given = list(given)
-        key, kept = repr((sql, parameters, given)), self._answers
+        kept = self._answers
+        if not plain or not all(isinstance(one, tuple) for one in given):
+            kept = None
+        key = "" if kept is None else repr((sql, parameters, given))  # long with many ids
         if kept is not None and key in kept:
-            return kept[key]
+            return {**kept[key]}
         ask = partial(rows.arrays, sql=sql, parameters=parameters, plain=plain)
         with self.answered(lambda at, _: ask(at), sql, given) as found:
-            if kept is not None and plain and all(isinstance(one, tuple) for one in given):
-                kept[key] = found
+            if kept is not None:
+                kept[key] = {**found}  # callers take columns out
                 size = sum(one.nbytes for held in kept.values() for one in held.values())
                 while size > self.memory // 4:  # the oldest ones are dropped
                     size -= sum(one.nbytes for one in kept.pop(next(iter(kept))).values())
