@@ -98,6 +98,22 @@ def test_every_example_is_accepted(data: Path) -> None:
     assert len(statements) > 100
 
 
+@pytest.mark.parametrize(
+    ("other", "own"),
+    [
+        ("GLOBALLY[0s, 2s] e.x > 1", "ALWAYS[0s, 2s] e.x > 1"),
+        ("finally e.x > 1", "EVENTUALLY e.x > 1"),
+        ("NEVER[0s, 2s] e.x > 1", "ALWAYS[0s, 2s] NOT e.x > 1"),
+        ("e.x > 1 UNLESS[0s, 2s] e.y", "e.y RELEASE[0s, 2s] (e.x > 1 OR e.y)"),
+    ],
+)
+def test_operators_of_other_tools_are_synonyms(other: str, own: str) -> None:
+    def tree(text: str) -> str:
+        return tree_text(parse(f"CHECK c: {text}")[0])
+
+    assert tree(other) == tree(own)
+
+
 def test_keyword_is_a_name_at_other_places() -> None:
     (match,) = parse("match (limit:Car) where limit.frames > 3 return limit.match as match")
 

@@ -209,14 +209,25 @@ def rule_case(span: TextSpan, children: Children) -> s.Case:
     return s.Case(tuple(branches), otherwise, span)
 
 
+_SYNONYMS: Final = {"GLOBALLY": "ALWAYS", "FINALLY": "EVENTUALLY", "NEVER": "ALWAYS"}
+"""Temporal operators of other tools, with the operator of the language. NEVER also negates its operand."""
+
+
 def rule_temporal(span: TextSpan, children: Children) -> s.Temporal:
     word, bound, operand = children
-    return s.Temporal(word.text.upper(), (operand,), TextSpan(span.start, word.span.end), bound)
+    name, place = word.text.upper(), TextSpan(span.start, word.span.end)
+    if name == "NEVER":
+        operand = s.Logic("NOT", (operand,), place)
+    return s.Temporal(_SYNONYMS.get(name, name), (operand,), place, bound)
 
 
 def rule_temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
     left, word, bound, right = children
-    return s.Temporal(word.text.upper(), (left, right), word.span, bound)
+    name = word.text.upper()
+    if name == "UNLESS":  # weak until: the right operand releases the left one, and may replace it
+        left, right = right, s.Logic("OR", (left, right), word.span)
+        name = "RELEASE"
+    return s.Temporal(name, (left, right), word.span, bound)
 
 
 def rule_bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
