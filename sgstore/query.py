@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from sgstore.base.display import IN_NOTEBOOK
 from sgstore.errors import StoreError, place_named, url_named
+from sgstore.lang.library import require_sql, statement
 from sgstore.lang.sql import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.model.criticality import KNOWN
@@ -920,7 +921,8 @@ class Store:
         )
 
         with self.file.snapshot():
-            compiled = compile_query(text, self.catalog(), parameters)
+            text, values = statement(text, parameters)
+            compiled = compile_query(text, self.catalog(), values)
             ref = self.file.frame(_ref(frame))
             if ref.trace in compiled.left_out:
                 answers = self.file.trace(ref.trace_id).answers
@@ -1050,6 +1052,7 @@ def matches_of(
 
         pattern = query if isinstance(query, Pattern) else Pattern.of(query)
         query, parameters = str(pattern), {**pattern.parameters, **parameters}
+    query, parameters = statement(query, parameters)
     asked = union_parts(query, parameters)
     return (
         make(query, parameters) if asked is None else union(query, asked, asked.each(make, query))
@@ -1082,6 +1085,7 @@ class UserStatement:
     """
 
     def __init__(self, find: Callable[..., Matches], tables: Collection[str], text: str) -> None:
+        require_sql(text)
         self._sql, self._given = text, None
         self.reasons: dict[str, str] = {}
         self.notes: tuple[str, ...] = ()

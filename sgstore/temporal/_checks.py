@@ -17,6 +17,7 @@ import numpy as np
 from sgstore.base.display import IN_NOTEBOOK
 from sgstore.lang.bind import not_computed, of_check
 from sgstore.lang.help import compared_in_check
+from sgstore.lang.library import statement
 from sgstore.lang.sql import compile_checks, entities, relation, traces_of
 from sgstore.matches import Interval, notes_in
 from sgstore.model.frame_ids import trace_of
@@ -151,6 +152,7 @@ class CheckRun:
         status: bool = False,
     ) -> None:
         self._file, self._catalog = file, catalog
+        text, parameters = statement(text, parameters, check=True)
         self._text, self._parameters = text, parameters
         self._compat, self._status = sgsm_compat, status
         with file.snapshot():

@@ -18,6 +18,7 @@ from sgstore.errors import QueryError, TraceError
 from sgstore.graphs.online import GcPaused, replayed
 from sgstore.lang.bind import MOTION, bind_checks, bind_query, not_computed, of_check, of_query
 from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts
+from sgstore.lang.library import statement
 from sgstore.lang.memory import FrameView
 from sgstore.lang.sql import each_match, recorded_events
 from sgstore.lang.syntax import parse
@@ -589,6 +590,7 @@ def _bound(
     text: str, catalog: Catalog, parameters: Mapping[str, Any]
 ) -> tuple[list[BoundCheck], list[Query]]:
     """Return the checks and patterns of a query text, with resolved names."""
+    text, parameters = statement(text, parameters, check=True)
     statements = [*each_match(parse(text))]
     written = [one for one in statements if not isinstance(one, MatchClause)]
     named = {name for one in statements for name in _parameters(one)}

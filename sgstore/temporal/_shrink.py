@@ -17,6 +17,7 @@ import numpy as np
 from sgstore.errors import StoreError
 from sgstore.lang.bind import CheckInCatalog
 from sgstore.lang.ir import Tense, walk
+from sgstore.lang.library import statement
 from sgstore.lang.sql import CLOCK, Window, compile_checks, extents, union_parts
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import CheckClause
@@ -130,6 +131,7 @@ def shortest_clips(
         The clip does not exist.
     """
     with file.snapshot():
+        text, parameters = statement(text, parameters)
         span = None if clip is None else _span(file, clip)
         held = catalog()
         window = None if span is None else _of_trace(held, span[0].trace_id)

@@ -107,6 +107,64 @@ def test_a_file_that_is_no_store_is_told_so_whatever_its_name(
     assert "not a store; expected a file that 'sgstore ingest' made" in capsys.readouterr().err
 
 
-def test_a_query_in_place_of_a_file_is_seen(store: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["check", store, "CHECK a: ALWAYS ego.speed < 50"]) == 2
-    assert "this is a query, not the name of a file" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "answer"),
+    [
+        (["ls"], "write: sgstore info"),
+        (["query", "a"], "write: sgstore find"),
+        (["coverage", "a.sgstore"], "write: sgstore coverage COMMAND a.sgstore"),
+        (["lock", "a.sgstore"], "write: sgstore lock COMMAND a.sgstore"),
+        (["a.sgstore"], "write: sgstore info a.sgstore"),
+        (["a.mcap"], "write: sgstore doctor a.mcap"),
+        (["patterns", "cut_in"], "write: sgstore patterns show cut_in"),
+    ],
+)
+def test_unknown_command_gives_the_right_one(
+    arguments: list[str], answer: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments) == 2
+    assert answer in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("arguments", [["help"], ["help", "find"], ["-V"]])
+def test_usual_words_for_help_and_version(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments) == 0
+    assert "sgstore" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("verb", "text", "code", "answer"),
+    [
+        ("find", "cut_in", 0, ""),
+        ("find", "cut_inn", 2, "did you mean 'cut_in'?"),
+        ("find", "stopped", 2, "write it after WHERE"),
+        ("find", "r_g1_safe_distance", 2, "run it with check"),
+        ("find", "SELECT 1", 2, "run SQL with sgstore sql"),
+        ("find", "lost.sgql", 2, "No such file"),
+        ("sql", "MATCH (e:Ego)", 2, "use find"),
+        ("sql", "cut_in", 2, "use find"),
+        ("sql", "CHECK ALWAYS ego.speed < 5", 2, "use check"),
+        ("check", "ALWAYS ego.speed < 50", 0, "true"),
+        ("check", "CHECK a: NEVER ego.speed > 50", 0, "true"),
+        ("check", "cut_in", 2, "run it with find"),
+        ("check", "SELECT 1", 2, "run SQL with sgstore sql"),
+        ("check", "rss_distance", 0, "0 false"),
+    ],
+)
+def test_every_verb_reads_every_text_or_names_the_right_verb(
+    store: str, verb: str, text: str, code: int, answer: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run([verb, store, text]) == code
+    printed = capsys.readouterr()
+    assert answer in printed.out + printed.err
+
+
+def test_every_verb_reads_files(store: str, tmp_path: Path) -> None:
+    (tmp_path / "a.sgql").write_text("MATCH (e:Ego) LIMIT 1")
+    (tmp_path / "b").write_text("CHECK a: ALWAYS ego.speed < 50")
+    (tmp_path / "c.sql").write_text("SELECT count(*) FROM frames")
+
+    for verb, name in (("find", "a.sgql"), ("check", "b"), ("sql", "c.sql")):
+        assert run([verb, store, str(tmp_path / name)]) == 0

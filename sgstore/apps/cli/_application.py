@@ -44,7 +44,7 @@ app = Verbs(
 @app.callback(invoke_without_command=True)
 def sgstore(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    version: Annotated[bool, typer.Option("--version", "-V", help="Print the version.")] = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -132,6 +132,8 @@ def run(arguments: list[str]) -> int:
     int
         The exit code, as listed in :mod:`sgstore.apps.cli`.
     """
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
     try:
         code = _exit_code(arguments)
     except SgstoreError as error:

@@ -40,7 +40,7 @@ verbs = Verbs()
 @verbs.command(rich_help_panel=PANEL)
 def check(
     store: AskedPath,
-    files: Annotated[list[Path] | None, Argument()] = None,
+    checks: Annotated[list[str] | None, Argument()] = None,
     explain: bool = False,
     require: bool = False,
     junit: Path | None = None,
@@ -57,8 +57,8 @@ def check(
 
     Parameters
     ----------
-    files : [FILE…]
-        Files of CHECK statements; - reads stdin.
+    checks : [CHECK…]
+        Checks, their names in the library, or files; - reads stdin.
     explain
         Print the parsed checks and their SQL.
     require
@@ -74,7 +74,7 @@ def check(
     if library:
         every = [one.name for one in patterns().values() if one.is_check]
         statements = replace(statements, names=[*(statements.names or ()), *every])
-    asked, values = statements.asked(files)
+    asked, values = statements.asked(checks)
     text = joined([*chain.from_iterable(asked.values())])
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask) as opened:
@@ -135,6 +135,8 @@ def _reported(
         say(f"{one} is true, and an entity is absent in {frames} frame{'s' * (frames != 1)}")
     if junit is not None:
         write_junit(junit, kept)
+    if tally["false"] and not require and junit is None and ask.for_people:
+        say(f"exit code 0; --require makes it {NO_MATCH}")
     return NO_MATCH if require and tally["false"] else 0
 
 

@@ -39,7 +39,7 @@ verbs = Verbs()
 @verbs.command(rich_help_panel=PANEL)
 def monitor(
     trace: str,
-    files: Annotated[list[Path] | None, Argument()] = None,
+    checks: Annotated[list[str] | None, Argument()] = None,
     ego: str = "",
     duration: str | None = None,
     require: bool = False,
@@ -61,8 +61,8 @@ def monitor(
     ----------
     trace : TRACE
         A recording; or carla://HOST:PORT, until Ctrl-C.
-    files : [FILE…]
-        Files of CHECK and MATCH statements; - reads stdin.
+    checks : [CHECK…]
+        Checks and patterns, their names in the library, or files; - reads stdin.
     ego
         Ego: id, role or name; by default that of the recording.
     duration : TIME
@@ -80,7 +80,7 @@ def monitor(
     from sgstore.model.config import Config
     from sgstore.temporal import Monitor, opened
 
-    asked, values = statements.asked(files)
+    asked, values = statements.asked(checks)
     settings = reading.settings() or Config()
     write = _write_json if as_json else _write_text
     longest = seconds_of(duration, "--duration") if duration else None

@@ -14,7 +14,7 @@ tables : [NAME=]FILE
     Join a table of your own (Parquet, CSV, JSON): by frame_id, or by trace and seq, time_ns or t;
     repeatable.
 query : QUERY
-    A pattern: 'MATCH (e:Ego) …'.
+    A pattern: 'MATCH (e:Ego) …', the name of one in the library, or a file.
 file
     Read the query from a file; - reads stdin.
 budget
@@ -249,12 +249,62 @@ def _is_database(place: str | Path) -> bool:
 
 
 class Group(TyperGroup):
-    """Group of commands (such as ``sgstore coverage``) with examples at the end of its help."""
+    """Group of commands (such as ``sgstore coverage``) with examples at the end of its help.
+
+    The error of an unknown command shows the right command line.
+    """
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that the first argument names, and the arguments of the command."""
+        try:
+            return super().resolve_command(ctx, args)
+        except Exception as error:
+            instead = _command_instead(self, ctx, args)
+            if instead and hasattr(error, "message"):
+                vars(error)["message"] = f"No such command {args[0]!r}; write: {instead}"
+            raise
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help of a group of commands, followed by its examples."""
         super().format_help(ctx, formatter)
         _write_examples(ctx)
+
+
+_WORDS_OF_OTHERS: Final = {
+    "info": ("list", "ls", "traces", "stat", "describe"),
+    "find": ("query", "search", "match", "filter"),
+    "sql": ("select-sql", "duckdb", "run"),
+    "ingest": ("add", "load", "convert", "build", "create", "index", "init"),
+    "show": ("view", "plot", "draw", "render", "picture"),
+    "serve": ("explore", "explorer", "open", "ui", "web", "gui", "browse"),
+    "remove": ("rm", "delete", "drop"),
+    "export": ("clip", "clips", "cut", "extract"),
+    "check": ("test", "validate", "rules", "assert"),
+    "doctor": ("inspect", "lint", "diagnose"),
+    "prioritize": ("rank", "order", "sort"),
+    "criticality": ("metrics", "ttc"),
+    "config": ("settings", "presets", "parameters"),
+    "patterns list": ("library", "pattern", "scenarios"),
+}
+"""Command → its names in other tools."""
+
+
+def _command_instead(group: TyperGroup, ctx: Any, args: list[str]) -> str:
+    """Return the right command line for an unknown command; an empty text if no command is similar."""
+    word, path = args[0], ctx.command_path
+    place = _looks_like_store(word) or Path(word).suffix in {".mcap", ".osi", ".log"}
+    if path == "sgstore":
+        if place:
+            verb = "info" if _looks_like_store(word) else "doctor"
+            return f"sgstore {verb} {word}"
+        found = (verb for verb, words in _WORDS_OF_OTHERS.items() if word.lower() in words)
+        return next((f"sgstore {verb}" for verb in found), "")
+    if place:
+        names = ", ".join(name for name in group.commands if not group.commands[name].hidden)
+        return f"{path} COMMAND {word}, where COMMAND is one of {names}"
+    from sgstore.lang.library import patterns
+
+    return f"{path} show {word}" if "show" in group.commands and word in patterns() else ""
 
 
 def _says_one_thing(parameter: Any) -> bool:
@@ -569,8 +619,8 @@ class Statements:
     parameters: Parameters = None
     sgsm_compat: bool = False
 
-    def asked(self, files: Sequence[Path] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
-        """Return the statements by source (file, library, command line), and the values of their parameters.
+    def asked(self, given: Sequence[str] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
+        """Return the statements by source (arguments, library, options), and the values of their parameters.
 
         Returns
         -------
@@ -580,17 +630,20 @@ class Statements:
             Library patterns take the values of their own parameters; all others belong to the
             texts.
         """
-        from sgstore.lang.library import pattern_named
+        from sgstore.lang.library import pattern_named, patterns, statement
 
-        values, texts = parameters_of(self.parameters), self.texts or []
-        if not (files or self.names or texts):
-            raise typer.BadParameter("add a FILE, -p NAME or -e TEXT; they can be combined")
-        found = {one.name: one for one in map(pattern_named, self.names or ())}
+        values = parameters_of(self.parameters)
+        named = [one for one in given or () if one in patterns()]
+        texts = [*map(text_or_file, (one for one in given or () if one not in patterns()))]
+        texts = [statement(one, {}, check=True)[0] for one in (*texts, *(self.texts or ()))]
+        if not (named or self.names or texts):
+            raise typer.BadParameter("add a CHECK, a FILE or the NAME of a pattern")
+        found = {one.name: one for one in map(pattern_named, (*named, *(self.names or ())))}
         taken = {name for one in found.values() for name in one.parameters}
         rest = {name: value for name, value in values.items() if name not in taken}
-        if rest and not (files or texts):
+        if rest and not texts:
             found[next(iter(found))].written(**rest)  # raises an error with the known parameters
-        asked = {"pattern": [*map(text_of, files or ()), *texts]} if files or texts else {}
+        asked = {"pattern": texts} if texts else {}
         for name, one in found.items():
             own = {key: value for key, value in values.items() if key in one.parameters}
             asked[name] = [one.written(**own)]
@@ -687,7 +740,18 @@ def query_of(text: str | None, file: Path | None) -> str:
     """Return the text of a query, from an argument or from a file."""
     if (text is None) == (file is None):
         raise typer.BadParameter("add a query as an argument, or a file with -f FILE")
-    return text if text is not None else text_of(file or Path("-"))
+    return text_or_file(text) if text is not None else text_of(file or Path("-"))
+
+
+def text_or_file(argument: str) -> str:
+    """Return the text of a file if an argument is ``-`` or the name of a file, else the argument itself."""
+    path = Path(argument)
+    try:
+        found = path.is_file()
+    except (OSError, ValueError):  # a query is not a file name
+        found = False
+    named = path.suffix in {".sgql", ".sql", ".txt"} and not re.search(r"\s", argument)
+    return text_of(path) if found or named or argument == "-" else argument
 
 
 def asked_of(
@@ -696,10 +760,10 @@ def asked_of(
     """Return the text of a query (argument, file or library name), and the values of its parameters."""
     if sum(source is not None for source in (text, file, name)) != 1:
         raise typer.BadParameter("expected one of: a query, -f FILE, -p NAME")
-    if name is None:
-        return query_of(text, file), values
-    from sgstore.lang.library import pattern_named
+    from sgstore.lang.library import pattern_named, statement
 
+    if name is None:
+        return statement(query_of(text, file), values)
     return pattern_named(name).written(**values), {}
 
 
@@ -708,9 +772,7 @@ def text_of(file: Path) -> str:
     try:
         return sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        written = re.match(r"\s*(MATCH|CHECK|DEFINE|USING)\b", str(file))
-        hint = "; this is a query, not the name of a file" if written else ""
-        raise ConfigError(f"{file}: {getattr(error, 'strerror', None) or error}{hint}") from error
+        raise ConfigError(f"{file}: {getattr(error, 'strerror', None) or error}") from error
 
 
 def lines_of(file: Path) -> list[str]:

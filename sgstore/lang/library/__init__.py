@@ -2,6 +2,7 @@
 
 from sgstore.lang.library._entries import NamedPattern, entries, pattern_named, patterns, predicates
 from sgstore.lang.library._search import search
+from sgstore.lang.library._statements import require_sql, statement
 
 __all__ = [
     "NamedPattern",
@@ -9,5 +10,7 @@ __all__ = [
     "pattern_named",
     "patterns",
     "predicates",
+    "require_sql",
     "search",
+    "statement",
 ]
