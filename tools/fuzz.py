@@ -37,6 +37,7 @@ import carla_recordings
 import commonroad_scenarios
 import fuzz_texts
 import numpy as np
+import recorder_logs
 import recordings
 import sumo_recordings
 import zstandard
@@ -134,6 +135,9 @@ def sample(flavour: str) -> Sample:
     if flavour == ".xml":
         text = commonroad_scenarios.scenario(frames=FRAMES + 9).encode()
         return Sample([Channel("", "xml", "", "", b"")], [Message(0, 0, text)], flavour)
+    if flavour == ".log":
+        packets = [Message(0, 0, data) for data in recorder_logs.packets(FRAMES)]
+        return Sample([Channel("", "packet", "", "", b"")], packets, flavour)
     if flavour.startswith(".osi"):
         version = b"\x0a\x04\x08\x03\x10\x05"
         messages = [
@@ -174,8 +178,11 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "autoware": lambda path: autoware_recordings.drive(path, FRAMES),
     "commonroad": commonroad,
     "sumo": lambda path: sumo_recordings.as_mcap(path, sumo_recordings.drive(FRAMES)),
+    "carla_recorder": lambda path: recorder_logs.as_mcap(
+        path, recorder_logs.drive(path.with_suffix(".log"), FRAMES)
+    ),
 }
-FLAVOURS = [*WRITERS, ".osi", ".osi.zst", ".xml"]
+FLAVOURS = [*WRITERS, ".osi", ".osi.zst", ".xml", ".log"]
 """Flavours of recordings."""
 KINDS = [*FLAVOURS, *fuzz_texts.LAWS]
 """All that is hurt."""
@@ -493,7 +500,7 @@ def write(hurt: Sample, path: Path, draw: random.Random) -> None:
                 writer.add_message(ids[message.channel], at, message.data, at)
             writer.finish()
     else:
-        heads = hurt.ending != ".xml"
+        heads = hurt.ending.startswith(".osi")
         content = b"".join(
             (struct.pack("<I", len(m.data)) if heads else b"") + m.data for m in hurt.messages
         )

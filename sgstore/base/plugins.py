@@ -99,6 +99,7 @@ READERS: Final = Registry(
         foxglove="foxglove._trace:FoxgloveTrace",
         commonroad="commonroad._trace:CommonRoadTrace",
         sumo="sumo._trace:SumoTrace",
+        carla_recorder="carla._recorder:CarlaRecorderTrace",
     ),
     "flavour",
 )

@@ -18,7 +18,7 @@ from sgstore.errors import TraceError
 from sgstore.graphs.online import Frame, check_entities
 from sgstore.mcap import IDS, Findings, OutOfOrder, digest_of, read_and_digest
 from sgstore.model.vocabulary import KINDS, TypeMeaning
-from sgstore.model.world import POSE, Channel, MessageRefs, TraceInfo, TraceReport
+from sgstore.model.world import POSE, Channel, Event, MessageRefs, TraceInfo, TraceReport
 from sgstore.readers._blocks import (
     FIRST_STEPS,
     FrameRows,
@@ -793,6 +793,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         self._known: dict[str, tuple[int, Entity]] = {}
         self._late: dict[int, Entity] = {}  # Static entities that appeared after the first block.
         self._begun = self._has_ego = False
+        self._seq = -1
 
     def decode(self, run: Messages, row: int) -> FrameRows | None:
         """Return the frame of a message. A frame that is unreadable or contradictory is counted as lost."""
@@ -814,6 +815,9 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         if not self.is_inside(log_time):  # A clip contains it for its static entities.
             return None
         self._begun = True
+        self._seq += 1
+        for kind, ident, other in frame.events:
+            self.roster.happen(Event(kind, frame.time_ns, log_time, self._seq, ident, other))
         return self._rows(frame, log_time)
 
     def complete(self, frames: list[FrameRows]) -> list[FrameRows]:

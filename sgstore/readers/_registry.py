@@ -18,6 +18,9 @@ from sgstore.base.display import first_of
 from sgstore.errors import TraceError
 from sgstore.mcap import MAGIC, McapFile, messages_at, open_regular
 from sgstore.model.world import TraceReport
+from sgstore.readers.carla._recorder_file import ENDINGS as _LOG_ENDINGS
+from sgstore.readers.carla._recorder_file import CarlaRecorderFile, is_recorder_log
+from sgstore.readers.carla._recorder_file import read_messages as _read_recorder_messages
 from sgstore.readers.commonroad._file import ENDINGS as _SCENARIO_ENDINGS
 from sgstore.readers.commonroad._file import CommonRoadFile, is_scenario
 from sgstore.readers.commonroad._file import read_messages as _read_scenario_messages
@@ -37,13 +40,13 @@ if TYPE_CHECKING:
 
 
 ENDINGS: Final = (
-    *(".mcap", *_OSI_ENDINGS),
+    *(".mcap", *_OSI_ENDINGS, *_LOG_ENDINGS),
     *dict.fromkeys((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS)),  # Both have the suffix .xml.
 )
 """Suffixes of recordings, for the search in a folder; see :func:`is_recording`."""
 
 
-RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile
+RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile | CarlaRecorderFile
 """A file of messages in any format."""
 
 
@@ -83,8 +86,10 @@ def readers() -> Iterator[RecordingReader]:
 
 
 def is_recording(path: Path) -> bool:
-    """Return True if a file is a recording, by its suffix; XML files also by their first bytes."""
+    """Return True if a file is a recording, by its suffix; logs and XML files also by their first bytes."""
     name = path.name.lower()
+    if name.endswith(_LOG_ENDINGS):
+        return is_recorder_log(path)
     xml = name.endswith((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS))
     return name.endswith(ENDINGS) and (not xml or is_scenario(path) or is_fcd(path))
 
@@ -167,6 +172,8 @@ def _format_of(
         return CommonRoadFile, _read_scenario_messages
     if is_fcd(path):
         return SumoFile, _read_steps
+    if is_recorder_log(path):
+        return CarlaRecorderFile, _read_recorder_messages
     return (OsiFile, _read_osi_messages) if _is_single_channel(path) else (McapFile, messages_at)
 
 

@@ -43,6 +43,7 @@ _SCHEMAS: Final = {
     "commonroad.Map": MAP,
     "commonroad.Step": STATES,
     "sumo.Timestep": STATES,
+    "carla.RecorderFrame": STATES,
     **{
         f"{package}_{name}": rank
         for package in ("autoware", "autoware_auto")

@@ -18,6 +18,7 @@ import carla_recordings
 import commonroad_scenarios
 import numpy as np
 import pytest
+import recorder_logs
 import recordings
 import sumo_recordings
 from foxglove_scenes import SceneRecorder, cube
@@ -93,6 +94,9 @@ EXAMPLES = {
     "foxglove json": lambda path: scene(path, "json"),
     "commonroad": steps,
     "sumo": lambda path: sumo_recordings.as_mcap(path, sumo_recordings.drive(25)),
+    "carla_recorder": lambda path: recorder_logs.as_mcap(
+        path, recorder_logs.drive(path.with_suffix(".log"), hidden=0)
+    ),
 }
 NO_EGO = {"commonroad", "sumo"}
 """Flavours that tell nobody to be the ego."""
@@ -533,7 +537,7 @@ def test_a_flavour_that_cannot_be_loaded_is_named_only_where_it_is_needed(
 def test_what_nobody_reads_is_answered_with_the_flavours_there_are(tmp_path: Path) -> None:
     with pytest.raises(
         TraceError,
-        match=r"flavour known \(osi, carla, autoware, foxglove, commonroad, sumo\).*'world' \(toybox",
+        match=r"flavour known \(osi, carla, autoware, foxglove, commonroad, sumo, .*\).*'world' \(toybox",
     ):
         open_trace(toybox(tmp_path / "toys.mcap"))
 

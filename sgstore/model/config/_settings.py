@@ -339,7 +339,8 @@ class Config:
         the simulator's id, role or name of the ego; empty: that of the trace
     mapping : str
         mapping of the boxes of a Foxglove scene to kinds: a shipped mapping ('nuscenes2mcap') or
-        the path of a TOML file; empty: the shipped one that fits. Other recordings need none
+        the path of a TOML file; empty: the shipped one that fits. For logs of CARLA's recorder:
+        'carla_origins' (positions are origins of actors). Other recordings need none
     sees : bool
         whether visibility from the ego is computed; if not, it is unknown
     egos : tuple of str

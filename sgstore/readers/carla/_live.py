@@ -34,15 +34,20 @@ import numpy as np
 from sgstore.errors import ConfigError, MissingExtraError, TraceError
 from sgstore.graphs.online import Frame
 from sgstore.maps.opendrive import read_map
-from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, SIGNALS, VEHICLES, type_meanings
-from sgstore.readers.carla._signals import AtOnce, Light, light_state, shared_signals, signals_of
+from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, VEHICLES, type_meanings
+from sgstore.readers.carla._signals import (
+    AtOnce,
+    Light,
+    light_state,
+    shared_signals,
+    sign_at,
+    signals_of,
+)
 from sgstore.readers.carla._survey import EGO_ROLES, meaning_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from sgstore.maps.roads import RoadMap
     from sgstore.model.vocabulary import TypeMeaning
@@ -68,9 +73,6 @@ LIGHTS: Final = (
     (0x400, "light_special2"),
 )
 """Bit of ``VehicleLightState`` → light of a vehicle."""
-
-SAME_PLACE: Final = 1.0
-"""Maximum distance of a sign from its signal in the map; m."""
 
 TIMEOUT_S: Final = 10.0
 """Time limit for the answer of a server; s."""
@@ -279,7 +281,7 @@ class LiveWorld:
                 continue
             if str(actor.type_id) != TRAFFIC_LIGHT:
                 place = actor.get_transform().location
-                found[ident] = self._sign_at(place.x, -place.y)
+                found[ident] = sign_at(self.road_map, place.x, -place.y)
             elif (told := str(actor.get_opendrive_id())) in self._light_ids:
                 self._heads[ident] = told
             else:
@@ -303,20 +305,6 @@ class LiveWorld:
         nodes = self.road_map.nodes
         rows = np.flatnonzero(nodes.kind == KIND_CODE["traffic_light"]).tolist()
         return frozenset(nodes.name[row] for row in rows)
-
-    @cached_property
-    def _sign_rows(self) -> NDArray[np.intp]:
-        codes = [KIND_CODE[kind] for kind in SIGNALS if kind != "traffic_light"]
-        return np.flatnonzero(np.isin(self.road_map.nodes.kind, codes))
-
-    def _sign_at(self, x: float, y: float) -> str:
-        """Return the name of the map's traffic sign at a position; empty without a sign."""
-        nodes, rows = self.road_map.nodes, self._sign_rows
-        if not len(rows):
-            return ""
-        apart = np.hypot(nodes.x[rows] - x, nodes.y[rows] - y)
-        nearest = int(np.argmin(apart))
-        return nodes.name[rows[nearest]] if apart[nearest] <= SAME_PLACE else ""
 
     def _add_scenery(self, frame: Frame) -> None:
         """Add the objects of the CARLA level to a frame: static ones once, vehicles and people always."""
@@ -347,7 +335,7 @@ class LiveWorld:
                 "type_name": label,
             }
             if kind == "sign":
-                more["map_ref"] = self._sign_at(*place[:2])
+                more["map_ref"] = sign_at(self.road_map, *place[:2])
             if kind in MOVING:
                 more |= dict.fromkeys(_STILL, 0.0)
             found.append((f"level:{thing.id}", kind, place, more))

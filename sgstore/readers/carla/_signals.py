@@ -28,7 +28,13 @@ import numpy as np
 from sgstore.base.display import first_of
 from sgstore.base.tables import components
 from sgstore.maps.roads import RoadMap
-from sgstore.model.vocabulary import KIND_CODE, LIGHT_STATE_CODE, RELATION_CODE, TypeMeaning
+from sgstore.model.vocabulary import (
+    KIND_CODE,
+    LIGHT_STATE_CODE,
+    RELATION_CODE,
+    SIGNALS,
+    TypeMeaning,
+)
 from sgstore.model.world import POSE
 from sgstore.readers._blocks import FAR, NAN
 from sgstore.readers._ros2 import ident_of, number, records
@@ -60,6 +66,9 @@ LEARNT_FROM: Final = 3
 """Minimum number of lights for a learned offset."""
 LEARNT_WITHIN: Final = 5.0
 """Maximum distance of these lights from their signals; m."""
+
+SAME_PLACE: Final = 1.0
+"""Maximum distance of a sign from its signal in the map; m."""
 
 MOST_NAMED: Final = 5
 """Maximum number of lights or lanes in a warning."""
@@ -125,6 +134,18 @@ def signals_of(
     left = np.delete(free, list(matched.values()))
     others = {ident: lights[ident] for ident in idents if ident not in found}
     return found | _by_boxes(others, road_map, left.tolist())
+
+
+def sign_at(road_map: RoadMap, x: float, y: float) -> str:
+    """Return the name of the map's traffic sign at a position; empty without a sign."""
+    nodes = road_map.nodes
+    codes = [KIND_CODE[kind] for kind in SIGNALS if kind != "traffic_light"]
+    rows = np.flatnonzero(np.isin(nodes.kind, codes))
+    if not len(rows):
+        return ""
+    apart = np.hypot(nodes.x[rows] - x, nodes.y[rows] - y)
+    nearest = int(np.argmin(apart))
+    return nodes.name[rows[nearest]] if apart[nearest] <= SAME_PLACE else ""
 
 
 class _Rule(NamedTuple):
