@@ -395,7 +395,7 @@ COMMENT ON VIEW main.lane_gaps IS 'How far it is along the lanes: one row for ea
 -- writes the SELECT of this view, with a column for each of them, and what its comment says of them.
 CREATE VIEW main.pairs AS {{pairs}};
 
-COMMENT ON VIEW main.pairs IS 'One row for each ordered pair of entities that move, in the same frame, however far apart; a is src, b is dst. {{numbers of pairs}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
+COMMENT ON VIEW main.pairs IS 'One row for each ordered pair of entities that move or change (traffic lights change), in the same frame, however far apart; a is src, b is dst. Without lights: WHERE src_kind <> ''traffic_light'' AND dst_kind <> ''traffic_light''. {{numbers of pairs}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
 
 -- As many columns again, whose statement takes the database some time to read.
 CREATE VIEW main.criticality AS {{criticality}};
@@ -436,11 +436,11 @@ COMMENT ON VIEW main.world_lane_states IS 'The columns of lane_states, and how e
 
 CREATE VIEW main.world_pairs AS {{world_pairs}};
 
-COMMENT ON VIEW main.world_pairs IS 'The columns of pairs, for each ordered pair of entities that move, in the same frame, as world_nodes has them: beyond the graphs, too.';
+COMMENT ON VIEW main.world_pairs IS 'The columns of pairs, for each ordered pair of entities that move or change, in the same frame, as world_nodes has them: beyond the graphs, too.';
 
 CREATE VIEW main.world_criticality AS {{world_criticality}};
 
-COMMENT ON VIEW main.world_criticality IS 'The columns of criticality, for each ordered pair of entities that move, in the same frame, as world_nodes has them: beyond the graphs, too.';
+COMMENT ON VIEW main.world_criticality IS 'The columns of criticality, for each ordered pair of entities that move or change, in the same frame, as world_nodes has them: beyond the graphs, too.';
 
 CREATE VIEW main.world_lane_dists AS {{world_lane_dists}};
 
@@ -497,7 +497,7 @@ CREATE VIEW main.attributes AS
 SELECT frame_id, node_id, attribute AS name, json_extract_string(value, '$') AS text, value
 FROM inside.attribute WHERE relation IS NULL;
 
-COMMENT ON VIEW main.attributes IS 'Attributes of a client''s own: one row for each of a node in a frame that was imported as a graph and for which nodes has no column. name: as in the file; text: its value as text; value: as JSON.';
+COMMENT ON VIEW main.attributes IS 'Attributes without a column in nodes: one row for each of a node in a frame. They come from imported graphs, and from recordings: control_… (commanded control inputs of a vehicle; steer, throttle, … in nodes are the applied ones), manual_gear, ang_vel_x and ang_vel_y (about the axes of the map, degrees/s). name: as in the file; text: its value as text; value: as JSON.';
 
 CREATE VIEW main.edge_attributes AS
 SELECT frame_id, node_id AS src, relation, dst, attribute AS name, json_extract_string(value, '$') AS text, value

@@ -15,7 +15,7 @@ from sgstore.exporters import Recorder
 from sgstore.readers import LiveWorld, Sensors
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Sequence
+    from collections.abc import Callable, Generator, Mapping, Sequence
     from pathlib import Path
 
     from sgstore.exporters import Written
@@ -59,6 +59,7 @@ def record(  # noqa: PLR0913  as many options as a recording has
     step_s: float | None = None,
     scenery: bool = True,
     on_frame: Callable[[int, float], None] | None = None,
+    commands: Callable[[], Mapping[str, float | bool | str]] | None = None,
 ) -> Recorded:
     """Record a running CARLA world into an MCAP file.
 
@@ -82,6 +83,9 @@ def record(  # noqa: PLR0913  as many options as a recording has
     on_frame : function, optional
         Called after each frame with the number of recorded frames and the recorded simulation time
         (s).
+    commands : function, optional
+        Called before each frame; returns the commanded control inputs of the ego by name, which are
+        recorded beside the applied ones (``control_steer``).
 
     Raises
     ------
@@ -99,7 +103,7 @@ def record(  # noqa: PLR0913  as many options as a recording has
         recorder = stack.enter_context(
             Recorder(to, map_text=live.map_text, map_name=live.map_name, sensors=blueprints)
         )
-        run = _FrameWriter(live, recorder, on_frame)
+        run = _FrameWriter(live, recorder, on_frame, commands)
         snapshots = stack.enter_context(closing(_snapshots(world, step_s)))
         try:
             for snapshot in snapshots:
@@ -126,13 +130,18 @@ class _FrameWriter:
     """Writer of CARLA frames and of the sensor data for each frame, into an MCAP file."""
 
     def __init__(
-        self, live: LiveWorld, recorder: Recorder, on_frame: Callable[[int, float], None] | None
+        self,
+        live: LiveWorld,
+        recorder: Recorder,
+        on_frame: Callable[[int, float], None] | None,
+        commands: Callable[[], Mapping[str, float | bool | str]] | None,
     ) -> None:
         self.ego = ""
         self.seconds = 0.0
         self._live = live
         self._recorder = recorder
         self._on_frame = on_frame
+        self._commands = commands
         self._frames = 0
         self._start_ns = 0
         self._without_ego = 0
@@ -140,6 +149,8 @@ class _FrameWriter:
         self._tick: int | None = None
 
     def take(self, snapshot: Any) -> None:
+        if self._commands is not None:
+            self._live.commands = dict(self._commands())
         frame = self._live.frame(snapshot)
         self._recorder.frame(frame)
         if not self._frames:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
@@ -10,6 +11,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from sgstore.graphs.online import NUMBERS
 from sgstore.model.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS, VEHICLES
+from sgstore.model.world import ATTRIBUTE
 from sgstore.readers import add_fields, descriptors
 
 if TYPE_CHECKING:
@@ -17,7 +19,8 @@ if TYPE_CHECKING:
 
 # The format is a sensor view, not a plain ground truth, because only a sensor view has the pedals
 # of the host vehicle. Values without an OSI field are not written: the steering input, the hand
-# brake, taxis and electric vehicles as special kinds, custom subkinds. Static objects are written
+# brake, taxis and electric vehicles as special kinds, custom subkinds. Attributes without a column
+# are references of sgstore's own type. Static objects are written
 # once, on first appearance, as several producers do. A traffic light is three bulbs, each on or
 # off, linked to the map's signal by its id. OSI's ids are numbers: a numeric id is kept, another id
 # gets a new number and is written as the object's name. Source: open-simulation-interface 3.8.0;
@@ -184,6 +187,9 @@ class OsiFrames:
         if str(number) != entity.ident:
             own = thing.source_reference.add(type="net.sgstore")
             own.identifier.append(f"entity_name:{entity.ident}")
+        for name, value in (entity.own or {}).items():
+            own = thing.source_reference.add(type="net.sgstore")
+            own.identifier.append(f"{ATTRIBUTE}{name}={json.dumps(value)}")
         if entity.map_ref:
             key = "traffic_sign_id" if hasattr(thing, "main_sign") else "object_id"
             thing.source_reference.add(type=OPENDRIVE).identifier.append(f"{key}:{entity.map_ref}")

@@ -20,6 +20,7 @@ from sgstore.base.tables import chained
 from sgstore.model.graph import Edges, LaneDistances, StaticPresence
 from sgstore.model.scene_columns import MapRecords, SceneColumns, edge_attributes
 from sgstore.model.vocabulary import (
+    CONTROL,
     ENTITY_KINDS,
     EVENT_KINDS,
     KIND_CODE,
@@ -48,7 +49,9 @@ from sgstore.model.world import (
     nearest_frames,
     number,
     origin_of,
+    own_column,
     quantize,
+    valid_attributes,
     without_implausible,
 )
 
@@ -85,6 +88,7 @@ class Entity(NamedTuple):
     numbers: tuple[float, ...]
     whole: tuple[int, ...]
     trailer: str = ""
+    own: Mapping[str, Any] | None = None
 
     @property
     def constants(self) -> tuple[int, str, str]:
@@ -223,6 +227,10 @@ class Frame:
         brake: float = _NAN,
         gear: float | None = None,
         hand_brake: bool | None = None,
+        manual_gear: bool | None = None,
+        ang_vel_x: float = _NAN,
+        ang_vel_y: float = _NAN,
+        control: Mapping[str, float | bool | str] | None = None,
         special: str = "",
         subkind: str = "",
         type_name: str = "",
@@ -259,6 +267,13 @@ class Frame:
             1, 2, …; 0: neutral; below 0: backwards.
         hand_brake : bool, optional
             True if the hand brake is on.
+        manual_gear : bool, optional
+            True if the driver, not the vehicle, chooses the gear.
+        ang_vel_x, ang_vel_y : float
+            Angular velocity about the map's x and y axes; degrees/s. The one about z is ``yaw_rate``.
+        control : mapping, optional
+            Commanded control inputs by name, beside the applied ones: ``{"steer": 0.2, "target_speed": 8}``.
+            A query uses them as ``control_steer`` and ``control_target_speed``.
         special, subkind, type_name : str
             Special kind, subkind, the simulator's own type name; see :class:`sgstore.model.world.Entities`.
         static : bool
@@ -292,6 +307,8 @@ class Frame:
         pose = self._plausible(str(ident), (*pose, length, width, height))
         gears = _NAN if gear is None else gear, _NAN if hand_brake is None else float(hand_brake)
         numbers = (*pose, steer, throttle, brake, *gears)
+        own: dict[str, Any] = {f"{CONTROL}{name}": value for name, value in (control or {}).items()}
+        own |= {"manual_gear": manual_gear, "ang_vel_x": ang_vel_x, "ang_vel_y": ang_vel_y}
         self.entities.append(
             Entity(
                 ident=str(ident),
@@ -304,6 +321,7 @@ class Frame:
                 numbers=tuple(map(_inside, NUMBERS, numbers)),
                 whole=(_mask_of(lights), _light_code(light_state), 0),
                 trailer=str(trailer),
+                own=valid_attributes(own) or None,
             )
         )
 
@@ -435,9 +453,14 @@ class Replay:
                 numbers=tuple(values),
                 whole=tuple(codes),
                 trailer=self._trailers[node],
+                own=own,
             )
-            for node, values, codes in zip(
-                states.node[start:stop].tolist(), numbers.tolist(), whole.tolist(), strict=True
+            for node, values, codes, own in zip(
+                states.node[start:stop].tolist(),
+                numbers.tolist(),
+                whole.tolist(),
+                states.own[start:stop].tolist(),
+                strict=True,
             )
         ]
 
@@ -608,9 +631,12 @@ def _moving(states: States) -> list[Attributes]:
     whole = [states.lights, states.light_state, states.derived, states.gear, states.hand_brake]
     codes = zip(*(column.tolist() for column in whole), strict=True)
     return [
-        {name: value for name, value, told in zip(names, row, is_known, strict=True) if told}
+        (own or {})
+        | {name: value for name, value, told in zip(names, row, is_known, strict=True) if told}
         | _coded(*whole)
-        for row, is_known, whole in zip(table.tolist(), known, codes, strict=True)
+        for row, is_known, whole, own in zip(
+            table.tolist(), known, codes, states.own.tolist(), strict=True
+        )
     ]
 
 
@@ -872,6 +898,7 @@ class Stepper:
             lights=lights,
             light_state=light_state.astype(np.int8),
             derived=derived,
+            own=own_column([e.own for e in of]),
             **{name: numbers[:, i] for i, name in enumerate(NUMBERS)},
         )
 

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.model.criticality import RECORDED
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS, UNEVEN
 from sgstore.model.vocabulary import (
+    CONTROL,
     KINDS,
     LIGHT_STATES,
     MAP_KINDS,
@@ -430,6 +431,17 @@ def own_attribute(name: str, kind: Type) -> Attribute:
     whole = kind is Type.whole
     kind = Type.number if whole else kind
     return Attribute(name, kind, {}, "of a client's own", DisplayUnit.own, whole=whole)
+
+
+RECORDED_OWN: Final[Mapping[str, Type]] = {
+    **dict.fromkeys(("ang_vel_x", "ang_vel_y"), Type.number),
+    **dict.fromkeys(
+        (f"{CONTROL}{name}" for name in ("steer", "throttle", "brake", "gear")), Type.number
+    ),
+    **dict.fromkeys((f"{CONTROL}{name}" for name in ("hand_brake", "reverse")), Type.boolean),
+    **dict.fromkeys(("manual_gear", f"{CONTROL}manual_gear"), Type.boolean),
+}
+"""Attributes without a column that recordings usually have. They are valid in every store."""
 
 
 def own_type(types: Collection[Type]) -> Type:

@@ -136,6 +136,9 @@ LIGHT_STATES: Final[Sequence[str]] = _light_states
 SPECIALS: Final = ("emergency", "taxi", "electric", "public_transport", "service")
 """Special roles of an entity: CARLASGG's ``special_type`` and OSI's vehicle roles."""
 
+CONTROL: Final = "control_"
+"""Prefix of commanded control inputs: ``control_steer`` beside the applied ``steer``."""
+
 VEHICLE_LIGHTS: Final = (
     *("light_left", "light_right", "light_brake", "light_reverse", "light_position"),
     *("light_low_beam", "light_high_beam", "light_fog", "light_interior"),

@@ -21,7 +21,7 @@ from sgstore.base.tables import taken
 from sgstore.mcap import Findings, Loss
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
     from typing import Any
 
@@ -46,6 +46,16 @@ TOLERANCE_NS: Final = 1_000
 
 TOLERANCE_SHARE: Final = 100
 """Time tolerance as a fraction of the median period: one part in this number."""
+
+
+LONGEST_NAME: Final = 200
+"""Maximum length of an attribute name; characters."""
+
+LONGEST_TEXT: Final = 10_000
+"""Maximum length of an attribute text; characters."""
+
+ATTRIBUTE: Final = "attribute:"
+"""Start of an OSI identifier with an attribute without an OSI field: ``attribute:control_steer=0.2``."""
 
 
 def seconds_of(ns: int) -> float:
@@ -74,6 +84,28 @@ def tolerance_ns(period_ns: int) -> int:
         Tolerance; ns. A hundredth of the period, at least a microsecond.
     """
     return max(TOLERANCE_NS, period_ns // TOLERANCE_SHARE)
+
+
+def own_column(values: Sequence[Mapping[str, Any] | None]) -> NDArray[np.object_]:
+    """Return the column :attr:`States.own` for attributes without a column, one mapping per row."""
+    column = np.full(len(values), None, object)
+    column[:] = values
+    return column
+
+
+def valid_attributes(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes that a store can hold: finite numbers, texts and truth values.
+
+    Names have 1 to :data:`LONGEST_NAME` characters, texts at most :data:`LONGEST_TEXT`.
+    """
+    return {
+        name: value
+        for name, value in values.items()
+        if 0 < len(name) <= LONGEST_NAME
+        and isinstance(value, (bool, int, float, str))
+        and not (isinstance(value, float) and not math.isfinite(value))
+        and not (isinstance(value, str) and len(value) > LONGEST_TEXT)
+    }
 
 
 def derivable_ns(period_ns: float) -> float:
@@ -426,6 +458,8 @@ class States:
         Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read.
     carrier : int64
         Node id of the carrier or towing vehicle; -1: none; :data:`UNTOLD`: not yet computed.
+    own : object
+        Attributes without a column, as a mapping (name → number, text or truth value), or ``None``.
     """
 
     node: Ints
@@ -454,6 +488,7 @@ class States:
     hand_brake: Floats
     derived: Ints
     carrier: Ints
+    own: NDArray[np.object_]
 
     def __post_init__(self) -> None:
         for column in fields(self):
@@ -480,6 +515,7 @@ class States:
             "light_state": np.full(n, -1, np.int8),
             "derived": np.zeros(n, np.int64),
             "carrier": np.full(n, UNTOLD),
+            "own": np.full(n, None, object),
         }
         return cls(
             **{

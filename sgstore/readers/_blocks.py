@@ -34,6 +34,8 @@ from sgstore.model.world import (
     States,
     derivable_ns,
     leaps,
+    own_column,
+    valid_attributes,
     without_implausible,
 )
 
@@ -92,6 +94,8 @@ class FrameRows:
         :data:`sgstore.model.world.INPUTS` of the ego; NaN for missing ones.
     driven : mapping
         Node id → the same inputs, of vehicles other than the ego.
+    own : mapping
+        Node id → its attributes without a column; see :attr:`sgstore.model.world.States.own`.
     kinds : mapping
         Node id → kind in this frame, for entities that were added with another kind.
     seconds : float
@@ -109,6 +113,7 @@ class FrameRows:
     light_state: Ints
     controls: tuple[float, ...] = NO_INPUTS
     driven: Mapping[int, tuple[float, ...]] = field(default_factory=dict[int, "tuple[float, ...]"])
+    own: Mapping[int, Mapping[str, Any]] = field(default_factory=dict[int, "Mapping[str, Any]"])
     kinds: Mapping[int, Called] = field(default_factory=dict[int, "Called"])
     seconds: float = NAN
     returned: int = 0
@@ -629,6 +634,7 @@ def _block(
             lights=np.concatenate([frame.lights for frame in frames]),
             light_state=np.concatenate([frame.light_state for frame in frames]).astype(np.int8),
             derived=derived,
+            own=_own(frames),
             **_controls(nodes, ego, frames, counts),
         ),
         ego=ego,
@@ -798,6 +804,7 @@ class LifetimeTracker:
             node=np.array(nodes, np.int64),
             ego=of.get(frame.ego, -1),
             driven={of[number]: told for number, told in frame.driven.items() if number in of},
+            own={of[number]: told for number, told in frame.own.items() if number in of},
             returned=self._roster.returned,
         )
 
@@ -867,6 +874,18 @@ def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> 
             columns[start + np.flatnonzero(nodes[start : start + count] == node)] = told
         start += count
     return {name: columns[:, column] for column, name in enumerate(INPUTS)}
+
+
+def _own(frames: list[FrameRows]) -> NDArray[np.object_]:
+    """Return the attributes without a column, one mapping or ``None`` per row of the frames."""
+    column = own_column([None] * sum(map(len, frames)))
+    start = 0
+    for frame in frames:
+        for node, told in frame.own.items():
+            for row in np.flatnonzero(frame.node == node).tolist():
+                column[start + row] = valid_attributes(told) or None
+        start += len(frame)
+    return column
 
 
 def _states(node: Ints, values: Floats, **more: NDArray[np.generic]) -> States:

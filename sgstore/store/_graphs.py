@@ -280,7 +280,8 @@ class Graphs:
         )
         for graph in columns.graphs():
             for node, name, value in own.get(graph.frame_id, ()):
-                graph.nodes[node] = {name: value, **graph.nodes[node]}
+                if node in graph.nodes:
+                    graph.nodes[node] = {name: value, **graph.nodes[node]}
             yield graph
 
 

@@ -167,6 +167,20 @@ def state_columns(
     }
 
 
+def own_attributes(
+    graph: GraphBlock | WorldBlock,
+) -> list[tuple[int, int, int, int, str, str]]:
+    """Return the attributes of objects without a column, as rows of :meth:`Segment.keep_attributes`."""
+    frames, states = graph.frames, graph.frames.states
+    frame_of = frames.frame_of
+    rows = (row for row, own in enumerate(states.own.tolist()) if own)
+    return [
+        (int(frame_of[row]), int(states.node[row]), -1, 0, name, as_json(value))
+        for row in rows
+        for name, value in states.own[row].items()
+    ]
+
+
 def node_columns(graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds) -> Columns:
     """Return the rows of the store table ``node`` as columns. Kinds are codes."""
     seq = graph.frames.seq[graph.presence.frame]
@@ -307,6 +321,6 @@ def plain(text: str) -> str:
     return text if text.isascii() else text.encode("utf-8", "replace").decode()
 
 
-def as_json(values: dict[str, Any]) -> str:
+def as_json(values: Any) -> str:
     """Return values as canonical JSON text. Equal values give equal texts."""
     return plain(json.dumps(values, sort_keys=True, ensure_ascii=False))

@@ -50,7 +50,7 @@ def schema_version() -> str:
 
 
 TEXT: Final = (
-    "b72b814976bd1e9c428727fabb90bbb2cd8ba84eccf994048d1c029d8089b2e6",
+    "3c19727148bb1ce972456aa9410c38357aa451940ba8a040b45fb212fc8fbd02",
     "7535a0e47dd54aff42b430f36fcecb652340d281021f582733125e752a644a4c",
 )
 """Digests of the text and of the statements of ``schema.sql``. Parsing the statements takes 10 ms."""
@@ -265,7 +265,7 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 
 _MOST_COMPARED: Final = 64
 
-KNOWN: Final = "a107cc47b0e8b923fbce81b1087ea23639223e65a9159ac0cb3bc3320ed303b5"
+KNOWN: Final = "88cc89a9c30bd1ca48d3ed75dc8c5ba4ec58402b7109afb8f95dedb3a6378486"
 """Digest of a store's objects in DuckDB 2. A comparison of tokens takes 30 ms.
 
 Objects of other versions are compared token by token.

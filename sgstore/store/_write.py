@@ -384,6 +384,9 @@ class Segment:
                 insert("world_edge", columns)
             insert("world_lane_single", packing.lane_columns(world, trace_id, kinds))
             insert("world_gap_single", packing.gap_columns(world, trace_id))
+        for part in (graph, world):
+            if part is not None:
+                self.keep_attributes(part.frames.seq, packing.own_attributes(part))
         insert("gap_single", packing.gap_columns(graph, trace_id))
         insert("event", self._owned(self._happenings.of(graph.frames)))
         for table, columns in abstracted.items():

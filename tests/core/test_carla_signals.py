@@ -100,6 +100,33 @@ def test_commands_stand_in_for_controls_that_were_not_recorded(path: Path) -> No
     assert (frame["1"]["steer"], frame["1"]["throttle"]) == (0.5, 0.75)
 
 
+@pytest.mark.parametrize("first", [True, False])
+def test_commands_are_kept_beside_the_applied_controls(path: Path, first: bool) -> None:
+    spin = {"x": 0.5, "y": -0.25, "z": 0.125}
+    with Bridge(path) as bridge:
+        bridge.actors(HERO)
+        for i in range(3):
+            for now in (first, not first):
+                if now:
+                    bridge.status(i * 0.1, throttle=0.25, manual_gear_shift=i == 1)
+                    bridge.command(i * 0.1, steer=-0.5, throttle=0.75, brake=0, reverse=True)
+                else:
+                    twist = {"linear": dict.fromkeys("xyz", 0.0), "angular": spin}
+                    bridge.objects(i * 0.1, [vehicle(1) | {"twist": twist}, vehicle(2)])
+
+    for size in (1, 60):
+        frames = states(read(path, size)[1])
+        assert [frame["1"]["throttle"] for frame in frames] == [0.25] * 3
+        own = [frame["1"]["own"] for frame in frames]
+        assert [(o["control_throttle"], o["control_steer"]) for o in own] == [(0.75, 0.5)] * 3
+        assert [o["manual_gear"] for o in own] == [False, True, False]
+        assert {(o["control_reverse"], o["control_hand_brake"]) for o in own} == {(True, False)}
+        # A mirrored rotation: the bridge has the wrong sign about x and y.
+        rates = {(o["ang_vel_x"], o["ang_vel_y"]) for o in own}
+        assert rates == {(math.degrees(-0.5), math.degrees(0.25))}
+        assert {frame["2"]["own"] for frame in frames} == {None}
+
+
 def test_a_status_tells_the_gear_that_is_in_and_the_hand_brake(path: Path) -> None:
     told = [
         ({"gear": 1}, (1, 0)),

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 import shapely
-from builders import Place, thing
+from builders import Place, frames, thing
 from test_sgg_traces import opened, recording
 
 from sgstore.errors import ConfigError
 from sgstore.graphs.relations import waypoints_of
 from sgstore.maps.opendrive import read_map
-from sgstore.model.config import Config, LaneSettings, RangeSettings
+from sgstore.model.config import Config, LaneSettings, RangeSettings, configured
 from sgstore.model.vocabulary import KIND_CODE, RELATION_CODE
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 
@@ -227,3 +227,15 @@ def test_waypoints_in_range_are_present_and_lead_on(data: Path) -> None:
         around = np.flatnonzero(waypoint & (np.hypot(nodes.x - x, nodes.y - y) <= 30))
         assert set(around.tolist()) <= present
         assert len(present - set(around.tolist())) < 60  # of bodies that reach beyond
+
+
+def test_the_preset_carlasgg_keeps_waypoints() -> None:
+    block = frames([thing("ego", 5, -1.5)])
+    counts = {}
+    for granularity in ("lane", "waypoint"):
+        config = configured(preset="carlasgg", lanes={"granularity": granularity})
+        graph = SceneGraphGenerator(road(), config).block(block)
+        nodes = map_of_graphs(road(), config).nodes.kind[-1 - graph.presence.node]
+        counts[granularity] = int((nodes == KIND_CODE["waypoint"]).sum())
+    assert counts["lane"] == 0
+    assert counts["waypoint"] > 20

@@ -122,6 +122,26 @@ def agree(online: SceneGraph, stored: SceneGraph, names: dict[int, str]) -> None
                 assert told == value, (of[node], name)
 
 
+def test_commanded_controls_are_recorded_beside_the_applied_ones(tmp_path: Path) -> None:
+    world, path = busy(), tmp_path / "run.mcap"
+    ego = next(a for a in world.actors if a.id == 24)
+    ego.control = carla.VehicleControl(throttle=0.5, manual_gear_shift=True)
+    ego.angular_velocity = carla.Vector3D(2.0, 3.0, 0.0)
+    record(world, path, duration_s=0.3, commands=lambda: {"throttle": 0.75, "planner": "mpc"})
+
+    (outcome,) = ingest(tmp_path / "s.sgstore", [path])
+    store = Store(tmp_path / "s.sgstore")
+
+    assert outcome.losses == []
+    (row, *_) = store.find(
+        "MATCH (e:Ego) WHERE e.control_throttle > e.throttle RETURN e.throttle, e.control_throttle,"
+        " e.control_planner, e.manual_gear, e.ang_vel_x, e.ang_vel_y"
+    )
+    assert tuple(row) == (0.5, 0.75, "mpc", True, -2.0, 3.0)
+    graph = store.file.graph("run#0")
+    assert graph.nodes[graph.ego]["control_planner"] == "mpc"
+
+
 # What is in the file ------------------------------------------------------------------------------
 
 

@@ -30,6 +30,7 @@ from sgstore.lang.syntax import comparison_hint, hint_at, said_of
 from sgstore.lang.syntax import tree as s
 from sgstore.model.pair_numbers import COURSES
 from sgstore.model.vocabulary import (
+    CONTROL,
     KINDS,
     LANE_TYPES,
     entity_kinds,
@@ -196,6 +197,8 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
     kinds = names.scope.kinds(key).every
     possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds] + [*names.session.own]
     found = NODE_ATTRIBUTES.get(normalize_name(name)) or _own_attribute(name, names.session.own)
+    if found is None and names.session.online and name.startswith(CONTROL):
+        found = own_attribute(name, Type.number)  # A client can command any key.
     if found is None:
         hint = said_of("attributes", name) or _no_attribute(name)
         names.session.unknown("attribute", name, span, possible, hint)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang.bind._in_range import scopes_of
-from sgstore.lang.catalog import PAIR_NAMES, Type
+from sgstore.lang.catalog import PAIR_NAMES, RECORDED_OWN, Type
 from sgstore.lang.ir import Bound, Edge, Kinds, Node, Scope, ego_kinds
 from sgstore.lang.library import predicates
 from sgstore.lang.syntax import condition_hint, hint_at, variable_hint
@@ -126,7 +126,8 @@ class Session:
     def ask(self, catalog: Catalog) -> None:
         """Copy the facts that name resolution needs from a catalog of the store."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
-        self.own, self.own_edges, self.part = catalog.own, catalog.own_edges, catalog.part
+        self.own = {**RECORDED_OWN, **catalog.own}
+        self.own_edges, self.part = catalog.own_edges, catalog.part
         self.online = catalog.online
 
     def look_beyond(self, catalog: Catalog, *, world: bool) -> None:

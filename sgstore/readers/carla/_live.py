@@ -152,6 +152,9 @@ class LiveWorld:
     world : carla.World
     map_text, map_name : str
         The road map as OpenDRIVE, and its name in the simulator.
+    commands : dict
+        Commanded control inputs of the ego for the next frames, by name; empty by default. The client sets
+        them, because a simulator returns only the applied ones.
 
     Raises
     ------
@@ -172,6 +175,7 @@ class LiveWorld:
         self._at_once: AtOnce | None = None
         self._scenery = scenery
         self._told = False
+        self.commands: Mapping[str, float | bool | str] = {}
 
     @cached_property
     def road_map(self) -> RoadMap:
@@ -235,7 +239,9 @@ class LiveWorld:
         frame = Frame(round(snapshot.timestamp.elapsed_seconds * 1e9), ego)
         lights = self.world.get_vehicles_light_states()
         for ident, actor in here.items():
-            inputs = _controls(actor) if ident == ego else {}
+            inputs = _controls(actor) | _spin(states[ident]) if ident == ego else {}
+            if ident == ego and self.commands:
+                inputs["control"] = self.commands
             _add_actor(frame, ident, actor, states[ident], lights.get(ident), inputs)
         if self._scenery:
             self._add_scenery(frame)
@@ -408,6 +414,12 @@ def _motion(state: Any) -> dict[str, Any]:
     }
 
 
+def _spin(state: Any) -> dict[str, float]:
+    """Return the angular velocity of a CARLA actor about the map's x and y axes; degrees/s."""
+    spin = state.get_angular_velocity()
+    return {"ang_vel_x": 0.0 - spin.x, "ang_vel_y": spin.y}
+
+
 def in_world(point: tuple[float, float, float], transform: Any) -> tuple[float, float, float]:
     """Convert a point from the axes of a ``carla.Transform`` into map axes; m."""
     x, y, z = point
@@ -445,6 +457,7 @@ def _controls(actor: _Actor) -> dict[str, Any]:
         "brake": control.brake,
         "gear": control.gear,
         "hand_brake": control.hand_brake,
+        "manual_gear": control.manual_gear_shift,
     }
 
 

@@ -7,6 +7,8 @@ props in the list of actors have no position and are ignored; signs come from th
 
 * Axes and units of ROS equal those of sgstore: x ahead, y to the left, z up, metres, radians. The bridge has
   already mirrored CARLA's y and yaw. Velocities and accelerations of objects are in map axes.
+* The bridge mirrors an angular velocity like a velocity. A mirrored rotation has the other sign about the axes
+  in the mirror's plane, so the angular velocities about x and y are negated.
 * The origin of a vehicle is on the ground below its centre, that of a walker in the centre of its body. In
   sgstore, the position is the centre of the box, so a vehicle is lifted by half its height along its own
   upright axis. (The bridge drops the small offset of some blueprints between origin and box.)
@@ -23,15 +25,16 @@ ego_vehicle.py); carla.VehicleLightState.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
 from sgstore.errors import MapError, TraceError
 from sgstore.maps.opendrive import read_map
-from sgstore.model.vocabulary import KINDS
+from sgstore.model.vocabulary import CONTROL, KINDS
 from sgstore.model.world import LARGEST, POSE
 from sgstore.readers._base import SurveyedDecoder, SurveyedTrace
 from sgstore.readers._blocks import FAR, NAN, NO_INPUTS, UPRIGHT, FrameRows
@@ -75,6 +78,7 @@ COLUMNS: Final = (
     *(f"accel.linear.{axis}" for axis in "xyz"),
     "twist.angular.z",
     *(f"shape.dimensions[{i}]" for i in range(3)),
+    *(f"twist.angular.{axis}" for axis in "xy"),
 )
 """Used numbers of ``derived_object_msgs/Object``."""
 STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
@@ -85,7 +89,7 @@ ODOMETRY_COLUMNS: Final = (
     *(f"pose.pose.position.{axis}" for axis in "xyz"),
     *(f"pose.pose.orientation.{part}" for part in "xyzw"),
     *(f"twist.twist.linear.{axis}" for axis in "xyz"),
-    "twist.twist.angular.z",
+    *(f"twist.twist.angular.{axis}" for axis in "zxy"),
 )
 """Used numbers of ``nav_msgs/Odometry``; its velocity is in the axes of the vehicle."""
 
@@ -94,7 +98,7 @@ HOLDS: Final = 500_000_000
 MAX_JSON: Final = 1 << 20
 """Maximum size of a JSON message; bytes."""
 
-_ID, _CLASS, _SHAPE, _POSITION, _TURN, _MOTION, _SIZE = 0, 1, 2, 3, 6, 10, 17
+_ID, _CLASS, _SHAPE, _POSITION, _TURN, _MOTION, _SIZE, _SPIN = 0, 1, 2, 3, 6, 10, 17, 20
 _SPHERE, _CYLINDER, _CONE = 2, 3, 4
 _CARLA_LIGHTS: Final = (5, 4, 3, 6, 0, 1, 2, 7, 8, 9, 10)
 """Bit in ``VEHICLE_LIGHTS`` → bit of ``carla.VehicleLightState``. These are: position 0,
@@ -110,7 +114,7 @@ class CarlaRawFrame:
     Attributes
     ----------
     time_ns, log_time_ns : int
-    objects : (n, 20) float64
+    objects : (n, 22) float64
         Columns :data:`COLUMNS`.
     nodes : (n,) int64
         Node id of each object.
@@ -120,7 +124,9 @@ class CarlaRawFrame:
         Actor id → :data:`sgstore.model.world.INPUTS`.
     vehicle_lights : mapping
         Actor id → mask of :data:`sgstore.model.vocabulary.VEHICLE_LIGHTS`.
-    odometry : (11,) float64 or None
+    own : dict
+        Actor id → attributes without a column: commanded controls and the mode of the gear.
+    odometry : (13,) float64 or None
         Columns :data:`ODOMETRY_COLUMNS` of the ego, if it is not among the objects.
     kinds : dict
         As in :class:`~sgstore.readers._blocks.FrameRows`.
@@ -133,6 +139,7 @@ class CarlaRawFrame:
     light_states: Ints
     controls: dict[int, Controls] = field(default_factory=dict[int, "Controls"])
     vehicle_lights: Mapping[int, int] = field(default_factory=dict[int, int])
+    own: dict[int, dict[str, Any]] = field(default_factory=dict[int, "dict[str, Any]"])
     odometry: Floats | None = None
     kinds: dict[int, Called] = field(default_factory=dict[int, "Called"])
 
@@ -168,11 +175,13 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._seq = -1
         self._frame: CarlaRawFrame | None = None
         self._controls: dict[int, tuple[int, Controls]] = {}
+        self._own: dict[tuple[int, bool], tuple[int, dict[str, Any]]] = {}
         self._vehicle_lights: tuple[int, Mapping[int, int]] = NEVER, {}
         self._odometry: tuple[int, Floats | None] = NEVER, None
         self._fields: dict[int, ColumnReader] = {}
         self._driven = survey.driven
         self._drivers: dict[int, int] = {}
+        self._with_status: set[int] = set()
         self._take = self._takers()
         self.channels = self._leading | {*self._take}
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
@@ -236,9 +245,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
             self._lights.of_frame(),
             kinds=kinds,
         )
-        for ident, (stamp, controls) in self._controls.items():
-            if -SAME_TICK <= time_ns - stamp <= HOLDS:
-                frame.controls[ident] = controls
+        self._add_controls(frame)
         stamp, lights = self._vehicle_lights
         if abs(time_ns - stamp) <= SAME_TICK:
             frame.vehicle_lights = lights
@@ -246,6 +253,15 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._seq += 1
         self._see_odometry()
         return frame
+
+    def _add_controls(self, frame: CarlaRawFrame) -> None:
+        """Add the latest controls to a frame, if they are recent."""
+        for ident, (stamp, controls) in self._controls.items():
+            if -SAME_TICK <= frame.time_ns - stamp <= HOLDS:
+                frame.controls[ident] = controls
+        for (ident, _), (stamp, own) in self._own.items():
+            if -SAME_TICK <= frame.time_ns - stamp <= HOLDS:
+                frame.own.setdefault(ident, {}).update(own)
 
     def _enter(self, ident: int, classification: float) -> None:
         """Add a new object of a CARLA message to the object table."""
@@ -326,9 +342,25 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
             light_state=np.full(len(node), -1, np.int64),
             controls=driven.pop(ego, NO_INPUTS),
             driven=driven,
+            own=self._own_of(frame, ego),
             kinds=frame.kinds,
         )
         return rows.with_heads((self._lights.nodes, self._lights.values, frame.light_states))
+
+    def _own_of(self, frame: CarlaRawFrame, ego: int) -> dict[int, dict[str, Any]]:
+        """Return the attributes without a column, of the ego and of vehicles with controls, by node id."""
+        found = {self._nodes.get(ident, -1): own for ident, own in frame.own.items()}
+        for node in {ego, *found} - {-1}:
+            rows = np.flatnonzero(frame.nodes == node)
+            if len(rows):
+                spin = frame.objects[rows[0], _SPIN:]
+            elif node == ego and frame.odometry is not None:
+                spin = frame.odometry[-2:]
+            else:
+                continue
+            x, y = (0.0 - np.degrees(spin)).tolist()
+            found[node] = found.get(node, {}) | {"ang_vel_x": x, "ang_vel_y": y}
+        return found
 
     def _lights_of(self, frame: CarlaRawFrame, node: Ints) -> Ints:
         lights = frame.vehicle_lights
@@ -348,11 +380,12 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
             for channel, role in self._driven.items()
             if (ident := found.egos.id_of(role)) is not None
         }
+        self._with_status = {ident for content, ident in own.values() if content == STATUS}
         for channel, (content, ident) in own.items():
             # A status contains the applied controls, a command only the requested ones.
-            applied = (STATUS, ident) in own.values()
-            if content == (STATUS if applied else COMMANDS):
-                columns = tuple(("control." if applied else "") + name for name in CONTROLS)
+            if content in {STATUS, COMMANDS}:
+                inside = "control." if content == STATUS else ""
+                columns = tuple(inside + name for name in CONTROLS)
                 self._fields[channel] = ColumnReader(found.structures[channel], (*STAMP, *columns))
                 self._drivers[channel] = ident
                 takers[channel] = self._take_controls
@@ -378,8 +411,15 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         stamp = self._stamps.beside(log_time, stamp_from(told[:2]))
         controls = np.where(np.isfinite(told[2:]), told[2:], NAN).tolist()
         applied = self._survey.contents[channel] == STATUS
+        here = self._frame is not None and abs(self._frame.time_ns - stamp) <= SAME_TICK
+        own = _own_inputs(controls, applied=applied)
+        self._own[ident, applied] = stamp, own
+        if self._frame is not None and here:
+            self._frame.own.setdefault(ident, {}).update(own)
+        if not applied and ident in self._with_status:
+            return
         self._controls[ident] = stamp, _inputs(controls, applied=applied)
-        if self._frame is not None and abs(self._frame.time_ns - stamp) <= SAME_TICK:
+        if self._frame is not None and here:
             self._frame.controls[ident] = self._controls[ident][1]
 
     def _take_event(self, channel: int, log_time: int, data: memoryview) -> None:
@@ -424,7 +464,7 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
 
     Parameters
     ----------
-    objects : (n, 20) float64
+    objects : (n, 22) float64
         Columns :data:`COLUMNS`.
     lifted : (n,) bool
         True if the origin is at the bottom of the box.
@@ -581,6 +621,22 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
             return read_map(self._survey.map_text, self._survey.map_name)
         except MapError:  # The reading of the map for its lanes reports the error.
             return None
+
+
+def _own_inputs(told: Sequence[float], *, applied: bool) -> dict[str, Any]:
+    """Return attributes without a column from CARLA's vehicle controls.
+
+    Of an applied control, only the mode of the gear has no column. A requested control has none at all.
+    """
+    values: dict[str, Any] = dict(zip(CONTROLS, told, strict=True))
+    values["steer"] = 0.0 - values["steer"]
+    values["manual_gear"] = values.pop("manual_gear_shift")
+    for name in ("hand_brake", "reverse", "manual_gear"):
+        values[name] = None if math.isnan(values[name]) else bool(values[name])
+    if applied:
+        return {"manual_gear": values["manual_gear"]}
+    values["gear"] = NAN if math.isnan(values["gear"]) else int(values["gear"])
+    return {f"{CONTROL}{name}": value for name, value in values.items()}
 
 
 def _inputs(told: Sequence[float], *, applied: bool) -> Controls:

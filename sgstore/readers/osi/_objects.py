@@ -16,8 +16,10 @@ Source: protobuf encoding (protobuf.dev/programming-guides/encoding); osi_object
 
 from __future__ import annotations
 
+import json
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
@@ -32,7 +34,7 @@ from sgstore.model.vocabulary import (
     TypeMeaning,
     type_meanings,
 )
-from sgstore.model.world import POSE
+from sgstore.model.world import ATTRIBUTE, LONGEST_TEXT, POSE
 from sgstore.readers._blocks import FAR, NAN
 from sgstore.readers.osi._lanes import OWN, LaneSignal
 from sgstore.readers.osi._schema import (
@@ -41,6 +43,7 @@ from sgstore.readers.osi._schema import (
     enum_name,
     fields_of,
     has_field,
+    identifiers,
     map_ref,
     static_pose,
 )
@@ -324,6 +327,41 @@ class MovingObjects:
         oriented = thing.base.HasField("orientation")
         near = thing.base.HasField("position") and bool(_near(values[None], oriented=oriented)[0])
         return values, near, light_bits(thing), code_of(thing)
+
+
+def own_attributes(content: bytes, message: type[Any], *, is_ego: bool) -> dict[str, Any]:
+    """Return the attributes without a column of a serialised OSI moving object.
+
+    They are references of the type ``net.sgstore`` (``attribute:control_steer=0.2``), as a recording of a live
+    run has them, and the ego's angular velocity about the map's x and y axes.
+    """
+    found: dict[str, Any] = {}
+    marked = ATTRIBUTE.encode() in content
+    if not (marked or is_ego):
+        return found
+    with suppress(*DECODE_ERRORS):
+        thing = message.FromString(content)
+        if is_ego and any(thing.base.orientation_rate.HasField(name) for name in ("roll", "pitch")):
+            found |= _spin(thing.base.orientation, thing.base.orientation_rate)
+        for source, text in identifiers(thing) if marked else ():
+            name, _, value = text.removeprefix(ATTRIBUTE).partition("=")
+            if (
+                source == "net.sgstore"
+                and text.startswith(ATTRIBUTE)
+                and len(value) <= LONGEST_TEXT
+            ):
+                found[name] = json.loads(value)
+    return found
+
+
+def _spin(turn: Any, rate: Any) -> dict[str, float]:
+    """Return the angular velocity about the map's x and y axes; degrees/s."""
+    roll = rate.roll * math.cos(turn.pitch)
+    sin, cos = math.sin(turn.yaw), math.cos(turn.yaw)
+    return {
+        "ang_vel_x": math.degrees(cos * roll - sin * rate.pitch),
+        "ang_vel_y": math.degrees(sin * roll + cos * rate.pitch),
+    }
 
 
 def _meanings(told: Any, bit: int) -> NDArray[np.int64]:

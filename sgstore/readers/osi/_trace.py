@@ -24,7 +24,13 @@ from sgstore.model.world import POSE, Event
 from sgstore.readers._base import SurveyedDecoder, SurveyedTrace
 from sgstore.readers._blocks import NAN, NO_INPUTS, FrameRows, LossTally
 from sgstore.readers._stamps import NO_TIME
-from sgstore.readers.osi._objects import UNTOLD, MovingObjects, TrafficLights, code_of
+from sgstore.readers.osi._objects import (
+    UNTOLD,
+    MovingObjects,
+    TrafficLights,
+    code_of,
+    own_attributes,
+)
 from sgstore.readers.osi._schema import (
     CONDITIONS,
     DECODE_ERRORS,
@@ -300,6 +306,11 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
                 lights=lights[rows],
                 light_state=stands[rows],
                 controls=frame.controls,
+                own={
+                    one: told
+                    for one, content in zip(frame.nodes, frame.objects, strict=True)
+                    if (told := own_attributes(content, self._class, is_ego=one == ego))
+                },
                 kinds=kinds.get(len(done), {}),
             )
             one = one if whole else self._usable(one, usable[rows], ego)
