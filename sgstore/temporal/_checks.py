@@ -56,7 +56,7 @@ from sgstore.temporal._formula import (
 from sgstore.temporal._known_range import ShortRange, short_ranges
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
-from sgstore.temporal._offline import PlanValues, Premises, TraceReader, frame_times, traces
+from sgstore.temporal._offline import PlanValues, Premises, frame_times, traces
 from sgstore.temporal._plan import kept_throughout, needs_text, plan_of_returned, plan_text
 from sgstore.temporal._premises import bindings_of, premises_of
 from sgstore.temporal._quantifiers import (
@@ -103,6 +103,7 @@ if TYPE_CHECKING:
     from sgstore.lang.sql import Window
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.store import StoreFile
+    from sgstore.temporal._trace_group import TraceReader
 
     Codes = NDArray[np.int8]
     Keys = NDArray[np.int64]

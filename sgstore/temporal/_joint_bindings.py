@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.temporal._offline import TimedRelation, refuse_many
+from sgstore.temporal._offline import refuse_many
+from sgstore.temporal._trace_group import codes_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.model.world import Ints
+    from sgstore.temporal._trace_group import TimedRelation
 
     Keys = NDArray[np.int64]
 
@@ -96,12 +98,7 @@ def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
     """Return the index pairs of equal rows in two tables, ordered by the first table."""
     if not len(left) or not len(right):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    both = np.concatenate((left, right))
-    if both.shape[1]:
-        _, codes = np.unique(both, axis=0, return_inverse=True)
-        codes = codes.reshape(-1)
-    else:
-        codes = np.zeros(len(both), np.int64)
+    codes = codes_of(np.concatenate((left, right)))
     one, other = codes[: len(left)], codes[len(left) :]
     order = np.argsort(other, kind="stable")
     low = np.searchsorted(other[order], one, "left")

@@ -7,7 +7,7 @@ bindings at once.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -28,18 +28,18 @@ from sgstore.lang.sql import (
     traces_of,
 )
 from sgstore.matches import TooMuchError, Windows
-from sgstore.model.frame_ids import FRAME_BITS, trace_of
+from sgstore.model.frame_ids import FRAME_BITS
 from sgstore.model.vocabulary import RELATIONS
-from sgstore.model.world import JUMP_NS, longest_step_ns, seconds_of, tolerance_ns
 from sgstore.temporal._check_plan import FAVOURABLE, SIGNS, CheckPlan
 from sgstore.temporal._formula import Formula, propositions, tolerant
 from sgstore.temporal._plan import Ask, ask_text
 from sgstore.temporal._robustness import MARGIN_CELLS, MarginTable, margin_columns
-from sgstore.temporal._signal_values import Clock, SignalValues
+from sgstore.temporal._signal_values import SignalValues
 from sgstore.temporal._signals import evaluate_rows
+from sgstore.temporal._trace_group import TimedRelation, TraceGroup, TraceReader, ordering
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -50,108 +50,6 @@ if TYPE_CHECKING:
     from sgstore.temporal._plan import Plan, Test
 
     Keys = NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class TimedRelation:
-    """Table of query matches: node ids of each match, and the frames in which it occurs.
-
-    Attributes
-    ----------
-    keys : (K, n) int64
-        Distinct bindings in ascending order.
-    starts : (K + 1,) int64
-        Start of each binding's frames.
-    frames : (R,) int64
-        Numbers of frames, ascending for each binding.
-    values : tuple of (R,) arrays
-        Queried values of each match; unknown values are masked.
-    """
-
-    keys: Keys
-    starts: Ints
-    frames: Ints
-    values: tuple[Any, ...] = ()
-
-    @classmethod
-    def of(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> TimedRelation:
-        """Return the table of matches from unsorted rows of frame and node ids. Duplicate rows are dropped.
-
-        Parameters
-        ----------
-        frames : (R,) int64
-        keys : (R, n) int64
-        values : sequence of (R,) arrays
-        """
-        order = np.lexsort((frames, *keys.T[::-1]))
-        frames, keys = frames[order], keys[order]
-        new = np.ones(len(frames), np.bool_)
-        new[1:] = np.any(keys[1:] != keys[:-1], axis=1)
-        fresh = new.copy()
-        fresh[1:] |= frames[1:] != frames[:-1]
-        if not fresh.all():
-            order, frames, keys, new = order[fresh], frames[fresh], keys[fresh], new[fresh]
-        first = np.flatnonzero(new)
-        starts = np.append(first, len(frames))
-        return cls(keys[first], starts, frames, tuple(value[order] for value in values))
-
-    def between(self, first: int, last: int) -> TimedRelation:
-        """Return the table limited to a range of frames, ends included. Frame numbers restart at 0."""
-        rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
-        owners = np.searchsorted(self.starts, rows, "right") - 1
-        new = np.flatnonzero(np.diff(owners, prepend=-1))
-        keys, starts = self.keys[owners[new]], np.append(new, len(rows))
-        values = tuple(value[rows] for value in self.values)
-        return TimedRelation(keys, starts, self.frames[rows] - first, values)
-
-    def find(self, wanted: Keys) -> Ints:
-        """Return the table index of each combination of node ids (B, n), shape (B,). -1 means not found."""
-        if not len(self.keys) or not len(wanted):
-            return np.full(len(wanted), -1)
-        if not wanted.shape[1]:
-            return np.zeros(len(wanted), np.int64)
-        both = np.concatenate((self.keys, wanted))
-        _, codes = np.unique(both, axis=0, return_inverse=True)
-        codes = codes.reshape(-1)
-        place = np.full(int(codes.max()) + 1, -1)
-        place[codes[: len(self.keys)]] = np.arange(len(self.keys))
-        return place[codes[len(self.keys) :]]
-
-    def rows_of(self, places: Ints) -> tuple[Ints, Ints]:
-        """Return all frame rows of some matches, given their indices in the table.
-
-        The result is the position in ``places`` and the row index of each.
-        """
-        known = np.flatnonzero(places >= 0)
-        first, end = self.starts[places[known]], self.starts[places[known] + 1]
-        counts = end - first
-        owner = np.repeat(known, counts)
-        offset = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
-        return owner, np.repeat(first, counts) + offset
-
-    def flags(self, places: Ints, length: int) -> Bools:
-        """Return a mask (B, length) of the frames in which each match occurs. For index -1 it is false."""
-        found = np.zeros((len(places), length), np.bool_)
-        owner, rows = self.rows_of(places)
-        found[owner, self.frames[rows]] = True
-        return found
-
-    def column(self, places: Ints, length: int, number: int = 0) -> Column:
-        """Return the value of each match in each frame, as a column (B, length) with a mask of known values."""
-        told = self.values[number]
-        plain = np.ma.getdata(told)
-        kind = np.float64 if plain.dtype.kind in "iuf" else plain.dtype
-        values = np.zeros((len(places), length), kind)
-        if plain.dtype.kind == "O":
-            values[:] = ""
-        known = np.zeros((len(places), length), np.bool_)
-        owner, rows = self.rows_of(places)
-        at = owner, self.frames[rows]
-        values[at] = plain[rows]
-        known[at] = ~np.ma.getmaskarray(told)[rows]
-        if kind is np.float64:
-            known &= ~np.isnan(values)
-        return Column(values, known)
 
 
 def refuse_many(bindings: int, told: str) -> None:
@@ -177,11 +75,11 @@ def words() -> NDArray[np.str_]:
     return np.array(sorted(RELATIONS))
 
 
-CELLS: Final = 4_000_000
-"""Product of bindings and frames processed at once."""
-
 ROW_BYTES: Final = 100
 """Memory for sorting one row of two or three nodes; bytes."""
+
+ROWS_LESS: Final = 4
+"""Rows of a table that take the memory of one row as counted by :class:`Windows`."""
 
 EDGE_BYTES: Final = 100
 """Additional memory for one edge of a row; bytes."""
@@ -194,58 +92,6 @@ MOST_BINDINGS: Final = 5_000_000
 
 NODES_NAMED: Final = 1_000
 """Largest number of node ids that narrow a query: each id is a parameter."""
-
-
-@dataclass(slots=True)
-class TraceReader:
-    """Data of one trace in memory: frames, times and query results.
-
-    Attributes
-    ----------
-    trace_id : int
-    name : str
-    frame_ids, numbers, times, log_times : (F,) int64
-        Frame ids, frame numbers (``seq``), simulation times and log times (ns).
-    start : int
-        Simulation time from which seconds are counted; ns.
-    clock : Clock
-    relations : dict of str to TimedRelation
-    """
-
-    trace_id: int
-    name: str
-    frame_ids: Ints
-    numbers: Ints
-    times: Ints
-    log_times: Ints
-    start: int
-    clock: Clock
-    relations: dict[str, TimedRelation] = field(default_factory=dict[str, TimedRelation])
-
-    def __len__(self) -> int:
-        return len(self.frame_ids)
-
-    def between(self, first: int, last: int) -> TraceReader:
-        """Return a range of frames (ends included) as a separate trace."""
-        rows = slice(first, last + 1)
-        return replace(
-            self,
-            frame_ids=self.frame_ids[rows],
-            numbers=self.numbers[rows],
-            times=self.times[rows],
-            log_times=self.log_times[rows],
-            clock=replace(self.clock, times=self.clock.times[rows], runs=self.clock.runs[rows]),
-            relations={name: one.between(first, last) for name, one in self.relations.items()},
-        )
-
-    @property
-    def together(self) -> int:
-        """Number of node combinations to process at once, so that arrays over all frames fit into memory."""
-        return max(CELLS // max(len(self), 1), 1)
-
-    def seconds(self, frame: int) -> float:
-        """Return the time of a frame since the start of the trace; s."""
-        return seconds_of(int(self.times[frame] - self.start))
 
 
 class PlanValues(SignalValues):
@@ -463,14 +309,45 @@ def traces(
     QueryError
         A query has too many matches in one trace.
     """
-    asked = [one for one in extents(catalog) if within is None or one[0] in within]
-    steps = Windows(asked, whole_traces=True)
     ask = partial(read, file, catalog, whole, asks, gaps=gaps, premises=premises)
+    ordered = [trace.trace_id for trace in catalog.traces]
+    for group in _groups(extents(catalog), within, ask):
+        places = {trace: place for place, trace in enumerate(group.ids.tolist())}
+        for trace in ordered:
+            if trace in places:
+                yield group.reader(places[trace])
+
+
+def groups(
+    file: StoreFile,
+    catalog: Catalog,
+    whole: Query,
+    asks: Mapping[str, Ask],
+    *,
+    gaps: str = "break",
+    within: Window | None = None,
+) -> Iterator[TraceGroup]:
+    """Yield the traces of :func:`traces` in groups, in the order of their ids, which is fastest."""
+    every = sorted(extents(catalog))
+
+    def ask(window: Window | None) -> tuple[TraceGroup, int]:
+        part = None if window is None else window.whole(every)
+        return read(file, catalog, whole, asks, part, gaps=gaps)
+
+    yield from _groups(every, within, ask)
+
+
+def _groups(
+    every: list[tuple[int, int]],
+    within: Window | None,
+    ask: Callable[[Window | None], tuple[TraceGroup, int]],
+) -> Iterator[TraceGroup]:
+    asked = [one for one in every if within is None or one[0] in within]
+    steps = Windows(asked, whole_traces=True)
     for window in steps:
         for found, rows in steps.parts(window or within, ask):
-            steps.rows += rows
-            yield from found
-            found.clear()
+            steps.rows += rows // ROWS_LESS
+            yield found
 
 
 def read(
@@ -482,7 +359,7 @@ def read(
     *,
     gaps: str,
     premises: Premises | None = None,
-) -> tuple[list[TraceReader], int]:
+) -> tuple[TraceGroup, int]:
     """Return the traces of a window, loaded into memory, and the number of rows read. :func:`traces` calls it.
 
     Raises
@@ -491,23 +368,21 @@ def read(
         The rows exceed the memory limit.
     """
     about = chosen_traces(file, whole, catalog)
-    found = _clocks(about, frame_times(file, window), gaps)
+    group = TraceGroup.of(about, frame_times(file, window), gaps)
     rows, memory = 0, file.memory
     for names in _together(asks, premises):
         ask = asks[names[0]]
-        left = _left(ask, found, premises)
-        narrower = _narrowed(ask, left.values(), premises)
-        for trace in found.values():
-            if narrower is None or trace.trace_id not in left:
-                trace.relations |= {name: no_rows(asks[name]) for name in names}
-        if narrower is not None:
-            size = ROW_BYTES + EDGE_BYTES * len(ask.edges)
-            where = window if len(left) == len(found) else _window_of(left, catalog)
-            values = {name: asks[name].value for name in names}
-            many = _relate(file, catalog, values, narrower, where, left, memory // size)
-            rows, memory = rows + many, memory - many * size
-    ordered = (trace.trace_id for trace in catalog.traces)
-    return [found[trace] for trace in ordered if trace in found], rows
+        left = _left(ask, group, premises)
+        narrower = _narrowed(ask, group, left, premises)
+        if narrower is None:
+            group.relations |= {name: no_rows(asks[name]) for name in names}
+            continue
+        size = ROW_BYTES + EDGE_BYTES * len(ask.edges)
+        where = window if left.all() else _window_of(group.ids[left].tolist(), catalog)
+        values = {name: asks[name].value for name in names}
+        many = _relate(file, catalog, values, narrower, where, group, memory // size)
+        rows, memory = rows + many, memory - many * size
+    return group, rows
 
 
 def _together(asks: Mapping[str, Ask], premises: Premises | None) -> list[list[str]]:
@@ -534,43 +409,46 @@ def _differ_in_value(ask: Ask, other: Ask) -> bool:
     )
 
 
-def _narrowed(ask: Ask, traces: Collection[TraceReader], premises: Premises | None) -> Ask | None:
+def _narrowed(ask: Ask, group: TraceGroup, left: Bools, premises: Premises | None) -> Ask | None:
     """Return a single-frame query limited to the nodes that earlier queries matched.
 
     ``None`` means that they matched no nodes.
     """
-    if not traces:
+    if not left.any():
         return None
-    ids = {} if premises is None else premises.nodes(ask, traces)
+    ids = {} if premises is None else premises.nodes(ask, _readers(group, left))
     narrow = ask.loose or ask.value is not None
     for before in ask.after:
-        keys = [trace.relations[before.name].keys for trace in traces]
+        keys = group.relations[before.name].keys
+        keys = keys[left[keys[:, 0]], 1:]
         for node in set(before.variables) & set(ask.variables) if narrow else ():
-            held = np.unique(np.concatenate([k[:, before.variables.index(node)] for k in keys]))
+            held = np.unique(keys[:, before.variables.index(node)])
             ids[node] = np.intersect1d(ids[node], held) if node in ids else held
     few = {node: held.tolist() for node, held in ids.items() if len(held) <= NODES_NAMED}
     return ask.among(few) if few else ask
 
 
-def _left(
-    ask: Ask, traces: Mapping[int, TraceReader], premises: Premises | None
-) -> dict[int, TraceReader]:
-    """Return the traces in which all earlier steps, or the queries of a premise, have matches."""
-    return {
-        trace_id: trace
-        for trace_id, trace in traces.items()
-        if all(len(trace.relations[before.name].keys) for before in ask.after)
-        and (premises is None or premises.left(trace.relations))
-    }
+def _left(ask: Ask, group: TraceGroup, premises: Premises | None) -> Bools:
+    """Return a mask of the traces in which all earlier steps, or the queries of a premise, have matches."""
+    found = np.ones(len(group.ids), np.bool_)
+    for before in ask.after:
+        found &= np.bincount(group.relations[before.name].keys[:, 0], minlength=len(found)) > 0
+    if premises is not None:
+        found &= [bool(premises.left(one.relations)) for one in _readers(group, found | True)]
+    return found
 
 
-def _window_of(traces: Mapping[int, TraceReader], catalog: Catalog) -> Window:
+def _readers(group: TraceGroup, chosen: Bools) -> list[TraceReader]:
+    return [group.reader(place) for place in np.flatnonzero(chosen).tolist()]
+
+
+def _window_of(traces: Collection[int], catalog: Catalog) -> Window:
     return Window.of([one.extent for one in catalog.traces if one.trace_id in traces])
 
 
 def no_rows(ask: Ask) -> TimedRelation:
-    """Return the table of a query without matches."""
-    keys = np.zeros((0, len(ask.columns)), np.int64)
+    """Return the table of a query without matches, for a group of traces."""
+    keys = np.zeros((0, 1 + len(ask.columns)), np.int64)
     values = () if ask.value is None else (np.ma.masked_all(0),)
     return TimedRelation.of(np.zeros(0, np.int64), keys, values)
 
@@ -622,25 +500,6 @@ def _ordered(file: StoreFile, sql: str, low: int, high: int) -> dict[str, Ints]:
     return found
 
 
-def _clocks(
-    about: Mapping[int, Sequence[Any]], clock: Mapping[str, Ints], gaps: str
-) -> dict[int, TraceReader]:
-    ids = clock["frame_id"]
-    found: dict[int, TraceReader] = {}
-    for trace_id, rows in _by_trace(ids):
-        if trace_id not in about:
-            continue
-        name, start, period = about[trace_id]
-        numbers, times, logs = (clock[column][rows] for column in ("seq", "time_ns", "log_time_ns"))
-        longest, tolerance = longest_step_ns(period), tolerance_ns(period)
-        ticks = Clock.of(ascending(times), numbers, period, longest, tolerance)
-        if gaps == "bridge":
-            jumps = np.diff(ticks.times, prepend=ticks.times[:1]) == JUMP_NS
-            ticks = replace(ticks, runs=np.cumsum(jumps))
-        found[trace_id] = TraceReader(trace_id, name, ids[rows], numbers, times, logs, start, ticks)
-    return found
-
-
 def arrays_of(
     file: StoreFile,
     catalog: Catalog,
@@ -664,16 +523,46 @@ def arrays_of(
     arrays = file.arrays(*last, given=before, plain=True)
     ids = np.ma.getdata(arrays["frame_id"]).astype(np.int64, copy=False)
     if len(ids) > most:
-        held = (one.name for one in catalog.traces if window is None or one.extent[0] in window)
-        raise TooMuchError(
-            f"{ask_text(ask)} holds for more than {most:,} combinations of nodes and frames of"
-            f" {', '.join(held)}, more than memory may take",
-            hint="restrict its nodes: add a label, an edge between them, or a condition; or allow more memory",
-        )
+        raise _too_many(catalog, ask, window, most)
+    return ids, _keys(ask, arrays, len(ids)), [arrays[f":{n}"] for n in range(len(values))]
+
+
+def masks_of(
+    file: StoreFile, catalog: Catalog, ask: Ask, window: Window | None, most: int
+) -> tuple[Ints, Keys, Ints]:
+    """Return the matches of a single-frame query without a value, unsorted: buckets, node ids, masks of frames.
+
+    Raises
+    ------
+    TooMuchError
+        The masks have more than ``most`` frames.
+    """
+    bound = {*ask.variables, *ask.edges}
+    statement = relation(ask.query, catalog, window, (), bound, most + 1, masked=True)
+    *before, last = statement.steps()
+    arrays = file.arrays(*last, given=before, plain=True)
+    buckets, masks = (
+        np.ma.getdata(arrays[name]).astype(np.int64, copy=False) for name in ("bucket", "frames")
+    )
+    if int(np.bitwise_count(masks).sum()) > most:
+        raise _too_many(catalog, ask, window, most)
+    return buckets, _keys(ask, arrays, len(buckets)), masks
+
+
+def _too_many(catalog: Catalog, ask: Ask, window: Window | None, most: int) -> TooMuchError:
+    held = (one.name for one in catalog.traces if window is None or one.extent[0] in window)
+    return TooMuchError(
+        f"{ask_text(ask)} holds for more than {most:,} combinations of nodes and frames of"
+        f" {', '.join(held)}, more than memory may take",
+        hint="restrict its nodes: add a label, an edge between them, or a condition; or allow more memory",
+    )
+
+
+def _keys(ask: Ask, arrays: Mapping[str, Any], rows: int) -> Keys:
+    """Return the columns of nodes and edges of a result. Relations become their index in :func:`words`."""
     columns = [np.ma.getdata(arrays[key]).astype(np.int64, copy=False) for key in ask.variables]
     columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
-    keys = np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)
-    return ids, keys, [arrays[f":{n}"] for n in range(len(values))]
+    return np.stack(columns, axis=1) if columns else np.zeros((rows, 0), np.int64)
 
 
 def _relate(
@@ -682,54 +571,35 @@ def _relate(
     named: Mapping[str, Bound | None],
     ask: Ask,
     window: Window | None,
-    found: Mapping[int, TraceReader],
+    group: TraceGroup,
     most: int,
 ) -> int:
-    """Run one single-frame query, add its matches to each trace, and return their number.
+    """Run one single-frame query, add its matches to a group of traces, and return their number.
 
     ``named`` has the value of the matches for each name, ``most`` is the largest number allowed.
     """
     if ask.everywhere:
-        for trace in found.values():
-            table = TimedRelation.of(np.arange(len(trace)), np.zeros((len(trace), 0), np.int64))
-            trace.relations |= dict.fromkeys(named, table)
+        starts = group.starts.copy()
+        keys = np.arange(len(group.ids))[:, None]
+        table = TimedRelation(keys, starts, np.arange(len(group.frame_ids)))
+        group.relations |= dict.fromkeys(named, table)
         return 0
     asked = [value for value in named.values() if value is not None]
+    if not asked:
+        table = group.table(*masks_of(file, catalog, ask, window, most))
+        group.relations |= dict.fromkeys(named, table)
+        return len(table.frames)
     ids, keys, values = arrays_of(file, catalog, ask, window, asked, most)
-    told = len(ask.columns)
-    order = np.lexsort((*keys.T[told:][::-1], ids))
-    keys = keys[:, :told]
-    ids, keys, values = ids[order], keys[order], [value[order] for value in values]
-    parts = dict(_by_trace(ids))
-    nothing = slice(0, 0)
-    for trace in found.values():
-        rows = parts.get(trace.trace_id, nothing)
-        frames = np.searchsorted(trace.frame_ids, ids[rows])
-        table = TimedRelation.of(frames, keys[rows], [value[rows] for value in values])
-        for number, name in enumerate(named):
-            own = replace(table, values=table.values[number : number + 1])
-            trace.relations[name] = own
+    told = 1 + len(ask.columns)
+    frames = group.places(ids)
+    if frames.min(initial=0) < 0:
+        known = frames >= 0
+        frames, keys = frames[known], keys[known]
+        values = [value[known] for value in values]
+    keys = np.column_stack((group.owners(frames), keys))
+    order = ordering([*keys.T[:told], frames, *keys.T[told:]])
+    keys, frames = keys[order, :told], frames[order]
+    table = TimedRelation.ordered(frames, keys, [value[order] for value in values])
+    for number, name in enumerate(named):
+        group.relations[name] = replace(table, values=table.values[number : number + 1])
     return len(ids)
-
-
-def _by_trace(ids: Ints) -> Iterable[tuple[int, slice]]:
-    """Return pairs of trace id and slice, which split ordered frame ids by trace."""
-    if not len(ids):
-        return []
-    owners = trace_of(ids)
-    starts = np.flatnonzero(np.diff(owners, prepend=-1))
-    ends = np.append(starts[1:], len(ids))
-    return [(int(owners[a]), slice(int(a), int(z))) for a, z in zip(starts, ends, strict=True)]
-
-
-def ascending(times: Ints) -> Ints:
-    """Return frame times corrected to ascend strictly. Repeated times and backward jumps are moved forward.
-
-    A repeated time becomes a nanosecond later. After a backward jump, all times are shifted by
-    :data:`sgstore.model.world.JUMP_NS` after the last one. So the jump is a gap that no time bound spans.
-    """
-    steps = np.diff(times, prepend=times[:1])
-    if np.any(steps < 0):
-        times = times + np.cumsum(np.where(steps < 0, JUMP_NS - steps, 0))
-    ticks = np.arange(len(times))
-    return np.maximum.accumulate(times - ticks) + ticks if len(times) else times

@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 
     from sgstore.lang.ir import BoundCheck
     from sgstore.model.world import Ints
-    from sgstore.temporal._offline import TimedRelation
     from sgstore.temporal._plan import Ask, Test
+    from sgstore.temporal._trace_group import TimedRelation
 
     Keys = NDArray[np.int64]
 

@@ -24,12 +24,12 @@ from sgstore.temporal._offline import (
     EDGE_BYTES,
     ROW_BYTES,
     arrays_of,
-    ascending,
     buckets_of,
     chosen_traces,
     times_of,
 )
 from sgstore.temporal._signal_values import Clock, SignalValues
+from sgstore.temporal._trace_group import ascending, ordering
 from sgstore.temporal._windows import over_columns
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ class BindingRows:
             frames, keys = frames[known], keys[known]
             values = {name: _rows(value, known) for name, value in values.items()}
         owners = line.owners[frames]
-        order = _order([owners, *keys.T, frames - line.starts[owners]])
+        order = ordering([owners, *keys.T, frames - line.starts[owners]])
         frames, keys = frames[order], keys[order]
         fresh = np.ones(len(order), np.bool_)
         fresh[1:] = np.diff(owners[order]) != 0
@@ -456,32 +456,6 @@ def _rows(column: Column, rows: Any) -> Column:
 def _whole(column: Column, rows: int) -> Column:
     shape = 1, rows
     return Column(np.broadcast_to(column.values, shape), np.broadcast_to(column.known, shape))
-
-
-def _order(columns: Sequence[Ints]) -> Ints:
-    """Return the sort order of table rows by several columns. The first column is the primary key."""
-    rows = len(columns[0])
-    if not rows:
-        return np.zeros(0, np.int64)
-    code, size = np.zeros(rows, np.int64), 1
-    for column in columns:
-        low = int(column.min())
-        many = int(column.max()) - low + 1
-        size *= many
-        if size >= 1 << 62:
-            return np.lexsort(columns[::-1])
-        if many > 1:
-            code *= many
-            code += column
-            code -= low
-    bits = rows.bit_length()
-    if size.bit_length() + bits > 62:
-        return np.argsort(code, kind="stable")
-    code <<= bits  # sorting numbers that include their row index is much faster
-    code |= np.arange(rows)
-    code.sort()
-    code &= (1 << bits) - 1
-    return code
 
 
 def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.errors import QueryError
 from sgstore.lang.ir import Bound, OverMatch, Query, SignalCall, StepTime, is_formula
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import ExternalRelation, Window, relation, value_text
@@ -16,7 +17,7 @@ from sgstore.model.world import JUMP_NS, seconds_of
 from sgstore.temporal._formula import formula_text
 from sgstore.temporal._joint_bindings import JoinedBindings, joined
 from sgstore.temporal._match_values import Stretches, picked
-from sgstore.temporal._offline import PlanValues, TimedRelation, TraceReader, traces, words
+from sgstore.temporal._offline import PlanValues, groups, traces, words
 from sgstore.temporal._plan import (
     Test,
     asks_of_steps,
@@ -29,6 +30,7 @@ from sgstore.temporal._plan import (
     way_text,
 )
 from sgstore.temporal._runs import RunFinder
+from sgstore.temporal._trace_group import TimedRelation, TraceGroup
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from sgstore.temporal._formula import Formula
     from sgstore.temporal._plan import Ask
     from sgstore.temporal._signal_values import Clock
+    from sgstore.temporal._trace_group import JointClock, TraceReader
 
     Keys = NDArray[np.int64]
 
@@ -83,11 +86,13 @@ class BindingLine:
 
     Parameters
     ----------
-    clock : Clock
+    clock : Clock or JointClock
     """
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: Clock | JointClock) -> None:
         self.clock = clock
+        self._periods = np.broadcast_to(clock.period, len(clock.times))
+        self._tolerances = np.broadcast_to(clock.tolerance, len(clock.times))
         self.frames = len(clock.times)
         self.stride = self.frames + 1
         breaks = np.ones(self.stride, np.bool_)
@@ -142,8 +147,9 @@ class BindingLine:
         else:
             times = self.clock.times
             length = times[self.frame(places[last])] - times[self.frame(places[first])]
-            length = length + (self.clock.period if hold.inclusive else 0)
-        return places[hold.fits(length, self.clock.tolerance)[runs]]
+            length = length + (self._periods[self.frame(places[first])] if hold.inclusive else 0)
+        tolerances: Any = self._tolerances[self.frame(places[first])]
+        return places[hold.fits(length, tolerances)[runs]]
 
     def window(self, leg: Leg, places: Ints) -> tuple[Ints, Ints]:
         """Return the first and last allowed position of the next step, for each position of a step."""
@@ -179,8 +185,8 @@ class BindingLine:
             return frame if side == "left" else np.full_like(frame, self.frames - 1)
         if by.frames:
             return frame + by.amount
-        tolerance = self.clock.tolerance if side == "right" else -self.clock.tolerance
-        amount = max(by.amount + tolerance, 0)
+        tolerance = self._tolerances[frame]
+        amount = np.maximum(by.amount + (tolerance if side == "right" else -tolerance), 0)
         then = np.minimum(times[frame], np.iinfo(np.int64).max - amount) + amount
         return (
             np.searchsorted(times, then, "left")
@@ -252,6 +258,9 @@ def _one_a_run(line: BindingLine, first: Ints, possible: Ints) -> Ints:
     runs = line.runs(first)[np.searchsorted(first, possible)] if len(possible) else possible
     return possible[np.diff(runs, prepend=-1) != 0] if len(possible) else possible
 
+
+TRACE: Final = ":trace"
+"""Key column with the index of a match's trace in its group."""
 
 MOST_MATCHES: Final = 2_000_000
 """Largest number of multi-frame matches of one trace: each takes about 300 bytes."""
@@ -344,34 +353,36 @@ class Finder:
             for first, last, keys, values in self._runs.found(places, _whole(window)):
                 yield "a trace", (first, last, self._ordered(self._named(0), keys), values)
             return
-        for trace in self.readers(window, places):
-            for part in self._find(trace, places) if len(trace) else ():
-                yield trace.name, part
+        about = self._file, self._catalog, self._query, self._asks_of(places)
+        for group in groups(*about, gaps=self._query.gaps, within=_whole(window)):
+            for part in self._found(group, places):
+                yield group.names[-1], part
 
-    def readers(
-        self, window: Window | None, places: tuple[Bound, ...] = ()
-    ) -> Iterator[TraceReader]:
-        """Yield all traces that a window touches, loaded with the data that the query needs.
-
-        Parameters
-        ----------
-        window : Window or None
-        places : tuple of Bound
-            Values to compute for each match.
-        """
-        ordered = sorted(self._steps, key=lambda ask: len(ask.after))
-        about = self._file, self._catalog, self._query, self._asks_of(places, ordered)
+    def readers(self, window: Window | None) -> Iterator[TraceReader]:
+        """Yield all traces that a window touches, loaded with the data that the query needs."""
+        about = self._file, self._catalog, self._query, self._asks_of(())
         return traces(*about, gaps=self._query.gaps, within=_whole(window))
 
     def matches(self, trace: TraceReader) -> bool:
         """True if the selected frames of a trace contain a match of the query."""
-        return any(len(part[0]) for part in self._find(trace, ()))
+        return any(len(part[0]) for part in self.found_in(TraceGroup.alone(trace), ()))
 
-    def _asks_of(self, places: tuple[Bound, ...], steps: Sequence[Ask]) -> dict[str, Ask]:
+    def _found(self, group: TraceGroup, places: tuple[Bound, ...]) -> list[_Part]:
+        """Return the matches in a group of traces. If they are too many together, search trace by trace."""
+        try:
+            return [*self.found_in(group, places)]
+        except QueryError:
+            if len(group.ids) == 1:
+                raise
+        each = (TraceGroup.alone(group.reader(place)) for place in range(len(group.ids)))
+        return [part for one in each for part in self.found_in(one, places)]
+
+    def _asks_of(self, places: tuple[Bound, ...]) -> dict[str, Ask]:
         """Return all single-frame queries: of steps, conditions and returned values.
 
         Queries of returned values need only the nodes that match the steps.
         """
+        steps = sorted(self._steps, key=lambda ask: len(ask.after))
         for place in places:
             for value in _worked_out(place):
                 self._planned(value)
@@ -407,29 +418,32 @@ class Finder:
                 lines.append(f"returned {value_text(value)} = {name}")
         return "\n".join([*lines, *needs_text(self._plan, self._catalog)])
 
-    def _find(self, trace: TraceReader, places: tuple[Bound, ...]) -> Iterator[_Part]:
-        line = BindingLine(trace.clock)
-        held = [self._held(trace, line, number) for number in range(len(self._steps))]
+    def found_in(self, group: TraceGroup, places: tuple[Bound, ...]) -> Iterator[_Part]:
+        """Yield the matches of the query in a group of traces, in portions."""
+        if not len(group.frame_ids):
+            return
+        line = BindingLine(group.clock)
+        held = [self._held(group, line, number) for number in range(len(self._steps))]
         if not self._query.spans:
-            yield self._frames(trace, held[0], places)
+            yield from self._frames(group, held[0], places)
             return
         ways = (each for way in self._query.ways for each in self._of_way(line, held, way))
         for one in self._chosen(line, held, [*ways]) if self._query.alternatives else ways:
-            yield from self._matches(trace, line, one, places)
+            yield from self._matches(group, line, one, places)
 
     def _of_way(
         self, line: BindingLine, held: list[TimedRelation], way: StepWay
     ) -> Iterator[MatchesOfWay]:
         """Yield the matches of one alternative step sequence of the query."""
         happen = way.happen
-        together = joined([(self._named(n), held[n]) for n in happen], self._apart)
+        together = joined([(self._columns(n), held[n]) for n in happen], self._apart)
         for part in together.parts([held[n] for n in happen]):
             at = [self._placed(line, held[n], part.places[:, i]) for i, n in enumerate(happen)]
             absent: dict[int, Ints] = {}
             for number in way.steps:
                 if self._query.steps[number].absent:
                     own = part.bindings[
-                        :, [part.variables.index(name) for name in self._named(number)]
+                        :, [part.variables.index(name) for name in self._columns(number)]
                     ]
                     absent[number] = self._placed(line, held[number], held[number].find(own))
             legs = self._legs(way, at, absent)
@@ -456,7 +470,9 @@ class Finder:
             frames[:, : len(one.happen)] = line.frame(one.told)
             runs = line.run_starts(one.at[0])[np.searchsorted(one.at[0], one.told[:, 0])]
             owners = one.told[:, 0] // line.stride
-            keys = self._ordered(one.part.variables, one.part.bindings[owners])
+            bindings = one.part.bindings[owners]
+            keys = self._ordered(one.part.variables, bindings)
+            keys = np.column_stack((bindings[:, 0], keys))
             about = np.full((len(frames), 3), one.happen[0])
             about[:, 1], about[:, 2] = line.frame(runs), number
             tables.append(np.column_stack((keys, about, frames)))
@@ -485,87 +501,95 @@ class Finder:
         ask = self._steps[number]
         return (*(n for n in ask.variables if n in self._tied), *ask.edges)
 
-    def _held(self, trace: TraceReader, line: BindingLine, number: int) -> TimedRelation:
+    def _columns(self, number: int) -> tuple[str, ...]:
+        """Return the key columns of the table of a step: the trace, then the nodes and edges."""
+        return TRACE, *self._named(number)
+
+    def _held(self, group: TraceGroup, line: BindingLine, number: int) -> TimedRelation:
         """Return the table of frames in which a step matches, with its pattern, conditions and duration."""
         step, ask = self._query.steps[number], self._steps[number]
-        relation = trace.relations[ask.name]
-        owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
-        kept = np.ones(len(owners), np.bool_)
-        for formula in self._when[number]:
-            kept &= self._true(trace, relation, ask, formula, owners)
-        keys, frames = relation.keys[owners[kept]], relation.frames[kept]
-        keys = keys[:, [ask.columns.index(name) for name in self._named(number)]]
-        relation = TimedRelation.of(frames, keys)
+        relation, names = group.relations[ask.name], (TRACE, *ask.columns)
+        if self._when[number]:
+            kept = self._true(group, relation, ask, self._when[number])
+            owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
+            relation = TimedRelation.ordered(relation.frames[kept], relation.keys[owners[kept]])
+        if names != self._columns(number):
+            owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
+            keys = relation.keys[:, [names.index(name) for name in self._columns(number)]]
+            relation = TimedRelation.of(relation.frames, keys[owners])
         if step.hold is None:
             return relation
         owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
         places = line.held(owners * line.stride + relation.frames, step.hold)
-        return TimedRelation.of(line.frame(places), relation.keys[places // line.stride])
+        return TimedRelation.ordered(line.frame(places), relation.keys[places // line.stride])
 
     def _true(
-        self, trace: TraceReader, relation: TimedRelation, ask: Ask, formula: Formula, owners: Ints
+        self, group: TraceGroup, relation: TimedRelation, ask: Ask, formulas: Sequence[Formula]
     ) -> Any:
-        """Return a mask of the rows of a step's matches for which a temporal formula is true."""
-        true = np.zeros(len(owners), np.bool_)
-        for low, high, rows in _chunks(relation.starts, trace.together):
-            bindings = relation.keys[low:high, : len(ask.variables)]
-            values = PlanValues(self._plan, trace, ask.variables, bindings).formula(formula)
-            true[rows] = values[owners[rows] - low, relation.frames[rows]]
+        """Return a mask of the rows of a step's matches for which temporal formulas are true."""
+        true = np.zeros(len(relation.frames), np.bool_)
+        for trace, part, low in _chunks(group, relation):
+            bindings = part.keys[:, : len(ask.variables)]
+            owners = np.repeat(np.arange(len(part.keys)), np.diff(part.starts))
+            values = PlanValues(self._plan, trace, ask.variables, bindings)
+            here = np.ones(len(owners), np.bool_)
+            for formula in formulas:
+                here &= values.formula(formula)[owners, part.frames]
+            true[low : low + len(here)] = here
         return true
 
     # Single frames
 
     def _frames(
-        self, trace: TraceReader, relation: TimedRelation, places: tuple[Bound, ...]
-    ) -> _Part:
+        self, group: TraceGroup, relation: TimedRelation, places: tuple[Bound, ...]
+    ) -> Iterator[_Part]:
         names = self._named(0)
-        owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
-        told = [np.zeros(len(owners), object) for _ in places]
-        line = BindingLine(trace.clock)
-        at_row = owners * line.stride + relation.frames
-        first = np.searchsorted(at_row, line.run_starts(at_row))
-        last = np.searchsorted(at_row, line.run_ends(at_row))
-        for low, high, rows in _chunks(relation.starts, trace.together):
-            at = owners[rows] - low, relation.frames[rows]
-            values = PlanValues(self._plan, trace, names, relation.keys[low:high])
-            for number, place in enumerate(places):
+        for trace, part, _ in _chunks(group, relation):
+            owners = np.repeat(np.arange(len(part.keys)), np.diff(part.starts))
+            line = BindingLine(trace.clock)
+            at_row = owners * line.stride + part.frames
+            first = np.searchsorted(at_row, line.run_starts(at_row))
+            last = np.searchsorted(at_row, line.run_ends(at_row))
+            values = PlanValues(self._plan, trace, names, part.keys)
+            told: list[Any] = []
+            for place in places:
                 if not isinstance(place, OverMatch):
-                    told[number][rows] = picked(self._value(place, values), *at)
+                    told.append(picked(self._value(place, values), owners, part.frames))
                     continue
-                runs, member = np.unique(first[rows], return_inverse=True)
-                ends = relation.frames[last[runs]]
-                stretches = Stretches(owners[runs] - low, relation.frames[runs], ends)
-                told[number][rows] = self._over(place, values, stretches)[member]
-        ids = trace.frame_ids[relation.frames]
-        new = np.ones(len(ids), np.bool_)
-        new[1:] = (np.diff(ids) != 1) | (np.diff(owners) != 0)
-        for column in told:
-            new[1:] |= column[1:] != column[:-1]
-        first = np.flatnonzero(new)
-        last = np.append(first[1:], len(ids))[: len(first)] - 1
-        keys = self._ordered(names, relation.keys[owners[first]])
-        return ids[first], ids[last], keys, [column[first].tolist() for column in told]
+                runs, member = np.unique(first, return_inverse=True)
+                ends = part.frames[last[runs]]
+                stretches = Stretches(owners[runs], part.frames[runs], ends)
+                told.append(self._over(place, values, stretches)[member])
+            ids = trace.frame_ids[part.frames]
+            new = np.ones(len(ids), np.bool_)
+            new[1:] = (np.diff(ids) != 1) | (np.diff(owners) != 0)
+            for column in told:
+                new[1:] |= column[1:] != column[:-1]
+            first = np.flatnonzero(new)
+            last = np.append(first[1:], len(ids))[: len(first)] - 1
+            keys = self._ordered(names, part.keys[owners[first]])
+            yield ids[first], ids[last], keys, [column[first].tolist() for column in told]
 
     # Sequences
 
     def _matches(
-        self, trace: TraceReader, line: BindingLine, one: MatchesOfWay, places: tuple[Bound, ...]
+        self, group: TraceGroup, line: BindingLine, one: MatchesOfWay, places: tuple[Bound, ...]
     ) -> Iterator[_Part]:
         at, told = one.at, one.told
-        owners = told[:, 0] // line.stride
+        bindings = one.part.bindings[told[:, 0] // line.stride]
         frames = line.frame(told)
         ends = frames[:, -1]
         if self._query.steps[one.happen[-1]].hold is not None:
             runs = line.run_ends(at[-1])
             ends = line.frame(runs[np.searchsorted(at[-1], told[:, -1])])
-        keys = self._ordered(one.part.variables, one.part.bindings[owners])
+        keys = self._ordered(one.part.variables, bindings)
         spans: dict[Bound, tuple[Ints, Ints]] = {}
         for place in places:
             if isinstance(place, OverMatch) and {place.start, place.end} <= {None, *one.happen}:
                 spans[place] = self._span(line, place, one, ends)
-        values = self._at_matches(trace, one, owners, frames, places, spans)
-        values += [trace.frame_ids[frames[:, 0]].tolist(), trace.frame_ids[ends].tolist()]
-        last = trace.frame_ids[frames[:, -1]]
+        values = self._at_matches(group, one, bindings, frames, places, spans)
+        values += [group.frame_ids[frames[:, 0]].tolist(), group.frame_ids[ends].tolist()]
+        last = group.frame_ids[frames[:, -1]]
         yield last, last, keys, values
 
     def _placed(self, line: BindingLine, relation: TimedRelation, places: Ints) -> Ints:
@@ -605,9 +629,9 @@ class Finder:
 
     def _at_matches(
         self,
-        trace: TraceReader,
+        group: TraceGroup,
         one: MatchesOfWay,
-        owners: Ints,
+        bindings: Keys,
         frames: Ints,
         places: tuple[Bound, ...],
         spans: dict[Bound, tuple[Ints, Ints]],
@@ -615,22 +639,24 @@ class Finder:
         happen, part = one.happen, one.part
         asked = tuple(p for p in places if p in spans or not isinstance(p, StepTime | OverMatch))
         found: dict[Bound, list[Any]] = {place: [] for place in asked}
-        size = trace.together
-        for low in range(0, len(owners) if asked else 0, size):
-            rows = slice(low, low + size)
-            here = np.arange(len(owners[rows]))
-            bindings = part.bindings[owners[rows]]
-            values = PlanValues(self._plan, trace, part.variables, bindings)
-            for place in asked:
-                if isinstance(place, OverMatch):
-                    stretches = Stretches(here, *(end[rows] for end in spans[place]))
-                    value = self._over(place, values, stretches)
-                else:
-                    value = picked(self._value(place, values), here, frames[rows, -1])
-                found[place] += value.tolist()
+        owners = bindings[:, 0]
+        first = np.flatnonzero(np.diff(owners, prepend=-1)) if asked else owners[:0]
+        for begin, end in zip(first.tolist(), [*first[1:].tolist(), len(owners)], strict=False):
+            trace, start = group.reader(owners[begin]), group.starts[owners[begin]]
+            for low in range(begin, end, trace.together):
+                rows = slice(low, min(low + trace.together, end))
+                here = np.arange(len(owners[rows]))
+                values = PlanValues(self._plan, trace, part.variables[1:], bindings[rows, 1:])
+                for place in asked:
+                    if isinstance(place, OverMatch):
+                        stretches = Stretches(here, *(last[rows] - start for last in spans[place]))
+                        value = self._over(place, values, stretches)
+                    else:
+                        value = picked(self._value(place, values), here, frames[rows, -1] - start)
+                    found[place] += value.tolist()
         for place in places:
             if isinstance(place, StepTime) and place.step in happen:
-                times = trace.times[frames[:, happen.index(place.step)]] - trace.start
+                times = group.times[frames[:, happen.index(place.step)]] - group.begins[owners]
                 found[place] = [seconds_of(time) for time in times.tolist()]
             found.setdefault(
                 place, [None] * len(owners)
@@ -658,11 +684,22 @@ def _whole(window: Window | None) -> Window | None:
     return Window(window.low >> BUCKET_BITS << BUCKET_BITS, high << BUCKET_BITS, window.traces)
 
 
-def _chunks(starts: Ints, size: int) -> Iterator[tuple[int, int, slice]]:
-    """Yield ranges of at most ``size`` node combinations, with the slice of their frame rows."""
-    for low in range(0, len(starts) - 1, size):
-        high = min(low + size, len(starts) - 1)
-        yield low, high, slice(int(starts[low]), int(starts[high]))
+def _chunks(
+    group: TraceGroup, relation: TimedRelation
+) -> Iterator[tuple[TraceReader, TimedRelation, int]]:
+    """Yield parts of a table with few node combinations of one trace, and the first row of each part."""
+    for place in np.unique(relation.keys[:, 0]).tolist():
+        trace, whole = group.reader(place), group.part(relation, place)
+        begin = int(relation.starts[np.searchsorted(relation.keys[:, 0], place)])
+        for low in range(0, len(whole.keys), trace.together):
+            high = min(low + trace.together, len(whole.keys))
+            first, end = whole.starts[low], whole.starts[high]
+            starts = whole.starts[low : high + 1] - first
+            yield (
+                trace,
+                TimedRelation(whole.keys[low:high], starts, whole.frames[first:end]),
+                begin + int(first),
+            )
 
 
 def _worked_out(place: Bound) -> tuple[Bound, ...]:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sgstore.lang.catalog import Catalog
     from sgstore.lang.ir import Bound, BoundCheck, Query
     from sgstore.store import FrameRef, StoreFile
-    from sgstore.temporal._offline import TraceReader
+    from sgstore.temporal._trace_group import TraceReader
 
 Span = tuple["FrameRef", "FrameRef"]
 """First and last frame of a clip."""

@@ -132,6 +132,24 @@ def test_traces_that_hold_too_much_together_are_asked_one_by_one(
     assert found == store.find(LOOSE).rows()
 
 
+def test_a_sequence_is_joined_once_for_all_traces(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[int] = []
+
+    def counted(*given: Any) -> Any:
+        calls.append(1)
+        return matches_of(*given)
+
+    monkeypatch.setattr(_sequences, "matches_of", counted)
+    text = "USING UNKNOWN false MATCH (a) WHERE a.speed > 3 THEN MATCH (a) WHERE a.speed <= 3"
+
+    traces = {interval.trace for interval in store.find(text).intervals()}
+
+    assert len(traces) > 1
+    assert len(calls) == 1
+
+
 def test_sequences_joined_in_parts_are_those_joined_at_once(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

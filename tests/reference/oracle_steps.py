@@ -20,11 +20,11 @@ from sgstore.lang.catalog import Catalog
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax import tree as s
 from sgstore.model.world import longest_step_ns, tolerance_ns
-from sgstore.temporal._offline import TimedRelation, TraceReader
 from sgstore.temporal._sequence_monitor import FrameTime, sequence_monitor
 from sgstore.temporal._sequences import Finder
 from sgstore.temporal._signal_state import StreamClock
 from sgstore.temporal._signal_values import Clock
+from sgstore.temporal._trace_group import TimedRelation, TraceGroup, TraceReader
 from sgstore.temporal._valuation import QueryCache
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def over_columns(query: Any, held: Held, times: list[int]) -> Counter[Any]:
         )
     found: Counter[Any] = Counter()
     names = sorted(query.scope.nodes)
-    for _, _, keys, values in finder._find(trace, ()):
+    for _, _, keys, values in finder.found_in(TraceGroup.alone(trace), ()):
         for key, first, last in zip(keys.tolist(), values[-2], values[-1], strict=True):
             found[tuple(zip(names, key, strict=True)), first, last] += 1
     return found

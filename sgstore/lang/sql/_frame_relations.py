@@ -29,9 +29,9 @@ from sgstore.lang.ir import (
     TraceAttribute,
 )
 from sgstore.lang.sql._attributes import Aliases, attribute_text
-from sgstore.lang.sql._expressions import column_of, expression_text, leaves
-from sgstore.lang.sql._frames import frames
-from sgstore.lang.sql._masks import SqlBuilder
+from sgstore.lang.sql._expressions import column_of, columns_of, expression_text, leaves
+from sgstore.lang.sql._frames import frames, masks, phases
+from sgstore.lang.sql._masks import SqlBuilder, folded, in_which
 from sgstore.lang.sql._results import SqlStatement, finished, rows
 from sgstore.lang.sql._rewrite import rewritten
 from sgstore.lang.sql._select import Select, nested
@@ -61,6 +61,8 @@ def relation(
     values: Iterable[Bound] = (),
     bound: Iterable[str] | None = None,
     most: int | None = None,
+    *,
+    masked: bool = False,
 ) -> SqlStatement:
     """Return the SQL for the frames in which a pattern matches, with the ids of the matched nodes.
 
@@ -77,12 +79,14 @@ def relation(
         Keys of the nodes and edges to return. The others must only exist. ``None`` means all nodes.
     most : int, optional
         Largest number of rows to read.
+    masked : bool
+        Return masks of frames without values. A match may then have several rows in a bucket.
 
     Returns
     -------
     SqlStatement
-        Columns: ``frame_id``, the keys of the nodes in alphabetical order, those of the edges, then the values,
-        as ``:0``, ``:1``, …. The rows are not sorted.
+        Columns: ``frame_id`` (if masked, ``bucket`` and ``frames``), the keys of the nodes in
+        alphabetical order, those of the edges, then the values, as ``:0``, ``:1``, …. The rows are not sorted.
     """
     keys = set(query.scope.nodes if bound is None else bound)
     nodes = sorted(keys & set(query.scope.nodes))
@@ -94,8 +98,15 @@ def relation(
     values = [column.value for column in query.result.columns]
     sql = SqlBuilder(query, catalog, window)
     wanted = [leaf for value in values for leaf in leaves(value)]
-    text = frames(sql, query.scope, None, frozenset(nodes), frozenset(edges), wanted)
-    columns = [f'":rows"."{FRAME}" AS "{FRAME}"']
+    parts, both = phases(sql, query.scope), (frozenset(nodes), frozenset(edges))
+    if masked and not (parts.rest or parts.late):
+        text = masks(sql, query.scope, parts, None, *both)
+    else:
+        text = frames(sql, query.scope, None, *both, wanted)
+        text = folded(text, columns_of(*both)) if masked else text
+    of_frames = ("bucket", "frames") if masked else (FRAME,)
+    which = in_which('":rows"') if masked else [f'":rows"."{FRAME}"']
+    columns = [f'{column} AS "{name}"' for column, name in zip(which, of_frames, strict=True)]
     columns += [f'":rows".{quoted(f"{key}.id")} AS {quoted(key)}' for key in nodes]
     columns += [
         f'CAST(":rows".{quoted(f"{key}.type")} AS VARCHAR) AS {quoted(key)}' for key in edges
@@ -106,7 +117,7 @@ def relation(
         columns.append(f'{told} AS ":{number}"')
     body = "SELECT " + ",\n  ".join(columns) + "\nFROM " + nested(text, ":rows")
     body += "" if most is None else f"\nLIMIT {most}"
-    return finished(sql, body, (FRAME, *nodes, *edges, *(f":{n}" for n in range(len(values)))))
+    return finished(sql, body, (*of_frames, *nodes, *edges, *(f":{n}" for n in range(len(values)))))
 
 
 _CLOCK: Final = """SELECT "frame_id", "seq", "time_ns", "log_time_ns" FROM "frame"

@@ -1,0 +1,443 @@
+"""Query results of traces in memory: clocks and tables of matches, for one trace or for a group of traces.
+
+A group has the frames of all its traces in one array, and each table begins with the index of the trace. So the
+work of a sequence does not grow with the number of traces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.lang.operators import Column
+from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS, seq_of, trace_of
+from sgstore.model.world import JUMP_NS, longest_step_ns, seconds_of, tolerance_ns
+from sgstore.temporal._signal_values import Clock
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.model.world import Bools, Ints
+
+    Keys = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class TimedRelation:
+    """Table of query matches: node ids of each match, and the frames in which it occurs.
+
+    Attributes
+    ----------
+    keys : (K, n) int64
+        Distinct bindings in ascending order.
+    starts : (K + 1,) int64
+        Start of each binding's frames.
+    frames : (R,) int64
+        Numbers of frames, ascending for each binding.
+    values : tuple of (R,) arrays
+        Queried values of each match; unknown values are masked.
+    """
+
+    keys: Keys
+    starts: Ints
+    frames: Ints
+    values: tuple[Any, ...] = ()
+
+    @classmethod
+    def of(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> TimedRelation:
+        """Return the table of matches from unsorted rows of frame and node ids. Duplicate rows are dropped.
+
+        Parameters
+        ----------
+        frames : (R,) int64
+        keys : (R, n) int64
+        values : sequence of (R,) arrays
+        """
+        order = ordering([*keys.T, frames])
+        return cls.ordered(frames[order], keys[order], [value[order] for value in values])
+
+    @classmethod
+    def ordered(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> TimedRelation:
+        """Return the table of matches from rows that are sorted by node ids, then by frame."""
+        new = _changes(keys)
+        fresh = new.copy()
+        fresh[1:] |= frames[1:] != frames[:-1]
+        if not fresh.all():
+            frames, keys, new = frames[fresh], keys[fresh], new[fresh]
+            values = [value[fresh] for value in values]
+        first = np.flatnonzero(new)
+        return cls(keys[first], np.append(first, len(frames)), frames, tuple(values))
+
+    def between(self, first: int, last: int) -> TimedRelation:
+        """Return the table limited to a range of frames, ends included. Frame numbers restart at 0."""
+        rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
+        owners = np.searchsorted(self.starts, rows, "right") - 1
+        new = np.flatnonzero(np.diff(owners, prepend=-1))
+        keys, starts = self.keys[owners[new]], np.append(new, len(rows))
+        values = tuple(value[rows] for value in self.values)
+        return TimedRelation(keys, starts, self.frames[rows] - first, values)
+
+    def find(self, wanted: Keys) -> Ints:
+        """Return the table index of each combination of node ids (B, n), shape (B,). -1 means not found."""
+        if not len(self.keys) or not len(wanted):
+            return np.full(len(wanted), -1)
+        if not wanted.shape[1]:
+            return np.zeros(len(wanted), np.int64)
+        codes = codes_of(np.concatenate((self.keys, wanted)))
+        place = np.full(int(codes.max()) + 1, -1)
+        place[codes[: len(self.keys)]] = np.arange(len(self.keys))
+        return place[codes[len(self.keys) :]]
+
+    def rows_of(self, places: Ints) -> tuple[Ints, Ints]:
+        """Return all frame rows of some matches, given their indices in the table.
+
+        The result is the position in ``places`` and the row index of each.
+        """
+        known = np.flatnonzero(places >= 0)
+        first, end = self.starts[places[known]], self.starts[places[known] + 1]
+        counts = end - first
+        owner = np.repeat(known, counts)
+        offset = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
+        return owner, np.repeat(first, counts) + offset
+
+    def flags(self, places: Ints, length: int) -> Bools:
+        """Return a mask (B, length) of the frames in which each match occurs. For index -1 it is false."""
+        found = np.zeros((len(places), length), np.bool_)
+        owner, rows = self.rows_of(places)
+        found[owner, self.frames[rows]] = True
+        return found
+
+    def column(self, places: Ints, length: int, number: int = 0) -> Column:
+        """Return the value of each match in each frame, as a column (B, length) with a mask of known values."""
+        told = self.values[number]
+        plain = np.ma.getdata(told)
+        kind = np.float64 if plain.dtype.kind in "iuf" else plain.dtype
+        values = np.zeros((len(places), length), kind)
+        if plain.dtype.kind == "O":
+            values[:] = ""
+        known = np.zeros((len(places), length), np.bool_)
+        owner, rows = self.rows_of(places)
+        at = owner, self.frames[rows]
+        values[at] = plain[rows]
+        known[at] = ~np.ma.getmaskarray(told)[rows]
+        if kind is np.float64:
+            known &= ~np.isnan(values)
+        return Column(values, known)
+
+
+CELLS: Final = 4_000_000
+"""Product of bindings and frames processed at once."""
+
+
+@dataclass(slots=True)
+class TraceReader:
+    """Data of one trace in memory: frames, times and query results.
+
+    Attributes
+    ----------
+    trace_id : int
+    name : str
+    frame_ids, numbers, times, log_times : (F,) int64
+        Frame ids, frame numbers (``seq``), simulation times and log times (ns).
+    start : int
+        Simulation time from which seconds are counted; ns.
+    clock : Clock
+    relations : dict of str to TimedRelation
+    """
+
+    trace_id: int
+    name: str
+    frame_ids: Ints
+    numbers: Ints
+    times: Ints
+    log_times: Ints
+    start: int
+    clock: Clock
+    relations: dict[str, TimedRelation] = field(default_factory=dict[str, TimedRelation])
+
+    def __len__(self) -> int:
+        return len(self.frame_ids)
+
+    def between(self, first: int, last: int) -> TraceReader:
+        """Return a range of frames (ends included) as a separate trace."""
+        rows = slice(first, last + 1)
+        return replace(
+            self,
+            frame_ids=self.frame_ids[rows],
+            numbers=self.numbers[rows],
+            times=self.times[rows],
+            log_times=self.log_times[rows],
+            clock=replace(self.clock, times=self.clock.times[rows], runs=self.clock.runs[rows]),
+            relations={name: one.between(first, last) for name, one in self.relations.items()},
+        )
+
+    @property
+    def together(self) -> int:
+        """Number of node combinations to process at once, so that arrays over all frames fit into memory."""
+        return max(CELLS // max(len(self), 1), 1)
+
+    def seconds(self, frame: int) -> float:
+        """Return the time of a frame since the start of the trace; s."""
+        return seconds_of(int(self.times[frame] - self.start))
+
+
+@dataclass(frozen=True, slots=True)
+class JointClock:
+    """Times of the frames of several traces. A trace begins a day after the one before, as after a jump.
+
+    Attributes
+    ----------
+    times : (F,) int64
+        Ascending; ns.
+    gap_before : (F,) bool
+        Mask of the frames after a gap, and of the first frames of the traces.
+    period, tolerance : (F,) int64
+        See :class:`Clock`, for the trace of each frame.
+    """
+
+    times: Ints
+    gap_before: Bools
+    period: Ints
+    tolerance: Ints
+
+
+@dataclass(slots=True)
+class TraceGroup:
+    """Data of several traces in memory: frames, times and query results, in the order of the trace ids.
+
+    Attributes
+    ----------
+    ids, begins, periods : (T,) int64
+        Ids, start times and frame periods of the traces; ns.
+    names : list of str
+    starts : (T + 1,) int64
+        First frame of each trace.
+    frame_ids, numbers, times, log_times : (F,) int64
+        See :class:`TraceReader`.
+    ticks : (F,) int64
+        Times that ascend in each trace; ns.
+    runs : (F,) int64
+        Number of each frame's run without gaps.
+    relations : dict of str to TimedRelation
+        Their keys begin with the index of the trace.
+    """
+
+    ids: Ints
+    begins: Ints
+    periods: Ints
+    names: list[str]
+    starts: Ints
+    frame_ids: Ints
+    numbers: Ints
+    times: Ints
+    log_times: Ints
+    ticks: Ints
+    runs: Ints
+    relations: dict[str, TimedRelation] = field(default_factory=dict[str, TimedRelation])
+
+    @classmethod
+    def of(
+        cls, about: Mapping[int, Sequence[Any]], clock: Mapping[str, Ints], gaps: str
+    ) -> TraceGroup:
+        """Return the frames of some traces. ``about``: id → name, start (ns), frame period (ns)."""
+        names = "frame_id", "seq", "time_ns", "log_time_ns"
+        columns = [clock[name] for name in names]
+        known = np.isin(trace_of(columns[0]), [*about])
+        if not known.all():
+            columns = [column[known] for column in columns]
+        owners = trace_of(columns[0])
+        first = np.flatnonzero(np.diff(owners, prepend=-1))
+        ids, starts = owners[first], np.append(first, len(owners))
+        told = [about[trace] for trace in ids.tolist()]
+        begins, periods = (np.array([one[n] for one in told], np.int64) for n in (1, 2))
+        ticks = columns[2].copy()
+        steps = np.diff(ticks, prepend=ticks[:1])
+        steps[first] = 1
+        late = np.flatnonzero(steps <= 0)
+        for trace in np.unique(np.searchsorted(starts, late, "right") - 1).tolist():
+            own = slice(starts[trace], starts[trace + 1])
+            ticks[own] = ascending(ticks[own])
+        steps = np.diff(ticks, prepend=ticks[:1])
+        if gaps == "bridge":
+            breaks = steps == JUMP_NS
+        else:
+            longest = np.array([longest_step_ns(period) for period in periods.tolist()])
+            breaks = steps > np.repeat(longest, np.diff(starts))
+            breaks |= np.diff(columns[1], prepend=columns[1][:1] - 1) != 1
+        breaks[first] = True
+        names = [one[0] for one in told]
+        return cls(ids, begins, periods, names, starts, *columns, ticks, np.cumsum(breaks))
+
+    @classmethod
+    def alone(cls, trace: TraceReader) -> TraceGroup:
+        """Return a single trace as a group."""
+        clock = trace.clock
+        ids, begins, periods = (
+            np.array([one]) for one in (trace.trace_id, trace.start, clock.period)
+        )
+        starts = np.array([0, len(trace)])
+        frames = trace.frame_ids, trace.numbers, trace.times, trace.log_times
+        found = cls(ids, begins, periods, [trace.name], starts, *frames, clock.times, clock.runs)
+        for name, one in trace.relations.items():
+            keys = np.insert(one.keys, 0, 0, axis=1)
+            found.relations[name] = replace(one, keys=keys)
+        return found
+
+    @property
+    def clock(self) -> JointClock:
+        """Clock of all frames."""
+        counts = np.diff(self.starts)
+        first = self.starts[:-1]
+        steps = np.diff(self.ticks, prepend=self.ticks[:1])
+        steps[first] = JUMP_NS
+        gaps = np.diff(self.runs, prepend=self.runs[:1]) != 0
+        gaps[first] = True
+        tolerances = [tolerance_ns(period) for period in self.periods.tolist()]
+        both = (np.repeat(np.array(one, np.int64), counts) for one in (self.periods, tolerances))
+        return JointClock(np.cumsum(steps), gaps, *both)
+
+    @property
+    def _whole(self) -> bool:
+        """True if no trace lacks a frame, so that frame numbers are indices."""
+        first = np.repeat(self.starts[:-1], np.diff(self.starts))
+        return bool(np.array_equal(self.numbers + first, np.arange(len(first))))
+
+    def owners(self, frames: Ints) -> Ints:
+        """Return the index of the trace of each frame."""
+        return np.repeat(np.arange(len(self.ids)), np.diff(self.starts))[frames]
+
+    def places(self, frame_ids: Ints) -> Ints:
+        """Return the index of each frame. -1 means that the group does not have it."""
+        if not len(self.frame_ids):
+            return np.full(len(frame_ids), -1)
+        traces = trace_of(frame_ids)
+        first = np.flatnonzero(np.diff(traces, prepend=-1))
+        owners = np.minimum(np.searchsorted(self.ids, traces[first]), len(self.ids) - 1)
+        found = np.repeat(self.starts[owners], np.diff(first, append=len(traces)))
+        found += seq_of(frame_ids)
+        np.minimum(found, len(self.frame_ids) - 1, out=found)
+        elsewhere = np.flatnonzero(self.frame_ids[found] != frame_ids)
+        if len(elsewhere):  # of another trace, or of a missing frame
+            wanted = frame_ids[elsewhere]
+            there = np.searchsorted(self.frame_ids, wanted)
+            there = np.minimum(there, len(self.frame_ids) - 1)
+            found[elsewhere] = np.where(self.frame_ids[there] == wanted, there, -1)
+        return found
+
+    def table(self, buckets: Ints, keys: Keys, masks: Ints) -> TimedRelation:
+        """Return the table of matches from rows of buckets, node ids and masks of frames, unsorted."""
+        traces = buckets >> BUCKET_BITS
+        owners = np.searchsorted(self.ids, traces)
+        if len(self.ids):
+            known = self.ids[np.minimum(owners, len(self.ids) - 1)] == traces
+        else:
+            known = np.zeros(len(owners), np.bool_)
+        if not known.all():
+            owners, buckets, keys, masks = (one[known] for one in (owners, buckets, keys, masks))
+        order = ordering([owners, *keys.T, buckets])
+        keys, buckets = np.column_stack((owners, keys))[order], buckets[order]
+        new = _changes(keys)
+        fresh = new.copy()
+        fresh[1:] |= buckets[1:] != buckets[:-1]
+        masks = masks[order]
+        if not fresh.all():
+            masks = np.bitwise_or.reduceat(masks, np.flatnonzero(fresh))
+            keys, buckets, new = keys[fresh], buckets[fresh], new[fresh]
+        bits = np.flatnonzero(_bits(masks))
+        row, bit = bits >> FRAME_BITS, bits & ((1 << FRAME_BITS) - 1)
+        if self._whole:
+            frames = (self.starts[keys[:, 0]] + seq_of(buckets << FRAME_BITS))[row] + bit
+        else:
+            frames = self.places((buckets << FRAME_BITS)[row] + bit)
+        before = np.cumsum(np.bitwise_count(masks), dtype=np.int64)
+        first = np.flatnonzero(new)
+        starts = np.append(0, before)[np.append(first, len(masks))]
+        return TimedRelation(keys[first], starts, frames)
+
+    def reader(self, place: int) -> TraceReader:
+        """Return the data of one trace."""
+        rows = slice(int(self.starts[place]), int(self.starts[place + 1]))
+        period = int(self.periods[place])
+        clock = Clock(self.ticks[rows], self.runs[rows], period, tolerance_ns(period))
+        frames = (one[rows] for one in (self.frame_ids, self.numbers, self.times, self.log_times))
+        about = int(self.ids[place]), self.names[place], *frames, int(self.begins[place]), clock
+        relations = {name: self.part(one, place) for name, one in self.relations.items()}
+        return TraceReader(*about, relations)
+
+    def part(self, relation: TimedRelation, place: int) -> TimedRelation:
+        """Return the part of a table for one trace."""
+        low, high = np.searchsorted(relation.keys[:, 0], [place, place + 1]).tolist()
+        starts = relation.starts[low : high + 1]
+        rows = slice(int(starts[0]), int(starts[-1]))
+        return TimedRelation(
+            relation.keys[low:high, 1:],
+            starts - starts[0],
+            relation.frames[rows] - self.starts[place],
+            tuple(value[rows] for value in relation.values),
+        )
+
+
+def _bits(masks: Ints) -> NDArray[np.uint8]:
+    """Return the bits of masks, 64 for each, the lowest first."""
+    return np.unpackbits(masks.astype("<i8").view(np.uint8), bitorder="little")
+
+
+def _changes(keys: Keys) -> Bools:
+    """Return a mask of the rows that differ from the row before."""
+    found = np.ones(len(keys), np.bool_)
+    if len(keys):
+        found[1:] = False
+    for column in keys.T:
+        found[1:] |= column[1:] != column[:-1]
+    return found
+
+
+def codes_of(keys: Keys) -> Ints:
+    """Return a number for each row of a table, which equal rows share; from 0 to before the number of rows."""
+    order = ordering([*keys.T])
+    found = np.empty(len(keys), np.int64)
+    found[order] = np.cumsum(_changes(keys[order])) - 1
+    return found
+
+
+def ordering(columns: Sequence[Ints]) -> Ints:
+    """Return the sort order of table rows by several columns. The first column is the primary key."""
+    rows = len(columns[0])
+    if not rows:
+        return np.zeros(0, np.int64)
+    code, size = np.zeros(rows, np.int64), 1
+    for column in columns:
+        low = int(column.min())
+        many = int(column.max()) - low + 1
+        size *= many
+        if size >= 1 << 62:
+            return np.lexsort(columns[::-1])
+        if many > 1:
+            code *= many
+            code += column
+            code -= low
+    bits = rows.bit_length()
+    if size.bit_length() + bits > 62:
+        return np.argsort(code, kind="stable")
+    code <<= bits  # sorting numbers that include their row index is much faster
+    code |= np.arange(rows)
+    code.sort()
+    code &= (1 << bits) - 1
+    return code
+
+
+def ascending(times: Ints) -> Ints:
+    """Return frame times corrected to ascend strictly. Repeated times and backward jumps are moved forward.
+
+    A repeated time becomes a nanosecond later. After a backward jump, all times are shifted by
+    :data:`sgstore.model.world.JUMP_NS` after the last one. So the jump is a gap that no time bound spans.
+    """
+    steps = np.diff(times, prepend=times[:1])
+    if np.any(steps < 0):
+        times = times + np.cumsum(np.where(steps < 0, JUMP_NS - steps, 0))
+    ticks = np.arange(len(times))
+    return np.maximum.accumulate(times - ticks) + ticks if len(times) else times
