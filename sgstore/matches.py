@@ -16,7 +16,7 @@ from functools import lru_cache, partial
 from heapq import merge
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 
 from sgstore.base.display import IN_NOTEBOOK
 from sgstore.base.quoting import quoted
@@ -82,6 +82,9 @@ LOOKED_AT: Final = 2_000
 
 ROWS: Final = 1_000_000
 """Target number of rows per window. Windows grow after few rows and shrink after many."""
+
+KEPT: Final = 10_000
+"""Largest number of rows that matches keep after their number was asked."""
 
 BLOCK: Final = 50_000
 """Multi-frame matches inserted into the database at once."""
@@ -170,6 +173,7 @@ class Matches(Tabular):
     """
 
     of_match = False
+    _kept: tuple[Catalog, list[Row]] | None = None
 
     def __init__(
         self,
@@ -249,6 +253,7 @@ class Matches(Tabular):
         if most < 0:
             raise ValueError(f"limit is {most}, expected 0 or more")
         fewer = copy.copy(self)
+        fewer._kept = None  # noqa: SLF001
         fewer._limit = most if self._limit is None else min(self._limit, most)  # noqa: SLF001
         fewer._ready = self._ready.limited(most)  # noqa: SLF001
         return fewer
@@ -326,7 +331,49 @@ class Matches(Tabular):
             return scope_of((one.report for one in traces), world=compiled.bound.world)
 
     def __iter__(self) -> Iterator[Row]:
+        with self._file.snapshot():
+            if self._kept is not None and self._kept[0] is self._catalog():
+                return iter(self._kept[1])
         return self._rows(whole=False)
+
+    def __len__(self) -> int:
+        """Return the number of rows, each match in each frame; see :meth:`count` for frames.
+
+        Rows of a small result are kept until the store changes, so that they are not searched twice.
+        """
+        with self._file.snapshot(), closing(self._rows(whole=True)) as rows:
+            if self._kept is not None and self._kept[0] is self._catalog():
+                return len(self._kept[1])
+            some = list(islice(rows, KEPT + 1))
+            if len(some) <= KEPT:
+                self._kept = self._catalog(), some
+            return len(some) + sum(1 for _ in rows)
+
+    def __bool__(self) -> bool:
+        """True if there is a match."""
+        return bool(self.head(1))
+
+    @overload
+    def __getitem__(self, place: int) -> Row: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[Row]: ...
+    def __getitem__(self, place: int | slice) -> Row | list[Row]:
+        """Return the row at an index, or the rows of a slice, as of a list."""
+        if isinstance(place, int):
+            return (self.rows() if place < 0 else self.head(place + 1))[place]
+        last = place.stop
+        whole = last is None or min(place.start or 0, last, place.step or 1) < 0
+        return (self.rows() if whole else self.head(last))[place]
+
+    def head(self, number: int = 5) -> list[Row]:
+        """Return the first rows.
+
+        Examples
+        --------
+        >>> store.find("MATCH (v:Bus) RETURN v.name AS name, count(*) AS frames").head()
+        [Row(name='bus 3', frames=466)]
+        """
+        return list(self.limit(number))
 
     def _rows(self, *, whole: bool) -> Iterator[Row]:
         with self._compiled() as compiled:
@@ -749,7 +796,7 @@ class UnionMatches(Matches):
 
     def __init__(self, text: str, asked: UnionParts, parts: Sequence[Matches]) -> None:
         first = parts[0]
-        self._file, self._text = first._file, text  # noqa: SLF001
+        self._file, self._text, self._catalog = first._file, text, first._catalog  # noqa: SLF001
         self._parts, self._distinct, self._limit = tuple(parts), asked.distinct, None
         self.columns, self.graphs = first.columns, first.graphs
         self._results = [part._ready.bound.result for part in parts]  # noqa: SLF001
@@ -771,6 +818,7 @@ class UnionMatches(Matches):
         if most < 0:
             raise ValueError(f"limit is {most}, expected 0 or more")
         fewer = copy.copy(self)
+        fewer._kept = None  # noqa: SLF001
         fewer._limit = most if self._limit is None else min(self._limit, most)  # noqa: SLF001
         return fewer
 

@@ -341,14 +341,23 @@ class Store:
         """Return the catalog of the store for queries. It is cached until the file changes."""
         return self.file.catalog()
 
-    def find(self, query: str | Pattern | nx.Graph[Any], /, **parameters: object) -> Matches:
+    def find(
+        self,
+        query: str | Pattern | nx.Graph[Any] = "",
+        /,
+        *,
+        pattern: str = "",
+        **parameters: object,
+    ) -> Matches:
         """Return the matches of a pattern. The search runs when the matches are read.
 
         Parameters
         ----------
         query : str, Pattern or networkx graph
             ``MATCH … WHERE … RETURN …``, see the documentation of the language; or a :class:`sgstore.Pattern`;
-            or a graph of networkx.
+            or a graph of networkx; or the name of a pattern in the library.
+        pattern : str
+            Name of a pattern in the library, in place of ``query``.
         **parameters
             Values of ``$name``: numbers, texts, truth values, or lists of these.
 
@@ -364,11 +373,13 @@ class Store:
         >>> text = "MATCH (v:Bus) WHERE v.speed > $least RETURN v.name AS name, count(*) AS frames"
         >>> store.find(text, least=5).rows()
         [Row(name='bus 3', frames=276)]
+        >>> [row.t for row in store.find(pattern="cut_in").head(2)]
+        [10.3]
         """
         from sgstore.temporal import TemporalMatches
 
         make = partial(TemporalMatches, self.file, self.file.catalog)
-        return matches_of(make, UnionMatches, query, parameters)
+        return matches_of(make, UnionMatches, query or pattern, parameters)
 
     def check(
         self,

@@ -1,4 +1,4 @@
-"""Tables and pictures as HTML, for notebooks.
+"""Tables and pictures as HTML for notebooks, and tables as text.
 
 Texts from recordings are escaped, so they cannot add tags, styles or scripts to the page.
 """
@@ -34,6 +34,23 @@ def cell(value: Any, longest: int = LONGEST) -> str:
     text = json.dumps(value, ensure_ascii=False) if isinstance(value, list | dict) else str(value)
     text = "".join(c if c.isprintable() else "�" for c in " ".join(text.split()))
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
+
+
+def text_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], below: str = "") -> str:
+    """Return a table as lines of text, with a text below it. Numbers are right-aligned."""
+    texts = [[str(name) for name in columns], *([cell(value) for value in row] for row in rows)]
+    width = [max(map(len, column)) for column in zip(*texts, strict=True)]
+    right = [all(isinstance(v, int | float) for v in column) for column in zip(*rows, strict=True)]
+    right = right or [False] * len(width)
+    texts.insert(1, ["─" * size for size in width])
+    lines = [
+        "  ".join(
+            text.rjust(size) if numbers else text.ljust(size)
+            for text, size, numbers in zip(line, width, right, strict=True)
+        ).rstrip()
+        for line in texts
+    ]
+    return "\n".join([*lines, below] if below else lines)
 
 
 def html_table(

@@ -231,7 +231,12 @@ class Collection:
     info = traces
 
     def find(
-        self, query: str | Pattern | nx.Graph[Any], /, **parameters: object
+        self,
+        query: str | Pattern | nx.Graph[Any] = "",
+        /,
+        *,
+        pattern: str = "",
+        **parameters: object,
     ) -> CollectionMatches | CollectionUnion:
         """Return the matches of a pattern; see :meth:`sgstore.Store.find`.
 
@@ -247,7 +252,9 @@ class Collection:
         >>> fleet.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").count()
         108
         """
-        return matches_of(partial(CollectionMatches, self), CollectionUnion, query, parameters)
+        return matches_of(
+            partial(CollectionMatches, self), CollectionUnion, query or pattern, parameters
+        )
 
     def check(
         self,

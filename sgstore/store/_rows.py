@@ -205,6 +205,10 @@ class Rows(Tabular):
     >>> for row in rows:
     ...     print(row)
     ('town', 750)
+    >>> print(rows)
+    trace  frames
+    ─────  ──────
+    town      750
     """
 
     def __init__(
@@ -234,13 +238,26 @@ class Rows(Tabular):
         more = " and more" * self.truncated
         return f"<{len(self):,} rows{more} of {', '.join(self.columns)}>"
 
+    def __str__(self) -> str:
+        """Return the first rows of a result as a table of text."""
+        from sgstore.base.display import text_table
+
+        return text_table(self.columns, *self._shown())
+
     def _repr_html_(self) -> str:
         """Return the first rows of a result as an HTML table, for notebooks."""
-        from sgstore.base.display import IN_NOTEBOOK, html_table
+        from sgstore.base.display import html_table
+
+        some, below = self._shown()
+        return html_table(self.columns, some, below=below)
+
+    def _shown(self) -> tuple[list[tuple[Any, ...]], str]:
+        """Return the first rows of a result, and a note if there are more."""
+        from sgstore.base.display import IN_NOTEBOOK
 
         some = self._values[:IN_NOTEBOOK]
         more = self.truncated or len(self._values) > len(some)
-        return html_table(self.columns, some, below=f"the first {len(some)} rows" if more else "")
+        return some, f"the first {len(some)} rows" if more else ""
 
     def __len__(self) -> int:
         return len(self.values)

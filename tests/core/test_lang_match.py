@@ -303,3 +303,17 @@ def test_nested_operators_are_planned_together(town: Store, shape: str) -> None:
         speed = eval(shape.format("speed"), {"speed": speed, "sqrt": math.sqrt, "pow": pow})
     assert found == pytest.approx(speed)
     assert (nothing is None) == ("/" in shape or "%" in shape)
+
+
+def test_matches_have_a_number_indices_and_slices(open_town: Store) -> None:
+    matches = open_town.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)")
+    rows = matches.rows()
+
+    assert len(matches) == len(rows) > 100
+    assert list(matches) == rows
+    assert (matches[3], matches[-1], matches[2:9:3]) == (rows[3], rows[-1], rows[2:9:3])
+    assert (matches[-4:], matches.head(2), matches[:0]) == (rows[-4:], rows[:2], [])
+    with pytest.raises(IndexError):
+        matches[len(rows)]
+    assert matches
+    assert not open_town.find("MATCH (e:Ego) WHERE e.speed > 99")
