@@ -345,8 +345,6 @@ class Store:
         self,
         query: str | Pattern | nx.Graph[Any] = "",
         /,
-        *,
-        pattern: str = "",
         **parameters: object,
     ) -> Matches:
         """Return the matches of a pattern. The search runs when the matches are read.
@@ -356,10 +354,9 @@ class Store:
         query : str, Pattern or networkx graph
             ``MATCH … WHERE … RETURN …``, see the documentation of the language; or a :class:`sgstore.Pattern`;
             or a graph of networkx; or the name of a pattern in the library.
-        pattern : str
-            Name of a pattern in the library, in place of ``query``.
         **parameters
-            Values of ``$name``: numbers, texts, truth values, or lists of these.
+            Values of ``$name``: numbers, texts, truth values, or lists of these. Without a query,
+            ``pattern`` is the name of a pattern in the library.
 
         Raises
         ------
@@ -379,7 +376,7 @@ class Store:
         from sgstore.temporal import TemporalMatches
 
         make = partial(TemporalMatches, self.file, self.file.catalog)
-        return matches_of(make, UnionMatches, query or pattern, parameters)
+        return matches_of(make, UnionMatches, query, parameters)
 
     def check(
         self,
@@ -1063,6 +1060,9 @@ def matches_of(
 
         pattern = query if isinstance(query, Pattern) else Pattern.of(query)
         query, parameters = str(pattern), {**pattern.parameters, **parameters}
+    if not query and isinstance(name := parameters.get("pattern"), str):
+        query = name
+        parameters = {key: value for key, value in parameters.items() if key != "pattern"}
     query, parameters = statement(query, parameters)
     asked = union_parts(query, parameters)
     return (

@@ -234,8 +234,6 @@ class Collection:
         self,
         query: str | Pattern | nx.Graph[Any] = "",
         /,
-        *,
-        pattern: str = "",
         **parameters: object,
     ) -> CollectionMatches | CollectionUnion:
         """Return the matches of a pattern; see :meth:`sgstore.Store.find`.
@@ -252,9 +250,7 @@ class Collection:
         >>> fleet.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").count()
         108
         """
-        return matches_of(
-            partial(CollectionMatches, self), CollectionUnion, query or pattern, parameters
-        )
+        return matches_of(partial(CollectionMatches, self), CollectionUnion, query, parameters)
 
     def check(
         self,
