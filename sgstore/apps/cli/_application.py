@@ -50,8 +50,8 @@ def sgstore(
 ) -> None:
     """Find the driving scenes that matter.
 
-    Recordings go in (ingest), frames are found by what happens in them (find, sql), looked at (show), and
-    exported as clips (export). SGSTORE_STORE names the store of verbs that are given none.
+    Read recordings into a store (ingest), find frames (find, sql), draw them (show), cut clips (export).
+    SGSTORE_STORE names the store of commands without one.
     """
     set_verbosity(quiet=quiet, verbose=verbose)
     if version:

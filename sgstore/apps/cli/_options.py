@@ -127,6 +127,10 @@ if TYPE_CHECKING:
 class Verb(TyperCommand):
     """Command of ``sgstore`` that rejects a repeated option, unless the option collects several values."""
 
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the arguments and options of a command; flags show no type in the help."""
+        return _plain(super().get_params(ctx))
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments of a command, and return the unparsed ones."""
         if ctx.resilient_parsing:  # completion of an unfinished command line
@@ -153,6 +157,14 @@ class Verb(TyperCommand):
         """Write the help of a command, followed by its examples."""
         super().format_help(ctx, formatter)
         _write_examples(ctx)
+
+
+def _plain(parameters: list[Any]) -> list[Any]:
+    """Return parameters whose flags have no placeholder, such as ``<bool>``, in the help."""
+    for one in parameters:
+        if getattr(one, "is_flag", False):
+            one.metavar = ""
+    return parameters
 
 
 @cache
@@ -264,9 +276,24 @@ class Group(TyperGroup):
                 vars(error)["message"] = f"No such command {args[0]!r}; write: {instead}"
             raise
 
+    _shows_options = True
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the options of the group; none while the help lists its commands."""
+        return _plain(super().get_params(ctx)) if self._shows_options else []
+
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help of a group of commands, followed by its examples."""
-        super().format_help(ctx, formatter)
+        """Write the help of a group: its commands, its options and its examples."""
+        self._shows_options = False
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self._shows_options = True
+        texts = {", ".join(one.opts): one.help or "" for one in self.get_params(ctx)}
+        width = max(map(len, texts))
+        typer.echo(
+            "\n".join(["", " Options:", *(f"   {n:{width}}  {t}" for n, t in texts.items()), ""])
+        )
         _write_examples(ctx)
 
 
