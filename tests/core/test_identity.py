@@ -215,7 +215,7 @@ def test_an_id_that_returns_as_another_kind_is_a_new_entity(tmp_path: Path, writ
     scenes = [
         *stand(3, other, Body(7, 20.0)),
         *stand(2, other, start=0.3),
-        *stand(3, other, person, start=0.5),
+        *stand(3, other, person, Body(5, 40.0), start=0.5),
         *stand(2, other, person, Body(9, 30.0), start=0.8),
     ]
     path = write(tmp_path / "reuse", scenes)
@@ -224,6 +224,7 @@ def test_an_id_that_returns_as_another_kind_is_a_new_entity(tmp_path: Path, writ
 
         assert tracks(blocks, 7) == {1: ("car", [0, 1, 2]), 2: ("person", [5, 6, 7, 8, 9])}
         assert tracks(blocks, 3) == {1: ("car", [*range(10)])}
+        assert tracks(blocks, 5) == {1: ("car", [5, 6, 7])}
         assert tracks(blocks, 9) == {1: ("car", [8, 9])}
         assert any("7#2" in warning for warning in report.warnings)
 
