@@ -87,8 +87,8 @@ def _inside(folder: Path) -> Iterator[Path]:
     bags = {path.parent for path in folder.rglob(METADATA) if bag_folder(path.parent) is not None}
     own = {part.path for bag in bags for part in _parts(bag)}
     yield from bags
-    for path in folder.rglob("*"):
-        if is_recording(path) and path.is_file() and path not in own:
+    for path in (folder, *folder.rglob("*")):
+        if is_recording(path) and path not in own:
             yield path
 
 

@@ -19,6 +19,7 @@ import math
 import random
 import re
 import resource
+import shutil
 import struct
 import sys
 import tempfile
@@ -33,6 +34,7 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 import autoware_recordings
+import av2_logs
 import carla_recordings
 import commonroad_scenarios
 import fuzz_texts
@@ -135,6 +137,15 @@ def sample(flavour: str) -> Sample:
     if flavour == ".xml":
         text = commonroad_scenarios.scenario(frames=FRAMES + 9).encode()
         return Sample([Channel("", "xml", "", "", b"")], [Message(0, 0, text)], flavour)
+    if flavour in FOLDERS:
+        with tempfile.TemporaryDirectory() as folder:
+            path = FOLDERS[flavour](Path(folder) / "log", FRAMES)
+            found = Sample([], [], flavour)
+            for number, file in enumerate(sorted(one for one in path.rglob("*") if one.is_file())):
+                encoding = "json" if file.suffix == ".json" else ""
+                found.channels.append(Channel(str(file.relative_to(path)), encoding, "", "", b""))
+                found.messages.append(Message(number, 0, file.read_bytes()))
+        return found
     if flavour == ".log":
         packets = [Message(0, 0, data) for data in recorder_logs.packets(FRAMES)]
         return Sample([Channel("", "packet", "", "", b"")], packets, flavour)
@@ -178,11 +189,14 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "autoware": lambda path: autoware_recordings.drive(path, FRAMES),
     "commonroad": commonroad,
     "sumo": lambda path: sumo_recordings.as_mcap(path, sumo_recordings.drive(FRAMES)),
+    "av2": lambda path: av2_logs.as_mcap(path, av2_logs.drive(path.with_suffix(".d"), FRAMES)),
     "carla_recorder": lambda path: recorder_logs.as_mcap(
         path, recorder_logs.drive(path.with_suffix(".log"), FRAMES)
     ),
 }
-FLAVOURS = [*WRITERS, ".osi", ".osi.zst", ".xml", ".log"]
+FOLDERS: dict[str, Callable[[Path, int], Path]] = {".av2": av2_logs.drive}
+"""Recordings that are folders: their files are hurt."""
+FLAVOURS = [*WRITERS, *FOLDERS, ".osi", ".osi.zst", ".xml", ".log"]
 """Flavours of recordings."""
 KINDS = [*FLAVOURS, *fuzz_texts.LAWS]
 """All that is hurt."""
@@ -474,6 +488,14 @@ def mutate(whole: Sample, draw: random.Random) -> Sample:  # noqa: C901, PLR0912
 
 def write(hurt: Sample, path: Path, draw: random.Random) -> None:
     """The file of a recording, which may be hurt itself."""
+    if hurt.ending in FOLDERS:
+        shutil.rmtree(path, ignore_errors=True)
+        path.mkdir()
+        for message in hurt.messages:
+            file = path / hurt.channels[message.channel].topic
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(message.data)
+        return
     if hurt.ending == ".mcap":
         with path.open("wb") as stream:
             writer = Writer(
@@ -606,7 +628,7 @@ def run(flavours: list[str], runs: int, seed: int, keep: Path) -> dict[str, dict
                     ending, bar = "FAILED", max(bar, peak() + MEGABYTES)
                     keep.mkdir(parents=True, exist_ok=True)
                     kept = keep / f"{flavour.replace(' ', '_').strip('.')}_{number}{path.name[4:]}"
-                    kept.write_bytes(path.read_bytes())
+                    shutil.copytree(path, kept) if path.is_dir() else shutil.copy(path, kept)
                     print(f"{flavour}, seed {number}: kept as {kept}", file=sys.stderr)
                     traceback.print_exc()
                 counts[ending] = counts.get(ending, 0) + 1

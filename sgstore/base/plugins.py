@@ -100,6 +100,7 @@ READERS: Final = Registry(
         commonroad="commonroad._trace:CommonRoadTrace",
         sumo="sumo._trace:SumoTrace",
         carla_recorder="carla._recorder:CarlaRecorderTrace",
+        av2="av2._trace:Av2Trace",
     ),
     "flavour",
 )

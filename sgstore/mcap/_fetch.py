@@ -91,6 +91,28 @@ def bag_folder(path: Path) -> Path | None:
         return None
 
 
+FOLDERS: Final = {
+    # Argoverse 2, sensor data set.
+    "city_SE3_egovehicle.feather": ("annotations*.feather", "map/log_map_archive_*.json"),
+}
+"""File in each folder of a format → patterns of the other files of a recording; the first is required."""
+
+
+def log_files(path: Path) -> list[Path] | None:
+    """Return the files of a recording that is a folder of another format. ``None`` means another path."""
+    if url_named(path) is not None:
+        return None
+    for mark, patterns in FOLDERS.items():
+        try:
+            if (path / mark).is_file():
+                found = [sorted(path.glob(pattern)) for pattern in patterns]
+                if found[0]:
+                    return [path / mark, *(file for files in found for file in files)]
+        except (OSError, ValueError):
+            return None
+    return None
+
+
 @lru_cache(maxsize=1024)
 def _is_remote_bag(url: str) -> bool:
     """Return True if a URL is a bag folder in an object store. A URL with a file suffix is not a bag."""
@@ -302,8 +324,10 @@ def digest_of(path: Path) -> str:
     TraceError
         A file cannot be read.
     """
-    folder = bag_folder(path)
-    files = [path] if folder is None else [p.path for p in parts_of(folder) if p.size >= 0]
+    files = log_files(path)
+    if files is None:
+        folder = bag_folder(path)
+        files = [path] if folder is None else [p.path for p in parts_of(folder) if p.size >= 0]
     digest = hashlib.sha256()
     for one in files:
         with open_regular(one) as file:
@@ -370,6 +394,9 @@ def mark_of(path: Path) -> tuple[int, int]:
     TraceError
         The metadata of the bag are unreadable, or all its files are missing.
     """
+    if (inside := log_files(path)) is not None:
+        marks = [_mark(file) for file in inside]
+        return sum(size for size, _ in marks), max(time for _, time in marks)
     folder = bag_folder(path)
     if folder is None:
         return _mark(path)

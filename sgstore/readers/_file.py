@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, ClassVar, Final, Self
 
 import numpy as np
 from mcap.records import Channel, Schema
 
-from sgstore.mcap import MESSAGE_HEAD, Messages
+from sgstore.errors import TraceError
+from sgstore.mcap import MESSAGE_HEAD, Loss, Messages
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from mcap.records import Metadata
@@ -101,6 +102,94 @@ class MessageFile:
         """Return an empty iterator, because files of this format have no attachments."""
         del place
         return iter(())
+
+
+class NumberedFile(MessageFile):
+    """File of another format whose messages are made on request: 0 is the road map, others are time steps.
+
+    A subclass calls :meth:`add_channels`, and defines :meth:`message` and :meth:`time_of`.
+
+    Attributes
+    ----------
+    counts : dict
+        Number of messages by channel.
+    losses : list of str
+        Unreadable parts of the file.
+    """
+
+    RUN: ClassVar[int] = 256
+    """Maximum number of messages in a run."""
+
+    def add_channels(
+        self, named: dict[str, str], steps: int, about: dict[str, str], schemas: dict[str, bytes]
+    ) -> None:
+        """Add the channels of the steps and of the map.
+
+        Parameters
+        ----------
+        named : dict
+            Topic → schema: of the map, if there is one, and of the steps.
+        steps : int
+            Number of steps.
+        about : dict
+            Metadata of the channels.
+        schemas : dict
+            Name of a schema → JSON schema.
+        """
+        self.counts = dict[int, int]()
+        self.losses = list[str]()
+        self._has_map = len(named) == 2
+        for number, (topic, name) in enumerate(named.items(), start=3 - len(named)):
+            schema = Schema(id=number, data=schemas[name], encoding="jsonschema", name=name)
+            self.add_channel(topic, schema, "json", about)
+            self.counts[number] = steps if number == 2 else 1
+
+    def message(self, number: int) -> bytes:
+        """Return the bytes of a message by number. An unknown number is an ``IndexError``."""
+        raise NotImplementedError
+
+    def time_of(self, number: int) -> int:
+        """Return the time of a step by number, from 1; ns."""
+        raise NotImplementedError
+
+    def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
+        """Yield the map, then the steps. The ``offset`` of a message is its number."""
+        for reason in self.losses:
+            report.lose(Loss(reason, bytes=0))
+        if not wanted(-1):
+            return
+        total = self.counts[2] + 1
+        runs = [range(1)] if self._has_map else []
+        runs += [range(at, min(at + self.RUN, total)) for at in range(1, total, self.RUN)]
+        for numbers in runs:
+            held = {number: self.message(number) for number in numbers}
+            yield held_messages(
+                held,
+                [self.time_of(max(number, 1)) if total > 1 else 0 for number in numbers],
+                channel=[2 if number else 1 for number in numbers],
+                sequence=[max(number - 1, 0) for number in numbers],
+            )
+
+
+def read_numbered(
+    recording: NumberedFile, places: Iterable[tuple[int, int, int]]
+) -> Iterator[bytes]:
+    """Yield the bytes of messages, by their numbers and lengths.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be read, or a message does not match, because the file was replaced.
+    """
+    for _, offset, length in places:
+        try:
+            data = recording.message(offset) if offset >= 0 else b""
+        except IndexError:
+            data = b""
+        if len(data) != length or not data:
+            reason = f"no message of {length} bytes at {offset} there: the file was replaced"
+            raise TraceError(reason, path=recording.path)
+        yield data
 
 
 def held_messages(

@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING, Final, Protocol
 from sgstore.base import plugins
 from sgstore.base.display import first_of
 from sgstore.errors import TraceError
-from sgstore.mcap import MAGIC, McapFile, messages_at, open_regular
+from sgstore.mcap import MAGIC, McapFile, log_files, messages_at, open_regular
 from sgstore.model.world import TraceReport
+from sgstore.readers.av2._file import Av2File
+from sgstore.readers.av2._file import read_messages as _read_av2_messages
 from sgstore.readers.carla._recorder_file import ENDINGS as _LOG_ENDINGS
 from sgstore.readers.carla._recorder_file import CarlaRecorderFile, is_recorder_log
 from sgstore.readers.carla._recorder_file import read_messages as _read_recorder_messages
@@ -46,7 +48,7 @@ ENDINGS: Final = (
 """Suffixes of recordings, for the search in a folder; see :func:`is_recording`."""
 
 
-RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile | CarlaRecorderFile
+RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile | CarlaRecorderFile | Av2File
 """A file of messages in any format."""
 
 
@@ -86,12 +88,17 @@ def readers() -> Iterator[RecordingReader]:
 
 
 def is_recording(path: Path) -> bool:
-    """Return True if a file is a recording, by its suffix; logs and XML files also by their first bytes."""
+    """Return True if a path is a recording, by its suffix; logs and XML files also by their first bytes.
+
+    A folder is a recording if it has the files of a log of Argoverse 2. Bags are left to the caller.
+    """
     name = path.name.lower()
+    if not name.endswith(ENDINGS) or path.is_dir():
+        return log_files(path) is not None
     if name.endswith(_LOG_ENDINGS):
         return is_recorder_log(path)
     xml = name.endswith((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS))
-    return name.endswith(ENDINGS) and (not xml or is_scenario(path) or is_fcd(path))
+    return not xml or is_scenario(path) or is_fcd(path)
 
 
 def open_recording(path: str | Path) -> RecordingFile:
@@ -168,6 +175,8 @@ def _format_of(
     path: Path,
 ) -> tuple[Callable[[Path], RecordingFile], Callable[..., Iterator[bytes | memoryview]]]:
     """Return the functions that open a file of this format, and that read single messages of it."""
+    if log_files(path) is not None:
+        return Av2File, _read_av2_messages
     if is_scenario(path):
         return CommonRoadFile, _read_scenario_messages
     if is_fcd(path):

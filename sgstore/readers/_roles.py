@@ -44,6 +44,8 @@ _SCHEMAS: Final = {
     "commonroad.Step": STATES,
     "sumo.Timestep": STATES,
     "carla.RecorderFrame": STATES,
+    "av2.Map": MAP,
+    "av2.Frame": STATES,
     **{
         f"{package}_{name}": rank
         for package in ("autoware", "autoware_auto")

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import autoware_recordings
+import av2_logs
 import carla_recordings
 import commonroad_scenarios
 import numpy as np
@@ -94,6 +95,7 @@ EXAMPLES = {
     "foxglove json": lambda path: scene(path, "json"),
     "commonroad": steps,
     "sumo": lambda path: sumo_recordings.as_mcap(path, sumo_recordings.drive(25)),
+    "av2": lambda path: av2_logs.as_mcap(path, av2_logs.drive(path.with_suffix(""))),
     "carla_recorder": lambda path: recorder_logs.as_mcap(
         path, recorder_logs.drive(path.with_suffix(".log"), hidden=0)
     ),

@@ -281,9 +281,7 @@ def test_a_folder_gives_its_scenarios_and_no_other_xml(made: Path) -> None:
 
     assert recordings([made.parent]) == [made]
     made.unlink()
-    with pytest.raises(
-        StoreError, match=r"no recording \(\.mcap, \.osi, \.osi\.zst, \.xml, \.xml\.gz\)"
-    ):
+    with pytest.raises(StoreError, match=r"no recording \(\.mcap, \.osi, .*\.xml, \.xml\.gz\)"):
         recordings([made.parent])
 
 

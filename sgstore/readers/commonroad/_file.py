@@ -13,11 +13,9 @@ import math
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
-from mcap.records import Schema
-
 from sgstore.errors import MapError, TraceError
-from sgstore.mcap import Loss, mark_of_open, open_regular
-from sgstore.readers._file import MessageFile, held_messages
+from sgstore.mcap import mark_of_open, open_regular
+from sgstore.readers._file import NumberedFile, read_numbered
 from sgstore.readers.commonroad._document import (
     MAX_BYTES,
     ROOT,
@@ -28,10 +26,8 @@ from sgstore.readers.commonroad._document import (
 from sgstore.readers.commonroad._lanelets import light_place, map_text, meaning_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
-
-    from sgstore.mcap import Findings, Messages
 
 ENDINGS: Final = (".xml",)
 """Suffixes of such files; :func:`is_scenario` checks the contents."""
@@ -41,10 +37,7 @@ STEP: Final = "commonroad.Step"
 NAME: Final = "scenario"
 """Key of the scenario name in the metadata of a channel."""
 
-_MAP_CHANNEL, _STEP_CHANNEL = 1, 2
 _HEAD: Final = 4096
-_RUN: Final = 256
-"""Maximum number of messages in a run."""
 
 
 def is_scenario(path: Path) -> bool:
@@ -58,7 +51,7 @@ def is_scenario(path: Path) -> bool:
         return False
 
 
-class CommonRoadFile(MessageFile):
+class CommonRoadFile(NumberedFile):
     """CommonRoad scenario with the interface of an MCAP file (log of messages).
 
     Parameters
@@ -97,34 +90,14 @@ class CommonRoadFile(MessageFile):
         self._steps = _steps(self._scenario)
         self._standing = [one for one in self._scenario.obstacles.values() if one.static]
         about = {NAME: self._scenario.name or path.stem}
-        for number, name, topic in (
-            (_MAP_CHANNEL, MAP, "/commonroad/map"),
-            (_STEP_CHANNEL, STEP, "/commonroad/steps"),
-        ):
-            schema = Schema(id=number, data=_schema(name), encoding="jsonschema", name=name)
-            self.schemas[number] = schema
-            if self._map or number != _MAP_CHANNEL:
-                self.add_channel(topic, schema, "json", about)
-        self.counts = {_STEP_CHANNEL: len(self._steps)}
-        if self._map:
-            self.counts[_MAP_CHANNEL] = 1
-
-    def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
-        """Yield all messages of the scenario: the map, then one per time step.
-
-        The ``offset`` of a message is its number.
-        """
-        for reason in self._scenario.lost:
-            report.lose(Loss(reason, bytes=0))
+        named = {"/commonroad/map": MAP} if self._map else {}
+        named["/commonroad/steps"] = STEP
+        self.add_channels(
+            named, len(self._steps), about, {name: _schema(name) for name in (MAP, STEP)}
+        )
+        self.losses += self._scenario.lost
         if self._scenario.more_lost:
-            report.lose(Loss(f"{self._scenario.more_lost} more of the same kinds", bytes=0))
-        if not wanted(-1):
-            return
-        if self._map:
-            yield self._messages(range(1))
-        total = len(self._steps) + 1
-        for start in range(1, total, _RUN):
-            yield self._messages(range(start, min(start + _RUN, total)))
+            self.losses.append(f"{self._scenario.more_lost} more of the same kinds")
 
     def message(self, number: int) -> bytes:
         """Return the bytes of a message by number: 0 is the map, followed by the time steps.
@@ -139,26 +112,15 @@ class CommonRoadFile(MessageFile):
         standing = self._standing if number == 1 else []
         return _step_message(self._scenario, self._steps[number - 1], standing)
 
-    def _messages(self, numbers: range) -> Messages:
-        held = {number: self.message(number) for number in numbers}
-        return held_messages(
-            held,
-            [self._time(number) for number in numbers],
-            channel=[_STEP_CHANNEL if number else _MAP_CHANNEL for number in numbers],
-            sequence=[max(number - 1, 0) for number in numbers],
-        )
-
-    def _time(self, number: int) -> int:
-        """Return the time of a message; ns. The map has the time of the first step."""
-        steps = self._steps
-        step = steps[max(number - 1, 0)] if steps else 0
-        return round(step * self._scenario.step * 1e9)
+    def time_of(self, number: int) -> int:
+        """Return the time of a step by number, from 1; ns."""
+        return round(self._steps[number - 1] * self._scenario.step * 1e9)
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
     """Yield the bytes of messages of a scenario, by their offsets and lengths.
 
-    See :meth:`CommonRoadFile.walk`.
+    See :class:`CommonRoadFile`.
 
     Raises
     ------
@@ -166,15 +128,7 @@ def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterato
         The file cannot be read, or a message does not match, because the file was replaced.
     """
     with CommonRoadFile(path) as recording:
-        for _, offset, length in places:
-            try:
-                data = recording.message(offset) if offset >= 0 else b""
-            except IndexError:
-                data = b""
-            if len(data) != length or not data:
-                reason = f"no message of {length} bytes at {offset} there: the file was replaced"
-                raise TraceError(reason, path=path)
-            yield data
+        yield from read_numbered(recording, places)
 
 
 def _steps(scenario: TrafficScenario) -> list[int]:

@@ -1,0 +1,3 @@
+"""Reader of logs of the Argoverse 2 sensor data set."""
+
+__all__ = []
