@@ -505,6 +505,8 @@ def assemble(
             frame = decoder.decode(run, row)
             if frame is None:
                 continue
+            if sizes:  # the last frame can have objects of later messages of its time
+                sizes[-1] = entered
             window = size + (first > 0)
             if len(done) + len(raw) > window:  # The frame after the block is complete, too.
                 done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes)
@@ -521,6 +523,8 @@ def assemble(
             open_refs += between.take()
         between.add(refs(run.span(start, len(run))))
     open_refs += between.take()
+    if sizes:
+        sizes[-1] = decoder.roster.size
     done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes)
     if len(done) - (first > 0) > size:
         yield _block(first, done, size, block_refs, decoder.roster, known)
@@ -785,26 +789,19 @@ class LifetimeTracker:
         self, frame: FrameRows, run: int, earlier: dict[int, Sight | None], size: int
     ) -> FrameRows:
         """Return a frame with the node ids of its objects. Objects with a reused id are added."""
-        numbers, followed = frame.node.tolist(), dict[int, int]()
-        # An object that reuses an id comes before the new ids of this frame, and moves their nodes.
-        for row in sorted(range(len(numbers)), key=lambda row: numbers[row] >= size):
-            number = numbers[row]
+        numbers, nodes = frame.node.tolist(), self._roster.nodes_of(frame.node).tolist()
+        for row, number in enumerate(numbers):
             if row not in earlier and number not in self._lives:
                 continue
             kind = self._roster.entered(number).kind
             if number not in self._lives:
-                node = int(self._roster.nodes_of(frame.node[row]))
-                self._lives[number] = Lives(Life((node, 1), kind, earlier[row]))
+                self._lives[number] = Lives(Life((nodes[row], 1), kind, earlier[row]))
             called = frame.kinds.get(number)
             kind = KIND_CODE[called[0].kind] if called else kind
             lamp = frame.light_state[row] >= 0
             place = (NAN,) * 3 if lamp else tuple(frame.values[row, _X : _X + 3].tolist())
-            here = Sight(place, frame.time_ns, run)
-            followed[row] = self._follow(number, kind, here, called, size)
+            nodes[row] = self._follow(number, kind, Sight(place, frame.time_ns, run), called, size)
         self._seq += 1
-        nodes = self._roster.nodes_of(frame.node).tolist()
-        for row, node in followed.items():
-            nodes[row] = node
         of = dict(zip(numbers, nodes, strict=True))
         return replace(
             frame,

@@ -69,6 +69,14 @@ def write_osi(path: Path, scenes: list[Scene]) -> Path:
     return recorder.path
 
 
+def write_osi_topics(path: Path, scenes: list[Scene]) -> Path:
+    with osi.Recorder(path.with_suffix(".mcap")) as recorder:
+        for time, bodies in scenes:
+            for topic, some in (("a", bodies[:2]), ("b", bodies[2:])):
+                recorder.ground_truth(time, _osi_things(some), topic=topic)
+    return recorder.path
+
+
 def write_osi_file(path: Path, scenes: list[Scene]) -> Path:
     messages = [osi.ground_truth(t, _osi_things(b)).SerializeToString() for t, b in scenes]
     path = path.with_suffix(".osi")
@@ -151,6 +159,7 @@ def write_sumo(path: Path, scenes: list[Scene]) -> Path:
 Writer = Callable[[Path, list[Scene]], Path]
 FLAVOURS: dict[str, Writer] = {
     "osi": write_osi,
+    "osi topics": write_osi_topics,
     "osi file": write_osi_file,
     "carla": write_carla,
     "foxglove": write_foxglove,
