@@ -27,8 +27,8 @@ MAX_MAP_BYTES: Final = 1 << 28
 
 NO_MAP: Final = "no road map: without road nodes and without relations that need them"
 
-_SHOWN_WARNINGS: Final = 5
-"""Number of named defects of a road map; further defects are counted."""
+_SHOWN_WARNINGS: Final = 1_000
+"""Number of named defects of a road map in a report; further defects are counted."""
 
 PROJECTOR_INFO: Final = "map_projector_info.yaml"
 """Autoware's file next to a Lanelet2 map, with its projection."""

@@ -1,7 +1,6 @@
 """Small recordings that once gave a wrong answer: each gives the right one.
 
 Each test is named after a folder of ``cases/`` of the shared data. Its ``expected.txt`` describes the fault.
-Cases about road maps belong to another issue and are not here.
 """
 
 from __future__ import annotations
@@ -304,3 +303,42 @@ def test_truth_09_autoware_tracked_objects(case: Callable[[str], Case]) -> None:
     rows = sorted(guard.values(query))
     assert rows[0][1:] == pytest.approx((101.0, 50.0), abs=1e-3)
     assert rows[1][1:] == pytest.approx((109.433, 50.4433), abs=1e-3)
+
+
+TRAVELS = "MATCH (a:Lane)-[:travelsTo]->(b:Lane) RETURN DISTINCT a.name, b.name"
+
+
+@pytest.mark.parametrize(
+    ("folder", "name", "line"),
+    [
+        ("bugs-16-lane-links-in-junction-only", "j_nolinks", ""),
+        ("bugs-17-signal-beyond-its-road", "sig_long", "<signal> 's1': its s = 250 m is beyond"),
+        ("bugs-18-negative-lane-width", "negw", "lane 1/0/-2: its width is negative (-3 m)"),
+        (
+            "bugs-19-road-length-contradicts",
+            "len_short",
+            "length is 60 m, but its planView has 100 m",
+        ),
+    ],
+)
+def test_bugs_16_to_19_maps(case: Callable[[str], Case], folder: str, name: str, line: str) -> None:
+    odd = case(folder)
+    _, reported = odd.ingest(f"{name}.mcap", options=("--map", str(odd.folder / f"{name}.xodr")))
+    run(["map", str(odd.folder / f"{name}.xodr"), "--json"])
+    listed = odd.capsys.readouterr().out
+
+    assert line in reported
+    assert line in listed
+    if name == "j_nolinks":
+        assert odd.values(TRAVELS) == [("1/0/-1", "3/0/-1"), ("3/0/-1", "2/0/-1")]
+    if name == "negw":
+        offsets = odd.values("MATCH (v:Car)-[r:isIn]->(l) RETURN l.name, r.offset")
+        assert [name for name, _ in offsets] == ["1/0/-3"] * 2
+        assert [offset for _, offset in offsets] == pytest.approx([0.75, 0.25], abs=1e-3)
+
+
+def test_bugs_15_lane_link_told_one_way(case: Callable[[str], Case]) -> None:
+    one_way = case("bugs-15-lane-link-told-one-way")
+    one_way.ingest("ow01.mcap", options=("--map", str(one_way.folder / "ow01.xodr")))
+
+    assert sorted(one_way.values(TRAVELS)) == [("1/0/-1", "2/0/-1"), ("2/0/1", "1/0/1")]

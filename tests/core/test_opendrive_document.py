@@ -239,8 +239,8 @@ def test_a_lane_whose_only_width_is_broken_costs_no_road_and_records_are_counted
     road_map = read_map(a_map(a_road("1", line(9.0), sections=section(*lanes))), "m")
 
     assert {"1/0/-2", "1"} <= {*road_map.nodes.name}
-    assert len(road_map.warnings) == 1
     assert "it and 1 more are left out" in road_map.warnings[0]
+    assert road_map.warnings[1:] == ("lane 1/0/-1: no width, which counts as 0",)
 
 
 @pytest.mark.data
@@ -267,7 +267,9 @@ def test_links_that_lead_nowhere_cost_no_road_and_are_said() -> None:
     assert "1/0/-1" in road_map.nodes.name
     assert [w for w in road_map.warnings if "missing lane -7" in w]
     assert [w for w in road_map.warnings if "missing road 'gone'" in w]
-    assert len(road_map.warnings) == 2
+    assert [w for w in road_map.warnings if "missing junction 'none'" in w]
+    assert [w for w in road_map.warnings if "lane 1/1/-1 leads nowhere" in w] == []
+    assert len(road_map.warnings) == 3
 
 
 def test_sections_for_one_side_are_said() -> None:

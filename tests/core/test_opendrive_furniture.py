@@ -438,4 +438,5 @@ def test_real_maps_have_what_their_files_count(data: Path) -> None:
         road_map = read_map(text, name)
         kinds = [KINDS[code] for code in road_map.nodes.kind]
         assert {kind: kinds.count(kind) for kind in expected} == expected
-        assert road_map.warnings == ()
+        # Three lane links of Town07 contradict others.
+        assert len(road_map.warnings) == (3 if name == "Town07" else 0)

@@ -49,7 +49,7 @@ def test_traffic_flows_on_from_road_to_road_at_the_point_of_contact() -> None:
     assert pairs(road_map, "travelsTo") == {("1/0/-1", "2/0/1"), ("2/0/-1", "1/0/1")}
 
 
-def test_a_link_to_the_wrong_end_of_a_lane_is_no_way_for_traffic() -> None:
+def test_a_link_to_the_wrong_lane_is_a_warning_and_the_touching_lane_counts() -> None:
     kept = section(lane(1, after=1), lane(0), lane(-1, after=-1))
     plans = {"1": line(40.0), "2": line(40.0, x=80.0, hdg=np.pi)}
     roads = [
@@ -57,7 +57,10 @@ def test_a_link_to_the_wrong_end_of_a_lane_is_no_way_for_traffic() -> None:
         for (name, plan), other in zip(plans.items(), "21", strict=True)
     ]
 
-    assert pairs(read_map(a_map(*roads), "head on"), "travelsTo") == set()
+    road_map = read_map(a_map(*roads), "head on")
+
+    assert pairs(road_map, "travelsTo") == {("1/0/-1", "2/0/1"), ("2/0/-1", "1/0/1")}
+    assert len([w for w in road_map.warnings if "meets head on" in w]) == 2
 
 
 def crossing(*connections: str, kind: str = "default") -> str:

@@ -143,6 +143,8 @@ class Document:
         Row of a road → its first defect.
     odd : dict
         Record → its first defect.
+    warnings : list of str
+        Contradictions that leave out no road or record.
     """
 
     def __init__(
@@ -153,6 +155,8 @@ class Document:
         self.characters = characters
         self.blame: dict[int, MapError] = {}
         self.odd: dict[Record, MapError] = {}
+        self.warnings: list[str] = []
+        self._numbers: dict[tuple[str, str, str], Floats] = {}
         self.road_ids = tables["road"].texts("id")
         for kind, table in tables.items():
             above = kind.rpartition("/")[0]
@@ -169,11 +173,14 @@ class Document:
     def numbers(self, kind: str, name: str, default: float | None = None) -> Floats:
         """Return an attribute of all elements of a kind as numbers.
 
-        Invalid numbers mark their road as defective.
+        Invalid numbers mark their road as defective. The array is read-only.
 
         A missing number without default, or one that is not finite or too large, is a defect of its
         road, and the value is 0. Outside roads, the value is the default.
         """
+        key = (kind, name, repr(default))
+        if key in self._numbers:
+            return self._numbers[key]
         table = self.tables[kind]
         missing = "0" if default is None else repr(default)
         values = _floats(table.texts(name, missing))
@@ -186,6 +193,8 @@ class Document:
         if default is None:
             absent = np.array([name not in a for a in table.attributes], bool)
             self.accuse(kind, absent, f"attribute {name!r} is missing")
+        values.flags.writeable = False
+        self._numbers[key] = values
         return values
 
     def integers(self, kind: str, name: str, default: int | None = None) -> Ints:
@@ -193,7 +202,7 @@ class Document:
 
         Invalid numbers mark their road as defective.
         """
-        values = self.numbers(kind, name, default)
+        values = self.numbers(kind, name, default).copy()
         broken = (values != np.floor(values)) | (np.abs(values) > 1e9)
         self.accuse(kind, broken, f"attribute {name!r} is not a whole number")
         values[broken] = 0 if default is None else default
@@ -227,6 +236,7 @@ class Document:
 
     def leave_out(self, records: Collection[Record]) -> None:
         """Remove defective records (such as lane widths) from the tables."""
+        self._numbers.clear()
         for kind in {kind for kind, _, _ in records}:
             table = self.tables[kind]
             every = self._records(kind, np.arange(len(table)))

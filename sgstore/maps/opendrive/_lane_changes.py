@@ -127,7 +127,11 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
     names = zip(lanes.section.tolist(), lanes.ident.tolist(), strict=True)
     row_of = {name: row for row, name in enumerate(names)}
     rows: list[tuple[int, bool, float, float]] = []
-    for raw, records in _records(document, "weight").items():
+    table = document["road/laneSection/lane/roadMark"]
+    weights = zip(table.parent, table.texts("weight"), strict=True)
+    broad = {raw for raw, weight in weights if weight.strip().lower() == "bold"}
+    every = _records(document, "weight") if broad else {}
+    for raw, records in ((raw, every[raw]) for raw in every if raw in broad):
         marks = sorted((at, weight == "bold" and mark != "none") for at, mark, weight in records)
         own, centre = int(lanes.row[raw]), int(lanes.centre[raw])
         section = centre if own < 0 else int(lanes.section[own])

@@ -65,6 +65,8 @@ JUMP: Final = 2e-4
 """Least distance of a jump at a cut; m."""
 CORNER: Final = 2e-4
 """Least change of direction at a cut that makes a corner; rad."""
+NEGATIVE: Final = 1e-3
+"""A width below minus this value is negative, not rounded; m."""
 _SAME_PLACE: Final = 1e-6
 _SAMPLES: Final = 5
 """Sample places between two cuts for the curvature."""
@@ -128,6 +130,11 @@ class LaneTable:
 
     def __len__(self) -> int:
         return len(self.section)
+
+    def name(self, document: Document, lane: int) -> str:
+        """Return the name of a lane in warnings: its road, the number of its section, its id."""
+        road = document.road_ids[self.road[lane]]
+        return f"lane {road}/{self.sections.number[self.section[lane]]}/{self.ident[lane]}"
 
 
 def read_lanes(document: Document) -> LaneTable:
@@ -234,6 +241,7 @@ def _intervals(document: Document, lanes: LaneTable, plan: PlanView) -> _LaneInt
         offset = document.numbers(kind, "sOffset", 0.0)[lane >= 0]
         of = lanes.section[lane[lane >= 0]]
         cuts.append((of, sections.start[of] + offset))
+    cuts += _ends_of_width(document, lanes)
     section = np.concatenate([c for c, _ in cuts])
     s = np.concatenate([at for _, at in cuts])
     inside = (section >= 0) & (s > sections.start[section] + _SAME_PLACE)
@@ -253,6 +261,37 @@ def _intervals(document: Document, lanes: LaneTable, plan: PlanView) -> _LaneInt
     last = first[1:] - 1
     end[last] = sections.end
     return _LaneIntervals(section, s, end, first)
+
+
+def _ends_of_width(document: Document, lanes: LaneTable) -> list[tuple[Ints, Floats]]:
+    """Return the places where the width of a lane becomes negative or positive, by section.
+
+    Each lane with a negative width causes a warning. Between the places its width counts as 0.
+    """
+    kind, sections = "road/laneSection/lane/width", lanes.sections
+    lane = lanes.row[document[kind].of]
+    rows = np.flatnonzero(lane >= 0)
+    offset = document.numbers(kind, "sOffset", 0.0)
+    rows = rows[np.lexsort((offset[rows], lane[rows]))]
+    lane, offset, width = lane[rows], offset[rows], coefficients_of(document, kind)[rows]
+    section = lanes.section[lane]
+    span = sections.end[section] - sections.start[section]
+    same = np.flatnonzero(lane[1:] == lane[:-1])
+    span[same] = np.minimum(offset[same + 1], span[same])
+    span -= offset
+    at = np.linspace(0.0, 1.0, 2 * _SAMPLES - 1) * np.maximum(span, 0.0)[:, None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        lowest = cubic(width[:, None], at).min(axis=1, initial=np.inf)
+    cuts: list[tuple[Ints, Floats]] = []
+    for row in np.flatnonzero((lowest < -NEGATIVE) & (span > 0)).tolist():
+        roots = np.roots(np.trim_zeros(width[row, ::-1], "f"))
+        ends = np.sort(roots[np.isreal(roots)].real)
+        start = sections.start[section[row]] + offset[row]
+        inside = ends[(ends > 0) & (ends < span[row])]
+        cuts.append((np.full(len(inside), section[row]), start + inside))
+        what = f"its width is negative ({lowest[row]:g} m), which counts as 0"
+        document.warnings.append(f"{lanes.name(document, int(lane[row]))}: {what}")
+    return cuts
 
 
 def _shifted(coefficients: Floats, by: Floats) -> Floats:
@@ -304,6 +343,8 @@ def _borders(
     start = intervals.start[interval] - lanes.sections.start[lanes.section[lane]]
     width, has_width = _of_lanes(document, "width", lanes, (lane, within, start))
     border, has_border = _of_lanes(document, "border", lanes, (lane, within, start))
+    half = (intervals.end - intervals.start)[interval] / 2
+    width[cubic(width, half) < -NEGATIVE] = 0.0
     width *= np.sign(lanes.ident)[lane][:, None]
     by_border = has_border & ~has_width
     inner, outer = np.empty_like(width), np.empty_like(width)
@@ -315,6 +356,11 @@ def _borders(
         below = lanes.inner[lane[rows]]
         inner[rows] = outer[first[below] + number[rows]] if begin else centre[interval[rows]]
         outer[rows] = np.where(by_border[rows][:, None], border[rows], inner[rows] + width[rows])
+    between = cubic(outer, half) - cubic(inner, half)
+    crossed = by_border & (between * np.sign(lanes.ident)[lane] < -NEGATIVE)
+    for row in np.unique(lane[crossed]).tolist():
+        what = "its border is on the wrong side of the lane inside it"
+        document.warnings.append(f"{lanes.name(document, row)}: {what}")
     return _LaneBorders(first, interval, inner, outer)
 
 

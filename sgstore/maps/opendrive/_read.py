@@ -14,10 +14,12 @@ import shapely
 
 from sgstore.base.tables import chained
 from sgstore.errors import MapError
+from sgstore.maps.opendrive._contradictions import contradictions
 from sgstore.maps.opendrive._document import Document, Record, Spoiled, read_document
+from sgstore.maps.opendrive._flows import flows
 from sgstore.maps.opendrive._lane_changes import read_broad_lines, read_lane_changes
-from sgstore.maps.opendrive._lanes import heights, odd_sections, read_lanes, surface
-from sgstore.maps.opendrive._network import Network, flows
+from sgstore.maps.opendrive._lanes import heights, read_lanes, surface
+from sgstore.maps.opendrive._network import Network
 from sgstore.maps.opendrive._nodes import (
     FIRST_LANE,
     containment,
@@ -146,7 +148,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
     lane_changes = read_lane_changes(document, lanes, ribbons)
     edges = [
         *neighbours(lanes, ribbons),
-        *flow_edges(lanes, surfaces, ribbons, flows(document, network)),
+        *flow_edges(lanes, surfaces, ribbons, flows(document, network, ribbons)),
         *containment(document, np.append(lanes.road, parking_road)),
         ("laneChange", FIRST_LANE + lane_changes.lane, FIRST_LANE + lane_changes.to),
         signals.edges(first_signal),
@@ -170,7 +172,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         road_types=road_types(document),
         junction_types=junction_types(document),
         controllers=read_controllers(document),
-        warnings=[*odd_sections(document), *network.warnings],
+        warnings=[*contradictions(document, lanes, plan), *network.warnings],
         stops=(signal, lane, ribbons.along_at(lane, s)),
         stop_lines=signals.stop_lines(first_signal),
         courses=LaneCourses.of(every, heights(document, lanes, every)),
