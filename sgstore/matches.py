@@ -21,7 +21,16 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 from sgstore.base.display import IN_NOTEBOOK
 from sgstore.base.quoting import quoted
 from sgstore.errors import QueryError, SgstoreError
-from sgstore.lang.ir import FRAME_COLUMNS, INTERVAL_COLUMNS
+from sgstore.lang.catalog import FRAME_ATTRIBUTES, TRACE_ATTRIBUTES, Type
+from sgstore.lang.ir import (
+    FRAME_COLUMNS,
+    INTERVAL_COLUMNS,
+    FrameAttribute,
+    NodeValue,
+    Result,
+    ReturnColumn,
+    TraceAttribute,
+)
 from sgstore.lang.sql import (
     Compiled,
     Layout,
@@ -45,7 +54,15 @@ from sgstore.store import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import (
+        Callable,
+        Collection,
+        Generator,
+        Iterable,
+        Iterator,
+        Mapping,
+        Sequence,
+    )
     from contextlib import AbstractContextManager
     from typing import Self
 
@@ -59,6 +76,9 @@ if TYPE_CHECKING:
     from sgstore.lang.sql import Gathered, SqlStatement, UnionParts
     from sgstore.store import Given, Rows
     from sgstore.temporal.truth_lanes import TruthLanes
+
+_TRACE_ID: Final = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
+_SEQ: Final = FrameAttribute(FRAME_ATTRIBUTES["seq"], Type.number)
 
 SHOWN: Final = 80
 """Maximum length of the query text in the repr of matches; characters."""
@@ -462,20 +482,41 @@ class Matches(Tabular):
         (e)-[:near_coll]->(v) ((197, 206),)
         e.speed < 5 ((203, 359), (369, 425), (517, 524), (579, 632), (711, 749))
         """
+        with self._compiled():
+            found = self.bindings(frame) if binding is None else [dict(binding)]
+            return self.parts_each([(frame.trace, frame.seq, next(iter(found), {}))])[0]
+
+    def parts_each(self, matches: Sequence[tuple[str, int, Mapping[str, int]]]) -> list[TruthLanes]:
+        """Return the truth lanes of matches, given by trace, frame number and binding; see :meth:`parts`.
+
+        A part is searched once for all matches with the same variables.
+
+        Examples
+        --------
+        >>> matches = store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)")
+        >>> two = [("town", 0, {"e": 0, "v": 2}), ("town", 511, {"e": 0, "v": 13})]
+        >>> [lanes.together()[0] for lanes in matches.parts_each(two)]
+        [(0, 0), (511, 520)]
+        """
         from sgstore.temporal.truth_lanes import (
             truth_lanes,  # imports numpy, which a query does not need
         )
 
         with self._compiled() as compiled:
-            found = self.bindings(frame) if binding is None else [dict(binding)]
-            facts = next((t for t in compiled.catalog.traces if t.trace_id == frame.trace_id), None)
-            window = None if facts is None else Window.of([facts.extent])
+            facts = {trace.name: trace for trace in compiled.catalog.traces}
 
-            def numbers(part: Query) -> NDArray[np.generic]:
-                frames = self._part(compiled, part).frames(window)
-                return self._file.arrays(**self._asked(frames))["seq"]
+            def rows(
+                part: Query, keys: Sequence[str], traces: Collection[str]
+            ) -> list[NDArray[np.generic]]:
+                values = [_TRACE_ID, _SEQ, *map(NodeValue, keys)]
+                columns = tuple(ReturnColumn(f":{n}", value) for n, value in enumerate(values))
+                result = Result(columns=columns, whole=False, distinct=True)
+                ready = self._part(compiled, replace(part, result=result))
+                window = Window.of([facts[trace].extent for trace in traces])
+                return [*self._file.arrays(**self._asked(ready.rows(window))).values()]
 
-            return truth_lanes(compiled.bound, frame.trace, facts, next(iter(found), {}), numbers)
+            asked = [(trace, binding) for trace, _, binding in matches]
+            return truth_lanes(compiled.bound, facts, asked, rows)
 
     def _part(self, compiled: Compiled, query: Query) -> Compiled:
         ready = query if query.steps else rewritten(query, compiled.catalog)
@@ -929,6 +970,11 @@ class UnionMatches(Matches):
         named = [p for p in self._parts if has_nodes(p._ready.bound, binding or {})] or self._parts  # noqa: SLF001
         matching = (p for p in named if any(given <= b.items() for b in p.bindings(frame)))
         return next(matching, named[0]).parts(frame, binding)
+
+    def parts_each(self, matches: Sequence[tuple[str, int, Mapping[str, int]]]) -> list[TruthLanes]:
+        """Return the truth lanes of matches, each of the part that :meth:`parts` chooses."""
+        frames = ((self._file.frame(f"{trace}#{seq}"), given) for trace, seq, given in matches)
+        return [self.parts(*one) for one in frames]
 
     def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
         """Yield the intervals of all parts, ordered by trace and start; see :meth:`Matches.intervals`."""

@@ -235,14 +235,17 @@ def _spans(found: list[Found], traces: Mapping[str, Any], around_s: float) -> Sp
 
 def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dict[str, Any]:
     """Return, by trace and nodes of a match, the frames in which each part of the pattern is true."""
-    parts: dict[str, Any] = {}
-    for trace, first, _, binding in found:
-        key = _key(trace, binding or None)
-        if key not in parts:
-            frame = store.file.frame(f"{trace}#{first}").frame_id
-            asked = {"ask": "parts", **question, "frame": frame, "binding": binding or None}
-            (parts[key],) = answer(store, asked, 0)
-    return parts
+    first = {
+        _key(trace, nodes or None): (trace, seq, nodes) for trace, seq, _, nodes in found[::-1]
+    }
+    matches = store.find(question["text"], **question["parameters"])
+    bound = {key: one for key, one in first.items() if one[2]}
+    lanes = dict(zip(bound, matches.parts_each([*bound.values()]), strict=True))
+    for key in first.keys() - bound.keys():  # the pattern has no nodes
+        trace, seq, _ = first[key]
+        lanes[key] = store.parts(question["text"], f"{trace}#{seq}", **question["parameters"])
+    keys = dict.fromkeys(_key(trace, nodes or None) for trace, _, _, nodes in found)
+    return {key: lanes[key].as_dict() for key in keys}
 
 
 def _columns(

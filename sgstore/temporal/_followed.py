@@ -68,7 +68,7 @@ class FollowedMatch:
 
     def __init__(self, query: Query, nodes: Mapping[str, int]) -> None:
         self._nodes = dict(nodes)
-        self._parts = tuple(parts_of(query, nodes))
+        self._parts = tuple(parts_of(query, {name: [node] for name, node in nodes.items()}))
         self._spans: list[list[tuple[int, int]]] = [[] for _ in self._parts]
         self._search = [
             None

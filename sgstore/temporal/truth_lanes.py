@@ -7,16 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sgstore.lang.help import parts_of
+from sgstore.lang.help import parts_of, separable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from sgstore.lang.catalog import TraceFacts
     from sgstore.lang.help import PatternPart
     from sgstore.lang.ir import Query
+
+    Match = tuple[str, Mapping[str, int]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,42 +106,62 @@ def _intersection(
 
 def truth_lanes(
     query: Query,
-    trace: str,
-    facts: TraceFacts | None,
-    given: Mapping[str, int],
-    numbers: Callable[[Query], NDArray[np.generic]],
-) -> TruthLanes:
-    """Return the truth lanes of a match in a trace.
-
-    A lane has the frames in which one part of the query's pattern is true.
+    facts: Mapping[str, TraceFacts],
+    matches: Sequence[Match],
+    rows: Callable[[Query, Sequence[str], Collection[str]], Sequence[NDArray[np.generic]]],
+) -> list[TruthLanes]:
+    """Return the truth lanes of matches: for each part of the query's pattern, the frames in which it is true.
 
     Parameters
     ----------
     query : Query
         A bound query.
-    trace : str
-    facts : TraceFacts, optional
-        Facts of the trace. ``None`` means that the trace has no facts; all lanes are then empty.
-    given : mapping of str to int
-        Node ids of some of its variables.
-    numbers : callable
-        Returns the numbers of the frames in which a query holds, in any order; duplicates are allowed.
+    facts : mapping of str to TraceFacts
+        By trace. The lanes of other traces are empty.
+    matches : sequence of (str, mapping)
+        Trace of each match, and node ids of some variables.
+    rows : callable
+        Returns the trace ids, the frame numbers and the ids of some nodes where a query holds in some traces.
+        Rows may repeat.
 
     Raises
     ------
     QueryNameError
         The pattern does not contain the variable.
     """
-    lanes: list[TruthLane] = []
-    for part in parts_of(query, given):
-        unknown = frozenset() if facts is None else part.query.relations - facts.answers
-        if facts is None:
-            lanes.append(TruthLane(part, ()))
-        elif unknown and not part.query.unknown_is_false:
-            lanes.append(TruthLane(part, (), tuple(sorted(unknown))))
-        else:
-            lanes.append(TruthLane(part, _runs_of(numbers(part.query))))
-    return TruthLanes(trace, given, tuple(lanes))
+    groups: dict[object, list[int]] = {}
+    for number, (_, given) in enumerate(matches):
+        alike = separable(query, given)
+        groups.setdefault(tuple(sorted(given)) if alike else number, []).append(number)
+    lanes: dict[int, list[TruthLane]] = {number: [] for number in range(len(matches))}
+    for group in groups.values():
+        names = matches[group[0]][1]
+        ids = {name: sorted({matches[one][1][name] for one in group}) for name in names}
+        traces = {matches[one][0] for one in group} & facts.keys()
+        for part in parts_of(query, ids):
+            asked = part.query.relations
+            lenient = part.query.unknown_is_false
+            known = {one for one in traces if lenient or asked <= facts[one].answers}
+            spelled = {key.lower(): key for key in part.query.scope.nodes}
+            keys = {name: spelled[name.lower()] for name in ids if name.lower() in spelled}
+            found = (
+                [np.ma.getdata(one) for one in rows(part.query, [*keys.values()], known)]
+                if known
+                else []
+            )
+            for one in group:
+                trace, given = matches[one]
+                if trace in known:
+                    wanted = [facts[trace].trace_id, *(given[name] for name in keys)]
+                    columns = [found[0], *found[2:]]
+                    here = np.logical_and.reduce(
+                        [c == v for c, v in zip(columns, wanted, strict=True)]
+                    )
+                    lanes[one].append(TruthLane(part, _runs_of(found[1][here])))
+                else:
+                    unknown = asked - facts[trace].answers if trace in facts else frozenset[str]()
+                    lanes[one].append(TruthLane(part, (), tuple(sorted(unknown))))
+    return [TruthLanes(*match, tuple(lanes[n])) for n, match in enumerate(matches)]
 
 
 def _runs_of(seq: NDArray[np.generic]) -> tuple[tuple[int, int], ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from oracle_parts import disagreement_of_matches, disagreement_of_parts, try_many_parts
@@ -15,6 +15,7 @@ from sgstore.apps.cli import run as run_verb
 from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
 from sgstore.query import Store
+from sgstore.store import StoreFile
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
@@ -175,3 +176,34 @@ def test_monitor_reports_start_of_staged_matches() -> None:
         (0, "4", {"e": "car 1"}, {}),
         (2, "1", {"e": "car 0", "v": "car 3"}, {}),
     ]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MATCH (v:Vehicle)-[:near]->(w:Vehicle) WHERE v.x > 5",
+        "MATCH (v:Vehicle), (w:Vehicle) WHERE delta(v.x, 0.5s) > 1 THEN MATCH (v) WHERE v.x > 20",
+        "MATCH (v:Vehicle), (w:Vehicle), (u:Vehicle) WHERE u.x > v.x",
+    ],
+)
+def test_truth_lanes_of_many_matches_equal_those_of_each_and_ask_once(
+    text: str, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matches, calls = store.find(text), list[str]()
+    pairs = [{"v": 1, "w": 2}, {"v": 2, "w": 1}, {"v": 0, "w": 1}]
+    each = [matches.parts(store.file.frame("run#0"), pair).as_dict() for pair in pairs]
+    arrays = StoreFile.arrays
+
+    def counted(file: StoreFile, sql: str, *given: Any, **more: Any) -> Any:
+        calls.append(sql)
+        return arrays(file, sql, *given, **more)
+
+    monkeypatch.setattr(StoreFile, "arrays", counted)
+    together = [lanes.as_dict() for lanes in matches.parts_each([("run", 0, p) for p in pairs])]
+    many = len(calls)
+    calls.clear()
+    matches.parts_each([("run", 0, pairs[0])])
+
+    assert together == each
+    assert any(lanes["lanes"][0]["spans"] for lanes in each)
+    assert many == len(calls) * (3 if "(u:" in text else 1)  # u must differ from v and w

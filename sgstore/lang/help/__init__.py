@@ -2,7 +2,7 @@
 
 from sgstore.lang.help._completion import words
 from sgstore.lang.help._notes import Compared, compared_in_check, compared_in_query, notes_on
-from sgstore.lang.help._pattern_parts import PatternPart, has_nodes, parts_of
+from sgstore.lang.help._pattern_parts import PatternPart, has_nodes, parts_of, separable
 from sgstore.lang.help._why_not import WhyNot, WhyNotSteps, events_in, looked_up, why_not
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "looked_up",
     "notes_on",
     "parts_of",
+    "separable",
     "why_not",
     "words",
 ]

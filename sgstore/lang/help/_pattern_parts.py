@@ -19,7 +19,7 @@ from sgstore.lang.sql import value_text
 from sgstore.model.vocabulary import RELATIONS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,15 +61,16 @@ class PatternPart:
 _Atom = b.Edge | b.Node | b.Bound
 
 
-def parts_of(query: b.Query, given: Mapping[str, int]) -> Iterator[PatternPart]:
+def parts_of(query: b.Query, given: Mapping[str, Collection[int]]) -> Iterator[PatternPart]:
     """Yield the independent parts of a query's graph patterns, step by step. ``given`` fixes some nodes to ids.
 
     Parameters
     ----------
     query : Query
         Query from the binder.
-    given : mapping of str to int
-        Node ids of some variables. For other variables, at least one node must exist.
+    given : mapping of str to collection of int
+        Allowed node ids of some variables; one each, unless :func:`separable`. For other variables, at least
+        one node must exist.
 
     Raises
     ------
@@ -81,13 +82,23 @@ def parts_of(query: b.Query, given: Mapping[str, int]) -> Iterator[PatternPart]:
         if name.lower() not in keys:
             known = ", ".join(key for key in keys.values() if not key.startswith("#"))
             raise QueryNameError(f"the pattern has no node '{name}'", hint=f"it has: {known}")
-    pins = {keys[name.lower()]: number for name, number in given.items()}
+    pins = {keys[name.lower()]: numbers for name, numbers in given.items()}
     if query.stages:
-        pins = {key: number for key, number in pins.items() if key in query.first.nodes}
+        pins = {key: numbers for key, numbers in pins.items() if key in query.first.nodes}
     if not query.steps:
         yield from _parts(query, query.first, (), pins, 0, None)
     for number, step in enumerate(query.steps, start=1):
         yield from _parts(query, step.scope, step.when, pins, number, step)
+
+
+def separable(query: b.Query, names: Iterable[str]) -> bool:
+    """True if no other node of the patterns must differ from the nodes with these names."""
+    keys = {key for key in _keys_of(query).values() if key.lower() in {n.lower() for n in names}}
+    scopes = [query.first, *(step.scope for step in query.steps)]
+    pairs = (
+        (scope, pair) for scope in scopes for pair in scope.distinct if len(keys & {*pair}) == 1
+    )
+    return not any((scope.kinds(one) & scope.kinds(other)) for scope, (one, other) in pairs)
 
 
 def has_nodes(query: b.Query, names: Iterable[str]) -> bool:
@@ -104,7 +115,7 @@ def _parts(
     query: b.Query,
     scope: b.Scope,
     when: tuple[b.Bound, ...],
-    pins: Mapping[str, int],
+    pins: Mapping[str, Collection[int]],
     number: int,
     step: b.BoundStep | None,
 ) -> Iterator[PatternPart]:
@@ -164,7 +175,7 @@ def _label(edge: b.Edge) -> str:
 
 
 def _groups(
-    scope: b.Scope, when: tuple[b.Bound, ...], pins: Mapping[str, int]
+    scope: b.Scope, when: tuple[b.Bound, ...], pins: Mapping[str, Collection[int]]
 ) -> Iterator[list[_Atom]]:
     """Yield groups of atoms (nodes, edges, conditions) that share free variables, in reading order.
 
@@ -196,7 +207,7 @@ def _groups(
     yield from groups.values()
 
 
-def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
+def _ties(atom: _Atom, pins: Mapping[str, Collection[int]], asked: set[str]) -> set[str]:
     """Return the free variables of an atom (node, edge or condition): nodes not fixed, and named edges."""
     ties = {f"node {key}" for key in _nodes(atom) if key not in pins}
     if isinstance(atom, b.Edge):
@@ -206,7 +217,7 @@ def _ties(atom: _Atom, pins: Mapping[str, int], asked: set[str]) -> set[str]:
     return ties | {f"edge {key}" for key in b.edges_of(atom)}
 
 
-def _apart(scope: b.Scope, pins: Mapping[str, int]) -> Iterator[tuple[str, str]]:
+def _apart(scope: b.Scope, pins: Mapping[str, Collection[int]]) -> Iterator[tuple[str, str]]:
     """Yield the pairs of pattern nodes that must differ, if neither is fixed and both allow a common kind."""
     for one, other in scope.distinct:
         if one not in pins and other not in pins and (scope.kinds(one) & scope.kinds(other)):
@@ -238,7 +249,7 @@ def _narrowed(
     scope: b.Scope,
     atoms: Sequence[_Atom],
     keys: Sequence[str],
-    pins: Mapping[str, int],
+    pins: Mapping[str, Collection[int]],
     when: tuple[b.Bound, ...],
 ) -> b.Scope:
     """Return a smaller graph pattern with only some atoms (nodes, edges, conditions).
@@ -251,13 +262,14 @@ def _narrowed(
         for atom in atoms
         if not isinstance(atom, b.Edge | b.Node) and not any(atom is one for one in when)
     ]
-    where += [b.node_among(key, [pins[key]]) for key in keys if key in pins]
+    where += [b.node_among(key, pins[key]) for key in keys if key in pins]
     for pair in sorted(scope.distinct):
         for one, other in (pair, pair[::-1]):
             free = one in keys and one not in pins and other in pins and other not in keys
             if free and scope.kinds(one) & scope.kinds(other):
                 of = b.NodeAttribute(one, _ID, Type.number)
-                value = b.Value(pins[other], Type.number)
+                (number,) = pins[other]
+                value = b.Value(number, Type.number)
                 where.append(b.Operation("<>", (of, value), Type.boolean))
     nodes = {key: scope.nodes[key] for key in keys}
     distinct = frozenset(pair for pair in scope.distinct if {*pair} <= {*keys})
