@@ -1,4 +1,4 @@
-"""The small sample that a wheel brings: the town without its lidar, and with a picture a second.
+"""The small sample that a wheel brings: the town without its lidar, and with a picture every two seconds.
 
     python samples/town/small.py [SOURCE.mcap [TARGET.mcap]]
 
@@ -18,7 +18,7 @@ SOURCE, TARGET = SAMPLE / "town.mcap", SAMPLE / "small" / "town.mcap"
 
 LEFT_OUT = "/ego/lidar/points"
 PICTURES = "/ego/camera/front/image"
-SECOND = 1_000_000_000
+STEP = 2_000_000_000
 
 
 def write(source: Path, target: Path) -> None:
@@ -39,9 +39,9 @@ def write(source: Path, target: Path) -> None:
             if channel.topic == LEFT_OUT:
                 continue
             if channel.topic == PICTURES:
-                if message.log_time // SECOND == pictured:
+                if message.log_time // STEP == pictured:
                     continue
-                pictured = message.log_time // SECOND
+                pictured = message.log_time // STEP
             if channel.id not in channels:
                 if schema.id not in schemas:
                     schemas[schema.id] = writer.register_schema(
