@@ -491,7 +491,9 @@ def assemble(
     wanted = np.zeros(IDS, np.bool_)
     wanted[[*decoder.channels]] = True
     raw: list[Raw] = []
-    sizes: list[int] = []  # Number of known ids at each frame.
+    sizes: list[
+        int
+    ] = []  # Number of known ids before each frame: all messages of the last one are read.
     lives = LifetimeTracker(decoder.roster, first_steps, sure_kinds=decoder.sure_kinds)
     done: list[FrameRows] = []  # The frame before the block, and its completed frames.
     open_refs: list[MessageRefs] = []
@@ -505,13 +507,12 @@ def assemble(
             frame = decoder.decode(run, row)
             if frame is None:
                 continue
-            if sizes:  # the last frame can have objects of later messages of its time
-                sizes[-1] = entered
+            sizes.append(entered)
             window = size + (first > 0)
             if len(done) + len(raw) > window:  # The frame after the block is complete, too.
-                done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes)
+                done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes[1:])
                 yield _block(first, done, size, block_refs, decoder.roster, known)
-                first, done, raw, sizes = first + size, done[-2:], [], []
+                first, done, raw, sizes = first + size, done[-2:], [], [entered]
                 window = size + 1
             if len(done) + len(raw) == window:
                 between.add(refs(run.span(start, row)))
@@ -519,13 +520,11 @@ def assemble(
                 before, same = between.split(int(run.log_time_ns[row]))
                 block_refs, open_refs = open_refs + before, same
             raw.append(frame)
-            sizes.append(decoder.roster.size)
             open_refs += between.take()
         between.add(refs(run.span(start, len(run))))
     open_refs += between.take()
-    if sizes:
-        sizes[-1] = decoder.roster.size
-    done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes)
+    sizes.append(decoder.roster.size)
+    done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes[1:])
     if len(done) - (first > 0) > size:
         yield _block(first, done, size, block_refs, decoder.roster, known)
         first, done = first + size, done[-2:]
