@@ -230,9 +230,10 @@ def _check(connection: DuckDBPyConnection, sql: str) -> None:
         raise SqlError(f"expected one statement, found {len(statements)}")
     kind = statements[0].type.name
     if kind not in _READS:
+        more = "; write rows to a file with -o FILE, or Rows.parquet()" if kind == "COPY" else ""
         raise SqlError(
             f"the store is read only here: {kind} is not allowed; expected SELECT, WITH, FROM, VALUES,"
-            " DESCRIBE, SHOW, SUMMARIZE or EXPLAIN"
+            f" DESCRIBE, SHOW, SUMMARIZE or EXPLAIN{more}"
         )
 
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
+from sgstore.base.display import first_of
 from sgstore.model.frame_ids import seq_of, trace_of
 from sgstore.model.vocabulary import natural
 from sgstore.temporal import unknown_notes
 from sgstore.testsets.coverage import UNKNOWN, ReportTable, names_of, of_unknown, shared, traces_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from sgstore.collection import Collection
     from sgstore.model.world import Ints
@@ -28,6 +31,45 @@ REASONS: Final = ("reason_a", "reason_b")
 APPEARED, VANISHED, CHANGED, SAME = "appeared", "vanished", "changed", "same"
 
 _CHECK: Final = re.compile(r"(?:^|[;\n])\s*CHECK\b", re.IGNORECASE)
+
+
+def sources(a: Store | Collection, b: Store | Collection) -> list[str]:
+    """Return the differences of two stores that no scene causes: settings, road maps and versions of sgstore.
+
+    Returns
+    -------
+    list of str
+        One line for each different setting, for the maps and for the versions.
+    """
+    found: list[dict[str, set[str]]] = []
+    for store in (a, b):
+        values: dict[str, set[str]] = {}
+        for one in store.info():
+            about = one if isinstance(one, dict) else asdict(one)
+            for name in ("version", "map"):
+                values.setdefault(name, set()).add(str(about.get(name, "")))
+            for name, value in _leaves(about.get("settings") or {}, ""):
+                values.setdefault(f"setting {name}", set()).add(json.dumps(value))
+        found.append(values)
+    was, now = found
+    return [
+        f"{name} differs: {_listed(was.get(name))} in A, {_listed(now.get(name))} in B"
+        for name in dict.fromkeys([*was, *now])
+        if was.get(name) != now.get(name)
+    ]
+
+
+def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    """Yield each setting with its dotted name."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _leaves(cast("dict[str, Any]", value), f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _listed(values: set[str] | None) -> str:
+    return first_of(sorted(values or ["default"], key=natural), 3)
 
 
 def scenes(a: Classed, b: Classed) -> ReportTable:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+import recordings
 
 import sgstore
 from sgstore.apps.cli import run
@@ -22,7 +23,7 @@ from sgstore.model.config import from_dict
 from sgstore.query import Store
 from sgstore.store import graph_digests
 from sgstore.testsets.coverage import classed, selection_of
-from sgstore.testsets.diff import by_frame, matches, scenes, verdicts
+from sgstore.testsets.diff import by_frame, matches, scenes, sources, verdicts
 from sgstore.testsets.locks import (
     Lock,
     cases_of,
@@ -499,3 +500,13 @@ def test_a_lock_is_there_though_nobody_reads_the_rows(
     os.close(writer)
 
     assert len(read_lock(lock).cases) == FRAMES
+
+
+def test_differences_of_settings_come_first(tmp_path: Path) -> None:
+    path = recordings.drive(tmp_path / "a.mcap", frames=4)
+    for name, config in (("a", {}), ("b", {"range": {"radius": 30.0}})):
+        ingest(tmp_path / f"{name}.sgstore", [path], config=from_dict(config))
+    before, after = (Store(tmp_path / f"{name}.sgstore") for name in "ab")
+
+    assert sources(before, before) == []
+    assert sources(before, after) == ["setting range.radius differs: 50.0 in A, 30.0 in B"]

@@ -27,6 +27,7 @@ NEEDED = sorted(
         *packages.project()["dependencies"],
         *(n for extra in packages.project()["optional-dependencies"].values() for n in extra),
     }
+    - {*packages.project()["optional-dependencies"]["all"]}
 )
 """What ``pyproject.toml`` names: what is always installed, and the extras."""
 

@@ -582,3 +582,11 @@ def test_outcomes_without_a_failure_are_told(
     assert run(["prioritize", str(town_store), EVERY, "--outcomes", str(outcomes)]) == status
 
     assert told in capsys.readouterr().err
+
+
+def test_limit_prints_the_first_cases(town_store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["prioritize", str(town_store), "--json"]) == 0
+    every = json.loads(capsys.readouterr().out)
+    assert run(["prioritize", str(town_store), "--json", "--limit", "3"]) == 0
+
+    assert json.loads(capsys.readouterr().out) == every[:3]

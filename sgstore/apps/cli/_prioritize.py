@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -162,6 +163,7 @@ def prioritize(
     parameters: Parameters = None,
     output: Annotated[Path | None, Option("--output", "-o")] = None,
     no_payloads: bool = False,
+    limit: Annotated[int, Option(min=0)] = 0,
     *,
     out: PrintedRows,
     bounds: QueryLimits,
@@ -211,7 +213,7 @@ def prioritize(
             )
         say_made(made, output)
     # Last, so that the lock exists even if the reader stops after the first rows.
-    out.write(ordered.columns, rows, ordered.types)
+    out.write(ordered.columns, islice(rows, limit or None), ordered.types)
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:

@@ -374,11 +374,22 @@ def diff(
         text, values = asked_of(query, None, name, values)
         compare = differences.verdicts if differences.has_checks(text) else differences.matches
         before, after = (ask.opened_at(Path(one), ask) for one in (a, b))
+        _say_sources(before, after)
         table = compare(before, after, text, values)
     else:
+        chosen = [*ask.frames(a, b)]
+        _say_sources(*(one.store for one in chosen))
         compare = differences.by_frame if by_frame else differences.scenes
-        table = compare(*(classed(one, abstraction) for one in ask.frames(a, b)))
+        table = compare(*(classed(one, abstraction) for one in chosen))
     # In a table the reasons are below it, each once.
     ask.report(table.without(*differences.REASONS) if ask.for_people else table)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0
+
+
+def _say_sources(*stores: Store | Collection) -> None:
+    """Print the differences of two stores that no scene causes."""
+    from sgstore.testsets.diff import sources
+
+    for text in sources(*stores):
+        say(text)
