@@ -496,7 +496,7 @@ class Matches(Tabular):
         >>> matches = store.find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)")
         >>> two = [("town", 0, {"e": 0, "v": 2}), ("town", 511, {"e": 0, "v": 13})]
         >>> [lanes.together()[0] for lanes in matches.parts_each(two)]
-        [(0, 0), (511, 520)]
+        [(0, 57), (511, 520)]
         """
         from sgstore.temporal.truth_lanes import (
             truth_lanes,  # imports numpy, which a query does not need

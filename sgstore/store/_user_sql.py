@@ -14,6 +14,7 @@ import duckdb
 
 from sgstore.errors import SqlError
 from sgstore.store._arrow import record_batches, table_of
+from sgstore.store._edge_counts import counted_edges
 from sgstore.store._engine_errors import EngineError, engine_fault, spill_fault
 from sgstore.store._interrupts import interrupt
 from sgstore.store._rows import BATCH, Batches, Rows
@@ -73,10 +74,11 @@ class UserSql:
     ) -> None:
         self._answer, self._given = answered, given
         self.sql, self.timeout_s = sql, timeout_s
+        self._run = sql  # a faster statement with the same result, if there is one
 
     def batches(self, size: int = BATCH) -> AbstractContextManager[Batches]:
         """Stream the rows of the statement in batches."""
-        return self._answered(lambda x: Batches(x, self.sql, size=size, shortened=True))
+        return self._answered(lambda x: Batches(x, self._run, size=size, shortened=True))
 
     def rows(self, max_rows: int | None = None) -> Rows:
         """Return the rows of the statement; ``Rows.truncated`` is true if there are more than the limit."""
@@ -97,7 +99,7 @@ class UserSql:
 
     def table(self) -> Any:
         """Return the rows of the statement as an Arrow table, or ``None`` if Arrow is not installed."""
-        with self._answered(lambda connection: table_of(connection, self.sql)) as found:
+        with self._answered(lambda connection: table_of(connection, self._run)) as found:
             return found
 
     def parquet(self, to: Path) -> int:
@@ -110,7 +112,7 @@ class UserSql:
         """
 
         def write(connection: DuckDBPyConnection) -> int | None:
-            stream = record_batches(connection, self.sql)
+            stream = record_batches(connection, self._run)
             return None if stream is None else ParquetTable.write_batches(stream, to)
 
         with self._answered(write) as number:
@@ -123,11 +125,15 @@ class UserSql:
     @contextmanager
     def _answered(self, step: Callable[[DuckDBPyConnection], T]) -> Generator[T]:
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
-            if self._given is not None:
+            self._run = self.sql
+            counted = None if self._given else counted_edges(self.sql)
+            given = [(counted[0], {})] if counted else self._given and self._given()
+            if given:
                 with self._interrupted(connection), self._refused():
                     connection.execute(f"USE {INSIDE}")
-                    give(connection, self._given())
+                    give(connection, given)
                     connection.execute("USE main")
+            self._run = counted[1] if counted else self.sql
             return until.enter_context(self._running(connection, step))
 
         with self._answer(ask, self.sql, public=True) as found:
