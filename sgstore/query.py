@@ -269,7 +269,7 @@ class Store:
         columns = ("trace", "frames", "seconds", "ego", "map", "flavour")
         traces = self.traces()
         rows = (
-            (one.name, one.frames, (one.end_ns - one.start_ns) / 1e9, one.ego, one.map, one.flavour)
+            (one.name, one.frames, one.seconds, one.ego, one.map, one.flavour)
             for one in traces[:IN_NOTEBOOK]
         )
         more = f"{len(traces) - IN_NOTEBOOK} more traces" if len(traces) > IN_NOTEBOOK else ""

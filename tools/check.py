@@ -70,7 +70,7 @@ TESTS = {
     "user_notes": "serve",
     "explorer": "serve live report explorer sandbox_pool",
     "online": "online identity",
-    "store": "everyday store store_* doors events world_rows",
+    "store": "everyday store store_* doors events world_rows fault_messages",
     "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink"
     " windows tolerance clock",
     "trace_sampling": "ingest",

@@ -102,6 +102,20 @@ def html_media(data: bytes, kind: str, text: str = "") -> str:
     return f"<figure style='{style}'>{shown}{said}</figure>"
 
 
+STORE_TEXT: Final = 80
+"""Longest text of a store in a message; characters."""
+
+
+def excerpt(text: Any) -> str:
+    """Return a text of a store for a message: one line of at most :data:`STORE_TEXT` characters."""
+    return cell(str(text)[: 4 * STORE_TEXT], STORE_TEXT)
+
+
+def excerpts(names: Sequence[str], most: int = 8) -> str:
+    """Return the first names of a store for a message, and the number of the others."""
+    return first_of([*map(excerpt, names[:most]), *names[most:]], most)
+
+
 def first_of(names: Sequence[str], most: int) -> str:
     """Return the first names of a list, and the number of the others: ``a, b and 3 more``."""
     more = f" and {len(names) - most} more" if len(names) > most else ""

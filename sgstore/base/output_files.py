@@ -35,13 +35,16 @@ _DESCRIPTOR: Final = re.compile(r"/dev/fd/(\d+)|/proc/self/fd/(\d+)")
 _NOT_REPLACEABLE: Final = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV}
 """Errors of a place in which a file is writable but not replaceable."""
 
+BIDIRECTIONAL: Final = (0x61C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+"""Characters that change the direction of the text around them, so that it reads as another text."""
+
 _CONTROLS: Final = {
     code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"
-}
+} | {code: f"\\u{code:04x}" for code in BIDIRECTIONAL}
 
 
 def without_controls(text: str) -> str:
-    r"""Replace terminal control characters by escapes such as ``\x1b``.
+    r"""Replace terminal and bidirectional control characters by escapes such as ``\x1b``.
 
     Line feeds and tabs stay.
     """

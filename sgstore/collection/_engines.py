@@ -139,7 +139,10 @@ class _Processes:
 
 
 class _Ray:
-    """Engine that runs tasks by Ray, which repeats lost tasks itself."""
+    """Engine that runs tasks by Ray, which repeats lost tasks itself.
+
+    If Ray itself has died, it is started again, once for each call of :meth:`map`.
+    """
 
     shares_files = False
 
@@ -148,13 +151,35 @@ class _Ray:
             self._ray: Any = import_module("ray")
         except ImportError as error:
             raise MissingExtraError("the engine ray", "ray") from error
+        self._address = address
+        errors = self._ray.exceptions
+        self._dead: tuple[type[Exception], ...] = (
+            *(errors.RaySystemError, errors.LocalRayletDiedError, ConnectionError),
+        )
+        self._start()
+
+    def _start(self) -> None:
         if not self._ray.is_initialized():
-            self._ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+            self._ray.init(address=self._address, log_to_driver=False, logging_level="ERROR")
         # Once: a new remote function would be sent to each worker again.
         self._run: Any = self._ray.remote(max_retries=RETRIES)(_done)
 
     def map(self, function: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
         name = f"{function.__module__}:{function.__qualname__}"
+        left = [*tasks]
+        try:
+            yield from self._outcomes(name, left)
+        except self._dead:
+            self._ray.shutdown()
+            try:
+                self._start()
+                yield from self._outcomes(name, left)
+            except self._dead as error:
+                reason = f"Ray died, and again after a restart: {_cause(error)}"
+                yield from ({"bundle": task["bundle"], "error": reason} for task in left)
+
+    def _outcomes(self, name: str, tasks: list[Task]) -> Iterator[Outcome]:
+        """Yield the outcomes of tasks, and remove each finished task from the list."""
         pending = {self._run.remote(name, task): task for task in tasks}
         while pending:
             some, left = self._ray.wait([*pending], num_returns=1)
@@ -162,9 +187,13 @@ class _Ray:
             for one in (*some, *others):
                 task = pending.pop(one)
                 try:
-                    yield self._ray.get(one)
+                    outcome = self._ray.get(one)
+                except self._dead:
+                    raise
                 except self._ray.exceptions.RayError as error:
-                    yield {"bundle": task["bundle"], "error": _cause(error)}
+                    outcome = {"bundle": task["bundle"], "error": _cause(error)}
+                tasks.remove(task)
+                yield outcome
 
 
 class _Spark:

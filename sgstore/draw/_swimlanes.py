@@ -108,7 +108,7 @@ def timelines(
     """
     wanted = {traces} - {""} if isinstance(traces, str) else {*traces}
     found = {
-        one.name: Timeline(one.name, (one.end_ns - one.start_ns) / 1e9)
+        one.name: Timeline(one.name, one.seconds)
         for one in store.info()
         if not wanted or one.name in wanted
     }
@@ -153,7 +153,7 @@ def parts_timeline(
     def spans(of: Iterable[tuple[int, int]]) -> list[LaneSpan]:
         return [(times[first], times[last], False) for first, last in of]
 
-    whole = Timeline(one.name, (one.end_ns - one.start_ns) / 1e9)
+    whole = Timeline(one.name, one.seconds)
     steps = len(found.steps) > 1
     for lane in found.lanes:
         name = f"{lane.part.step}. {lane.part.text}" if steps else lane.part.text

@@ -590,7 +590,8 @@ def message_columns(
         A log time exceeds signed 64 bits (year 2262).
     """
     if len(heads) and int(heads["log_time"].max()) > LAST_NS:
-        reason = f"a message bears the log time {int(heads['log_time'].max())} ns"
+        latest = int(heads["log_time"].max())
+        reason = f"a message has a log time after the year 2262 ({latest} ns)"
         raise TraceError(reason, offset=max(chunk_offset, 0))
     return Messages(
         chunk_offset=chunk_offset,

@@ -67,6 +67,21 @@ def seconds_of(ns: int) -> float:
     return whole if ns >= 0 else -whole
 
 
+def covered_s(start_ns: int, end_ns: int, frames: int, period_ns: int) -> float:
+    """Return the duration of a trace; s.
+
+    If its clock ends before its start, the duration is that of its frames at their usual distance.
+
+    Examples
+    --------
+    >>> covered_s(0, 3_000_000_000, 31, 100_000_000)
+    3.0
+    >>> covered_s(9_000_000_000, 1_000_000_000, 31, 100_000_000)
+    3.0
+    """
+    return (end_ns - start_ns if end_ns >= start_ns else (frames - 1) * abs(period_ns)) / 1e9
+
+
 def tolerance_ns(period_ns: int) -> int:
     """Return the clock tolerance of a trace: times this close count as equal; ns.
 

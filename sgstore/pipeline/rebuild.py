@@ -14,6 +14,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.display import excerpts
 from sgstore.base.temporary_folders import working_folder
 from sgstore.errors import ConfigError, SgstoreError, StoreError, TraceError, url_named
 from sgstore.ingest import ingest, recordings
@@ -115,7 +116,7 @@ def rebuild(
     _check_settings(path, old.traces)
     if old.others:
         raise StoreError(
-            f"{path}: not rebuilt, because tables of other programs would be lost: {', '.join(old.others)};"
+            f"{path}: not rebuilt, because tables of other programs would be lost: {excerpts(old.others, 100)};"
             " move them to another file first"
         )
     fresh = path.with_name(f"{path.name}.rebuild")
@@ -150,7 +151,7 @@ def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
     names = [one.name for one in whole.traces]
     strange = [name for name in leave_out if name not in names]
     if strange:
-        raise StoreError(f"{path}: no trace {strange[0]!r}; there are: {', '.join(names)}")
+        raise StoreError(f"{path}: no trace {strange[0]!r}; there are: {excerpts(names)}")
     kept = tuple(one for one in whole.traces if one.name not in leave_out)
     used = {one.map_id for one in kept}
     maps = {number: one for number, one in whole.maps.items() if number in used}

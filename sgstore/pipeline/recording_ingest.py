@@ -29,7 +29,7 @@ from sgstore.mcap import Loss, check_name, near
 from sgstore.model.config import ALL_EGOS, Config, from_dict
 from sgstore.model.trace_sampling import TracePart
 from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled
-from sgstore.model.world import longest_step_ns
+from sgstore.model.world import covered_s, longest_step_ns
 from sgstore.readers import on_map, open_trace
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.store import Identity, OnMap, Segment, StoreFile
@@ -240,8 +240,12 @@ class TraceTally:
 
     @property
     def seconds(self) -> float:
-        """Time from the first to the last frame of the trace, in seconds."""
-        return (self.times[-1] - self.times[0]) / 1e9 if self.times else 0.0
+        """Duration of the trace; s. See :func:`sgstore.model.world.covered_s`."""
+        if not self.times:
+            return 0.0
+        steps = np.sort(np.diff(np.frombuffer(self.times, np.int64)))
+        period = int(steps[(len(steps) - 1) // 2]) if len(steps) else 0
+        return covered_s(self.times[0], self.times[-1], self.frames, period)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts of the trace as JSON values.

@@ -16,7 +16,7 @@ import numpy as np
 from sgstore.base.display import first_of
 from sgstore.errors import TraceError
 from sgstore.graphs.online import Frame, check_entities
-from sgstore.mcap import IDS, Findings, OutOfOrder, digest_of, read_and_digest
+from sgstore.mcap import IDS, Findings, Loss, OutOfOrder, digest_of, read_and_digest
 from sgstore.model.vocabulary import KINDS, TypeMeaning
 from sgstore.model.world import POSE, Channel, Event, MessageRefs, TraceInfo, TraceReport
 from sgstore.readers._blocks import (
@@ -29,7 +29,7 @@ from sgstore.readers._blocks import (
     counted,
 )
 from sgstore.readers._roles import channel_rank
-from sgstore.readers._stamps import Stamps
+from sgstore.readers._stamps import Stamps, late_reason
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -594,6 +594,10 @@ class SurveyedDecoder(MessageDecoder[Raw], Generic[Raw, AnySurvey]):
         """Add the lost messages to the report, after all frames are read."""
         self._untimed = self._stamps.untimed
         super().settle()
+        for channel in sorted(self._leading):
+            late = self._survey.leads[channel].stamps.late
+            if late is not None:
+                self._report.losses.append(Loss(late_reason(*late), 0, 0))
 
 
 # Readers with complete frames in messages: messages → frames → blocks of frames.

@@ -25,6 +25,8 @@ OTHER_CLOCK: Final = 86_400_000_000_000
 """Minimum distance of stamps of two different clocks; ns."""
 MOST_RUNS: Final = 100_000
 """Maximum number of stored runs of messages without a stamp. Messages of further runs are losses."""
+LATEST_NS: Final = 1 << 62
+"""Limit of valid time stamps, so that differences of two fit into 64 bits; ns."""
 NO_TIME: Final = "a message has no time, and it cannot be derived"
 """Reason of the loss of such a message."""
 _STEPS: Final = 99
@@ -59,12 +61,15 @@ class Stamps:
         Log time and stamp of the first message with a stamp other than 0.
     steps : list of int
         First differences between stamps; ns.
+    late : tuple of int or None
+        Number of stamps beyond :data:`LATEST_NS`, which count as missing, and the first of them.
     """
 
     explicit: bool = True
     logged: bool = True
     first: Known | None = None
     steps: list[int] = field(default_factory=list[int])
+    late: tuple[int, int] | None = None
     _number: int = -1
     _zero: Known | None = None
     _last: Known | None = None
@@ -78,6 +83,9 @@ class Stamps:
 
     def see(self, log_time_ns: int, stamp_ns: int | None) -> None:
         """Record the time stamp of the message counted last."""
+        if stamp_ns is not None and abs(stamp_ns) >= LATEST_NS:
+            count, first = self.late or (0, stamp_ns)
+            self.late, stamp_ns = (count + 1, first), None
         if stamp_ns == 0:
             self._zero = self._zero or (log_time_ns, 0)
         if stamp_ns:
@@ -141,6 +149,7 @@ class StampReader:
         if self._clock is None:
             self.untimed += 1
             return log_time_ns
+        stamp_ns = _valid(stamp_ns)
         time_ns = stamp_ns or self._unstamped(log_time_ns, stamp_ns)
         if time_ns is not None:
             self._offset = log_time_ns - time_ns
@@ -148,7 +157,7 @@ class StampReader:
 
     def beside(self, log_time_ns: int, stamp_ns: int | None) -> int:
         """Return the simulation time of a message on another channel; ns."""
-        expected = log_time_ns - self._offset
+        expected, stamp_ns = log_time_ns - self._offset, _valid(stamp_ns)
         if self._clock is None:
             return log_time_ns
         if stamp_ns == 0 and not self._stamps.explicit:
@@ -192,6 +201,17 @@ class StampReader:
             return near
         begins = before is None or (behind is not None and behind[1] < before[1])
         return begins and stamps.is_near(behind)
+
+
+def late_reason(count: int, first_ns: int) -> str:
+    """Return the reason of the loss of time stamps beyond :data:`LATEST_NS`."""
+    year = 2262 if abs(first_ns) >= 1 << 63 else 2116
+    when = f"after the year {year}" if first_ns > 0 else "before the year 1824"
+    return f"{count} time stamps are {when} ({first_ns / 1e9:.6g} s): they count as missing"
+
+
+def _valid(stamp_ns: int | None) -> int | None:
+    return None if stamp_ns is None or abs(stamp_ns) >= LATEST_NS else stamp_ns
 
 
 def _between(log_time_ns: int, before: Known | None, behind: Known | None) -> int:

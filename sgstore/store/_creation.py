@@ -10,7 +10,7 @@ import duckdb
 
 from sgstore.base.quoting import literal
 from sgstore.errors import StoreError
-from sgstore.store._engine_errors import translated
+from sgstore.store._engine_errors import os_fault, translated
 from sgstore.store._locking import BLOCK_SIZE, STORAGE_VERSION, trust
 from sgstore.store._schema import SCHEMA_VERSION, schema_digest, schema_sql
 from sgstore.store._store_paths import Folder, refuse_odd_name
@@ -55,7 +55,7 @@ def _name(place: Path, path: Path) -> None:
             if not path.exists():
                 place.rename(path)
         except OSError as error:
-            raise StoreError(f"{path}: cannot be made: {error.strerror}") from error
+            raise os_fault(f"{path}: cannot be made", error) from error
 
 
 def attach_empty(connection: DuckDBPyConnection, place: Path) -> None:
@@ -84,7 +84,7 @@ def write_empty(place: Path) -> None:
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        raise StoreError(f"{place}: cannot be made: {error.strerror}") from error
+        raise os_fault(f"{place}: cannot be made", error) from error
 
 
 _empty: Final[list[bytes]] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
@@ -50,6 +52,10 @@ class EngineError(StoreError):
     """Error: DuckDB failed with an internal error."""
 
 
+class DiskFullError(StoreError):
+    """Error: the disk is full, or a limit of the file size or of the user is reached."""
+
+
 class HeldHereError(BusyError):
     """Error: a DuckDB connection of this process, not made by sgstore, uses the store file."""
 
@@ -82,7 +88,20 @@ def translated(path: Path) -> Generator[None]:
             raise BusyError(f"{path}: in use by another process for too long") from error
         if (spilled := spill_fault(message)) is not None:
             raise SqlError(spilled) from error
+        if any(os.strerror(code) in message for code in _FULL):
+            raise DiskFullError(f"{path}: {_DISK_FULL}") from error
         raise StoreError(f"{path}: {_reason(message)}") from error
+
+
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_FULL: Final = "the disk is full; free space, and run it again"
+
+
+def os_fault(message: str, error: OSError) -> StoreError:
+    """Return a store error for an operating system error. A full disk has its own class and words."""
+    if error.errno in _FULL:
+        return DiskFullError(f"{message}: {_DISK_FULL}")
+    return StoreError(f"{message}: {error.strerror}")
 
 
 def _reason(message: str) -> str:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import StoreError
-from sgstore.store._engine_errors import HeldHereError
+from sgstore.store._engine_errors import HeldHereError, os_fault
 from sgstore.store._lease import gate_of
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class _Gate:
             try:
                 self._lock = os.open(gate_of(self._path), os.O_RDWR | os.O_CREAT, 0o666)
             except OSError as error:
-                raise StoreError(f"{self._path}: cannot be written: {error.strerror}") from error
+                raise os_fault(f"{self._path}: cannot be written", error) from error
             if fcntl is not None:
                 _lock(self._lock, fcntl.LOCK_EX, self._path, deadline)
             if self._is_there():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.base.display import excerpts
 from sgstore.errors import StoreError
 from sgstore.model.frame_ids import frame_ids
 from sgstore.model.vocabulary import suggestion
@@ -242,7 +243,7 @@ def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -
     roles = dict(connection.execute(sql, [frame.trace_id]).fetchall())
     if channel not in roles:
         like = suggestion(channel, [topic for topic in roles if topic])
-        hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(map(repr, roles))}"
+        hint = f"did you mean {like!r}?" if like else f"there are: {excerpts([*map(repr, roles)])}"
         return StoreError(f"no channel {channel!r} in {frame.trace!r}; {hint}")
     reason = "no message near enough in time"
     if roles[channel] == "map":

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import sgstore.store._schema as shape
+from sgstore.base.display import excerpts
 from sgstore.base.quoting import quoted
 from sgstore.errors import StoreError
 from sgstore.store._creation import attach_empty
-from sgstore.store._engine_errors import BusyError
+from sgstore.store._engine_errors import BusyError, DiskFullError
 from sgstore.store._locking import Access, spill_folder
 from sgstore.store._publish import copy_sorted
 from sgstore.store._staging import scratch
@@ -318,16 +319,24 @@ def compact(path: Path, access: Access, memory: int) -> None:
     """Rewrite a store with sorted tables, and replace its file."""
     refuse_others(path, access)
     database = scratch(spill_folder(), memory=memory, threads=os.cpu_count() or 1)
-    with (
-        Folder(path) as beside,
-        database as connection,
-        access.attached(connection, beside.path),
-    ):
-        connection.execute("FORCE CHECKPOINT store")
-        attach_empty(connection, beside.path / "store")
-        copy_sorted(connection)
-        connection.execute("DETACH fresh")
-        _replace(path, beside.path / "store")
+    try:
+        with (
+            Folder(path) as beside,
+            database as connection,
+            access.attached(connection, beside.path),
+        ):
+            connection.execute("FORCE CHECKPOINT store")
+            attach_empty(connection, beside.path / "store")
+            copy_sorted(connection)
+            connection.execute("DETACH fresh")
+            _replace(path, beside.path / "store")
+    except DiskFullError as error:
+        reason = "the disk is full, and has no room for a second store"
+        raise DiskFullError(f"{path}: not compacted, and not changed: {reason}") from error
+
+
+_LISTED: Final = 100
+"""Number of listed objects that a rewrite would delete."""
 
 
 def settle(path: Path, access: Access, memory: int) -> None:
@@ -340,18 +349,20 @@ def settle(path: Path, access: Access, memory: int) -> None:
 
 
 def refuse_others(path: Path, access: Access) -> None:
-    """Raise an error if a store has user tables or views, which a rewrite would delete.
+    """Raise an error if a store has user tables, views, macros and so on, which a rewrite would delete.
 
     Raises
     ------
     StoreError
     """
     with access.reading() as connection:
-        others = shape.others(shape.objects_of(connection, shape.database_of(connection)))
+        database = shape.database_of(connection)
+        others = shape.others(shape.objects_of(connection, database))
+        others += shape.unlisted(connection, database)
     if others:
         raise StoreError(
             f"{path}: cannot be written anew: what is none of sgstore's would be lost:"
-            f" {', '.join(others)}; move them to another file first"
+            f" {excerpts(others, _LISTED)}; move them to another file first"
         )
 
 

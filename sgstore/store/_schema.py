@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final
 import duckdb
 import numpy as np
 
+from sgstore.base.display import STORE_TEXT, excerpt
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
 from sgstore.model.pair_numbers import pairs_view
@@ -203,8 +204,15 @@ def about_store(
         own, added = expected().tables["store_info"], {"NOT", "NULL"}  # later added to its columns
         if [word for word in made if word not in added] != [w for w in own if w not in added]:
             return {}  # an unknown table is not read
-    rows = connection.execute(f"SELECT key, value FROM {quoted(database)}.{schema}.store_info")
-    return {str(key): str(value) for key, value in rows.fetchall()}
+    rows = connection.execute(
+        f"SELECT key, system.main.substring(value, 1, {4 * STORE_TEXT})"
+        f" FROM {quoted(database)}.{schema}.store_info LIMIT {_MOST_INFO}"
+    )
+    return {str(key)[:STORE_TEXT]: str(value) for key, value in rows.fetchall()}
+
+
+_MOST_INFO: Final = 1000
+"""Maximum number of rows of ``store_info`` that are read."""
 
 
 def schema_of(objects: Objects) -> str:
@@ -227,8 +235,8 @@ def _info_of(objects: Objects) -> dict[str, str]:
 def other_version(about: dict[str, str]) -> str:
     """Return the error message for a store of another schema version; empty for the same version."""
     held, maker = (
-        about.get("schema_version", "unknown"),
-        about.get("created_by", "an unknown version"),
+        excerpt(about.get("schema_version", "unknown")),
+        excerpt(about.get("created_by", "an unknown version")),
     )
     if held != SCHEMA_VERSION:
         reason = f"a store of version {held}, expected {SCHEMA_VERSION}"
@@ -384,7 +392,7 @@ def _strange(objects: Objects) -> Iterator[str]:
     for enum in NAMES:
         for label in labels[enum][len(own_labels(enum)) :]:
             try:
-                learn(enum, label)
+                learn(enum, label[:STORE_TEXT])
             except ValueError as error:
                 yield f"a {enum.replace('_', ' ')}: {error}"
 
@@ -399,6 +407,35 @@ def others(objects: Objects) -> list[str]:
         for what, schema, name, _ in objects
         if what != "type" and (schema, name.lower()) not in ours
     )
+
+
+def unlisted(connection: DuckDBPyConnection, database: str) -> list[str]:
+    """Return user macros, sequences, types and empty schemas of a database, each with its sort."""
+    found = [("macro", name) for name in _names_in(connection, database, "functions", "function")]
+    found += [
+        ("sequence", name) for name in _names_in(connection, database, "sequences", "sequence")
+    ]
+    own = {*expected().types, *(f"{INSIDE}.{name}" for name in expected().types)}
+    types = _names_in(connection, database, "types", "type")
+    found += [("type", name) for name in types if name not in own]
+    used = {schema for _, schema, *_ in objects_of(connection, database)} | {"main", INSIDE}
+    schemas = connection.execute(
+        "SELECT schema_name FROM system.main.duckdb_schemas()"
+        " WHERE database_name = ? AND internal = false ORDER BY ALL",
+        [database],
+    )
+    found += [("empty schema", name) for (name,) in schemas.fetchall() if name not in used]
+    return [f"{what} {name}" for what, name in found]
+
+
+def _names_in(connection: DuckDBPyConnection, database: str, what: str, one: str) -> Iterable[str]:
+    internal = "" if one == "sequence" else " AND internal = false"
+    rows = connection.execute(
+        f"SELECT DISTINCT schema_name, {one}_name FROM system.main.duckdb_{what}()"
+        f" WHERE database_name = ?{internal} ORDER BY ALL",
+        [database],
+    ).fetchall()
+    return [name if schema == "main" else f"{schema}.{name}" for schema, name in rows]
 
 
 def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:
@@ -454,7 +491,7 @@ def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:
         ours = {"main": shape.tables | shape.inner, INSIDE: shape.views}.get(schema, {})
         if name.lower() in ours:
             what = "a table" if name.lower() in shape.tables else "a view"
-            yield f"{schema}.{name} takes the place of {what}"
+            yield f"{excerpt(schema)}.{name} takes the place of {what}"
 
 
 def _shadowing(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
@@ -497,7 +534,7 @@ def _attached(connection: DuckDBPyConnection, database: str) -> Iterator[str]:
         for schema, table, name in rows:
             ours = {*expected().tables, *expected().views, *expected().inner}
             if schema in {"main", INSIDE} and table.lower() in ours:
-                yield f"table {table!r} has the {what} {name!r}"
+                yield f"table {table!r} has the {what} {excerpt(name)!r}"
 
 
 INSIDE: Final = "inside"

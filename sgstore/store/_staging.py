@@ -30,6 +30,7 @@ from sgstore.store._columns import (
     parted,
     types_of,
 )
+from sgstore.store._engine_errors import os_fault
 from sgstore.store._locking import memory_setting, without_faults
 from sgstore.store._schema import enums_of, own_labels
 from sgstore.store._store_paths import Folder
@@ -355,7 +356,7 @@ class Sealed:
         try:
             (self.folder / _SAID).write_text(json.dumps(values), encoding="utf-8")
         except OSError as error:
-            raise StoreError(f"{self.folder}: cannot be written: {error.strerror}") from error
+            raise os_fault(f"{self.folder}: cannot be written", error) from error
 
     @classmethod
     def read(cls, folder: Path) -> Self:

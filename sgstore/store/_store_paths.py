@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.base.temporary_folders import HeldFolder, sweep
 from sgstore.errors import StoreError, one_store_needed, url_named
+from sgstore.store._engine_errors import os_fault
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -80,7 +81,7 @@ class Folder(HeldFolder):
         try:
             super().__init__(store.parent, f"{store.name}{_NAME}")
         except OSError as error:
-            raise StoreError(f"{store.parent}: cannot be written: {error.strerror}") from error
+            raise os_fault(f"{store.parent}: cannot be written", error) from error
 
     @staticmethod
     def refuse_name(path: Path) -> None:

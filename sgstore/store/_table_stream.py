@@ -10,6 +10,7 @@ import numpy as np
 
 from sgstore.errors import StoreError
 from sgstore.store._columns import TEXTS, blank, types_of
+from sgstore.store._engine_errors import os_fault
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -73,8 +74,8 @@ class TableFile:
             self._look()
 
     def _wrong(self, what: str, error: OSError | None = None) -> StoreError:
-        reason = f": {error.strerror}" if error else ""
-        return StoreError(f"{self._store}: what waits beside it {what}{reason}")
+        message = f"{self._store}: what waits beside it {what}"
+        return os_fault(message, error) if error else StoreError(message)
 
     def close(self) -> None:
         """Close the file of tables. Its content stays on disk."""

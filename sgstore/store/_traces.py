@@ -11,11 +11,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.display import excerpt
 from sgstore.errors import SgstoreError, StoreError, place_named, url_named
 from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS
 from sgstore.model.pair_numbers import UNEVEN
 from sgstore.model.vocabulary import natural, suggestion
-from sgstore.model.world import tolerance_ns
+from sgstore.model.world import covered_s, tolerance_ns
 from sgstore.store._packing import as_json, plain
 from sgstore.store._rows import run
 
@@ -204,9 +205,13 @@ class StoredTrace:
     ingested_at: datetime
     version: str
 
+    @property
+    def seconds(self) -> float:
+        """Duration of the trace; s. Never negative, also if the clock runs backwards."""
+        return covered_s(self.start_ns, self.end_ns, self.frames, self.period_ns)
+
     def __repr__(self) -> str:
-        seconds = (self.end_ns - self.start_ns) / 1e9
-        about = f"{self.frames} frames, {seconds:.1f} s, ego {self.ego!r}, map {self.map!r}"
+        about = f"{self.frames} frames, {self.seconds:.1f} s, ego {self.ego!r}, map {self.map!r}"
         return f"<StoredTrace {self.name!r}: {about}>"
 
     def as_dict(self) -> dict[str, Any]:
@@ -506,5 +511,5 @@ def _range(connection: DuckDBPyConnection, trace_id: int) -> str:
 
 
 def _listed(names: list[str]) -> str:
-    shown = ", ".join(repr(name) for name in names[:8])
+    shown = ", ".join(repr(excerpt(name)) for name in names[:8])
     return shown if len(names) <= 8 else f"{shown}, … ({len(names)} in all)"

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.display import excerpt
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.config import from_dict
 from sgstore.model.frame_ids import BUCKET_BITS
@@ -193,7 +194,7 @@ def _content_faults(connection: DuckDBPyConnection) -> Iterator[Fault]:
         try:
             from_dict(json.loads(text))
         except (SgstoreError, ValueError, TypeError, AttributeError) as error:
-            yield Fault("", "references", f"settings {number} cannot be read: {error}")
+            yield Fault("", "references", f"settings {number} cannot be read: {excerpt(error)}")
     for table, column in (
         ("trace", "name"),
         ("trace", "trace_id"),
@@ -201,7 +202,9 @@ def _content_faults(connection: DuckDBPyConnection) -> Iterator[Fault]:
     ):
         sql = f"SELECT {column} FROM {table} GROUP BY {column} HAVING count(*) > 1"
         for (value,) in connection.execute(sql).fetchall():
-            yield Fault("", "references", f"table {table} has {column} {value!r} more than once")
+            yield Fault(
+                "", "references", f"table {table} has {column} {excerpt(value)!r} more than once"
+            )
     bits = connection.execute("SELECT bit, m FROM bits ORDER BY bit, m").fetchall()
     if bits != [(bit, 1 << bit) for bit in range(BUCKET_FRAMES)]:
         yield Fault("", "rows", "table bits does not hold the bits of a mask")
@@ -303,7 +306,9 @@ def _shared_faults(
             now = found.get(number, Checksum())
             if now != (then or Checksum()):
                 check = "map" if owner == "map" else "rows"
-                yield Fault("", check, f"{owner} {name!r}: {_difference(table, now, then)}")
+                yield Fault(
+                    "", check, f"{owner} {excerpt(name)!r}: {_difference(table, now, then)}"
+                )
 
 
 def _rule_faults(

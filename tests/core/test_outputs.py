@@ -225,20 +225,22 @@ def test_a_place_that_is_none_is_an_error_of_ours(place: str, reason: str, tmp_p
 def test_no_form_of_rows_gives_orders_to_a_terminal(
     form: str, named: dict[str, str], capsys
 ) -> None:
-    every = " || ".join(f"chr({code})" for code in (*range(1, 32), *range(127, 160)))
+    turning = (0x61C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
+    codes = (*range(1, 32), *range(127, 160), *turning)
+    every = " || ".join(f"chr({code})" for code in codes)
     statement = f"SELECT 'a' || {every} || 'z' AS name, [chr(27), chr(155)] AS names"
 
     assert run(["sql", named["store"], statement, "--format", form]) == 0
 
     out = capsys.readouterr().out
-    dangerous = {chr(code) for code in (*range(32), *range(127, 160))} - {"\n", "\t"}
+    dangerous = {chr(code) for code in (0, *codes)} - {"\n", "\t"}
     assert not set(out) & dangerous
     assert "a" in out
     assert "z" in out
 
 
 def test_messages_give_no_orders_to_a_terminal(named: dict[str, str], capsys) -> None:
-    assert run(["info", named["store"], "--trace", "\x1b[31mred\x9b"]) == 1
+    assert run(["info", named["store"], "--trace", "\x1b[31mred\x9b\u202e"]) == 1
     err = capsys.readouterr().err
     assert "red" in err
-    assert not {"\x1b", "\x9b"} & set(err)
+    assert not {"\x1b", "\x9b", "\u202e"} & set(err)

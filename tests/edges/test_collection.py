@@ -6,9 +6,11 @@ import json
 import os
 import random
 import shutil
+import sys
 import time
 from collections import Counter
 from dataclasses import fields, replace
+from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
@@ -725,3 +727,60 @@ def test_a_catalogue_of_before_knows_no_scopes(tmp_path: Path) -> None:
     assert ParquetTable.read_rows(path, [*columns, "scope"], "scope") == [("b", 7, None)]
     snapshot = catalogue.Snapshot()
     assert snapshot.scope(world=True) == {}
+
+
+# The engine Ray, after the death of Ray itself --------------------------------------------------------
+
+
+class FakeRay(ModuleType):
+    """Ray whose tasks fail after a number of results, as often as it should die."""
+
+    def __init__(self, deaths: int, after: int) -> None:
+        super().__init__("ray")
+        error = type("RayError", (Exception,), {})
+        names = ("RaySystemError", "LocalRayletDiedError", "RayTaskError")
+        kinds = {name: type(name, (error,), {}) for name in names}
+        self.exceptions = SimpleNamespace(RayError=error, **kinds)
+        self.deaths, self.after, self.done, self.starts, self.runs = deaths, after, 0, 0, False
+
+    def is_initialized(self) -> bool:
+        return self.runs
+
+    def init(self, **_settings: Any) -> None:
+        self.starts, self.runs, self.done = self.starts + 1, True, 0
+
+    def shutdown(self) -> None:
+        self.runs = False
+
+    def remote(self, **_settings: Any) -> Callable[[Any], Any]:
+        return lambda _function: SimpleNamespace(remote=lambda _name, task: (task["bundle"],))
+
+    def wait(self, pending: list[Any], **_settings: Any) -> tuple[list[Any], list[Any]]:
+        return pending[:1], pending[1:]
+
+    def get(self, one: tuple[str]) -> dict[str, Any]:
+        if self.deaths and self.done == self.after:
+            self.deaths -= 1
+            raise self.exceptions.LocalRayletDiedError("the raylet died")
+        if one[0] == "bad":
+            raise self.exceptions.RayTaskError("broken")
+        self.done += 1
+        return {"bundle": one[0], "answer": 1}
+
+
+@pytest.mark.parametrize(("deaths", "starts", "failed"), [(0, 1, 0), (1, 2, 0), (2, 2, 2)])
+def test_ray_is_started_again_once(
+    deaths: int, starts: int, failed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ray = FakeRay(deaths, after=1)
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    tasks = [{"bundle": name} for name in ("a", "b", "bad", "c")]
+
+    found = [*engines.engine_named("ray").map(engines._done, tasks)]
+
+    assert ray.starts == starts
+    assert sorted(one["bundle"] for one in found) == ["a", "b", "bad", "c"]
+    assert sum("Ray died" in one.get("error", "") for one in found) == failed
+    assert [one["bundle"] for one in found if one.get("error") == "broken"] == ["bad"] * (
+        not failed
+    )

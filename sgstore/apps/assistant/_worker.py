@@ -82,7 +82,7 @@ def _traces(store: Store, limit: int) -> Reply:
         (
             one.name,
             one.frames,
-            round((one.end_ns - one.start_ns) / 1e9, 3),
+            round(one.seconds, 3),
             round(1e9 / one.period_ns, 2) if one.period_ns else None,
             one.ego,
             one.map,

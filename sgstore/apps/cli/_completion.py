@@ -117,7 +117,7 @@ def channels(ctx: typer.Context) -> Offers:
 
 
 def _about(trace: StoredTrace) -> str:
-    return f"{trace.frames} frames, {(trace.end_ns - trace.start_ns) / 1e9:g} s"
+    return f"{trace.frames} frames, {trace.seconds:g} s"
 
 
 def _traces(ctx: typer.Context) -> list[StoredTrace]:

@@ -110,6 +110,7 @@ import sgstore.apps.cli._completion as completion
 from sgstore.apps.cli._completion import STORE
 from sgstore.apps.cli._output import LONG_TABLE, Format, say, say_json, set_verbosity, write_rows
 from sgstore.apps.cli._process import set_deadline
+from sgstore.base.display import excerpts
 from sgstore.base.docstrings import split_docstring
 from sgstore.errors import ConfigError, url_named
 
@@ -878,7 +879,7 @@ def say_left_out(
     for name, reason in matches.reasons.items():
         of.setdefault(reason, []).append(name)
     for reason, names in of.items():
-        say(f"skipped, because they lack data for this query ({reason}): {', '.join(names)}")
+        say(f"skipped, because they lack data for this query ({reason}): {excerpts(names)}")
     say_notes(getattr(matches, "notes", ()))
 
 

@@ -16,7 +16,7 @@ from enum import StrEnum
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from sgstore.base.output_files import without_controls, written_text
+from sgstore.base.output_files import BIDIRECTIONAL, without_controls, written_text
 from sgstore.base.temporary_folders import working_folder
 from sgstore.errors import ExportError
 
@@ -313,7 +313,7 @@ def _dumps(columns: Sequence[str], row: Sequence[Any]) -> str:
     return json_text(_json_object(dict(zip(columns, row, strict=True))))
 
 
-_CONTROLS: Final = {code: f"\\u{code:04x}" for code in range(0x7F, 0xA0)}
+_CONTROLS: Final = {code: f"\\u{code:04x}" for code in (*range(0x7F, 0xA0), *BIDIRECTIONAL)}
 """Control characters for terminals that JSON does not escape."""
 
 
@@ -547,8 +547,11 @@ def _frames(values: dict[str, Any]) -> str:
     count = values.get("frames", 0)
     if not count:
         return ""
-    seconds = values.get("seconds", (values.get("end_ns", 0) - values.get("start_ns", 0)) / 1e9)
-    period = values.get("period_ns", 0) / 1e9
+    from sgstore.model.world import covered_s
+
+    step = values.get("period_ns", 0)
+    told = covered_s(values.get("start_ns", 0), values.get("end_ns", 0), count, step)
+    seconds, period = values.get("seconds", told), abs(step) / 1e9
     return f"{count}, {seconds:g} s" + (f", mostly every {period:g} s" if period else "")
 
 

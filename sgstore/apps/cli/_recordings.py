@@ -235,7 +235,7 @@ def info(
             say(f"{one.name}: clock jumps: {jumps}, gaps: {gaps}; info --trace lists them")
     rows = (
         (
-            *(one.name, one.frames, round((one.end_ns - one.start_ns) / 1e9, 3)),
+            *(one.name, one.frames, round(one.seconds, 3)),
             *(one.ego, one.map, one.flavour, len(one.report["losses"])),
             *(one.trace_id, str(one.path)),
         )
@@ -246,9 +246,13 @@ def info(
     return 0
 
 
+_TIMES: Final = ("start_ns", "end_ns", "frames", "period_ns")
+
+
 def _list_collection(url: str, names: list[str], out: PrintedRows) -> None:
     """Print the catalogue entries of the named traces of a collection, or of all traces."""
     from sgstore.collection import Collection
+    from sgstore.model.world import covered_s
 
     whole = Collection(url)
     note_collection(whole)
@@ -261,7 +265,7 @@ def _list_collection(url: str, names: list[str], out: PrintedRows) -> None:
     digits = 12 if out.for_people else None
     rows = (
         (
-            *(row["name"], row["frames"], round((row["end_ns"] - row["start_ns"]) / 1e9, 3)),
+            *(row["name"], row["frames"], round(covered_s(*(row[name] for name in _TIMES)), 3)),
             *(row["ego"], row["map"], row["trace_id"], row["bundle"][:digits], row["uri"]),
         )
         for row in found

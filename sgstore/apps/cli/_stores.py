@@ -24,8 +24,9 @@ from sgstore.apps.cli._options import (
     jobs_of,
 )
 from sgstore.apps.cli._output import count_bar, say
+from sgstore.base.display import excerpts
 from sgstore.base.output_files import write_bytes
-from sgstore.errors import ExportError
+from sgstore.errors import ExportError, StoreError
 
 if TYPE_CHECKING:
     from sgstore.maps.roads import RoadMap
@@ -60,7 +61,7 @@ def verify(
     hashed = f", {found.recordings} recordings" if payloads else ""
     wrong = f"{len(rows)} faults" if rows else "no fault"
     if found.others:
-        say(f"{store}: tables of other programs, not checked: {', '.join(found.others)}")
+        say(f"{store}: tables of other programs, not checked: {excerpts(found.others)}")
     say(f"{store}: {found.traces} traces, {found.rows} rows{hashed}: {wrong}")
     return ERROR if rows else 0
 
@@ -91,7 +92,13 @@ def remove(
         file.refuse_others()
     gone = file.remove(*traces) if traces else ()
     if compact:
-        file.compact()
+        try:
+            file.compact()
+        except StoreError as error:
+            if not gone:
+                raise
+            named = excerpts([trace.name for trace in gone])
+            raise StoreError(f"{error}; removed: {named}; the file is not smaller") from error
     rows = [(trace.name, trace.frames, str(trace.path)) for trace in gone]
     out.write(("trace", "frames", "file"), rows)
     return 0

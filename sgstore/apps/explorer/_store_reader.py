@@ -83,7 +83,7 @@ class Reads:
         for name, one in traces.items():
             x, y, digest, cameras = places[name]
             about = {"name": name, "frames": one.frames, "period": one.period_ns / 1e9}
-            about |= {"seconds": (one.end_ns - one.start_ns) / 1e9, "map": one.map}
+            about |= {"seconds": one.seconds, "map": one.map}
             listed.append(about | {"map_key": digest[:16], "origin": (x, y), "cameras": cameras})
         return {"store": file.path.name, "traces": listed, "codes": StateColumns(file).codes()}
 

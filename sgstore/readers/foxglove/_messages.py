@@ -205,7 +205,6 @@ _SCENE_FIELDS: Final[dict[str, Any]] = {
 """Used fields of a scene; lines, triangles and texts stay bytes."""
 ERRORS: Final = (*DECODE_ERRORS, RecursionError)
 """Exceptions for a malformed message."""
-_LATEST: Final = 1 << 62
 _DELETE_ALL: Final = 1
 
 
@@ -444,7 +443,7 @@ def _deletion(gone: Any) -> Deletion:
 
 
 def _time(part: Any) -> int | None:
-    """Return a timestamp or duration of a Foxglove message; ns. ``None`` means missing or out of range.
+    """Return a timestamp or duration of a Foxglove message, in any range; ns. ``None`` means missing.
 
     Protobuf has ``seconds`` and ``nanos``, JSON ``sec`` and ``nsec``.
     """
@@ -455,5 +454,4 @@ def _time(part: Any) -> int | None:
         seconds, nanos = _get(part, "sec", 0), _get(part, "nsec", 0)
     else:
         nanos = _get(part, "nanos", 0)
-    time_ns = int(seconds) * 1_000_000_000 + int(nanos)
-    return time_ns if abs(time_ns) < _LATEST else None
+    return int(seconds) * 1_000_000_000 + int(nanos)

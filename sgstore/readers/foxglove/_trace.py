@@ -38,7 +38,7 @@ from sgstore.readers._base import (
     ref_of,
 )
 from sgstore.readers._blocks import FAR, NAN, FrameRows, LossTally
-from sgstore.readers._stamps import NO_TIME, Stamps
+from sgstore.readers._stamps import LATEST_NS, NO_TIME, Stamps
 from sgstore.readers.foxglove._mapping import Mapping, mapping_for
 from sgstore.readers.foxglove._messages import (
     ERRORS,
@@ -208,7 +208,8 @@ class FoxgloveSurvey(Survey[Lead]):
 
 def time_of(scene: SceneUpdate) -> int | None:
     """Return the time of a Foxglove scene message: that of its latest object; ``None`` without a time."""
-    return max((box.time_ns for box in scene.boxes if box.time_ns is not None), default=None)
+    times = [box.time_ns for box in scene.boxes if box.time_ns is not None]
+    return max((one for one in times if abs(one) < LATEST_NS), default=max(times, default=None))
 
 
 @dataclass(slots=True)

@@ -468,13 +468,18 @@ def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
 
 
 def time_of(message: Any, ground: Any) -> int | None:
-    """Return the time stamp of an OSI message; ns. ``None`` means without a valid time stamp."""
+    """Return the time stamp of an OSI message; ns. ``None`` means without one.
+
+    A stamp out of the valid range is returned only without a valid one.
+    """
+    late: int | None = None
     for part in (ground, message):
         if part.HasField("timestamp"):
-            time_ns = part.timestamp.seconds * 1_000_000_000 + part.timestamp.nanos
+            time_ns = int(part.timestamp.seconds * 1_000_000_000 + part.timestamp.nanos)
             if abs(time_ns) < LATEST_NS:
-                return int(time_ns)
-    return None
+                return time_ns
+            late = time_ns if late is None else late
+    return late
 
 
 @lru_cache(maxsize=64)
