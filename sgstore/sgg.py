@@ -146,7 +146,7 @@ class SceneGraphGenerator:
         self._left_out: Bools = np.zeros(0, np.bool_)
         self._scenery = States.of(node=np.zeros(0, np.int64))
         self._still = StillPairs(config)
-        self._parking = Parking()
+        self._parking = Parking(on_map=road_map is not None)
         self._hitches = Hitches()
         self._grounds: MapColumns | None = None
         self._classes = Classes()
@@ -713,7 +713,7 @@ class SceneGraphGenerator:
             strange = of[(of < 0) | (of >= len(self._kinds))]
             if len(strange):
                 raise ValueError(f"a state of node {strange[0]}, which no block has introduced")
-        self._parking.see(frames.states)
+        self._parking.see(frames)
         carrier = self._hitches.see(frames, partial(self._bodies, frames))
         return replace(frames, states=replace(frames.states, carrier=carrier))
 

@@ -28,6 +28,7 @@ from sgstore.model.vocabulary import (
     LIGHT_STATE_CODE,
     LIGHT_STATES,
     MAP_KINDS,
+    NOISE_MARKS,
     SPECIALS,
     VEHICLE_LIGHTS,
     kind_named,
@@ -36,6 +37,7 @@ from sgstore.model.vocabulary import (
 from sgstore.model.world import (
     INPUTS,
     POSE,
+    SMOOTHED,
     Entities,
     FaultTally,
     FrameBlock,
@@ -651,7 +653,8 @@ def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float
         about["gear"] = int(gear)
     if not math.isnan(hand_brake):
         about["hand_brake"] = bool(hand_brake)
-    return about | {name: bool(derived >> bit & 1) for bit, name in enumerate(_DERIVED)}
+    names = (*_DERIVED, *NOISE_MARKS) if derived & SMOOTHED else _DERIVED
+    return about | {name: bool(derived >> bit & 1) for bit, name in enumerate(names)}
 
 
 def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:

@@ -24,6 +24,7 @@ from sgstore.model.vocabulary import (
     KINDS,
     LIGHT_STATES,
     MAP_KINDS,
+    NOISE_MARKS,
     OWN_ENTITY_KINDS,
     OWN_KINDS,
     RELATIONS,
@@ -126,6 +127,12 @@ class Type(StrEnum):
 
 DERIVED: Final = ("velocity", "acceleration", "yaw_rate")
 """Quantities that may have been computed by differences. The index is the bit in ``state.derived``."""
+
+_OF_NOISE: Final = (
+    "whether it stands, in a recording with noise: it hardly moves for a second",
+    "whether its acceleration is impossible, in a recording with noise: above 12 m/s²",
+    "whether its yaw rate is impossible, in a recording with noise",
+)
 
 _ENTITIES: Final = frozenset(OWN_ENTITY_KINDS)
 _LANES: Final = frozenset({"lane"})
@@ -343,6 +350,12 @@ NODE_ATTRIBUTES: Final = _named(
                 _ENTITIES,
             )
             for what in DERIVED
+        ),
+        *(
+            Attribute(
+                name, Type.boolean, {Home.state: "derived"}, doc, DisplayUnit.derived, _ENTITIES
+            )
+            for name, doc in zip(NOISE_MARKS, _OF_NOISE, strict=True)
         ),
         *(
             Attribute(

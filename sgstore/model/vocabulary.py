@@ -139,6 +139,9 @@ SPECIALS: Final = ("emergency", "taxi", "electric", "public_transport", "service
 CONTROL: Final = "control_"
 """Prefix of commanded control inputs: ``control_steer`` beside the applied ``steer``."""
 
+NOISE_MARKS: Final = ("stands", "unreal_accel", "unreal_yaw_rate")
+"""Attributes of bodies in recordings with noise, in the order of their bits after ``derived_yaw_rate``."""
+
 VEHICLE_LIGHTS: Final = (
     *("light_left", "light_right", "light_brake", "light_reverse", "light_position"),
     *("light_low_beam", "light_high_beam", "light_fog", "light_interior"),

@@ -149,6 +149,9 @@ FASTEST: Final = 150.0
 HARDEST: Final = 30.0
 """Highest valid acceleration derived from positions or velocities; m/s²."""
 
+STANDS, UNREAL_ACCELERATION, UNREAL_TURN, SMOOTHED = 8, 16, 32, 64
+"""Bits of ``derived`` in recordings with noise, see :class:`States`."""
+
 LEAP: Final = 5.0
 """A position belongs to another body if it is this far beyond the reach at :data:`FASTEST`; m."""
 
@@ -470,7 +473,9 @@ class States:
     hand_brake : float64
         1: on, 0: off.
     derived : int64
-        Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read.
+        Bit 0: velocity, bit 1: acceleration, bit 2: yaw rate was computed by differences, not read. Recordings
+        with noise have more bits: 3: it stands; 4: impossible acceleration; 5: impossible yaw rate; 6: the
+        other bits are known.
     carrier : int64
         Node id of the carrier or towing vehicle; -1: none; :data:`UNTOLD`: not yet computed.
     own : object

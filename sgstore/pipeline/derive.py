@@ -195,7 +195,7 @@ def _derived(file: StoreFile, trace: StoredTrace, config: Config, name: str) -> 
                 crowds.see(graph)
                 frames += len(graph)
                 edges += len(graph.edges)
-        building.publish(config.as_dict(), _digest(config), generator.answers)
+        building.publish(config.as_stored(), _digest(config), generator.answers)
     losses = [loss.reason for loss in crowds.losses(config)]
     return Derivation(trace.name, "derived", frames, edges, losses)
 
@@ -209,7 +209,7 @@ def _road_map(file: StoreFile, trace: StoredTrace, config: Config) -> RoadMap | 
 
 
 def _digest(config: Config) -> str:
-    return hashlib.sha256(repr(config.as_dict()).encode()).hexdigest()
+    return hashlib.sha256(repr(config.as_stored()).encode()).hexdigest()
 
 
 def _settings(trace: StoredTrace, wanted: Config) -> Config:

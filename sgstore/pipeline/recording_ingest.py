@@ -366,6 +366,7 @@ class SegmentReader:
         store = None if job.force else self._file
         digest = store.known_digest(path) if store else ""  # A known digest saves the hashing.
         with open_trace(path, ego=config.ego, digest=digest, mapping=config.mapping) as trace:
+            trace.noise = config.noise
             _log.debug("%s: a recording of flavour %s", path, trace.info.flavour)
             road_map, odd = self._maps.of(trace.info)
             lost = lost_lanes(trace.info, road_map)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -27,7 +28,10 @@ from sgstore.readers._blocks import (
     Raw,
     assemble,
     counted,
+    first_noise,
+    lacks_velocity,
 )
+from sgstore.readers._noise import ESTIMATED, Noise
 from sgstore.readers._roles import channel_rank
 from sgstore.readers._stamps import Stamps, late_reason
 
@@ -130,6 +134,9 @@ def light_places(road_map: RoadMap) -> dict[str, tuple[float, float, float]]:
 
 
 # First reading.
+
+FIRST_NOISE: Final = 3
+"""Number of frames that show if velocities are recorded."""
 
 BEGINNING: Final = 1_000_000_000
 """Maximum delay of a context message after the first frame; ns of log time."""
@@ -403,9 +410,12 @@ class MessageTrace:
     info : TraceInfo
     report : TraceReport
         Filled during the reading of blocks.
+    noise : float
+        Standard deviation of the positions; m. 0: exact; below 0: estimated from the first frames.
     """
 
     name: ClassVar[str] = ""
+    noise: float = -1.0
 
     def __init__(
         self,
@@ -477,7 +487,7 @@ class MessageTrace:
         decoder = self.decoder(report)
         refs = frame_refs(self.info.channels, self.recording.window)
         runs = self.recording.walk(report, rank=self._rank)
-        yield from counted(assemble(runs, size, decoder, refs, first_steps), report)
+        yield from counted(assemble(runs, size, decoder, refs, first_steps, self._noise()), report)
         decoder.settle()
         if not report.frames:
             topic = next(c.topic for c in self.info.channels if c.role == "ground_truth")
@@ -487,15 +497,28 @@ class MessageTrace:
     def _first_steps(self) -> list[int]:
         """Return the time differences between the first frames of the recording; ns."""
         decoder = self.decoder(TraceReport())
-        times: list[int] = []
+        times = [frame.time_ns for frame in islice(self._raw(decoder), FIRST_STEPS + 1)]
+        return np.diff(times).tolist()
+
+    def _noise(self) -> Noise:
+        """Return the noise of the positions, from the setting or the first frames."""
+        if self.noise >= 0:
+            return Noise(self.noise, self.noise)
+        decoder = self.decoder(TraceReport())
+        raw = self._raw(decoder)
+        frames = [*islice(raw, FIRST_NOISE)]
+        if decoder.measures or lacks_velocity(decoder, frames):
+            frames += islice(raw, ESTIMATED - len(frames))
+            return first_noise(decoder, frames)
+        return Noise()
+
+    def _raw(self, decoder: MessageDecoder[Any]) -> Iterator[Any]:
+        """Yield the raw frames of the recording in order."""
         for run in self.recording.walk(TraceReport(), rank=self._rank):
             for row in np.flatnonzero(np.isin(run.channel, [*decoder.channels])).tolist():
                 frame = decoder.decode(run, row)
                 if frame is not None:
-                    times.append(frame.time_ns)
-                if len(times) > FIRST_STEPS:
-                    return np.diff(times).tolist()
-        return np.diff(times).tolist()
+                    yield frame
 
 
 AnySurvey = TypeVar("AnySurvey", bound=Survey[Any])

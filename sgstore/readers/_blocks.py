@@ -38,6 +38,7 @@ from sgstore.model.world import (
     valid_attributes,
     without_implausible,
 )
+from sgstore.readers._noise import Noise, Smoother, noise_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -62,6 +63,9 @@ FAR: Final = 1e9
 
 UPRIGHT: Final = 1 - 1e-13
 """Sine of the pitch above which rounding makes heading and roll indistinguishable."""
+
+EXACT: Final = Noise()
+"""No noise: the positions of a simulator."""
 
 NEAR_REFS: Final = 250_000
 """Maximum number of message references after a frame, and before the next one."""
@@ -410,9 +414,12 @@ class MessageDecoder(Generic[Raw]):
     channels : frozenset of int
     sure_kinds : bool
         True if kinds are certain, as from a simulator; see :class:`LifetimeTracker`.
+    measures : bool
+        True if recorded velocities come from sensors and may have noise.
     """
 
     sure_kinds: ClassVar[bool] = True
+    measures: ClassVar[bool] = False
 
     def __init__(
         self, channels: Collection[int], window: tuple[int, int], report: TraceReport
@@ -467,6 +474,7 @@ def assemble(
     decoder: MessageDecoder[Raw],
     refs: Callable[[Messages], MessageRefs],
     first_steps: Iterable[int] = (),
+    noise: Noise = EXACT,
 ) -> Iterator[FrameBlock]:
     """Decode the messages of a recording, and yield blocks of consecutive frames.
 
@@ -481,6 +489,8 @@ def assemble(
         Returns the references of a run's messages that belong to frames.
     first_steps : iterable of int
         Times between the first frames; ns.
+    noise : Noise
+        Noise of the positions. Missing motion of noisy positions needs more frames before and after a block.
 
     Yields
     ------
@@ -490,16 +500,9 @@ def assemble(
     """
     wanted = np.zeros(IDS, np.bool_)
     wanted[[*decoder.channels]] = True
-    raw: list[Raw] = []
-    sizes: list[
-        int
-    ] = []  # Number of known ids before each frame: all messages of the last one are read.
-    lives = LifetimeTracker(decoder.roster, first_steps, sure_kinds=decoder.sure_kinds)
-    done: list[FrameRows] = []  # The frame before the block, and its completed frames.
-    open_refs: list[MessageRefs] = []
-    block_refs: list[MessageRefs] = []
+    steps = [step for step in first_steps if step > 0]
+    maker = _BlockMaker(decoder, size, steps, noise)
     between = _Between()
-    first, known = 0, 0
     for run in runs:
         start = 0
         for row in np.flatnonzero(wanted[run.channel]).tolist():
@@ -507,38 +510,114 @@ def assemble(
             frame = decoder.decode(run, row)
             if frame is None:
                 continue
-            sizes.append(entered)
-            window = size + (first > 0)
-            if len(done) + len(raw) > window:  # The frame after the block is complete, too.
-                done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes[1:])
-                yield _block(first, done, size, block_refs, decoder.roster, known)
-                first, done, raw, sizes = first + size, done[-2:], [], [entered]
-                window = size + 1
-            if len(done) + len(raw) == window:
+            yield from maker.ready(entered)
+            if maker.starts_block:
                 between.add(refs(run.span(start, row)))
-                start, known = row, entered
-                before, same = between.split(int(run.log_time_ns[row]))
-                block_refs, open_refs = open_refs + before, same
-            raw.append(frame)
-            open_refs += between.take()
+                start = row
+                maker.start_block(*between.split(int(run.log_time_ns[row])), entered)
+            maker.add(frame, between.take())
         between.add(refs(run.span(start, len(run))))
-    open_refs += between.take()
-    sizes.append(decoder.roster.size)
-    done += lives.follow(_on_earth(decoder.complete(raw), decoder.roster), sizes[1:])
-    if len(done) - (first > 0) > size:
-        yield _block(first, done, size, block_refs, decoder.roster, known)
-        first, done = first + size, done[-2:]
-    left = len(done) - (first > 0)
-    last = (
-        _block(first, done, left, open_refs, decoder.roster, decoder.roster.size) if left else None
-    )
-    lives.settle()
-    decoder.roster.settle()
+    maker.finish(between.take())
+    while maker.left > size:
+        yield maker.block(size)
+    last = maker.block(maker.left) if maker.left else None
+    maker.settle()
     if between.dropped:
         words = f"{between.dropped} sensor messages are far from all frames and were not linked"
         decoder.roster.report.warnings.append(words)
     if last is not None:
         yield last
+
+
+class _BlockMaker(Generic[Raw]):
+    """Frames that wait for the frames after them, and the blocks that they make.
+
+    Parameters
+    ----------
+    decoder : MessageDecoder
+    size : int
+        Frames per block.
+    steps : list of int
+        Times between the first frames; ns.
+    noise : Noise
+    """
+
+    def __init__(
+        self, decoder: MessageDecoder[Raw], size: int, steps: list[int], noise: Noise
+    ) -> None:
+        self._decoder, self._size = decoder, size
+        self._lives = LifetimeTracker(decoder.roster, steps, sure_kinds=decoder.sure_kinds)
+        period = float(np.median(steps)) / 1e9 if steps else 0.1
+        self._smoother = Smoother(noise, period) if noise else None
+        self._reach = noise.reach(period)
+        self._raw: list[Raw] = []
+        self._sizes: list[int] = []  # Number of known ids before the frame after each one.
+        self._done: list[FrameRows] = []  # Completed frames, also those before the block.
+        self._count = self._first = 0
+        # Of each block that began after the current one: its messages, and the entities before it.
+        self._borders: deque[tuple[list[MessageRefs], int]] = deque()
+        self._refs: list[MessageRefs] = []
+
+    @property
+    def starts_block(self) -> bool:
+        """True if the next frame is the first of another block."""
+        return self._count > 0 and self._count % self._size == 0
+
+    def start_block(self, before: list[MessageRefs], same: list[MessageRefs], known: int) -> None:
+        """End a block before the next frame; ``known``: number of entities before this frame."""
+        self._borders.append((self._refs + before, known))
+        self._refs = same
+
+    def add(self, frame: Raw, refs: list[MessageRefs]) -> None:
+        """Add a frame, and the messages before it."""
+        self._raw.append(frame)
+        self._refs += refs
+        self._count += 1
+
+    @property
+    def left(self) -> int:
+        """Number of frames that are in no block yet."""
+        return self._count - self._first
+
+    def ready(self, known: int) -> Iterator[FrameBlock]:
+        """Yield the next block if all frames that it depends on are complete.
+
+        ``known``: number of entities of the frames so far.
+        """
+        if self._raw:  # the last frame can have objects of later messages of its time
+            self._sizes.append(known)
+        if self.left >= self._size + self._reach:
+            self._complete()
+            yield self.block(self._size)
+
+    def finish(self, refs: list[MessageRefs]) -> None:
+        """End the last block; ``refs``: the messages after the last frame."""
+        self._sizes.append(self._decoder.roster.size)
+        self._complete()
+        self._borders.append((self._refs + refs, self._decoder.roster.size))
+
+    def block(self, size: int) -> FrameBlock:
+        """Return the next ``size`` frames as a block."""
+        refs, known = self._borders.popleft()
+        before = min(self._first, self._reach)
+        window, part = self._done[: before + size + self._reach], (before, size)
+        roster, smoother = self._decoder.roster, self._smoother
+        block = _block(self._first, window, part, refs, roster, known, smoother)
+        self._first += size
+        del self._done[: before + size - min(self._first, self._reach)]
+        return block
+
+    def settle(self) -> None:
+        """Add warnings about ids, gaps of the clock and impossible values to the report."""
+        self._lives.settle()
+        self._decoder.roster.settle()
+        if self._smoother is not None:
+            self._decoder.roster.report.warnings += self._smoother.warnings()
+
+    def _complete(self) -> None:
+        frames = _on_earth(self._decoder.complete(self._raw), self._decoder.roster)
+        self._done += self._lives.follow(frames, self._sizes)
+        self._raw, self._sizes = [], []
 
 
 @dataclass(slots=True)
@@ -599,30 +678,29 @@ def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[Frame
 def _block(
     first: int,
     window: list[FrameRows],
-    size: int,
+    part: tuple[int, int],
     refs: list[MessageRefs],
     roster: EntityTable,
     known: int,
+    smoother: Smoother | None,
 ) -> FrameBlock:
-    """Return a block of ``size`` frames, built from these frames and the frames next to them.
+    """Return a block of frames, built from these frames and the frames next to them.
 
-    ``known``: number of entities before the first frame of the next block.
+    ``part``: number of frames before the block, and of frames in it; ``known``: number of entities before
+    the first frame of the next block.
     """
-    skipped = int(first > 0)
+    skipped, size = part
     frames = window[skipped : skipped + size]
     counts = np.array([len(frame) for frame in frames], np.int64)
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    skip = len(window[0]) if skipped else 0
+    skip = sum(len(frame) for frame in window[:skipped])
     rows = slice(skip, skip + int(offsets[-1]))
-    values, derived, impossible = derive(
-        np.concatenate([frame.node for frame in window]),
-        np.repeat(np.arange(len(window)), [len(frame) for frame in window]),
-        np.array([frame.seconds for frame in window]),
-        np.concatenate([frame.values for frame in window]),
-        np.concatenate([frame.light_state for frame in window]) >= 0,
-        rows,
-    )
-    roster.impossible += impossible
+    columns = _columns(window, np.array([frame.seconds for frame in window]))
+    if smoother is None:
+        values, derived, impossible = derive(*columns, rows)
+        roster.impossible += impossible
+    else:
+        values, derived = smoother.fill(*columns, rows)
     nodes = np.concatenate([frame.node for frame in frames])
     ego = np.array([frame.ego for frame in frames], np.int64)
     entities, scenery = roster.take(known, frames[-1].returned)
@@ -646,6 +724,38 @@ def _block(
         messages=chained(refs),
         events=roster.take_events(),
     )
+
+
+def _columns(window: list[FrameRows], seconds: Floats) -> tuple[Ints, Ints, Floats, Floats, Bools]:
+    """Return node, frame, time steps, values and fixed rows of frames, as :func:`derive` needs them."""
+    return (
+        np.concatenate([frame.node for frame in window]),
+        np.repeat(np.arange(len(window)), [len(frame) for frame in window]),
+        seconds,
+        np.concatenate([frame.values for frame in window]),
+        np.concatenate([frame.light_state for frame in window]) >= 0,
+    )
+
+
+def first_noise(decoder: MessageDecoder[Raw], raw: list[Raw]) -> Noise:
+    """Estimate the noise of positions from the first frames of a recording."""
+    frames = decoder.complete(raw)
+    if not any(map(len, frames)):
+        return EXACT
+    time = np.array([frame.time_ns for frame in frames], np.int64)
+    steps = np.diff(time, prepend=time[0]) / 1e9
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    steps[(steps <= 0) | (steps > 3.01 * usual)] = np.nan
+    return noise_of(*_columns(frames, steps))
+
+
+def lacks_velocity(decoder: MessageDecoder[Raw], raw: list[Raw]) -> bool:
+    """Return True if a moving object of these frames has no recorded velocity."""
+    frames = decoder.complete(raw)
+    if not frames:
+        return False
+    _, _, _, values, fixed = _columns(frames, np.zeros(len(frames)))
+    return bool((np.isnan(values[:, _VELOCITY]) & ~fixed).any())
 
 
 FIRST_STEPS: Final = 64

@@ -75,7 +75,7 @@ class Identity:
         part: tuple[float | None, float | None] = (None, None),
     ) -> Identity:
         """Return the identity of a trace, from a recording (or a part of it), settings and road map."""
-        settings = as_json(replace(config, ego="", egos=()).as_dict())
+        settings = as_json(replace(config, ego="", egos=()).as_stored())
         return cls(
             trace_id=Identity.id_of(info.digest, info.ego),
             digest=info.digest,

@@ -7,25 +7,51 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.graphs.relations._scene import IS_VEHICLE
+from sgstore.model.world import SMOOTHED, STANDS
 
 if TYPE_CHECKING:
     from sgstore.graphs.relations._scene import Bodies, Standing
-    from sgstore.model.world import Bools, Codes, Entities, Floats, States
+    from sgstore.model.world import Bools, Codes, Entities, Floats, FrameBlock, Ints
 
 
 MOVED: Final = 0.3
 """An entity that stays within this distance of its first position has not moved: poses tremble; m."""
 
 
+STRAYED: Final = 2.0
+"""The same in recordings with noise, where boxes of standing vehicles wander; m."""
+
+SHARE: Final = 0.3
+"""Least share of frames with noise in which a parked vehicle stands."""
+
+DRIFT: Final = 0.2
+"""Greatest mean speed of a parked vehicle, from its first to its last noisy position; m/s."""
+
+LEAST_NS: Final = 3_000_000_000 - 1_000
+"""Least time for which a parked vehicle is seen if there is no map; ns."""
+
+NEVER: Final = np.iinfo(np.int64).min
+"""Time of a vehicle that was not seen."""
+
+
 class Parking:
     """Record of the vehicles of a trace that detects parked ones. Memory grows with vehicles, not time.
 
     A vehicle is parked if the simulator marks it as static. It is also parked if it does not move
-    in the whole trace and a lane for driving is never its primary lane. Without a map, or without
-    time in range, the state of an unmoved vehicle is unknown. A moving vehicle is never parked.
+    in the whole trace and a lane for driving is never its primary lane. Without a map, it must be
+    seen for 3 s. Without time in range of the map, or with less time, the state of an unmoved vehicle is
+    unknown. A moving vehicle is never parked. In a recording with noise, it may stray while it stands.
+
+    Parameters
+    ----------
+    on_map : bool
+        True if the trace has a road map.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, on_map: bool) -> None:
+        self._on_map = on_map
+        # First and last time; number of frames with noise, and of those in which it stands.
+        self._seen: Ints = np.zeros((4, 0), np.int64)
         self._vehicle: Bools = np.zeros(0, np.bool_)
         self._static: Bools = np.zeros(0, np.bool_)
         self._moved: Bools = np.zeros(0, np.bool_)
@@ -33,6 +59,7 @@ class Parking:
         self._stood: Bools = np.zeros((2, 0), np.bool_)
         self._drove: Bools = np.zeros((2, 0), np.bool_)
         self._place: Floats = np.zeros((0, 2))
+        self._last: Floats = np.zeros((0, 2))
 
     def learn(self, entities: Entities) -> None:
         """Record the new objects of a block of frames, to detect parked vehicles later."""
@@ -45,17 +72,30 @@ class Parking:
             np.concatenate([known, both], axis=1) for known in (self._stood, self._drove)
         )
         self._place = np.concatenate([self._place, np.full((len(entities), 2), np.nan)])
+        self._last = np.concatenate([self._last, np.full((len(entities), 2), np.nan)])
+        never = np.zeros((4, len(entities)), np.int64)
+        never[:2] = NEVER
+        self._seen = np.concatenate([self._seen, never], axis=1)
 
-    def see(self, states: States) -> None:
+    def see(self, frames: FrameBlock) -> None:
         """Record the positions of vehicles in the next frames."""
+        states = frames.states
         place = np.column_stack([states.x, states.y])
         node = states.node
         known = np.flatnonzero(np.isfinite(place).all(axis=1))
         new, first = np.unique(node[known], return_index=True)
         unseen = np.isnan(self._place[new, 0])
         self._place[new[unseen]] = place[known[first[unseen]]]
-        away = np.hypot(*(place - self._place[node]).T) > MOVED
+        noisy = states.derived & SMOOTHED > 0
+        away = np.hypot(*(place - self._place[node]).T) > np.where(noisy, STRAYED, MOVED)
         self._moved[node[away]] = True
+        self._last[node[known]] = place[known]
+        time = frames.time_ns[frames.frame_of]
+        begin, end, shaky, stood = self._seen
+        begin[new] = np.where(begin[new] == NEVER, time[known[first]], begin[new])
+        np.maximum.at(end, node[known], time[known])
+        np.add.at(shaky, node[noisy], 1)
+        np.add.at(stood, node[noisy & (states.derived & STANDS > 0)], 1)
 
     def stand(
         self, bodies: Bodies, standing: Standing, driving: Bools, *, beyond: bool = False
@@ -80,6 +120,10 @@ class Parking:
         return self._parked(1)
 
     def _parked(self, row: int) -> Codes:
-        known = self._stood[row] | self._moved | self._static
-        parked = self._static | ~(self._moved | self._drove[row])
+        begin, end, shaky, stood = self._seen
+        drift = np.hypot(*(self._last - self._place).T) > DRIFT * (end - begin) / 1e9
+        moved = self._moved | (shaky > 0) & (drift | (stood < SHARE * shaky))
+        long = (begin != NEVER) & (end - begin >= LEAST_NS) & ~np.array(self._on_map)
+        known = self._stood[row] | moved | self._static | long
+        parked = self._static | ~(moved | self._drove[row])
         return np.where(self._vehicle & known, parked, -1).astype(np.int8)

@@ -15,10 +15,11 @@ import numpy as np
 
 from sgstore.lang import ir as b
 from sgstore.lang.catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, Type
-from sgstore.lang.memory._frame_view import NodeColumns
+from sgstore.lang.memory._frame_view import NodeColumns, attribute_of
 from sgstore.lang.operators import OPERATORS, Column
 from sgstore.model.criticality import RECORDED
 from sgstore.model.pair_numbers import WAYS
+from sgstore.model.vocabulary import NOISE_MARKS
 
 if TYPE_CHECKING:
     from sgstore.lang.catalog import Attribute
@@ -126,6 +127,8 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
     if attribute.unit is DisplayUnit.own:
         of = _OWN[attribute.type]
         return lambda at: of(at.view.nodes[at.nodes[node]].get(name))
+    if name in NOISE_MARKS:
+        return lambda at: attribute_of(at.view.nodes[at.nodes[node]], name)
     return lambda at: at.view.nodes[at.nodes[node]].get(name)
 
 

@@ -25,7 +25,7 @@ from sgstore.model.pair_numbers import (
     PairNumbers,
     low_and_high,
 )
-from sgstore.model.vocabulary import MAP_KINDS, SIGNALS
+from sgstore.model.vocabulary import MAP_KINDS, NOISE_MARKS, SIGNALS
 
 if TYPE_CHECKING:
     from sgstore.lang import ir as b
@@ -305,7 +305,8 @@ class NodeColumns:
         column = self._columns.get(name)
         if column is None:
             nodes = view.nodes
-            told = [nodes[node].get(name, math.nan) for node in self.nodes]
+            of = attribute_of if name in NOISE_MARKS else dict.get
+            told = [of(nodes[node], name) for node in self.nodes]
             column = _known(np.array([math.nan if v is None else v for v in told], np.float64))
             if truth:
                 column = Column(column.values == 1, column.known)
@@ -323,6 +324,13 @@ class NodeColumns:
             values = view.pairs(name, one, ahead=ahead)
             column = self._columns[key] = _known(np.append(values, math.nan)[self._rows])
         return column
+
+
+def attribute_of(about: Mapping[str, Any], name: str) -> Any:
+    """Return an attribute of a node. Bodies of a recording without noise have no mark of noise."""
+    if name in NOISE_MARKS and "derived_velocity" in about:
+        return about.get(name, False)
+    return about.get(name)
 
 
 def _known(values: Floats) -> Column:

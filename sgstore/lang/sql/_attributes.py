@@ -10,7 +10,7 @@ from sgstore.lang.catalog import DERIVED, Attribute, DisplayUnit, Home, Type
 from sgstore.lang.ir import FrameAttribute, TraceAttribute
 from sgstore.lang.sql._select import Select, nested
 from sgstore.model.pair_numbers import low_and_high_sql
-from sgstore.model.vocabulary import MAP_KINDS, VEHICLE_LIGHTS
+from sgstore.model.vocabulary import MAP_KINDS, NOISE_MARKS, VEHICLE_LIGHTS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -188,7 +188,7 @@ def _part(attribute: Attribute, home: Home, column: str, alias: str, trace: str 
 
 _BITS: Final = {
     DisplayUnit.light: VEHICLE_LIGHTS,
-    DisplayUnit.derived: tuple(f"derived_{what}" for what in DERIVED),
+    DisplayUnit.derived: (*(f"derived_{what}" for what in DERIVED), *NOISE_MARKS),
 }
 
 _STILL: Final = {

@@ -348,6 +348,10 @@ class Config:
     rate : float
         frames kept for each second of the trace's clock: the first frame at or after each step of
         1/rate. 0: all frames
+    noise : float
+        standard deviation of recorded positions; m. Missing velocities, accelerations and yaw rates
+        of noisy positions are smoothed. 0: exact positions, as of a simulator; -1: estimated from
+        the first frames, above all from what stands
     kinds : tuple of str
         labels of what is kept: entities ('Vehicle', 'Person', 'Signal') and parts of the map
         ('Lane'); the ego always is. What is not kept is as if it were not there. Empty: everything
@@ -395,6 +399,7 @@ class Config:
     sees: bool = True
     egos: tuple[str, ...] = ()
     rate: float = 0.0
+    noise: float = -1.0
     kinds: tuple[str, ...] = ()
     exclude_ids: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
@@ -413,6 +418,8 @@ class Config:
             _make_known("new_kinds", add_kind, kind)
         check(all(self.exclude_ids), "exclude_ids", self.exclude_ids, "ids, roles or names")
         check(0 <= self.rate <= 1e6, "rate", self.rate, "0 or more frames per second")
+        right = "a length from 0 to 10 m, or -1 for an estimate"
+        check(0 <= self.noise <= 10 or self.noise == -1, "noise", self.noise, right)
         check_labels("kinds", self.kinds, ego=False)
         both = set(self.proximity.names) & set(self.direction.names)
         check(not both, "direction.names", self.direction.names, "other names than proximity.names")
@@ -468,6 +475,19 @@ class Config:
         {'vehicle.tuktuk': 2}
         """
         return {name: n for name, n in types.items() if name.lower() not in self.types}
+
+    def as_stored(self) -> dict[str, Any]:
+        """Return the settings as a store keeps them. Those of stores before ``noise`` stay the same.
+
+        Examples
+        --------
+        >>> "noise" in sgstore.Config().as_stored(), sgstore.Config(noise=0.1).as_stored()["noise"]
+        (False, 0.1)
+        """
+        found = self.as_dict()
+        if self.noise < 0:
+            del found["noise"]
+        return found
 
     def __repr__(self) -> str:
         """Return the settings that differ from the defaults: ``Config(range.radius=30.0)``."""

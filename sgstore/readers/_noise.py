@@ -1,0 +1,466 @@
+"""Motion from noisy positions: noise of a recording, smooth velocities, and vehicles that stand.
+
+Positions of measured recordings tremble, those of simulators do not. :func:`noise_of` estimates the noise
+from the first frames. :class:`Smoother` fits polynomials to the noisy positions around each frame.
+
+Notes
+-----
+A velocity is the slope of a line over up to two seconds, an acceleration the bend of a parabola over two
+seconds. At the ends of a track the window has one side; the acceleration then corrects the slope. An impossible
+step divides a track. A single position far off its neighbours is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from sgstore.model.world import POSE, SMOOTHED, STANDS, UNREAL_ACCELERATION, UNREAL_TURN
+
+if TYPE_CHECKING:
+    from sgstore.model.world import Bools, Floats, Ints
+
+ESTIMATED: Final = 120
+"""Number of first frames from which the noise of a recording is estimated."""
+
+HALF: Final = 0.5
+"""Half the window in which a body that stands must not move; s."""
+
+WIDE: Final = 1.0
+"""Half the window of accelerations, and the greatest of velocities; s."""
+
+MOST_ROWS: Final = 30
+"""Greatest number of frames on each side of a window."""
+
+CALM: Final = 0.05
+"""Standard deviation of velocities that the window aims at; m/s."""
+
+STILL: Final = 0.01
+"""Positions whose noise is below this value are exact; m."""
+
+BODIES: Final = 5
+"""Number of bodies whose kinks show that positions are interpolated."""
+
+KINKED: Final = 0.9
+"""Share of the bend that positions between two kinks lack."""
+
+JUMP: Final = 0.5
+"""A step that differs by more from its neighbours divides a track, beside noise and acceleration; m."""
+
+UNREAL: Final = 12.0
+"""Accelerations above this value, along or across, are physically impossible; m/s²."""
+
+SPINNING: Final = np.radians(120.0)
+"""Yaw rates above this value are physically impossible for a vehicle; rad/s."""
+
+_X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = (
+    POSE.index(name) for name in ("x", "heading", "vx", "ax", "yaw_rate")
+)
+
+
+class Noise(NamedTuple):
+    """Noise of the positions of a recording.
+
+    Attributes
+    ----------
+    jitter : float
+        Standard deviation from frame to frame; m.
+    wander : float
+        Standard deviation of the positions of bodies that stand, over seconds; m.
+    """
+
+    jitter: float = 0.0
+    wander: float = 0.0
+
+    def __bool__(self) -> bool:
+        return bool(max(self) > 0)
+
+    @property
+    def enter(self) -> float:
+        """Speed below which a body begins to stand; m/s."""
+        return float(np.clip(0.1 + 3 * self.wander, 0.1, 0.35))
+
+    @property
+    def leave(self) -> float:
+        """Speed above which a body no longer stands; m/s."""
+        return 1.3 * self.enter
+
+    def reach(self, period: float) -> int:
+        """Return the number of frames on each side that the values of a frame depend on."""
+        return min(MOST_ROWS, int(np.ceil(WIDE / period))) + 3 if self else 1
+
+    def half(self, period: float) -> float:
+        """Return half the window of velocities: the shortest in which they are calm; s."""
+        most = max(1, min(MOST_ROWS, int(WIDE / period)))
+        squares = 2 * np.cumsum(np.arange(1, most + 1) ** 2.0)
+        calm = self.jitter / (period * np.sqrt(squares)) <= CALM
+        return period * (int(np.argmax(calm)) + 1 if calm.any() else most)
+
+
+@dataclass(slots=True)
+class Tracks:
+    """Rows of frames in the order of node and time, divided where a body cannot have moved.
+
+    Attributes
+    ----------
+    order : (n,) int64
+        Rows in this order.
+    frame, time : (n,) int64
+        Number of the frame, and ns since the first one.
+    place : (n, 3) float64
+        x, y and z; m.
+    turn : (n,) float64
+        Heading; rad.
+    part : (n,) int64
+        Number of the part of a track.
+    used : (n,) bool
+        Rows with a usable position.
+    period : float
+        Time between frames; s.
+    """
+
+    order: Ints
+    frame: Ints
+    time: Ints
+    place: Floats
+    turn: Floats
+    part: Ints
+    used: Bools
+    period: float
+
+    @classmethod
+    def of(
+        cls,
+        node: Ints,
+        frame: Ints,
+        seconds: Floats,
+        values: Floats,
+        jitter: float,
+        period: float,
+    ) -> Tracks:
+        """Return the tracks of frames; arguments as of :func:`smooth`."""
+        order = np.lexsort([frame, node])
+        # Whole nanoseconds: differences are then the same in every block.
+        clock = np.cumsum(np.rint(np.where(seconds > 0, seconds, 0.0) * 1e9).astype(np.int64))
+        torn = np.cumsum(~(seconds > 0))
+        at, time = frame[order], clock[frame[order]]
+        place = values[order, _X : _X + 3]
+        used = np.isfinite(place[:, :2]).all(axis=1)
+        breaks = np.ones(len(order), np.bool_)
+        ahead = np.diff(at)
+        breaks[1:] = (np.diff(node[order]) != 0) | (ahead > 3) | (np.diff(torn[at]) != 0)
+        if len(order) > 3:
+            far = _jumps(time, place[:, :2], np.cumsum(breaks), jitter)
+            # A row with a jump before and behind, but none over it, is an outlier.
+            lone = np.flatnonzero(far[:-1] & far[1:]) if len(far) > 1 else np.zeros(0, np.int64)
+            lone = lone[_close(time, place[:, :2], lone, jitter)]
+            far[lone], far[lone + 1] = False, False
+            used[lone] = False
+            breaks |= far
+        return cls(order, at, time, place, values[order, _HEADING], np.cumsum(breaks), used, period)
+
+    def shifted(self, by: int) -> tuple[Ints, Bools]:
+        """Return the rows some places later in the same part, and a mask of those that exist."""
+        rows = np.arange(len(self.order)) + by
+        there = np.clip(rows, 0, len(rows) - 1)
+        return there, (rows == there) & (self.part[there] == self.part) & self.used[there]
+
+    def most(self, half: float) -> int:
+        """Return the greatest number of frames on each side of a window."""
+        return min(MOST_ROWS, round(half / self.period))
+
+    def fits(self, values: Floats, half: float, degree: int, turn: float = 0.0) -> Fit:
+        """Return the polynomial through the values around each row, by least squares.
+
+        Parameters
+        ----------
+        values : (n, c) float64
+        half : float
+            Half the window; s.
+        degree : int
+            1 or 2.
+        turn : float
+            Period of the values, such as 2π. 0: none.
+        """
+        sums = np.zeros((2 * degree + 1, len(values)))
+        moments = np.zeros((degree + 1, *values.shape))
+        low, high = np.zeros(len(values)), np.zeros(len(values))
+        most = self.most(half)
+        for by in range(-most, most + 1):
+            there, inside = self.shifted(by)
+            away = (self.time[there] - self.time) / 1e9
+            inside &= (np.abs(away) <= half * 1.01) & (
+                np.abs(self.frame[there] - self.frame) <= most
+            )
+            if not inside.any():
+                continue
+            rise = values[there] - values
+            if turn:
+                rise = rise - turn * np.round(rise / turn)
+            known = inside & np.isfinite(rise).all(axis=1)
+            away, rise = np.where(known, away, 0.0), np.where(known[:, None], rise, 0.0)
+            power = known.astype(np.float64)
+            for i in range(2 * degree + 1):
+                sums[i] += power
+                if i <= degree:
+                    moments[i] += power[:, None] * rise
+                power = power * away
+            low, high = np.minimum(low, away), np.maximum(high, away)
+        return Fit.of(sums, moments, high - low)
+
+
+@dataclass(slots=True)
+class Fit:
+    """Polynomials around rows: slope and bend at the middle of their windows.
+
+    Attributes
+    ----------
+    slope, bend : (n, c) float64
+        First and second derivative; NaN without enough rows.
+    middle : (n,) float64
+        Mean time of the window, from the time of the row; s.
+    span : (n,) float64
+        Length of the window; s.
+    """
+
+    slope: Floats
+    bend: Floats
+    middle: Floats
+    span: Floats
+
+    @classmethod
+    def of(cls, sums: Floats, moments: Floats, span: Floats) -> Fit:
+        """Return the solution of the normal equations."""
+        with np.errstate(all="ignore"):
+            middle = sums[1] / sums[0]
+            degree = len(moments) - 1
+            # Moments around the middle: the equations of slope and bend are then nearly independent.
+            s2 = sums[2] / sums[0] - middle**2
+            m0 = moments[0] / sums[0][:, None]
+            m1 = moments[1] / sums[0][:, None] - middle[:, None] * m0
+            slope = m1 / s2[:, None]
+            bend = np.full_like(slope, np.nan)
+            if degree == 2:
+                s3 = sums[3] / sums[0] - 3 * middle * sums[2] / sums[0] + 2 * middle**3
+                s4 = sums[4] / sums[0] - 4 * middle * sums[3] / sums[0]
+                s4 = s4 + 6 * middle**2 * sums[2] / sums[0] - 3 * middle**4
+                m2 = (
+                    moments[2] / sums[0][:, None]
+                    - 2 * middle[:, None] * moments[1] / sums[0][:, None]
+                )
+                m2 = m2 + (middle**2)[:, None] * m0 - s2[:, None] * m0
+                rest = s4 - s2**2 - s3**2 / s2
+                bend = 2 * (m2 - (s3 / s2)[:, None] * m1) / rest[:, None]
+                slope = slope - (s3 / s2)[:, None] * bend / 2
+                bend[sums[0] < 4] = np.nan
+        return cls(slope, bend, middle, span)
+
+    def instead(self, other: Fit, rows: Bools) -> Fit:
+        """Return the fit with some rows of another one."""
+        mixed = (
+            np.where(rows[:, None], b, a)
+            for a, b in zip((self.slope, self.bend), (other.slope, other.bend), strict=True)
+        )
+        return Fit(
+            *mixed, np.where(rows, other.middle, self.middle), np.where(rows, other.span, self.span)
+        )
+
+
+def _jumps(time: Ints, place: Floats, part: Ints, jitter: float) -> Bools:
+    """Return a mask of the rows to which the body cannot have moved from the row before."""
+    step = np.diff(time) / 1e9
+    moved = np.diff(place, axis=0)
+    whole = np.diff(part) == 0
+    with np.errstate(all="ignore"):
+        speed = moved / step[:, None]
+        near = np.full((5, *speed.shape), np.nan)
+        for i, by in enumerate((-2, -1, 1, 2, 0)):
+            rows = np.arange(len(speed)) + by
+            there = np.clip(rows, 0, len(speed) - 1)
+            same = (rows == there) & whole[there] & (part[there + 1] == part[1:])
+            near[i, same] = speed[there[same]]
+        middle = _median(near)
+        away = np.linalg.norm(moved - middle * step[:, None], axis=1)
+    far = whole & (away > JUMP + 6 * jitter + 2 * UNREAL * step**2)
+    return np.append(False, far)
+
+
+def _median(values: Floats) -> Floats:
+    """Return the median over the first axis without NaN; NaN if all are."""
+    ranked = np.sort(values, axis=0)
+    count = np.isfinite(values).sum(axis=0)
+    low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)
+    return (_nth(ranked, low) + _nth(ranked, high)) / 2
+
+
+def _nth(values: Floats, which: Ints) -> Floats:
+    return np.take_along_axis(values, which[None], axis=0)[0]
+
+
+def _close(time: Ints, place: Floats, rows: Ints, jitter: float) -> Bools:
+    """Return a mask of the rows whose neighbours on both sides fit together without them."""
+    inside = (rows >= 2) & (rows + 2 < len(time))
+    rows = np.clip(rows, 2, max(2, len(time) - 3))
+    before = (place[rows - 1] - place[rows - 2]) / (time[rows - 1] - time[rows - 2])[:, None]
+    step = time[rows + 1] - time[rows - 1]
+    away = place[rows + 1] - place[rows - 1] - before * step[:, None]
+    limit = JUMP + 8 * jitter + 2 * UNREAL * step**2
+    return inside & (np.linalg.norm(away, axis=1) <= limit)
+
+
+@dataclass(slots=True)
+class Smoother:
+    """Velocities, accelerations and yaw rates from noisy positions, block after block.
+
+    Parameters
+    ----------
+    noise : Noise
+    period : float
+        Time between frames; s.
+
+    Attributes
+    ----------
+    unreal : (2,) int64
+        Number of impossible accelerations and yaw rates.
+    """
+
+    noise: Noise
+    period: float
+    unreal: Ints = field(default_factory=lambda: np.zeros(2, np.int64))
+    _stands: dict[int, bool] = field(default_factory=dict[int, bool])
+
+    def fill(
+        self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
+    ) -> tuple[Floats, Ints]:
+        """Return the values of rows without gaps of motion, and their bits ``derived``.
+
+        Parameters and result are those of :func:`sgstore.readers._blocks.derive`.
+        """
+        tracks = Tracks.of(node, frame, seconds, values, self.noise.jitter, self.period)
+        half = self.noise.half(self.period)
+        near = tracks.fits(tracks.place, half, 1)
+        calm = tracks.fits(tracks.place, max(HALF, half), 1)
+        if self.noise.jitter:  # At the end of a track, the window on one side must be longer.
+            near = near.instead(calm, near.span < 1.9 * half)
+        wide = tracks.fits(tracks.place, WIDE, 2)
+        turns = tracks.fits(tracks.turn[:, None], HALF, 1, 2 * np.pi)
+        bend = np.where((wide.span >= HALF)[:, None], wide.bend, np.nan)
+        moved = near.slope - np.nan_to_num(bend) * near.middle[:, None]
+        moved[:, 2] = calm.slope[:, 2]
+        back = np.empty(len(node), np.int64)
+        back[tracks.order] = np.arange(len(node))
+        at = back[rows]
+        found = np.column_stack([moved, bend, turns.slope])[at]
+        speed = np.hypot(calm.slope[:, 0], calm.slope[:, 1])
+        stands = self._standing(node[rows], frame[rows], speed[at])
+        found[stands & np.isfinite(found[:, 2]), 2] = 0.0  # The height of boxes trembles, too.
+        return self._filled(values[rows], found, fixed[rows], stands)
+
+    def _filled(
+        self, values: Floats, found: Floats, fixed: Bools, stands: Bools
+    ) -> tuple[Floats, Ints]:
+        """Return values with derived motion in place of missing motion, and their bits."""
+        wanted, derived = values.copy(), np.zeros(len(values), np.int64)
+        for bit, (column, first, width) in enumerate(
+            ((_VELOCITY, 0, 3), (_ACCELERATION, 3, 3), (_YAW_RATE, 6, 1))
+        ):
+            part = found[:, first : first + width]
+            takes = np.isnan(values[:, column]) & ~fixed & np.isfinite(part[:, 0])
+            wanted[takes, column : column + width] = part[takes]
+            derived |= takes.astype(np.int64) << bit
+        with np.errstate(invalid="ignore"):
+            hard = np.hypot(wanted[:, _ACCELERATION], wanted[:, _ACCELERATION + 1]) > UNREAL
+            speed = np.hypot(wanted[:, _VELOCITY], wanted[:, _VELOCITY + 1])
+            rate = np.abs(wanted[:, _YAW_RATE])
+            spun = (rate > SPINNING) | (rate * speed > UNREAL)
+        self.unreal += [int(hard.sum()), int(spun.sum())]
+        wanted[hard & (derived & 2 > 0), _ACCELERATION : _ACCELERATION + 3] = np.nan
+        wanted[spun & (derived & 4 > 0), _YAW_RATE] = np.nan
+        for mask, bit in (
+            (stands & ~fixed, STANDS),
+            (hard, UNREAL_ACCELERATION),
+            (spun, UNREAL_TURN),
+            (~fixed, SMOOTHED),
+        ):
+            derived[mask] |= bit
+        return wanted, derived
+
+    def warnings(self) -> list[str]:
+        """Return the noise and the numbers of impossible values as warnings of a report."""
+        noise, (hard, spun) = self.noise, self.unreal.tolist()
+        found = [f"positions have a noise of {max(noise):.2g} m: missing motion is smoothed"]
+        if hard:
+            found.append(f"{hard} accelerations above {UNREAL:g} m/s² are impossible")
+        if spun:
+            found.append(f"{spun} yaw rates are impossible")
+        return found
+
+    def _standing(self, node: Ints, frame: Ints, speed: Floats) -> Bools:
+        """Return a mask of the rows whose body stands: slow enough, or not yet faster since it stood."""
+        enter, leave = self.noise.enter, self.noise.leave
+        sure = np.where(speed <= enter, 1, np.where(speed > leave, -1, 0))
+        order = np.lexsort([frame, node])
+        ids = node[order]
+        starts = np.diff(ids, prepend=-1) != 0
+        first = np.array([self._stands.get(one, False) for one in ids[starts].tolist()], np.int64)
+        kept = sure[order]
+        begin = np.flatnonzero(starts)
+        kept[begin] = np.where(kept[begin] == 0, 2 * first - 1, kept[begin])
+        last = np.maximum.accumulate(np.where(kept != 0, np.arange(len(kept)), 0))
+        result = np.empty(len(node), np.bool_)
+        result[order] = kept[last] > 0
+        ends = np.append(begin[1:], len(ids)) - 1
+        self._stands.update(zip(ids[ends].tolist(), result[order][ends].tolist(), strict=True))
+        return result
+
+
+def noise_of(node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools) -> Noise:
+    """Estimate the noise of positions from frames; parameters as of :meth:`Smoother.fill`.
+
+    A noisy body that stands stays within a metre for two seconds, and turns back on its way. Bodies of a
+    simulator stay exactly, or move on. Third differences show the noise from frame to frame.
+    """
+    rows = np.flatnonzero(~fixed)
+    period = float(np.nanmedian(seconds)) if np.isfinite(seconds).any() else 0.1
+    tracks = Tracks.of(node[rows], frame[rows], seconds, values[rows], 0.1, period)
+    place = tracks.place[:, :2]
+    whole = np.diff(tracks.part) == 0
+    steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    wander: list[float] = []
+    starts = np.flatnonzero(np.append(True, ~whole))
+    for a, b in zip(starts, np.append(starts[1:], len(place)), strict=True):
+        part, seen = place[a:b], tracks.time[a:b]
+        if b - a < 5 or seen[-1] - seen[0] < 2e9 * WIDE:
+            continue
+        size = float(np.hypot(*np.ptp(part, axis=0)))
+        if size <= 1 and steps[a : b - 1].sum() > 1.5 * size:
+            wander.append(float(np.std(part, axis=0).max()))
+    calm = float(np.median(wander)) if wander else 0.0
+    jitter, rough = _jitter(tracks)
+    if max(calm, jitter) < STILL and not rough:
+        return Noise()
+    return Noise(jitter if jitter >= STILL / 2 else 0.0, max(calm, jitter, STILL))
+
+
+def _jitter(tracks: Tracks) -> tuple[float, bool]:
+    """Return the noise from frame to frame, in m. True: positions are interpolated, with kinks between."""
+    place, n = tracks.place[:, :2], len(tracks.place)
+    if n < 20:
+        return 0.0, False
+    whole = tracks.part[3:] == tracks.part[:-3]
+    third = np.linalg.norm(np.diff(place, 3, axis=0)[whole], axis=1)
+    jitter = float(np.median(third)) / (1.1774 * 20**0.5) if len(third) else 0.0
+    wide = tracks.fits(place, HALF, 2)
+    middle = tracks.part[2:] == tracks.part[:-2]
+    step = (tracks.time[2:] - tracks.time[:-2])[:, None] / 2e9
+    with np.errstate(all="ignore"):
+        bend = np.diff(place, 2, axis=0) / step**2
+        smooth = wide.bend[1:-1]
+        apart = np.linalg.norm(bend - smooth, axis=1)
+        both = np.linalg.norm(bend, axis=1) + np.linalg.norm(smooth, axis=1)
+        bent = middle & (np.linalg.norm(smooth, axis=1) > 0.3)
+        share = (apart / both)[bent]
+    bodies = len(np.unique(tracks.part[1:-1][bent]))
+    return jitter, bodies >= BODIES and float(np.median(share)) > KINKED

@@ -1,0 +1,168 @@
+"""Motion from noisy positions: velocities, accelerations, standing and parked vehicles."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from recordings import Recorder, car
+
+import sgstore
+from sgstore.readers import open_trace
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+PERIOD = 0.1
+FRAMES = 150
+
+
+def driven(t: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Position and speed of a car that drives, brakes with 4 m/s² for 2 s, and stands."""
+    speed = np.clip(12 - 4 * np.clip(t - 4, 0, 2) - 2 * np.clip(t - 8, 0, 2), 0, None)
+    fine = np.linspace(0, t[-1], 20_001)
+    along = np.interp(
+        fine,
+        fine,
+        np.cumsum(np.clip(12 - 4 * np.clip(fine - 4, 0, 2) - 2 * np.clip(fine - 8, 0, 2), 0, None)),
+    ) * (fine[1] - fine[0])
+    x = np.interp(t, fine, along)
+    return x, 0.02 * x, speed * np.hypot(1, 0.02)
+
+
+def recorded(
+    path: Path, sigma: float, *, frames: int = FRAMES, wander: bool = False, parked: int = 6
+) -> tuple[NDArray[Any], Path]:
+    """Write a recording without velocities: an ego, and parked cars. Return the speed of the ego."""
+    rng = np.random.default_rng(7)
+    t = np.arange(frames) * PERIOD
+    x, y, speed = driven(t)
+    with Recorder(path) as recorder:
+        keys = rng.normal(0, sigma, (parked + 1, frames // 5 + 2, 2))
+        for i in range(frames):
+            a = i % 5 / 5
+            slow = keys[:, i // 5] * (1 - a) + keys[:, i // 5 + 1] * a
+            off = slow if wander else rng.normal(0, sigma, (parked + 1, 2))
+            cars = [moved(1, x[i] + off[0, 0], y[i] + off[0, 1])]
+            cars += [
+                moved(k + 2, 15.0 * k + off[k + 1, 0], 8.0 + off[k + 1, 1]) for k in range(parked)
+            ]
+            recorder.ground_truth(t[i], cars, host=1)
+    return speed, path
+
+
+def moved(ident: int, x: float, y: float) -> Any:
+    """A car without recorded motion."""
+    found = car(ident, x=x, y=y)
+    found.base.ClearField("velocity")
+    found.base.ClearField("acceleration")
+    found.base.ClearField("orientation_rate")
+    return found
+
+
+def states_of(path: Path, size: int = 60, noise: float = -1.0) -> dict[str, NDArray[Any]]:
+    """Columns of all states of a recording."""
+    with open_trace(path) as trace:
+        trace.noise = noise
+        blocks = list(trace.blocks(size))
+    names = ("node", "vx", "vy", "ax", "ay", "yaw_rate", "derived")
+    return {name: np.concatenate([getattr(b.states, name) for b in blocks]) for name in names}
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.1, 0.3])
+def test_speed_error_is_a_third_of_difference_quotients(tmp_path: Path, sigma: float) -> None:
+    truth, path = recorded(tmp_path / "a.mcap", sigma)
+    rms = []
+    for noise in (-1.0, 0.0):
+        found = states_of(path, noise=noise)
+        ego = found["node"] == 0
+        speed = np.hypot(found["vx"][ego], found["vy"][ego])
+        rms.append(float(np.sqrt(np.nanmean((speed - truth) ** 2))))
+    assert rms[0] < rms[1] / 3
+    assert not np.isnan(states_of(path)["vx"]).any()
+
+
+def test_exact_positions_are_differentiated_as_before(tmp_path: Path) -> None:
+    _, path = recorded(tmp_path / "a.mcap", 0.0)
+    found, exact = states_of(path), states_of(path, noise=0.0)
+    for name, column in found.items():
+        np.testing.assert_array_equal(column, exact[name])
+    assert found["derived"].max() <= 7
+
+
+@pytest.mark.parametrize("wander", [False, True])
+def test_blocks_do_not_change_smooth_values(tmp_path: Path, wander: bool) -> None:
+    _, path = recorded(tmp_path / "a.mcap", 0.1, frames=50, wander=wander, parked=3)
+    whole = states_of(path, 100)
+    for size in (1, 20):
+        for name, column in states_of(path, size).items():
+            np.testing.assert_array_equal(column, whole[name], err_msg=f"{name}, {size}")
+
+
+@pytest.mark.parametrize("wander", [False, True])
+def test_standing_cars_are_stopped_and_parked(tmp_path: Path, wander: bool) -> None:
+    _, path = recorded(tmp_path / "a.mcap", 0.06, wander=wander)
+    with sgstore.open(tmp_path / "s.sgstore", create=True) as store:
+        store.ingest(path)
+        world = "USING SCOPE world "
+        stood = store.find(
+            f"{world}MATCH (v:Car) WHERE stopped(v) AND NOT v.is_ego RETURN v.ident AS i"
+        ).rows()
+        assert len(stood) >= 0.98 * 6 * FRAMES
+        parked = store.find(
+            f"{world}MATCH (v:Car) WHERE v.parked RETURN DISTINCT v.ident AS i"
+        ).rows()
+        assert {row.i for row in parked} == {"2", "3", "4", "5", "6", "7"}
+        fast = store.find("MATCH (e:Ego) WHERE moving(e) RETURN frame.seq AS f").rows()
+        assert {row.f for row in fast} >= set(range(90))
+        hard = store.find("MATCH (e:Ego) WHERE hard_brake(e) RETURN frame.t AS t").rows()
+        assert hard
+        assert all(3.5 < row.t < 6.5 for row in hard)
+
+
+def test_a_jump_gives_no_acceleration(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for i in range(80):
+            back = 1.9 if i >= 40 else 0.0
+            lone = 3.0 if i == 60 else 0.0
+            place = 0.9 * i - back + lone + rng.normal(0, 0.03)
+            others = [moved(k + 2, 10.0 * k + rng.normal(0, 0.03), 9.0) for k in range(4)]
+            recorder.ground_truth(i * PERIOD, [moved(1, place, 0.0), *others], host=1)
+    found = states_of(path)
+    ego = found["node"] == 0
+    assert np.nanmax(np.abs(found["ax"][ego])) < 2
+    assert np.nanmax(np.abs(found["vx"][ego] - 9)) < 0.5
+
+
+def test_impossible_motion_is_marked(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    rng = np.random.default_rng(3)
+    with Recorder(path) as recorder:
+        for i in range(60):
+            one = moved(1, 8.0 * i * PERIOD + rng.normal(0, 0.03), rng.normal(0, 0.03))
+            one.base.orientation.yaw = float(np.remainder(3.0 * max(0, i - 30) * PERIOD, 2 * np.pi))
+            others = [moved(k + 2, 10.0 * k + rng.normal(0, 0.03), 9.0) for k in range(4)]
+            recorder.ground_truth(i * PERIOD, [one, *others], host=1)
+    with sgstore.open(tmp_path / "s.sgstore", create=True) as store:
+        (outcome,) = store.ingest(path)
+        assert any("yaw rates are impossible" in words for words in outcome.warnings)
+        assert (
+            store.find("MATCH (e:Ego) WHERE e.unreal_yaw_rate AND e.yaw_rate IS NULL").count() > 20
+        )
+        assert store.find("MATCH (e:Ego) WHERE e.unreal_accel").count() == 0
+        assert store.find("MATCH (e:Ego) WHERE NOT e.stands AND moving(e)").count() == 60
+
+
+def test_noise_can_be_set(tmp_path: Path) -> None:
+    _, path = recorded(tmp_path / "a.mcap", 0.1)
+    with pytest.raises(sgstore.ConfigError, match="noise"):
+        sgstore.Config(noise=-0.5)
+    with sgstore.open(tmp_path / "s.sgstore", create=True) as store:
+        (outcome,) = store.ingest(path, config=sgstore.Config(noise=0.0))
+        assert not any("noise" in words for words in outcome.warnings)
+        assert store.find("MATCH (v) WHERE v.stands").count() == 0
