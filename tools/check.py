@@ -56,7 +56,7 @@ TESTS = {
     "plugins": "plugins relations abstractions flavours",
     "query": "query api datasets",
     "quoting": "user_tables",
-    "readers": "osi osi_* carla carla_* carlasgg autoware av2 foxglove commonroad sumo cdr flavours"
+    "readers": "osi osi_* noise carla carla_* carlasgg autoware av2 foxglove commonroad sumo cdr flavours"
     " stamps identity",
     "rebuild": "rebuilding",
     "relations": "relations relations_* motion bodies bounds",

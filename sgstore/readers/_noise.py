@@ -84,7 +84,7 @@ class Noise(NamedTuple):
 
     @property
     def leave(self) -> float:
-        """Speed above which a body no longer stands; m/s."""
+        """Speed from which a standing body moves again; m/s."""
         return 1.3 * self.enter
 
     def reach(self, period: float) -> int:
@@ -303,10 +303,13 @@ def _close(time: Ints, place: Floats, rows: Ints, jitter: float) -> Bools:
     """Return a mask of the rows whose neighbours on both sides fit together without them."""
     inside = (rows >= 2) & (rows + 2 < len(time))
     rows = np.clip(rows, 2, max(2, len(time) - 3))
-    before = (place[rows - 1] - place[rows - 2]) / (time[rows - 1] - time[rows - 2])[:, None]
-    step = time[rows + 1] - time[rows - 1]
-    away = place[rows + 1] - place[rows - 1] - before * step[:, None]
-    limit = JUMP + 8 * jitter + 2 * UNREAL * step**2
+    with np.errstate(all="ignore"):  # Rows of other bodies and times do not count.
+        before = (
+            (place[rows - 1] - place[rows - 2]) / (time[rows - 1] - time[rows - 2])[:, None] * 1e9
+        )
+        step = (time[rows + 1] - time[rows - 1]) / 1e9
+        away = place[rows + 1] - place[rows - 1] - before * step[:, None]
+        limit = JUMP + 8 * jitter + 2 * UNREAL * step**2
     return inside & (np.linalg.norm(away, axis=1) <= limit)
 
 
@@ -398,7 +401,7 @@ class Smoother:
         return found
 
     def _standing(self, node: Ints, frame: Ints, speed: Floats) -> Bools:
-        """Return a mask of the rows whose body stands: slow enough, or not yet faster since it stood."""
+        """Return a mask of the rows with a standing body: slow enough, or not faster since then."""
         enter, leave = self.noise.enter, self.noise.leave
         sure = np.where(speed <= enter, 1, np.where(speed > leave, -1, 0))
         order = np.lexsort([frame, node])
