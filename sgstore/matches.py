@@ -72,7 +72,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang.catalog import Catalog
     from sgstore.lang.help import Compared
-    from sgstore.lang.ir import Query
+    from sgstore.lang.ir import Query, Scope
     from sgstore.lang.sql import Gathered, SqlStatement, UnionParts
     from sgstore.store import Given, Rows
     from sgstore.temporal.truth_lanes import TruthLanes
@@ -207,6 +207,7 @@ class Matches(Tabular):
         self._text = text
         self._parameters = parameters
         self._limit: int | None = None
+        self._some = False
         compiled = self._ready = self._compile(catalog())
         self.graphs = compiled.layout is not None
         self.columns = compiled.columns
@@ -329,11 +330,41 @@ class Matches(Tabular):
         >>> store.find("MATCH (v:Vehicle {name: 'car 7'})").notes
         ("the store has no name 'car 7'; the nearest is 'car 0'",)
         """
+        with self._compiled() as compiled:
+            return self.mistakes or self._absent(compiled)
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """Part of :attr:`notes` that needs no second search if nothing matches.
+
+        Examples
+        --------
+        >>> store.find("MATCH (e:Ego) WHERE e.heading < 200").mistakes
+        ('e.heading < 200 always holds; it lies between -180 and 180 degrees: write -160',)
+        """
         from sgstore.lang.help import compared_in_query
 
         with self._compiled() as compiled:
             compared = compared_in_query(compiled.bound)
-            return notes_in(self._file, compared, self._text, self._parameters)
+            texts = notes_in(self._file, compared, self._text, self._parameters)
+            return compiled.bound.doubts + texts
+
+    def _absent(self, compiled: Compiled) -> tuple[str, ...]:
+        """Return a note on a part of the pattern that no frame of the store has, if nothing matches."""
+        if self._some or len(compiled.reasons) == len(compiled.chosen):
+            return ()
+        from sgstore.lang.help import absent_part
+
+        def exists(scope: Scope) -> bool:
+            query = replace(
+                compiled.bound, scope=scope, result=Result(limit=1), steps=(), stages=()
+            )
+            ready = replace(compiled, bound=query, query=rewritten(query, compiled.catalog))
+            apart = copy.copy(self)
+            rows = apart._rows_of(self._statements(ready, Compiled.rows))  # noqa: SLF001
+            return next(rows, None) is not None
+
+        return absent_part(compiled.bound, exists)
 
     @property
     def scope(self) -> dict[str, Any]:
@@ -422,7 +453,9 @@ class Matches(Tabular):
         with self._compiled() as compiled:
             if compiled.limited_to_frames is not None:
                 return len({row[0] for row in self._frames()})
-            return self._file.rows(**self._asked(compiled.count())).values[0][0]
+            many = self._file.rows(**self._asked(compiled.count())).values[0][0]
+            self._some = many > 0
+            return many
 
     def frames(self) -> Iterator[FrameRef]:
         """Yield each matching frame once, ordered by trace name and frame number.
@@ -768,6 +801,7 @@ class Matches(Tabular):
             with self._file.batches(**self._asked(ready)) as batches:
                 for batch in batches:
                     windows.rows += len(batch)
+                    self._some = self._some or len(batch) > 0
                     yield from batch.values
 
     def _statements(
@@ -884,6 +918,11 @@ class UnionMatches(Matches):
     def notes(self) -> tuple[str, ...]:
         """Notes on likely mistakes in any part of the query."""
         return tuple(dict.fromkeys(note for part in self._parts for note in part.notes))
+
+    @property
+    def mistakes(self) -> tuple[str, ...]:
+        """Notes of all parts that need no second search."""
+        return tuple(dict.fromkeys(note for part in self._parts for note in part.mistakes))
 
     def _rows(self, *, whole: bool) -> Iterator[Row]:
         row = row_type(self.columns)

@@ -619,8 +619,8 @@ class CollectionMatches(TemporalMatches):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return an empty tuple: a collection does not search queries for likely mistakes."""
-        return ()
+        """Return the parts of the query that never hold, or always, without a search."""
+        return self._ready.bound.doubts
 
     @property
     def scope(self) -> dict[str, Any]:

@@ -785,6 +785,8 @@ class Query:
         Parts of a query with ``OPTIONAL MATCH``, ``WITH`` or a named path. The first is a pattern.
     world : bool
         True in scope ``world``: the query also covers data outside the graphs.
+    doubts : tuple of str
+        Notes on parts that never hold in recordings, or always.
     """
 
     scope: Scope
@@ -800,6 +802,7 @@ class Query:
     gaps: str = "break"
     stages: tuple[Stage, ...] = ()
     world: bool = False
+    doubts: tuple[str, ...] = ()
 
     @property
     def ways(self) -> tuple[StepWay, ...]:
@@ -1156,6 +1159,8 @@ class BoundCheck:
         Explicit range of the check around the ego; m. ``None`` means the range of the formula.
     limit : float or None
         The range, if traces may cover more. Entities farther away count as absent; m.
+    doubts : tuple of str
+        As in :class:`Query`.
     """
 
     name: str
@@ -1174,3 +1179,4 @@ class BoundCheck:
     world: bool = True
     range: float | None = None
     limit: float | None = None
+    doubts: tuple[str, ...] = ()

@@ -99,6 +99,28 @@ BEYOND: Final = ("isIn", "controlsTrafficOf", "leads", "follows")
 MAP_ONLY: Final = _declared_in("_map")
 """Relations between map elements only. They come with the map, and settings cannot exclude them."""
 
+_BETWEEN_ENTITIES: Final = (("entity", "entity"),)
+_BETWEEN_LANES: Final = (("lane", "lane"),)
+RELATION_ENDS: Final[Mapping[str, Sequence[tuple[str, str]]]] = {
+    "isIn": (
+        ("body", "lane|crosswalk|off_road|waypoint"),
+        ("lane", "road"),
+        ("road", "junction|roundabout"),
+        ("waypoint", "lane"),
+    ),
+    "travelsTo": (*_BETWEEN_LANES, ("waypoint", "waypoint")),
+    **dict.fromkeys(("laneChange", "opposes", "conflictsWith"), _BETWEEN_LANES),
+    **dict.fromkeys(SIDES, _BETWEEN_ENTITIES + _BETWEEN_LANES),
+    **dict.fromkeys(("controlsTrafficOf", "mayAffect"), (("signal", "lane"),)),
+    **dict.fromkeys((*PROXIMITY, *DIRECTIONS, "overlaps"), _BETWEEN_ENTITIES),
+    **dict.fromkeys(("leads", "follows", "tows"), (("vehicle", "vehicle"),)),
+    "sees": (("ego", "other"),),
+}
+"""Built-in relations → pairs of source and target. A *body* is an entity that is not a signal.
+
+Only recordings have these ends. Imported graphs may have others.
+"""
+
 _relations: Final = list(OWN_RELATIONS)
 RELATIONS: Final[Sequence[str]] = _relations
 """All registered relations. New relations are appended; see :func:`add_relation`."""

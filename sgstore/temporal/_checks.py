@@ -239,7 +239,8 @@ class CheckRun:
         with self._file.snapshot():
             compared = [pair for one in self._checks for pair in compared_in_check(one.check)]
             found = dict.fromkeys(compared)
-            return notes_in(self._file, found, self._text, self._parameters)
+            doubts = dict.fromkeys(note for one in self._checks for note in one.check.doubts)
+            return (*doubts, *notes_in(self._file, found, self._text, self._parameters))
 
     @property
     def scope(self) -> dict[str, Any]:

@@ -873,6 +873,7 @@ def bytes_of(text: str, option: str) -> int:
 
 def say_left_out(
     matches: Matches | Answer | ChosenFrames | UserStatement | CollectionRows,
+    notes: tuple[str, ...] | None = None,
 ) -> None:
     """Print the traces that cannot answer a query, with reasons, and likely mistakes in the query."""
     of: dict[str, list[str]] = {}
@@ -880,7 +881,7 @@ def say_left_out(
         of.setdefault(reason, []).append(name)
     for reason, names in of.items():
         say(f"skipped, because they lack data for this query ({reason}): {excerpts(names)}")
-    say_notes(getattr(matches, "notes", ()))
+    say_notes(getattr(matches, "notes", ()) if notes is None else notes)
 
 
 def say_scope(found: Mapping[str, Any], chosen: Format) -> None:

@@ -32,6 +32,7 @@ from sgstore.apps.cli._options import (
     parameters_of,
     query_of,
     say_left_out,
+    say_notes,
     say_scope,
     seconds_of,
     tables_of,
@@ -113,10 +114,11 @@ def find(
         if explain:
             typer.echo(matches.explain())
             return 0
-        say_left_out(matches)
+        say_left_out(matches, matches.mistakes)
         if count:
             number = matches.count()
             typer.echo(number)
+            _say_absent(matches, number)
             return NO_MATCH if require and not number else 0
         say_scope(getattr(matches, "scope", {}), ask.chosen)
         if ask.chosen in BINARY and not matches.graphs:
@@ -125,7 +127,14 @@ def find(
             number = _write_stretches(matches.intervals(), ask)
         else:
             number = ask.write(*_as_shown(matches, matches, ask.chosen))
+        _say_absent(matches, number)
     return _ended(number, ask, require=require)
+
+
+def _say_absent(matches: Matches, number: int) -> None:
+    """Print the part of the pattern that no frame of the store has, if nothing matches."""
+    if not number and not matches.mistakes:
+        say_notes(matches.notes)
 
 
 def _returns_nothing(text: str) -> bool:

@@ -119,6 +119,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         returns,
         world=settings.scope != "graph",
         range=settings.range,
+        doubts=tuple(dict.fromkeys(session.doubts)),
     )
     if settings.range is None or _knows_no_more(session.traces, settings.range):
         return found

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.errors import QueryNameError, TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang.bind._datasets import CLASSES, abstraction_named, seen_in
+from sgstore.lang.bind._possible import check_comparison
 from sgstore.lang.bind._precision import chosen, compared
 from sgstore.lang.bind._symbols import RESERVED, Binders, SymbolTable, call_hint
 from sgstore.lang.bind._text_tests import text_test
@@ -334,7 +335,8 @@ def _comparison(e: s.Comparison, names: SymbolTable) -> b.Operation:
         _canonical(left, right, e.left.span, names),
         _canonical(right, left, e.right.span, names),
     )
-    return b.Operation(e.word, compared(left, right), Type.boolean)
+    found = b.Operation(e.word, compared(left, right), Type.boolean)
+    return check_comparison(e, found, names)
 
 
 def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> None:
@@ -454,7 +456,8 @@ def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
             )
     items = tuple(_canonical(item, operand, e.choices.span, names) for item in choices.items)
     canonical = b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
-    found = b.Operation("IN", chosen(operand, canonical), Type.boolean)
+    found: b.Bound = b.Operation("IN", chosen(operand, canonical), Type.boolean)
+    found = check_comparison(e, found, names)
     return b.Operation("NOT", (found,), Type.boolean) if e.negated else found
 
 

@@ -212,7 +212,9 @@ def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
     before = {*relations}
     match parse(_ALONG_LANES):
         case (s.Define(body=s.Case() as body),):
+            shipped, names.session.shipped = names.session.shipped, True
             bound = names.body(meanings).bind(body)
+            names.session.shipped = shipped
             # Without a map the value is NULL, as for lane_dist. So traces without a map are not left out.
             relations.intersection_update(before)
             return bound

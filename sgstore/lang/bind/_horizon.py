@@ -404,8 +404,8 @@ def bounds(value: Bound, speed: float) -> Interval:
             return _OF_NODE.get(attribute.name, lambda _: _ANY)(speed)
         case b.PairNumber(function="closing_speed" | "rel_speed"):
             return -2 * speed, 2 * speed
-        case b.Operation(word, operands) if word in _COMPUTED:
-            return _COMPUTED[word]([bounds(one, speed) for one in operands])
+        case b.Operation(word, operands) if word in COMPUTED:
+            return COMPUTED[word]([bounds(one, speed) for one in operands])
         case _:
             return _ANY
 
@@ -437,7 +437,7 @@ def _absolute(parts: list[Interval]) -> Interval:
     return least, max(abs(low), abs(high))
 
 
-_COMPUTED: Final[Mapping[str, Callable[[list[Interval]], Interval]]] = {
+COMPUTED: Final[Mapping[str, Callable[[list[Interval]], Interval]]] = {
     "+": lambda parts: (parts[0][0] + parts[1][0], parts[0][1] + parts[1][1]),
     "-": lambda parts: (parts[0][0] - parts[1][1], parts[0][1] - parts[1][0]),
     "*": _product,
@@ -448,3 +448,4 @@ _COMPUTED: Final[Mapping[str, Callable[[list[Interval]], Interval]]] = {
     "max": lambda parts: (max(low for low, _ in parts), max(high for _, high in parts)),
     "coalesce": lambda parts: (min(low for low, _ in parts), max(high for _, high in parts)),
 }
+"""Functions from the intervals of the operands to the interval of the result."""

@@ -9,6 +9,7 @@ from sgstore.lang import ir as b
 from sgstore.lang.bind._expressions import BINDERS, edge_attribute, node_attribute
 from sgstore.lang.bind._functions import call
 from sgstore.lang.bind._match_values import over_match
+from sgstore.lang.bind._possible import check_edges
 from sgstore.lang.bind._recorded_events import happens
 from sgstore.lang.bind._stages import name_path
 from sgstore.lang.bind._symbols import RESERVED, THE_EGO, Binders, Session, Symbol, SymbolTable
@@ -33,6 +34,7 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
     All nodes and edges are bound before any condition. So a condition inside a node can use later nodes.
     """
     pending: list[tuple[s.NodePattern | s.EdgePattern, str]] = []
+    joined: list[tuple[s.EdgePattern, s.NodePattern, s.NodePattern, str]] = []
     for path in block.paths:
         keys = [_node(node, names) for node in path.nodes]
         pending += zip(path.nodes, keys, strict=True)
@@ -41,8 +43,13 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
             for edge, left, right in zip(path.edges, keys, keys[1:], strict=False)
         ]
         pending += edges
+        joined += [
+            (edge, *path.nodes[number : number + 2], key)
+            for number, (edge, key) in enumerate(edges)
+        ]
         if path.name is not None:
             name_path(path, keys, [key for _, key in edges], names)
+    check_edges(joined, names)
     for pattern, key in pending:
         _inline(pattern, key, names)
     if block.where is not None:

@@ -95,6 +95,7 @@ def bind_query(
         policy=settings.policy or "all",
         gaps=settings.gaps or "break",
         world=settings.scope == "world",
+        doubts=tuple(dict.fromkeys(session.doubts)),
     )
 
 
@@ -275,7 +276,7 @@ def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session
         case "nodes":
             session.injective = word == "distinct"
         case "unknown":
-            found.unknown_is_false = True
+            found.unknown_is_false, session.strict = True, False
         case "matches":
             found.policy = word
         case "gaps":

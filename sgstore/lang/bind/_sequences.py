@@ -566,7 +566,8 @@ def _parameters(
     called: TextSpan | None = None,
 ) -> Generator[None]:
     """Context manager that binds a scenario with its own parameter values, and names it in errors."""
-    outside = session.parameters
+    outside = session.parameters, session.shipped
+    session.shipped = called is not None
     if values is not None:
         session.parameters = values
     try:
@@ -577,4 +578,4 @@ def _parameters(
         reason, span = f"in {name}(): {error.reason}", called or error.span
         raise type(error)(reason, text=session.text, span=span, hint=error.hint) from None
     finally:
-        session.parameters = outside
+        session.parameters, session.shipped = outside

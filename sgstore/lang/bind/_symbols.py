@@ -98,6 +98,15 @@ class Session:
         Numbers of unnamed nodes and edges, and of blocks, so far.
     beyond : Scopes
         Relation scopes of the traces, if a statement uses data beyond the graphs; otherwise empty.
+    kinds_left : dict of str to Kinds
+        Kinds that the edges of a recording leave for each node.
+    strict : bool
+        True if all graphs are of recordings, so that impossible patterns are errors. ``USING UNKNOWN false``
+        accepts them.
+    doubts : list of str
+        Notes on parts of the query that never hold, or always.
+    shipped : bool
+        True in a sequence of the library, whose text is not that of the query.
     """
 
     text: str
@@ -122,6 +131,10 @@ class Session:
     numbers: int = 0
     blocks: int = 0
     beyond: b.Scopes = ()
+    kinds_left: dict[str, Kinds] = field(default_factory=dict[str, "Kinds"])
+    strict: bool = True
+    doubts: list[str] = field(default_factory=list[str])
+    shipped: bool = False
 
     def ask(self, catalog: Catalog) -> None:
         """Copy the facts that name resolution needs from a catalog of the store."""
@@ -129,6 +142,8 @@ class Session:
         self.own = {**RECORDED_OWN, **catalog.own}
         self.own_edges, self.part = catalog.own_edges, catalog.part
         self.online = catalog.online
+        others = catalog.names and catalog.names.get("relation")
+        self.strict = not (catalog.part or others or any(one.reach is None for one in self.traces))
 
     def look_beyond(self, catalog: Catalog, *, world: bool) -> None:
         """Set the pair settings of the traces, if the statement also uses entities outside the scene graphs."""
@@ -148,6 +163,20 @@ class Session:
     def refuse(self, reason: str, span: TextSpan, hint: str | None = None) -> NoReturn:
         """Raise a :class:`QueryError` that marks a part of the query text."""
         raise QueryError(reason, text=self.text, span=span, hint=hint)
+
+    def impossible(self, reason: str, span: TextSpan, hint: str) -> None:
+        """Raise an error for a part that no recording has; in a predicate or for other graphs, note it."""
+        if self.strict and not self.calls and not self.shipped:
+            self.refuse(reason, span, hint)
+        self.doubt(f"{reason}; {hint}")
+
+    def doubt(self, note: str) -> None:
+        """Keep a note on a part of the query. Bodies of the library get none."""
+        written = (self.predicates[normalize_name(name)] for name in self.calls)
+        library = predicates() if self.calls else {}
+        shipped = any(library.get(normalize_name(one.name)) is one for one in written)
+        if not shipped and not self.shipped:
+            self.doubts.append(note)
 
     def unknown(
         self, what: str, name: str, span: TextSpan, known: Iterable[str], hint: str | None = None

@@ -1,7 +1,13 @@
 """Help for users of the query language: reasons for failed matches, notes on a query, words for completion."""
 
 from sgstore.lang.help._completion import words
-from sgstore.lang.help._notes import Compared, compared_in_check, compared_in_query, notes_on
+from sgstore.lang.help._notes import (
+    Compared,
+    absent_part,
+    compared_in_check,
+    compared_in_query,
+    notes_on,
+)
 from sgstore.lang.help._pattern_parts import PatternPart, has_nodes, parts_of, separable
 from sgstore.lang.help._why_not import WhyNot, WhyNotSteps, events_in, looked_up, why_not
 
@@ -10,6 +16,7 @@ __all__ = [
     "PatternPart",
     "WhyNot",
     "WhyNotSteps",
+    "absent_part",
     "compared_in_check",
     "compared_in_query",
     "events_in",

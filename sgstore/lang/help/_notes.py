@@ -1,14 +1,18 @@
-"""Notes about likely mistakes in a query: compared texts that occur nowhere in the store.
+"""Notes about likely mistakes in a query: compared texts and scenes that occur nowhere in the store.
 
 A misspelt name finds nothing, without an error. So the notes list the texts that are not values in the store,
 each with the nearest value. The compiler finds the comparisons. The caller looks the texts up in the store.
+If nothing matches, a note names the first part of the pattern that no frame has.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang import ir as b
+from sgstore.lang.help._pattern_text import Writer
+from sgstore.lang.help._why_not import growing, part_text
 from sgstore.lang.sql import Select, nested
 from sgstore.model.vocabulary import entity_kinds
 
@@ -149,3 +153,67 @@ def _all_values(name: str) -> str:
         for column, table, *where in _TEXTS_OF[name]
     )
     return "\nUNION ALL\n".join(place.text() for place in places)
+
+
+def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str, ...]:
+    """Return a note on the first part of a query that no frame of the store has, or nothing.
+
+    Parameters
+    ----------
+    query : Query
+    exists : function
+        Function that returns True if some frame of the store matches a pattern.
+    """
+    steps = [query.steps[number].scope for number in sorted(query.certain)] if query.steps else []
+    for whole in steps or [query.first]:
+        where = [part for part in whole.where if not any(map(b.is_passed_on, b.walk(part)))]
+        scope = replace(whole, where=tuple(where))
+        if scope.nodes and not exists(scope):
+            return _first_absent(scope, exists)
+    return ()
+
+
+def _first_absent(whole: b.Scope, exists: Callable[[b.Scope], bool]) -> tuple[str, ...]:
+    writer, held = Writer(whole), list[str]()
+    for part, scope in growing(whole):
+        text = part_text(part, scope, writer)
+        if isinstance(part, b.Edge):
+            text = writer.labelled_edge(part, scope)
+        if not exists(scope):
+            alone = _alone(part, scope)
+            others = f" with {', '.join(held)}" if held and exists(alone) else ""
+            told = isinstance(part, b.Node | b.Edge) or _is_scene(part)
+            return (f"no frame of the store has {text}{others}",) if told else ()
+        held.append(text)
+    return ()
+
+
+def _is_scene(condition: b.Bound) -> bool:
+    """True for a condition that describes a scene, and not the absence of one or a part of a text."""
+    match condition:
+        case b.Operation(operands=(b.NodeAttribute(attribute=one), _)) if one.name == "id":
+            return False
+        case b.Operation(word=word):
+            return word in {"<", "<=", ">", ">=", "=", "OR"}
+        case b.BlockValue() | b.NodeAttribute() | b.EdgeAttribute():
+            return True
+        case _:
+            return False
+
+
+def _alone(part: b.Node | b.Edge | b.Bound, scope: b.Scope) -> b.Scope:
+    """Return the pattern of one part: the nodes and edges that it uses, and nothing else."""
+    edges = [part] if isinstance(part, b.Edge) else []
+    if isinstance(part, b.Node):
+        keys = {part.key}
+    elif isinstance(part, b.Edge):
+        keys = {part.src, part.dst}
+    else:
+        used = b.edges_of(part)
+        edges = [edge for edge in scope.edges if edge.key in used]
+        keys = {*b.nodes_of(part), *(end for edge in edges for end in (edge.src, edge.dst))}
+        keys = keys or set(list(scope.nodes)[:1])  # a pattern has a node
+    nodes = {key: node for key, node in scope.nodes.items() if key in keys}
+    distinct = frozenset(pair for pair in scope.distinct if {*pair} <= keys)
+    where = () if isinstance(part, b.Node | b.Edge) else (part,)
+    return b.Scope(nodes, {}, tuple(edges), where, distinct)

@@ -119,6 +119,11 @@ class Writer:
         ends = (f"({self.name(key, scope.kinds(key))})" for key in (edge.src, edge.dst))
         return self._arrow(edge).join(ends)
 
+    def labelled_edge(self, edge: b.Edge, scope: b.Scope) -> str:
+        """Return a pattern edge as query text, with the labels of its nodes."""
+        ends = (self.node(key, scope.kinds(key)) for key in (edge.src, edge.dst))
+        return self._arrow(edge).join(ends)
+
     def _arrow(self, edge: b.Edge) -> str:
         some = [relation for relation in RELATIONS if relation in edge.relations]
         label = "" if edge.relations == b.any_relation() else ":" + "|".join(some)

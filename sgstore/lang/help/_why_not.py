@@ -168,13 +168,13 @@ def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotS
 
 
 def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
-    scope, parts, writer = _nothing(asked), _parts(asked), Writer(asked)
+    scope, writer = _nothing(asked), Writer(asked)
     held: list[str] = []
-    for part, wider in _growing(asked, scope, parts):
+    for part, wider in growing(asked):
         if not _first(wider, query, view):
             return _failure(part, scope, query, view, writer, tuple(held))
         scope = wider
-        held.append(_text(part, scope, writer))
+        held.append(part_text(part, scope, writer))
     at = _first(scope, query, view)
     return WhyNot(tuple(held), "", _named(at, scope) if at else {}, "")
 
@@ -263,9 +263,10 @@ def _parts(scope: b.Scope) -> list[_Part]:
     return [*parts, *edges, *scope.where]
 
 
-def _growing(whole: b.Scope, scope: b.Scope, parts: list[_Part]) -> Iterator[tuple[_Part, b.Scope]]:
+def growing(whole: b.Scope) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope]]:
     """Yield each part of a pattern (node, edge or condition), with the pattern up to and including it."""
-    for part in parts:
+    scope = _nothing(whole)
+    for part in _parts(whole):
         if isinstance(part, b.Node):
             scope = replace(scope, nodes={**scope.nodes, part.key: part})
             distinct = frozenset(p for p in whole.distinct if set(p) <= set(scope.nodes))
@@ -301,7 +302,7 @@ def _failure(
     if isinstance(part, b.Node):
         at = _first(scope, query, view)
         nearest = _named(at, scope) if at else {}
-        return WhyNot(held, _text(part, scope, writer), nearest, _population(view))
+        return WhyNot(held, part_text(part, scope, writer), nearest, _population(view))
     # A condition on an edge needs a bound edge. A scope without such conditions does not bind it.
     edges = tuple(replace(edge, named=True) if edge.high == 1 else edge for edge in scope.edges)
     for at in islice(_bindings(replace(scope, edges=edges), query, view), MOST_LOOKED_AT):
@@ -311,7 +312,7 @@ def _failure(
             between = isinstance(part, b.Edge)
             found = _between(part, at, writer) if between else _values(part, at, query, writer)
             gaps = () if between else tuple(_gaps(part, at, query))
-    return WhyNot(held, _text(part, scope, writer), nearest, found, gaps)
+    return WhyNot(held, part_text(part, scope, writer), nearest, found, gaps)
 
 
 def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str, float, float]]:
@@ -372,7 +373,7 @@ def _apart(edge: b.Edge, at: Binding) -> float:
     return math.inf if distance is None else distance
 
 
-def _text(part: _Part, scope: b.Scope, writer: Writer) -> str:
+def part_text(part: _Part, scope: b.Scope, writer: Writer) -> str:
     """Return a node, edge or condition of a pattern as query text, with names for unnamed nodes."""
     if isinstance(part, b.Node):
         return writer.node(part.key, part.kinds)
