@@ -58,7 +58,7 @@ OWNERS = {
     "mcap": {"mcap", "readers", "exporters"},
     "google": {"readers", "exporters"},
     "zstandard": {"mcap", "readers", "exporters"},
-    "lz4": {"mcap", "exporters"},
+    "lz4": {"mcap", "readers/rosbags", "exporters"},
     "isal": {"mcap"},
     "numba": {"base/numba_loops"},
     "subprocess": {"base/processes"},  # of the standard library: one protocol for worker processes

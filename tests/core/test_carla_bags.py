@@ -237,7 +237,7 @@ def test_a_bag_without_any_file_is_refused(tmp_path: Path, path: Path) -> None:
         ("relative_file_paths:\n  - a/../../b.mcap", "which is not in its folder"),
         ('relative_file_paths:\n  - "a\\0b"', "none of the 1 files"),
         ("relative_file_paths:\n" + "  - a\n" * 10_001, "it lists 10001 files"),
-        ("storage_identifier: sqlite3\nrelative_file_paths: [a.db3]", "a bag of 'sqlite3'"),
+        ("storage_identifier: sqlite3\nrelative_file_paths: [a.db3]", "it lists no file that"),
         ("compression_mode: FILE\nrelative_file_paths: [a]", "compressed as a whole"),
         ("x" * (17 << 20), "more than 16777216 bytes"),
     ],

@@ -1,0 +1,197 @@
+"""Bags of ROS other than MCAP: SQLite and ROS 1 give what MCAP gives; definitions, order and damage."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from typing import TYPE_CHECKING, Any
+
+import autoware_recordings
+import carla_recordings
+import numpy as np
+import pytest
+import rosbag_files
+import zstandard
+
+from sgstore.errors import TraceError
+from sgstore.ingest import recordings
+from sgstore.model.world import States, TraceReport
+from sgstore.readers import (
+    decode,
+    open_recording,
+    open_trace,
+    parse_definition,
+    read_message,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.seconds(10)
+
+DRIVES = {"autoware": autoware_recordings.drive, "carla": carla_recordings.drive}
+CONTAINERS = {
+    "sqlite": lambda path, mcap: rosbag_files.as_db3(path / "a.db3", mcap),
+    "folder": lambda path, mcap: rosbag_files.as_bag(path / "bag", mcap),
+    "packed": lambda path, mcap: rosbag_files.as_bag(path / "bag", mcap, packed=True),
+    "ros1": lambda path, mcap: rosbag_files.as_ros1(path / "a.bag", mcap),
+    "ros1 lz4": lambda path, mcap: rosbag_files.as_ros1(path / "a.bag", mcap, compress=True),
+}
+
+
+def read(path: Path) -> tuple[Any, list[Any], Any]:
+    with open_trace(path) as trace:
+        return trace.info, list(trace.blocks()), trace.report
+
+
+@pytest.fixture(params=DRIVES)
+def mcap(tmp_path: Path, request: Any) -> Path:
+    return DRIVES[request.param](tmp_path / "a.mcap", 8)
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_a_bag_gives_the_frames_of_the_mcap_file(
+    mcap: Path, tmp_path: Path, container: str
+) -> None:
+    bag = CONTAINERS[container](tmp_path, mcap)
+    info, blocks, report = read(bag)
+    other, wanted, told = read(mcap)
+
+    assert (info.flavour, info.ego, info.map_text) == (other.flavour, other.ego, other.map_text)
+    assert (report.frames, report.losses, report.warnings) == (8, told.losses, told.warnings)
+    assert [block.entities.ident for block in blocks] == [block.entities.ident for block in wanted]
+    for block, want in zip(blocks, wanted, strict=True):
+        for name in States.__dataclass_fields__:
+            np.testing.assert_array_equal(getattr(block.states, name), getattr(want.states, name))
+
+
+@pytest.mark.parametrize("container", ["sqlite", "ros1"])
+def test_messages_are_read_back_by_their_place(mcap: Path, tmp_path: Path, container: str) -> None:
+    bag = CONTAINERS[container](tmp_path, mcap)
+    _, (block,), _ = read(bag)
+    refs = block.messages
+    sent = {message.log_time: message.data for _, _, message in rosbag_files.messages(mcap)}
+    for row in (0, len(refs) - 1):
+        place = {"offset": int(refs.offset[row]), "length": int(refs.length[row])}
+        data = read_message(bag, chunk_offset=-1, **place)
+        assert len(data) == place["length"]
+        assert container == "ros1" or data in sent.values()
+    with pytest.raises(TraceError, match="the bag was replaced"):
+        read_message(bag, chunk_offset=-1, offset=10**6, length=5)
+
+
+def test_a_folder_gives_each_bag_once(mcap: Path, tmp_path: Path) -> None:
+    bag = CONTAINERS["folder"](tmp_path, mcap)
+    ros1 = CONTAINERS["ros1"](tmp_path, mcap)
+    assert set(recordings([tmp_path])) == {bag, mcap, ros1}
+
+
+def test_a_file_that_is_compressed_as_a_whole_is_read(mcap: Path, tmp_path: Path) -> None:
+    bag = CONTAINERS["folder"](tmp_path, mcap)
+    file = bag / "bag_0.db3"
+    (bag / "bag_0.db3.zstd").write_bytes(zstandard.compress(file.read_bytes()))
+    file.unlink()
+    metadata = bag / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("bag_0.db3", "bag_0.db3.zstd"))
+    assert read(bag)[2].frames == 8
+
+
+def test_definitions_that_a_bag_lacks_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mcap = DRIVES["autoware"](tmp_path / "a.mcap", 8)
+    bag = rosbag_files.as_db3(tmp_path / "a.db3", mcap, defined=False)
+    with open_recording(bag) as recording:
+        texts = {schema.name: schema.data for schema in recording.schemas.values()}
+    assert texts["tf2_msgs/msg/TFMessage"]
+    with pytest.raises(TraceError, match="no ground truth"):
+        open_trace(bag)
+
+    known = {**carla_recordings.DEFINITIONS, **autoware_recordings.AUTOWARE}
+    for name, text in known.items():
+        package, _, short = name.partition("/")
+        folder = tmp_path / "ros/share" / package / "msg"
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{short}.msg").write_text(text)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "ros"))
+    info, blocks, report = read(bag)
+    assert (info.flavour, report.frames) == ("autoware", 8)
+    np.testing.assert_array_equal(blocks[0].states.x, read(mcap)[1][0].states.x)
+
+
+def test_damage_loses_only_what_it_hits(tmp_path: Path) -> None:
+    mcap = DRIVES["carla"](tmp_path / "a.mcap", 8)
+    bag = rosbag_files.as_ros1(tmp_path / "a.bag", mcap)
+    bag.write_bytes(bag.read_bytes()[:-3000])  # Without an index, and cut.
+    _, _, report = read(bag)
+    assert report.frames >= 4
+    assert any("ends inside a record" in loss.reason for loss in report.losses)
+
+    file = rosbag_files.as_db3(tmp_path / "a.db3", mcap)
+    connection = sqlite3.connect(file)
+    connection.execute("UPDATE messages SET data = 'text' WHERE id = 20")
+    connection.execute("UPDATE messages SET topic_id = 77 WHERE id = 21")
+    connection.commit()
+    connection.close()
+    _, _, report = read(file)
+    assert report.frames >= 7
+    reasons = {loss.reason for loss in report.losses}
+    assert reasons == {"a message has no data", "a.db3: 1 messages without a topic or a time"}
+    file.write_bytes(b"SQLite format 3\0" + bytes(500))
+    with pytest.raises(TraceError, match=r"a\.db3 cannot be read"):
+        open_trace(file)
+
+
+def test_headers_of_ros_1_have_a_number(tmp_path: Path) -> None:
+    """Definitions as ROS 1 writes them: ``uint32 seq`` and ``time stamp``."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    kinds, name = store.types, "geometry_msgs/msg/PointStamped"
+    head = kinds["std_msgs/msg/Header"](7, kinds["builtin_interfaces/msg/Time"](5, 6), "map")
+    message = kinds[name](head, kinds["geometry_msgs/msg/Point"](1.5, 2.5, 3.5))
+    with pytest.importorskip("rosbags.rosbag1").Writer(tmp_path / "a.bag") as writer:
+        connection = writer.add_connection("/at", name, typestore=store)
+        writer.write(connection, 9, store.serialize_ros1(message, name))
+    with open_recording(tmp_path / "a.bag") as recording:
+        (run,) = recording.walk(TraceReport())
+        schema = recording.schemas[1]
+        told = decode(parse_definition(schema.name, schema.data), run.data(0))
+    assert told["header"] == {"stamp": {"sec": 5, "nanosec": 6}, "frame_id": "map"}
+    assert told["point"] == {"x": 1.5, "y": 2.5, "z": 3.5}
+
+
+def decoded(bag: Path) -> list[tuple[float, ...]]:
+    """Independent decoder of a bag of ROS 1: places in the messages of ``nav_msgs/Odometry``."""
+    data, at, found, wanted = bag.read_bytes(), 13, [], b""
+    while at < len(data):
+        (size,) = struct.unpack_from("<I", data, at)
+        (length,) = struct.unpack_from("<I", data, at + 4 + size)
+        head, body = data[at + 4 : at + 4 + size], at + 8 + size
+        op = head[head.index(b"op=") + 3]
+        if op == 7 and b"nav_msgs/Odometry" in data[body : body + length]:
+            wanted = head[head.index(b"conn=") :][5:9]
+        if op == 2 and head[head.index(b"conn=") :][5:9] == wanted:
+            # seq, stamp, frame_id, child_frame_id
+            place = body + 12
+            for _ in range(2):
+                place += 4 + struct.unpack_from("<I", data, place)[0]
+            found.append(struct.unpack_from("<3d", data, place))
+        at = body if op == 5 else body + length  # The records of a chunk follow its header.
+    return found
+
+
+def test_a_bag_of_ros_1_equals_an_independent_decoder(tmp_path: Path) -> None:
+    """The poses of Autoware's older odometry are the ego's rear axle, 1.4 m behind its centre."""
+    mcap = tmp_path / "a.mcap"
+    with autoware_recordings.Stack(mcap) as stack:
+        for i in range(6):
+            stack.pose(1 + i / 10, 8.5 * i, 2.0, old=True)
+            stack.objects(1 + i / 10, [autoware_recordings.thing("car", 30, 0)])
+    bag = rosbag_files.as_ros1(tmp_path / "a.bag", mcap)
+    want = decoded(bag)
+    _, (block,), _ = read(bag)
+    ego = block.states.node == block.ego[0]
+    assert len(want) == 6
+    apart = block.states.x[ego] - [x for x, _, _ in want]
+    assert apart == pytest.approx(apart[0])
+    assert block.states.y[ego] == pytest.approx([y for _, y, _ in want])
