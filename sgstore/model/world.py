@@ -234,24 +234,28 @@ class FaultTally:
     """Number of listed faults. Further faults are only counted."""
 
     def __init__(self) -> None:
-        self._found: dict[str, tuple[str, int]] = {}
+        self._found: dict[str, tuple[str, int, int]] = {}
         self._more = 0
 
-    def add(self, ident: str, words: str) -> None:
-        """Count one impossible value of an object, such as ``length is -4.5 m``."""
+    def add(self, ident: str, words: str, frame: int = -1) -> None:
+        """Count one impossible value of an object, such as ``length is -4.5 m``.
+
+        ``frame``: number of the frame; -1 if unknown.
+        """
         number, _, value = words.partition(" ")
         what = f"{number} of entity {ident!r}"
         if what not in self._found and len(self._found) == self.MOST:
             self._more += 1
             return
-        first, count = self._found.get(what, (value, 0))
-        self._found[what] = first, count + 1
+        first, count, since = self._found.get(what, (value, 0, frame))
+        self._found[what] = first, count + 1, since
 
     def losses(self) -> list[Loss]:
         """Return one report entry for each object attribute with impossible values."""
         reasons = [
             f"{what} {first}: missing in {count} states"
-            for what, (first, count) in self._found.items()
+            + (f", first in frame {frame}" if frame >= 0 else "")
+            for what, (first, count, frame) in self._found.items()
         ]
         if self._more:
             reasons.append(f"{self._more} more sizes and speeds that no body has are missing")

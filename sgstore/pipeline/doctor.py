@@ -15,6 +15,7 @@ from sgstore.maps.map_files import Maps, lost_lanes
 from sgstore.mcap import Loss, near
 from sgstore.model.config import Config
 from sgstore.model.world import BUCKET_FRAMES, TraceReport
+from sgstore.pipeline.plausibility import Plausibility
 from sgstore.pipeline.recording_ingest import TraceTally
 from sgstore.readers import on_map, open_recording, open_trace
 
@@ -54,6 +55,9 @@ class Examination:
         Oddities without loss of data.
     losses : list of Loss
         Unusable parts.
+    implausible : list of dict
+        Well-formed but impossible data, one entry per kind: the fields of
+        :class:`sgstore.pipeline.plausibility.Finding`.
     error : str
         Reason why the recording cannot be ingested; empty if it can.
     """
@@ -76,6 +80,7 @@ class Examination:
     gaps_at: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     warnings: list[str] = field(default_factory=list[str])
     losses: list[Loss] = field(default_factory=list[Loss])
+    implausible: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     error: str = ""
 
     def as_dict(self) -> dict[str, Any]:
@@ -143,7 +148,6 @@ def _channels(found: Examination, report: TraceReport) -> Counter[int]:
 
 
 def _read(found: Examination, config: Config, maps: Maps, counts: Counter[int]) -> None:
-    tally = TraceTally()
     with open_trace(found.path, ego=config.ego, mapping=config.mapping) as trace:
         info = trace.info
         found.flavour, found.digest, found.ego = info.flavour, info.digest, info.ego
@@ -155,6 +159,7 @@ def _read(found: Examination, config: Config, maps: Maps, counts: Counter[int]) 
         used, odd = maps.of(info)
         found.road_map = used.name if used else ""
         on_map(trace, used)
+        tally = TraceTally(checked=Plausibility(used))
         try:
             for block in trace.blocks(2 * BUCKET_FRAMES):
                 tally.see(block)
@@ -164,5 +169,8 @@ def _read(found: Examination, config: Config, maps: Maps, counts: Counter[int]) 
                 setattr(found, name, value)
             found.frames, found.states, found.seconds = tally.frames, report.states, tally.seconds
             found.unknown_types = config.unknown_of(report.unknown_types)
-            found.warnings = [*odd, *report.warnings]
+            implausible = tally.checked.findings(report.losses)
+            found.implausible = [one.as_dict() for one in implausible]
+            known = [one.value for one in implausible]
+            found.warnings = [*odd, *(one for one in report.warnings if one not in known)]
             found.losses = [*lost_lanes(info, used), *report.losses]

@@ -30,6 +30,7 @@ from sgstore.model.config import ALL_EGOS, Config, from_dict
 from sgstore.model.trace_sampling import TracePart
 from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled
 from sgstore.model.world import covered_s, longest_step_ns
+from sgstore.pipeline.plausibility import Plausibility
 from sgstore.readers import on_map, open_trace
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.store import Identity, OnMap, Segment, StoreFile
@@ -221,17 +222,21 @@ class TraceTally:
         Number of entities by kind code.
     times : array
         Simulation times of the frames, 8 bytes each; ns.
+    checked : Plausibility
+        Check for implausible data.
     """
 
     frames: int = 0
     kinds: Counter[int] = field(default_factory=Counter[int])
     times: array[int] = field(default_factory=lambda: array("q"))
+    checked: Plausibility = field(default_factory=Plausibility)
 
     def see(self, frames: FrameBlock) -> None:
         """Add a block of frames to the counts of the trace."""
         self.frames += len(frames)
         self.kinds.update(frames.entities.kind.tolist())
         self.times.frombytes(frames.time_ns.astype(np.int64).tobytes())
+        self.checked.see(frames)
 
     @property
     def entities(self) -> dict[str, int]:
@@ -472,7 +477,7 @@ class SegmentReader:
         """Write the segments of several egos in one pass over the recording."""
         job, size = self._job, self._job.block_frames
         generator = SceneGraphGenerator(road_map, config)
-        tally = TraceTally()
+        tally = TraceTally(checked=Plausibility(road_map))
         blocks = job.part.blocks(map(self._meant, trace.blocks(size)), size)
         first = next(blocks, None)
         if first is None:
@@ -533,12 +538,15 @@ class SegmentReader:
         tally: TraceTally,
         parked: Sequence[Codes],
     ) -> None:
-        report, told = trace.report, tally.as_dict()
-        moot = report.about_ego if self._job.config.egos else []
+        report, told, egos = trace.report, tally.as_dict(), self._job.config.egos
+        moot = [*report.about_ego] if egos else []
+        found = tally.checked.findings(report.losses)
+        moot += [one.value for one in found]
         warnings = [warning for warning in report.warnings if warning not in moot]
+        warnings += [str(one) for one in found if not (egos and one.kind == "ego missing")]
         for one, segment in zip(group, segments, strict=True):
             outcome = one.outcome
-            if self._job.config.egos and not one.met:
+            if egos and not one.met:
                 reason = f"the ego {one.info.ego!r} is missing from all frames"
                 outcome.error = TraceError(reason, path=one.info.path)
                 continue

@@ -171,6 +171,8 @@ class EntityTable:
         Implausible sizes and speeds.
     impossible : (2,) int64
         Number of implausible derived velocities and accelerations.
+    completed : int
+        Number of frames with checked values.
 
     Notes
     -----
@@ -185,6 +187,7 @@ class EntityTable:
     happened: int = 0
     faults: FaultTally = field(default_factory=FaultTally)
     impossible: Ints = field(default_factory=lambda: np.zeros(2, np.int64))
+    completed: int = 0
     _events: list[Event] = field(default_factory=list["Event"])
     _rows: list[EntityRow] = field(default_factory=list["EntityRow"])
     _taken: int = 0
@@ -316,7 +319,9 @@ class EntityTable:
         if self.happened > MOST_EVENTS:
             warn(f"of {self.happened} events the report lists the first {MOST_EVENTS}")
 
-    def plausible(self, values: Floats, nodes: Sequence[int] | Ints) -> Floats:
+    def plausible(
+        self, values: Floats, nodes: Sequence[int] | Ints, frames: Ints | None = None
+    ) -> Floats:
         """Replace implausible sizes and speeds of objects by NaN, and count them.
 
         Parameters
@@ -325,10 +330,13 @@ class EntityTable:
             Columns :data:`POSE`.
         nodes : (n,) int
             Node id of each row.
+        frames : (n,) int64, optional
+            Frame of each row, in this call.
         """
         values, faults = without_implausible(values)
         for row, words in faults:
-            self.faults.add(self._rows[int(nodes[row])].ident, words)
+            frame = -1 if frames is None else self.completed + int(frames[row])
+            self.faults.add(self._rows[int(nodes[row])].ident, words, frame)
         return values
 
     def count_unknown(self, type_name: str) -> None:
@@ -963,10 +971,12 @@ def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
         roster.absurd += int(absurd.sum())
         values[absurd] = np.nan
     nodes = np.concatenate([frame.node for frame in frames] or [np.zeros(0, np.int64)])
-    plausible = roster.plausible(values, nodes)
+    counts = [len(frame) for frame in frames]
+    plausible = roster.plausible(values, nodes, np.repeat(np.arange(len(frames)), counts))
+    roster.completed += len(frames)
     if plausible is values and not absurd.any():
         return frames
-    cuts = np.cumsum([len(frame) for frame in frames])[:-1]
+    cuts = np.cumsum(counts)[:-1]
     return [
         replace(frame, values=part)
         for frame, part in zip(frames, np.split(plausible, cuts), strict=True)

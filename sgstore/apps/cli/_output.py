@@ -504,6 +504,19 @@ def write_report(values: dict[str, Any]) -> None:
     for title, items in _lists(values):
         lines += ["", f"{title}:", *(f"{GAP}{_shown(item)}" for item in items)]
     sys.stdout.writelines(f"{line}\n" for line in lines)
+    _write_implausible(values.get("implausible", []))
+
+
+def _write_implausible(findings: list[dict[str, Any]]) -> None:
+    """Print a table of implausible data, and the remedies."""
+    if not findings:
+        return
+    sys.stdout.write("\nimplausible data:\n")
+    columns = ("kind", "entity", "entities", "frame", "times", "value")
+    _write_table(columns, [[one[name] for name in columns] for one in findings], sys.stdout)
+    sys.stdout.write("\nremedies:\n")
+    for one in findings:
+        sys.stdout.write(f"{GAP}{one['kind']}: {one['remedy']}\n")
 
 
 def _facts(values: dict[str, Any]) -> Iterator[tuple[str, str]]:
