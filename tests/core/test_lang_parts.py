@@ -207,3 +207,13 @@ def test_truth_lanes_of_many_matches_equal_those_of_each_and_ask_once(
     assert together == each
     assert any(lanes["lanes"][0]["spans"] for lanes in each)
     assert many == len(calls) * (3 if "(u:" in text else 1)  # u must differ from v and w
+
+
+def test_places_in_lanes_are_read_only_for_the_kinds_of_their_entity(town_store: Path) -> None:
+    text = "MATCH (e:Ego)-[i:isIn {primary: TRUE}]->(l:Lane) WHERE l.turn = 'left'"
+
+    with Store(town_store) as store:
+        plan = store.find(f"{text} AND i.along > l.length / 2").explain()
+
+    assert '"l"."is_ego"' in plan
+    assert plan.count('"n"."turn" = \'left\'') == 2  # of single and of repeated places

@@ -368,7 +368,7 @@ def base_rows(
     for number, edge in enumerate(order, start=1):
         _join_edge(sql, base, scope, edge)
         if edge.key in lane:
-            _join_lane(sql, base, edge, lane.pop(edge.key))
+            _join_lane(sql, base, scope, edge, lane.pop(edge.key), parts.single.get(edge.dst, []))
         if number in steps:
             later = {end for one in order[number:] for end in (one.src, one.dst)}
             _join_tests(sql, base, scope, set(base.nodes) - later - parts.late, single)
@@ -745,11 +745,30 @@ def _join_conditions(
     base.select.where += [node_text(c, node, at, sql.values) for c in conditions]
 
 
-def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound]) -> None:
-    """Join the bit masks of the frames in which an edge meets conditions on its attributes, and on its lane."""
+def _join_lane(
+    sql: SqlBuilder,
+    base: Base,
+    scope: Scope,
+    edge: Edge,
+    conditions: list[Bound],
+    of_lane: list[Bound],
+) -> None:
+    """Join the bit masks of the frames in which an edge meets conditions on its attributes, and on its lane.
+
+    The kinds of its entity, and the conditions ``of_lane`` if the lane is read anyway, are tested here too,
+    because the table has a row for each entity, lane and frame.
+    """
     table, nodes = edge_table(edge, base.nodes[edge.src], base.nodes[edge.dst])
     keys = [f'"l".{quoted(column)}' for column in ("bucket", *nodes)]
     on_map = any(isinstance(leaf, NodeAttribute) for c in conditions for leaf in leaves(c))
+    profile = Profile.of(scope.kinds(edge.dst), sql.catalog)
+    if on_map and profile.mapped and profile.places == 1:
+        conditions = [*conditions, *(c for c in of_lane if not any(map(is_position, leaves(c))))]
+    of_kind: list[str] = []
+    if table == "lane_state" and not edge.both:
+        of_kind = kind_conditions(
+            scope.kinds(edge.src), '"l"."kind"', '"l"."is_ego"', entity_kinds()
+        )
 
     def leaf_text(leaf: Leaf) -> str:
         if isinstance(leaf, NodeAttribute):
@@ -760,7 +779,7 @@ def _join_lane(sql: SqlBuilder, base: Base, edge: Edge, conditions: list[Bound])
     rows: list[str] = []
     for part, mask in stored_rows(sql.catalog, table, '"l"').items():
         select = Select([*keys, f'{mask} AS "mask"'], [f'{quoted(part)} AS "l"'])
-        select.where = [*sql.within('"l"."bucket"'), *where]
+        select.where = [*sql.within('"l"."bucket"'), *of_kind, *where]
         if on_map:
             select.join('"bucket" AS "b"', ['"b"."bucket" = "l"."bucket"'])
             select.join(
