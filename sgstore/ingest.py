@@ -17,7 +17,7 @@ from sgstore.base.logs import logger
 from sgstore.base.processes import WorkerPool
 from sgstore.errors import SgstoreError, StoreError, TraceError, failure, url_named
 from sgstore.maps.map_files import Maps
-from sgstore.mcap import METADATA, bag_folder, mark_of, parts_of, remote_names
+from sgstore.mcap import METADATA, bag_folder, log_files, mark_of, parts_of, remote_names
 from sgstore.model.config import Config
 from sgstore.model.trace_sampling import TracePart
 from sgstore.model.world import BUCKET_FRAMES
@@ -86,6 +86,7 @@ def _inside(folder: Path) -> Iterator[Path]:
     """Yield the recordings in a folder and its subfolders. A bag counts once, without its files."""
     bags = {path.parent for path in folder.rglob(METADATA) if bag_folder(path.parent) is not None}
     own = {part.path for bag in bags for part in _parts(bag)}
+    own.update(bags, *(log_files(bag) or () for bag in bags))
     yield from bags
     for path in (folder, *folder.rglob("*")):
         if is_recording(path) and path not in own:

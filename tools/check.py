@@ -56,8 +56,8 @@ TESTS = {
     "plugins": "plugins relations abstractions flavours",
     "query": "query api datasets",
     "quoting": "user_tables",
-    "readers": "osi osi_* noise carla carla_* carlasgg autoware av2 foxglove commonroad sumo cdr flavours"
-    " stamps identity",
+    "readers": "osi osi_* noise carla carla_* carlasgg autoware av2 foxglove commonroad py123d rosbags"
+    " sumo cdr flavours stamps identity",
     "rebuild": "rebuilding",
     "relations": "relations relations_* motion bodies bounds",
     "roads": "roads roads_* lane_dist lane_places lane_courses roundabouts",

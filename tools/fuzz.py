@@ -39,8 +39,10 @@ import carla_recordings
 import commonroad_scenarios
 import fuzz_texts
 import numpy as np
+import py123d_logs
 import recorder_logs
 import recordings
+import rosbag_files
 import sumo_recordings
 import zstandard
 from foxglove_scenes import SceneRecorder, cube
@@ -137,6 +139,11 @@ def sample(flavour: str) -> Sample:
     if flavour == ".xml":
         text = commonroad_scenarios.scenario(frames=FRAMES + 9).encode()
         return Sample([Channel("", "xml", "", "", b"")], [Message(0, 0, text)], flavour)
+    if flavour in BAGS:
+        with tempfile.TemporaryDirectory() as folder:
+            mcap = carla_recordings.drive(Path(folder) / "a.mcap", FRAMES, everything=True)
+            data = BAGS[flavour](Path(folder) / f"a{flavour}", mcap).read_bytes()
+        return Sample([Channel("", "", "", "", b"")], [Message(0, 0, data)], flavour)
     if flavour in FOLDERS:
         with tempfile.TemporaryDirectory() as folder:
             path = FOLDERS[flavour](Path(folder) / "log", FRAMES)
@@ -190,13 +197,24 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "commonroad": commonroad,
     "sumo": lambda path: sumo_recordings.as_mcap(path, sumo_recordings.drive(FRAMES)),
     "av2": lambda path: av2_logs.as_mcap(path, av2_logs.drive(path.with_suffix(".d"), FRAMES)),
+    "py123d": lambda path: py123d_logs.as_mcap(
+        path, py123d_logs.drive(path.with_suffix(".d"), FRAMES)
+    ),
     "carla_recorder": lambda path: recorder_logs.as_mcap(
         path, recorder_logs.drive(path.with_suffix(".log"), FRAMES)
     ),
 }
-FOLDERS: dict[str, Callable[[Path, int], Path]] = {".av2": av2_logs.drive}
+FOLDERS: dict[str, Callable[[Path, int], Path]] = {
+    ".av2": av2_logs.drive,
+    ".123d": py123d_logs.drive,
+}
 """Recordings that are folders: their files are hurt."""
-FLAVOURS = [*WRITERS, *FOLDERS, ".osi", ".osi.zst", ".xml", ".log"]
+BAGS: dict[str, Callable[[Path, Path], Path]] = {
+    ".db3": rosbag_files.as_db3,
+    ".bag": rosbag_files.as_ros1,
+}
+"""Containers of ROS messages."""
+FLAVOURS = [*WRITERS, *FOLDERS, *BAGS, ".osi", ".osi.zst", ".xml", ".log"]
 """Flavours of recordings."""
 KINDS = [*FLAVOURS, *fuzz_texts.LAWS]
 """All that is hurt."""

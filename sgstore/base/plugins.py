@@ -101,6 +101,7 @@ READERS: Final = Registry(
         sumo="sumo._trace:SumoTrace",
         carla_recorder="carla._recorder:CarlaRecorderTrace",
         av2="av2._trace:Av2Trace",
+        py123d="py123d._trace:Py123dTrace",
     ),
     "flavour",
 )

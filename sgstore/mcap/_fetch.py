@@ -94,6 +94,12 @@ def bag_folder(path: Path) -> Path | None:
 FOLDERS: Final = {
     # Argoverse 2, sensor data set.
     "city_SE3_egovehicle.feather": ("annotations*.feather", "map/log_map_archive_*.json"),
+    # 123D.
+    "sync.arrow": (
+        "[be]*[xo]_[ds]*_se3*.arrow",  # box_detections_se3, ego_state_se3
+        "traffic_light_detections*.arrow",
+        "map.arrow",
+    ),
 }
 """File in each folder of a format → patterns of the other files of a recording; the first is required."""
 
@@ -102,6 +108,8 @@ def log_files(path: Path) -> list[Path] | None:
     """Return the files of a recording that is a folder of another format. ``None`` means another path."""
     if url_named(path) is not None:
         return None
+    if (stored := _sqlite_bag(path)) is not None:
+        return stored
     for mark, patterns in FOLDERS.items():
         try:
             if (path / mark).is_file():
@@ -111,6 +119,21 @@ def log_files(path: Path) -> list[Path] | None:
         except (OSError, ValueError):
             return None
     return None
+
+
+def _sqlite_bag(path: Path) -> list[Path] | None:
+    """Return the files of a rosbag2 bag in SQLite, with its ``metadata.yaml``; ``None`` for other paths."""
+    folder = bag_folder(path)
+    if folder is None:
+        return None
+    try:
+        found = read_metadata((folder / METADATA).read_text(encoding="utf-8", errors="replace"))
+        if found["storage_identifier"][:1] != ["sqlite3"]:
+            return None
+        files = [_inside(folder, name) for name in found["relative_file_paths"][:MAX_PARTS]]
+    except (OSError, TraceError):
+        return None
+    return [folder / METADATA, *(file for file in files if file.is_file())]
 
 
 @lru_cache(maxsize=1024)

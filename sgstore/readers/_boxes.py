@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
@@ -131,7 +131,15 @@ def interpolated(times: Any, poses: Floats, at: Any, furthest: float) -> Floats:
 
 
 class BoxesTrace(FramesTrace):
-    """Base class of readers of logs of annotated boxes. The metadata of a channel have the name of the log."""
+    """Base class of readers of logs of annotated boxes. The metadata of a channel have the name of the log.
+
+    Attributes
+    ----------
+    tables : tuple of str
+        Prefixes of type names in the vocabulary, in the order of their priority.
+    """
+
+    tables: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
         super().__init__(recording, ego=ego, digest=digest)
@@ -152,13 +160,16 @@ class BoxesTrace(FramesTrace):
         here = {one["id"] for one in told["boxes"]}
         frame = Frame(told["time_ns"], told["ego"] if told["ego"] in here else None)
         for one in told["boxes"]:
-            known = type_meanings().get(f"{self.name}_{one['type']}".lower())
-            meaning = known or type_meanings().get(one["type"].lower()) or TypeMeaning("unknown")
+            meaning = self._meaning(one["type"])
             about = {"special": meaning.special, "subkind": meaning.subkind}
             values = {name: one[name] for name in _NUMBERS if name in one}
             frame.add(one["id"], meaning.kind, **about, type_name=one["type"], **values)
         self.add_lights(frame, told)
         return frame
+
+    def _meaning(self, type_name: str) -> TypeMeaning:
+        known = (type_meanings().get(f"{table}_{type_name}".lower()) for table in self.tables)
+        return next(filter(None, known), TypeMeaning("unknown"))
 
     def add_lights(self, frame: Frame, told: dict[str, Any]) -> None:
         """Add the traffic lights of a message to a frame, if such logs have them."""

@@ -11,12 +11,12 @@ import inspect
 import re
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from sgstore.base import plugins
 from sgstore.base.display import first_of
 from sgstore.errors import TraceError
-from sgstore.mcap import MAGIC, McapFile, log_files, messages_at, open_regular
+from sgstore.mcap import MAGIC, METADATA, McapFile, log_files, messages_at, open_regular
 from sgstore.model.world import TraceReport
 from sgstore.readers.av2._file import Av2File
 from sgstore.readers.av2._file import read_messages as _read_av2_messages
@@ -29,6 +29,11 @@ from sgstore.readers.commonroad._file import read_messages as _read_scenario_mes
 from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
 from sgstore.readers.osi._file import OsiFile
 from sgstore.readers.osi._file import read_messages as _read_osi_messages
+from sgstore.readers.py123d._file import Py123dFile
+from sgstore.readers.py123d._file import read_messages as _read_py123d_messages
+from sgstore.readers.rosbags._file import ENDINGS as _BAG_ENDINGS
+from sgstore.readers.rosbags._file import RosbagFile
+from sgstore.readers.rosbags._file import read_messages as _read_bag_messages
 from sgstore.readers.sumo._file import ENDINGS as _SUMO_ENDINGS
 from sgstore.readers.sumo._file import SumoFile, is_fcd
 from sgstore.readers.sumo._file import read_messages as _read_steps
@@ -42,13 +47,22 @@ if TYPE_CHECKING:
 
 
 ENDINGS: Final = (
-    *(".mcap", *_OSI_ENDINGS, *_LOG_ENDINGS),
+    *(".mcap", *_OSI_ENDINGS, *_LOG_ENDINGS, *_BAG_ENDINGS),
     *dict.fromkeys((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS)),  # Both have the suffix .xml.
 )
 """Suffixes of recordings, for the search in a folder; see :func:`is_recording`."""
 
 
-RecordingFile = McapFile | OsiFile | CommonRoadFile | SumoFile | CarlaRecorderFile | Av2File
+RecordingFile = (
+    McapFile
+    | OsiFile
+    | CommonRoadFile
+    | SumoFile
+    | CarlaRecorderFile
+    | Av2File
+    | RosbagFile
+    | Py123dFile
+)
 """A file of messages in any format."""
 
 
@@ -90,7 +104,7 @@ def readers() -> Iterator[RecordingReader]:
 def is_recording(path: Path) -> bool:
     """Return True if a path is a recording, by its suffix; logs and XML files also by their first bytes.
 
-    A folder is a recording if it has the files of a log of Argoverse 2. Bags are left to the caller.
+    A folder is a recording if it has the files of a log of Argoverse 2 or 123D, or of a SQLite bag.
     """
     name = path.name.lower()
     if not name.endswith(ENDINGS) or path.is_dir():
@@ -175,15 +189,24 @@ def _format_of(
     path: Path,
 ) -> tuple[Callable[[Path], RecordingFile], Callable[..., Iterator[bytes | memoryview]]]:
     """Return the functions that open a file of this format, and that read single messages of it."""
-    if log_files(path) is not None:
-        return Av2File, _read_av2_messages
+    if (files := log_files(path)) is not None:
+        return _FOLDERS.get(files[0].name, (Av2File, _read_av2_messages))
     if is_scenario(path):
         return CommonRoadFile, _read_scenario_messages
     if is_fcd(path):
         return SumoFile, _read_steps
     if is_recorder_log(path):
         return CarlaRecorderFile, _read_recorder_messages
+    if path.name.lower().endswith(_BAG_ENDINGS):
+        return RosbagFile, _read_bag_messages
     return (OsiFile, _read_osi_messages) if _is_single_channel(path) else (McapFile, messages_at)
+
+
+_FOLDERS: Final[dict[str, tuple[Any, Any]]] = {
+    METADATA: (RosbagFile, _read_bag_messages),
+    "sync.arrow": (Py123dFile, _read_py123d_messages),
+}
+"""First file of a folder → functions that open it, and read single messages of it."""
 
 
 def _is_single_channel(path: Path) -> bool:

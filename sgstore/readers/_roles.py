@@ -44,6 +44,8 @@ _SCHEMAS: Final = {
     "commonroad.Step": STATES,
     "sumo.Timestep": STATES,
     "carla.RecorderFrame": STATES,
+    "py123d.Map": MAP,
+    "py123d.Frame": STATES,
     "av2.Map": MAP,
     "av2.Frame": STATES,
     **{

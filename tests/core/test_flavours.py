@@ -18,6 +18,7 @@ import av2_logs
 import carla_recordings
 import commonroad_scenarios
 import numpy as np
+import py123d_logs
 import pytest
 import recorder_logs
 import recordings
@@ -96,6 +97,7 @@ EXAMPLES = {
     "commonroad": steps,
     "sumo": lambda path: sumo_recordings.as_mcap(path, sumo_recordings.drive(25)),
     "av2": lambda path: av2_logs.as_mcap(path, av2_logs.drive(path.with_suffix(""))),
+    "py123d": lambda path: py123d_logs.as_mcap(path, py123d_logs.drive(path.with_suffix(""))),
     "carla_recorder": lambda path: recorder_logs.as_mcap(
         path, recorder_logs.drive(path.with_suffix(".log"), hidden=0)
     ),

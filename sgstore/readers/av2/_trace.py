@@ -18,6 +18,7 @@ class Av2Trace(BoxesTrace):
     """Log of Argoverse 2, or a clip of one, which yields frames."""
 
     name = "av2"
+    tables = ("av2",)
 
     @staticmethod
     def role(channel: Channel) -> str:
