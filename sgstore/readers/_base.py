@@ -483,11 +483,12 @@ class MessageTrace:
             The file is no longer readable, has no frame, or the requested ego is in no frame.
         """
         first_steps = self._first_steps()
+        noise = self._noise()
         report = self.report = TraceReport()
         decoder = self.decoder(report)
         refs = frame_refs(self.info.channels, self.recording.window)
         runs = self.recording.walk(report, rank=self._rank)
-        yield from counted(assemble(runs, size, decoder, refs, first_steps, self._noise()), report)
+        yield from counted(assemble(runs, size, decoder, refs, first_steps, noise), report)
         decoder.settle()
         if not report.frames:
             topic = next(c.topic for c in self.info.channels if c.role == "ground_truth")
