@@ -473,3 +473,15 @@ def test_an_earlier_end_violates_nothing_more(first: int) -> None:
                 assert whole[rule].verdict == "false", (seed, rule)
 
     assert min(ended["true"], ended["false"], ended["pending"]) > 3
+
+
+def test_rules_about_values_that_no_trace_has_are_unknown(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:  # without controls
+        for i in range(4):
+            recorder.ground_truth(i / 10, [recorded(1, x=i)], host=1)
+    ingest(tmp_path / "a.sgstore", [recorder.path])
+
+    for name in ("phi3", "phi5"):
+        (verdict,) = sgstore.open(tmp_path / "a.sgstore").check(name)
+        assert verdict.verdict == "unknown"
+        assert "never has a value" in verdict.reason
