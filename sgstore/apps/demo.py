@@ -57,7 +57,7 @@ RECORDING: Final = _SAMPLE / "town.mcap"
 """The recording in a checkout. A wheel does not contain it, because of its size: an eighth of the
 installation."""
 SMALL: Final = _SAMPLE / "small" / "town.mcap"
-"""The same drive without lidar, with one picture per second; part of the wheel."""
+"""The same drive without lidar, with a picture every two seconds; part of the wheel."""
 
 MOUNTS: Final = ("ego/lidar=0,0,1.75", "ego/camera/front=0.45,0,1.42,-90,0,-90")
 """Poses of the sensors on the ego."""

@@ -37,7 +37,7 @@ pytestmark = pytest.mark.seconds(42)
 
 NOT_ASKING = {
     *("ingest", "import", "rebuild", "derive", "remove", "verify", "info"),
-    *("doctor", "map", "monitor", "record", "demo", "mcp", "serve"),
+    *("doctor", "map", "monitor", "record", "demo", "try", "mcp", "serve"),
     *("config", "translate", "patterns list", "patterns search", "patterns show", "payload"),
     *("lock list", "lock union", "lock intersect", "lock minus"),
     *(f"collection {verb}" for verb in ("pack", "commit", "unpack", "verify", "rebuild", "gc")),

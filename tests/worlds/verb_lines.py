@@ -71,6 +71,7 @@ LINES: dict[str, list[str]] = {
     "shrink": ["{store}", "-p", "cut_in", "--to", "{new}.cut"],
     "export": ["{store}", "MATCH (e:Ego) WHERE e.speed > 9", "--to", "{new}.clips"],
     "demo": ["{new}.demo"],
+    "try": ["{recording}", "-o", "{new}.html"],
     "record": ["{new}.mcap"],
     "mcp": ["{store}"],
     "serve": ["{store}", "--host", "192.0.2.1"],  # an address of documents (RFC 5737): nobody's

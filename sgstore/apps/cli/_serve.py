@@ -17,12 +17,50 @@ from sgstore.apps.cli._options import (
     seconds_of,
     tables_of,
 )
-from sgstore.apps.cli._output import say
+from sgstore.apps.cli._output import ingest_bar, progress, say
 from sgstore.errors import MissingExtraError
 
 PANEL: Final = "Pictures and exports"
 
 verbs = Verbs()
+
+
+@verbs.command("try", rich_help_panel="Recordings")
+def try_recordings(
+    recordings: list[str],
+    output: Annotated[Path | None, Option("--output", "-o")] = None,
+    keep: Path | None = None,
+) -> int:
+    """Take a first look: rare and critical scenes, violated rules and missing data of a bounded sample.
+
+    Reads the first seconds of up to 100 recordings into a temporary store, and evaluates the whole library.
+    Each entry has the lines that reproduce it.
+
+    Parameters
+    ----------
+    recordings : RECORDING…
+        Recordings, folders of recordings or patterns of names.
+    output : PAGE
+        Write the page as HTML with pictures: .html.
+    keep : STORE
+        Keep the store of the sample.
+    """
+    from sgstore.apps.first_look import evaluate, sampled
+    from sgstore.base.output_files import without_controls, write_bytes
+    from sgstore.base.temporary_folders import working_folder
+    from sgstore.ingest import recordings as found_in
+
+    paths = found_in(recordings)
+    with working_folder("first look") as folder:
+        with ingest_bar() as bar:
+            look = sampled(paths, keep or folder / "sample.sgstore", bar)
+        evaluate(look, progress)
+        if output is None:
+            typer.echo(without_controls(look.text()))
+        else:
+            write_bytes(output, look.html().encode())
+            typer.echo(output)
+    return 0
 
 
 @verbs.command(rich_help_panel=PANEL)
