@@ -7,6 +7,7 @@ entities, so texts cannot expand. Depth and the numbers of elements and attribut
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING, Final
 from xml.parsers import expat
 
@@ -15,7 +16,13 @@ from sgstore.errors import MapError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+MAX_CHARACTERS: Final = 64 << 20
+"""Greatest length of the text of a map. Towns have a few million characters."""
+MAX_MAP_ELEMENTS: Final = 1_500_000
+"""Greatest number of elements of a map; an element takes up to a kilobyte of memory."""
 MAX_DEPTH: Final = 64
+_EARLY: Final = r"\s*(?:<!--(?s:.*?)-->\s*)*(?=<\?xml\s)"
+"""Space and comments before the XML declaration, which some editors write."""
 MAX_ATTRIBUTES: Final = 64
 
 
@@ -81,6 +88,10 @@ class MarkupParser:
             The text is not XML, has a document type declaration, or exceeds a limit. Exceptions of the
             callables propagate.
         """
+        if last:
+            text = isinstance(data, str)
+            early = re.match(_EARLY, data) if text else re.match(_EARLY.encode(), data)
+            data = data[early.end() :] if early else data
         try:
             self._parser.Parse(data, last)
         except expat.ExpatError as error:
@@ -110,13 +121,15 @@ class MarkupParser:
 
 
 def read_markup(parser: MarkupParser, text: str) -> None:
-    """Parse the whole text of a map.
+    """Parse the whole text of a map, of at most :data:`MAX_CHARACTERS`.
 
     Raises
     ------
     MapError
         The text is not XML, or exceeds a limit.
     """
+    if len(text) > MAX_CHARACTERS:
+        raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
     try:
         parser.feed(text, last=True)
     except MarkupError as error:

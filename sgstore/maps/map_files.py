@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import TraceInfo
 
 
-MAX_MAP_BYTES: Final = 1 << 28
+MAX_MAP_BYTES: Final = 1 << 27
 """Largest road map file; bytes."""
 
 NO_MAP: Final = "no road map: without road nodes and without relations that need them"
@@ -39,7 +39,9 @@ AUTOWARE_MAP: Final = "lanelet2_map.osm"
 _LOOKED_AT: Final = 4096
 _LANELETS: Final = re.compile(r"<osm[\s>/]")
 
-_ENCODING: Final = re.compile(rb"""\s*<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-9._-]{1,40})["']""")
+_ENCODING: Final = re.compile(
+    rb"""\s*(?:<!--(?s:.{0,4000}?)-->\s*){0,9}<\?xml[^>]{0,100}\sencoding=["']([A-Za-z0-9._-]{1,40})["']"""
+)
 
 
 def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
@@ -76,6 +78,10 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
             text = lanelet2_text(text, _projection(path.with_name(PROJECTOR_INFO)))
         elif is_sumo_net(text):
             text = sumo_net_text(text)
+        elif "<commonRoad" in text[:_LOOKED_AT]:
+            raise MapError(
+                "a CommonRoad scenario is a recording with a map: ingest it, without --map"
+            )
         return read_map(text, path.name, signs)
     except MapError as error:
         raise MapError(f"{path}: {error}") from error

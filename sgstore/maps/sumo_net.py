@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from sgstore.base.markup import MarkupParser, number, read_markup
+from sgstore.base.markup import MAX_MAP_ELEMENTS, MarkupParser, number, read_markup
 from sgstore.errors import MapError
 from sgstore.maps.roads import (
     MAX_LANES,
@@ -41,7 +41,6 @@ from sgstore.maps.roads import (
 if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
-MAX_ELEMENTS: Final = 8_000_000
 WIDTH: Final = 3.2
 """SUMO's default width of a lane; m."""
 CROSSING_WIDTH: Final = 4.0
@@ -56,6 +55,9 @@ _LANE_TYPES: Final = (
 """Classes of vehicles, and the lane type for these and all previous classes only."""
 _HEAD: Final = 1 << 16
 """Characters at the start of a text that decide whether it is a SUMO network."""
+_ODD_LENGTH: Final = 5.0
+_ODD_SHARE: Final = 0.2
+"""A greater difference of a lane's length to its shape is a contradiction; m, share of the shape."""
 _MAX_GAP: Final = 1.0
 """Greatest gap between neighbouring lanes, in addition to their widths; m."""
 
@@ -123,25 +125,25 @@ def sumo_net_text(text: str) -> str:
         The text is not XML or not a network, exceeds a limit, or has no usable lane.
     """
     net = _SumoNet()
-    read_markup(MarkupParser(net.start, most=MAX_ELEMENTS), text)
-    broken: list[str] = []
-    lines, crosswalks = _lines(net, broken)
+    read_markup(MarkupParser(net.start, most=MAX_MAP_ELEMENTS), text)
+    notes: list[str] = []
+    lines, crosswalks = _lines(net, notes)
     _add_opposites(net, lines)
     if not lines:
         raise MapError("a network of SUMO without lanes", element="net")
-    lanes, warnings = plain_lanes(_joined(net, lines))
-    if broken:
-        warnings.insert(0, about_lanes(broken, "left out, because its shape is not a line"))
+    lanes, warnings = plain_lanes(_joined(net, lines, notes))
     row_of = {lane.name: row for row, lane in enumerate(lanes)}
-    return lane_text(lanes, warnings, _lights(net, lines, row_of), crosswalks)
+    lights = _lights(net, lines, row_of)
+    return lane_text(lanes, [*notes, *_contradictions(net), *warnings], lights, crosswalks)
 
 
-def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[PlainCrosswalk]]:
+def _lines(net: _SumoNet, notes: list[str]) -> tuple[dict[str, LaneLine], list[PlainCrosswalk]]:
     """Return the lanes of a SUMO network by id, and its crosswalks."""
     lines: dict[str, LaneLine] = {}
     crosswalks: list[PlainCrosswalk] = []
     points = 0
     roundabouts = _roundabouts(net)
+    faults: dict[str, list[str]] = defaultdict(list)
     for edge in net.edges:
         if edge.function in {"walkingarea", "connector"}:
             continue
@@ -152,8 +154,8 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
             if points > MAX_POINTS:
                 raise MapError(f"lanes of more than {MAX_POINTS:,} points", element="lane")
             width = number(lane.get("width", ""), CROSSING_WIDTH if is_crossing else WIDTH)
-            if not ident or len(ident) > MAX_NAME or len(centre) < 2 or not 0 < width < 1000:
-                broken.append(ident or edge.ident)
+            if fault := _fault(ident, centre, width, lines):
+                faults[fault].append(ident or edge.ident)
                 continue
             sections, _ = Sections.across(centre, [], [], width / 2)
             if is_crossing:
@@ -163,7 +165,17 @@ def _lines(net: _SumoNet, broken: list[str]) -> tuple[dict[str, LaneLine], list[
         _add_neighbours(net, edge, lines)
     if len(lines) > MAX_LANES:
         raise MapError(f"{len(lines):,} lanes; a map may have {MAX_LANES:,}", element="lane")
+    notes += [about_lanes(lanes, fault) for fault, lanes in faults.items()]
     return lines, crosswalks
+
+
+def _fault(ident: str, centre: Floats, width: float, lines: dict[str, LaneLine]) -> str:
+    """Return the reason to leave out a SUMO lane, or an empty text."""
+    if not ident or len(ident) > MAX_NAME or len(centre) < 2:
+        return "left out, because its shape is not a line"
+    if not 0 < width < 1000:
+        return "left out, because its width is not positive"
+    return "there are two of this id; the first one counts" if ident in lines else ""
 
 
 def _lane_line(
@@ -249,21 +261,76 @@ def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
     return bool((np.hypot(*gaps.T) < _MAX_GAP).all())
 
 
-def _joined(net: _SumoNet, lines: dict[str, LaneLine]) -> list[LaneLine]:
-    """Return SUMO lanes with predecessors and successors, also through junctions with inner lanes."""
+def _joined(net: _SumoNet, lines: dict[str, LaneLine], notes: list[str]) -> list[LaneLine]:
+    """Return SUMO lanes with predecessors and successors, also through junctions with inner lanes.
+
+    An inner lane without a connection leads to the end of the connection through it.
+    """
     after: dict[str, list[Joint]] = defaultdict(list)
     before: dict[str, list[Joint]] = defaultdict(list)
-    for connection in net.connections:
-        src = _from_lane(connection)
-        via, end = connection.get("via", ""), f"{connection.get('to')}_{connection.get('toLane')}"
-        dst = via if via in lines else end
+
+    def join(src: str, dst: str) -> None:
         if src in lines and dst in lines:
             after[src].append(Joint(dst, Joint.START))
             before[dst].append(Joint(src, Joint.END))
+
+    known = {lane.get("id", "") for edge in net.edges for lane in edge.lanes}
+    missing: list[str] = []
+    for connection in net.connections:
+        ends = _from_lane(connection), _to_lane(connection), connection.get("via", "")
+        absent = [end for end in ends if end and end not in known]
+        missing += [f"from {ends[0]} to {ends[1]}"] * bool(absent)
+        join(ends[0], ends[2] if ends[2] in lines else ends[1])
+    for connection in net.connections:
+        if connection.get("via") in lines and not after[connection["via"]]:
+            join(connection["via"], _to_lane(connection))
+    if missing:
+        listed = ", ".join(dict.fromkeys(missing))
+        notes.append(f"connections {listed}: a lane of it is missing")
+    lost = [one for one in lines if one.startswith(":") and not (before[one] and after[one])]
+    notes += [about_lanes(lost, "in a junction, but no connection leads through it")] * bool(lost)
     return [
         replace(line, before=tuple(before[ident]), after=tuple(after[ident]))
         for ident, line in lines.items()
     ]
+
+
+def _to_lane(connection: dict[str, str]) -> str:
+    return f"{connection.get('to')}_{connection.get('toLane')}"
+
+
+def _contradictions(net: _SumoNet) -> list[str]:
+    """Return warnings about lengths, traffic lights and roundabouts that contradict the lanes."""
+    notes: list[str] = []
+    edges = {edge.ident for edge in net.edges}
+    for edge in net.edges:
+        for lane in edge.lanes if edge.function != "crossing" else ():
+            told, line = number(lane.get("length", "")), _centre_line(lane.get("shape", ""))
+            shown = float(run_of(line)[-1]) if len(line) else np.nan
+            if abs(told - shown) > max(_ODD_LENGTH, _ODD_SHARE * shown):
+                what = f"length is {told:g} m, but its shape has {shown:g} m"
+                notes.append(f"lane {lane.get('id', '')}: {what}")
+    linked: set[str] = set()
+    for connection in net.connections:
+        name, index = connection.get("tl", ""), connection.get("linkIndex", "")
+        if not name:
+            continue
+        linked.add(name)
+        what = f"connection from {_from_lane(connection)} to {_to_lane(connection)}"
+        states = net.phases.get(name)
+        if states is None:
+            notes.append(f"{what}: its traffic light {name!r} is missing")
+        elif not index.isdecimal() or any(int(index) >= len(state) for state in states):
+            notes.append(f"{what}: its link {index!r} of traffic light {name!r} is missing")
+    notes += [
+        f"traffic light {name!r}: no connection names it"
+        for name in net.phases
+        if name not in linked
+    ]
+    for roundabout in net.roundabouts:
+        absent = [edge for edge in roundabout.get("edges", "").split() if edge not in edges]
+        notes += [f"roundabout: its edge {edge!r} is missing" for edge in absent]
+    return notes
 
 
 def _from_lane(connection: dict[str, str]) -> str:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from opendrive_maps import a_map, a_road, border, element, lane, line, link, section, width
+from opendrive_maps import a_map, a_road, border, element, lane, line, link, section, spiral, width
 
+from sgstore.maps.map_files import read_map_file
 from sgstore.maps.opendrive import parse_map
 from sgstore.model.vocabulary import RELATION_CODE
 
@@ -191,6 +192,31 @@ def test_connections_that_lead_nowhere_are_warnings(text: str, said: str) -> Non
 
 def straight(**inner: str) -> RoadMap:
     return read(a_road("1", line(100.0), **inner))
+
+
+@pytest.mark.parametrize("last", [50.0, float("nan")])
+def test_a_bad_spiral_is_a_curve_to_the_next_geometry_and_keeps_its_road(last: float) -> None:
+    radius = 40 / np.pi
+    bad = spiral(20.0, 0.0, last, s=50, x=50).replace('"nan"', '"wide"')
+    after = line(30.0, s=70, x=50 + radius, y=radius, hdg=np.pi / 2)
+    road_map = read(a_road("1", line(50.0), bad, after))
+
+    (warning,) = road_map.warnings
+    assert "road '1': the spiral at s = 50 m has no usable curvature" in warning
+    place = road_map.ribbons.at(np.array([0]), np.array([0.0]))
+    assert (place.x[0], place.y[0]) == pytest.approx((0.0, -1.75))
+    s, x, y = (getattr(road_map.ribbons, name) for name in ("s", "left_x", "left_y"))
+    middle = np.interp(60.0, s, x), np.interp(60.0, s, y)
+    arc = 50 + radius * np.sin(np.pi / 4), radius * (1 - np.cos(np.pi / 4))
+    assert middle == pytest.approx(arc, abs=0.2)
+
+
+def test_a_comment_before_the_declaration_is_no_fault(tmp_path: Path) -> None:
+    file = tmp_path / "m.xodr"
+    head = '<!-- by hand -->\n<?xml version="1.0" encoding="iso-8859-1"?>'
+    file.write_text(head + a_map(a_road("\u00df", line(9.0))), encoding="iso-8859-1")
+
+    assert "\u00df" in read_map_file(file).nodes.name
 
 
 def placed(tag: str, s: float, **values: str) -> str:

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import shapely
-from commonroad_scenarios import CAR, HEAD, as_mcap, dynamic, lanelet, scenario, state
+from commonroad_scenarios import CAR, HEAD, LIGHT, as_mcap, dynamic, lanelet, lanes, scenario, state
 from test_export_mcap import cut
 from thorough import some
 
 import sgstore
+from sgstore.apps.cli import run
 from sgstore.errors import StoreError, TraceError
 from sgstore.ingest import recordings
 from sgstore.maps.opendrive import read_map
@@ -430,3 +431,17 @@ def test_real_scenarios_are_ingested_and_asked(tmp_path: Path) -> None:
         "SELECT count(DISTINCT light_state) FROM nodes WHERE kind = 'traffic_light'"
     ).values
     assert states >= 2
+
+
+def test_a_scenario_without_obstacles_is_a_map_and_one_frame(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = HEAD.format(name="ZAM_Empty-1_1_T-1", version="2020a") + lanes() + LIGHT
+    path = tmp_path / "empty.xml"
+    path.write_text(f"<!-- by hand -->\n{text}</commonRoad>", encoding="utf-8")
+
+    info, blocks, report = read(path)
+    assert (sum(len(block.time_ns) for block in blocks), report.losses) == (1, [])
+    assert info.map_text
+    assert run(["map", str(path), "--json"]) == 0
+    assert '"lane"' in capsys.readouterr().out

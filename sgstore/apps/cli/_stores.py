@@ -207,7 +207,7 @@ def map_(
     Parameters
     ----------
     file : FILE
-        OpenDRIVE (.xodr), Lanelet2 (.osm), or a recording that carries roads.
+        OpenDRIVE (.xodr), Lanelet2 (.osm), SUMO (.net.xml), or a recording that carries roads.
     picture
         Picture to draw, north up: .png or .svg.
     """
@@ -242,11 +242,13 @@ def _road_map(file: Path) -> RoadMap:
 
     try:
         with file.open("rb") as stream:
-            start = stream.read(64)
+            start = stream.read(4096)
     except OSError as error:
         raise MapError(f"{file}: {error.strerror or error}") from error
-    # Texts begin with a bracket, or a byte order mark; recordings do not.
-    if start.lstrip()[:1] in {b"<", b"{"} or start[:2] in {b"\xff\xfe", b"\xfe\xff", b"\xef\xbb"}:
+    # Texts begin with a bracket, or a byte order mark; recordings except scenarios do not.
+    if b"<commonRoad" not in start and (
+        start.lstrip()[:1] in {b"<", b"{"} or start[:2] in {b"\xff\xfe", b"\xfe\xff", b"\xef\xbb"}
+    ):
         return read_map_file(file)
     with open_trace(file) as trace:
         if not trace.info.map_text:

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from sgstore.base.display import first_of
-from sgstore.base.markup import MarkupParser, number, read_markup
+from sgstore.base.markup import MAX_MAP_ELEMENTS, MarkupParser, number, read_markup
 from sgstore.errors import MapError
 from sgstore.maps.roads import MAX_POINTS
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from sgstore.maps.lanelet2._projection import Projection
     from sgstore.model.world import Floats
 
-MAX_CHARACTERS: Final = 256 << 20
-MAX_ELEMENTS: Final = 8_000_000
+LISTED: Final = 1_000
+"""Greatest number of elements that a warning names."""
 _FAR: Final = 1e8
 """Greatest distance of a point from the origin; m."""
 _NODE_TAGS: Final = ("ele", "local_x", "local_y")
@@ -57,10 +60,8 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
     MapError
         The text is not XML, not OpenStreetMap data, or exceeds a limit.
     """
-    if len(text) > MAX_CHARACTERS:
-        raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
     builder = _OsmBuilder()
-    read_markup(MarkupParser(builder.start, most=MAX_ELEMENTS), text)
+    read_markup(MarkupParser(builder.start, most=MAX_MAP_ELEMENTS), text)
     ways = [one for one in builder.elements if one.kind == "way"]
     points = sum(len(way.members) for way in ways)
     if points > MAX_POINTS:
@@ -70,6 +71,13 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
     warnings: list[str] = []
     places = _places(nodes, projection, warnings)
     row = {node.ident: at for at, node in enumerate(nodes)}
+    # Nodes in one place are one node: lanelets meet there.
+    first = dict[tuple[float, ...], str]()
+    spots = map(tuple, np.round(places, 2).tolist())
+    same = {
+        node.ident: first.setdefault(spot, node.ident)
+        for node, spot in zip(nodes, spots, strict=True)
+    }
     document = OsmDocument({}, {}, {}, {}, warnings)
     broken: list[str] = []
     for way in ways:
@@ -80,13 +88,29 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
             broken.append(way.ident)
             continue
         document.lines[way.ident] = line
-        document.nodes[way.ident], document.tags[way.ident] = refs, way.tags
+        document.nodes[way.ident] = [same[ref] for ref in refs]
+        document.tags[way.ident] = way.tags
     if broken:
         warnings.append(
-            f"ways {first_of(broken, 8)}: a node of theirs is missing, or no place; left out"
+            f"ways {first_of(broken, LISTED)}: a node of theirs is missing, or no place; left out"
         )
     document.relations = {one.ident: one for one in builder.elements if one.kind == "relation"}
+    warnings += _contradictions(builder.elements, document)
     return document
+
+
+def _contradictions(elements: list[OsmElement], document: OsmDocument) -> Iterator[str]:
+    """Yield ids that occur twice, and members of lanelets and rules that are missing."""
+    for (kind, ident), count in Counter((one.kind, one.ident) for one in elements).items():
+        if count > 1:
+            yield f"{kind} {ident}: there are {count} of this id; the last one counts"
+    ways = {one.ident for one in elements if one.kind == "way"}
+    for ident, relation in document.relations.items():
+        if relation.tags.get("type") in {"lanelet", "regulatory_element"}:
+            for kind, ref, role in relation.members:
+                known = {"way": ways, "relation": document.relations}.get(kind, {ref})
+                if ref not in known:
+                    yield f"relation {ident}: its {kind} {ref} ({role}) is missing"
 
 
 def _places(nodes: list[OsmElement], projection: Projection, warnings: list[str]) -> Floats:

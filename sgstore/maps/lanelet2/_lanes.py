@@ -10,7 +10,7 @@ import numpy as np
 
 from sgstore.base.display import first_of
 from sgstore.errors import MapError
-from sgstore.maps.lanelet2._document import OsmDocument, read_osm
+from sgstore.maps.lanelet2._document import LISTED, OsmDocument, read_osm
 from sgstore.maps.lanelet2._lanelets import (
     CROSSWALK,
     line_of,
@@ -111,7 +111,7 @@ def _areas(document: OsmDocument) -> list[PlainObject]:
         document.warnings.append(f"areas left out: {told}")
     if broken:
         what = "expected an outer border that closes; left out"
-        document.warnings.append(f"areas {first_of(broken, 8)}: {what}")
+        document.warnings.append(f"areas {first_of(broken, LISTED)}: {what}")
     return found
 
 

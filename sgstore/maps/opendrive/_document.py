@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.markup import MarkupParser, number, read_markup
+from sgstore.base.markup import MAX_MAP_ELEMENTS, MarkupParser, number, read_markup
 from sgstore.errors import MapError
 
 if TYPE_CHECKING:
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, Ints
 
 
-MAX_CHARACTERS: Final = 256 << 20
-MAX_ELEMENTS: Final = 3_000_000
 MAX_MAGNITUDE: Final = 1e12
 """Greatest absolute value of a number; larger values count as defects."""
 
@@ -264,10 +262,8 @@ def read_document(text: str, skip: frozenset[int] = frozenset()) -> Document:
     MapError
         The text is not XML or not OpenDRIVE, has a document type declaration, or exceeds a limit.
     """
-    if len(text) > MAX_CHARACTERS:
-        raise MapError(f"{len(text):,} characters; a map may have {MAX_CHARACTERS:,}")
     builder = _Builder(skip)
-    read_markup(MarkupParser(builder.start, builder.end, most=MAX_ELEMENTS), text)
+    read_markup(MarkupParser(builder.start, builder.end, most=MAX_MAP_ELEMENTS), text)
     return Document(builder.tables, builder.ordinals, len(text))
 
 

@@ -99,10 +99,20 @@ def read_plan_view(document: Document) -> PlanView:
     arcs = document["road/geometry/arc"].of
     curvature[arcs] = document.numbers("road/geometry/arc", "curvature")
     kind[arcs] = ARC
-    _read_spirals(document, kind, curvature, rate, length)
+    wild = _read_spirals(document, kind, curvature, rate, length)
     u, v, span = _read_cubics(document, kind, length)
     document.accuse("road/geometry", kind < 0, "has no line, arc, spiral, poly3 or paramPoly3")
     order = np.lexsort((columns["s"], table.road))
+    for row in wild.tolist():
+        name = document.road_ids[table.road[row]]
+        document.warnings.append(
+            f"road {name!r}: the spiral at s = {columns['s'][row]:g} m has no usable curvature;"
+            " a curve to the next geometry counts"
+        )
+        at = int(np.flatnonzero(order == row)[0]) + 1
+        after = int(order[at]) if at < n and table.road[order[at]] == table.road[row] else None
+        u[row], v[row] = _curve_between(columns, row, after)
+        kind[row], span[row] = CUBIC, 1.0
     cubics = order[kind[order] == CUBIC]
     u, v, span = u[cubics], v[cubics], span[cubics]
     measure = _measured(u, v, span, length[cubics])
@@ -113,15 +123,36 @@ def read_plan_view(document: Document) -> PlanView:
 
 def _read_spirals(
     document: Document, kind: Codes, curvature: Floats, rate: Floats, length: Floats
-) -> None:
+) -> Ints:
+    """Read all spirals, and return the rows of those without a usable curvature."""
     spirals = document["road/geometry/spiral"].of
-    first = document.numbers("road/geometry/spiral", "curvStart")
-    last = document.numbers("road/geometry/spiral", "curvEnd")
+    first, last = (
+        document.rough_numbers("road/geometry/spiral", name, np.nan)
+        for name in ("curvStart", "curvEnd")
+    )
     turn = np.maximum(np.abs(first), np.abs(last)) * length[spirals]
-    document.accuse("road/geometry/spiral", turn > MAX_TURN, "winds more than six times")
+    usable = turn <= MAX_TURN
     kind[spirals] = SPIRAL
+    wild, spirals, first, last = spirals[~usable], spirals[usable], first[usable], last[usable]
     curvature[spirals] = first
     rate[spirals] = (last - first) / np.where(length[spirals] > 0, length[spirals], 1.0)
+    return wild
+
+
+def _curve_between(columns: dict[str, Any], row: int, after: int | None) -> tuple[Floats, Floats]:
+    """Return the cubic from a geometry to the next one, in its axes; a line if they do not fit."""
+    length, heading = columns["length"][row], columns["heading"][row]
+    start, end = np.array([1.0, 0.0]) * length, np.array([length, 0.0])
+    slope = start
+    if after is not None:
+        dx, dy = (columns[axis][after] - columns[axis][row] for axis in "xy")
+        cos, sin = np.cos(heading), np.sin(heading)
+        place = np.array([cos * dx + sin * dy, cos * dy - sin * dx])
+        if length / 4 <= np.hypot(dx, dy) <= length * 1.01:
+            turn = columns["heading"][after] - heading
+            end, slope = place, np.array([np.cos(turn), np.sin(turn)]) * length
+    cubic = np.stack((0 * start, start, 3 * end - 2 * start - slope, start + slope - 2 * end))
+    return cubic[:, 0], cubic[:, 1]
 
 
 def _read_cubics(document: Document, kind: Codes, length: Floats) -> tuple[Floats, Floats, Floats]:

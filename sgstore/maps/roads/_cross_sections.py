@@ -40,6 +40,10 @@ metres, and the share of its sideways distance; at the ends of a lane, which can
 last share."""
 
 
+_SWAPPED: Final = 0.1
+"""Least distance between two borders that are on the wrong sides; m."""
+
+
 @dataclass(frozen=True, slots=True)
 class Sections:
     """Cross sections of a lane along its centre line: centre, left and right points; n rows."""
@@ -56,6 +60,14 @@ class Sections:
     def turned_round(self) -> Sections:
         """Return the cross sections of the lane in the opposite direction."""
         return Sections(self.right[::-1], self.left[::-1], self.z[::-1])
+
+    def is_crossed(self) -> bool:
+        """Return True if the left border is on the right for more than a metre."""
+        step = np.diff(self.middle, axis=0)
+        across = (self.left - self.right)[1:] + (self.left - self.right)[:-1]
+        length = np.hypot(*step.T)
+        width = step[:, 0] * across[:, 1] - step[:, 1] * across[:, 0]
+        return bool(length[width < -_SWAPPED * length].sum() > 1.0)
 
     def up_to(self, left: Floats, right: Floats, z: float) -> Sections:
         """Return the cross sections of the lane with one more section at the end."""

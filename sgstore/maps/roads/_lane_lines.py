@@ -51,8 +51,10 @@ GAP: Final = 5.0
 """Ends of lanes with a larger gap do not touch, even if the file links them; m."""
 SEAM: Final = 1.0
 """Gaps up to this length between a lane and the next one are closed; m."""
-LISTED: Final = 8
+LISTED: Final = 1_000
 """Greatest number of lanes that a warning names."""
+_FEW: Final = 8
+"""The same of a warning about a guess."""
 _MOST_ACROSS: Final = 16
 """Greatest number of lanes without traffic between two lanes that count as neighbours."""
 _ABOUT: Final = 1.0
@@ -250,6 +252,7 @@ def plain_lanes(
     """
     _check_numbers(lines, areas)
     network = _shaped(lines)
+    _report(network, {area.ident for area in areas})
     _add_ways(network, areas)
     joints = _joints(network)
     beside = _beside(network)
@@ -331,7 +334,8 @@ def _shaped(lines: Sequence[LaneLine]) -> _Network:
         network.sections.append(sections)
         guessed += [line.ident] * (not told)
     width = f"no boundary beside them: as wide as lanes beside them are apart, else {WIDE} m"
-    _tell(network, guessed, width)
+    if guessed:
+        network.warnings.append(about_lanes(guessed, width, _FEW))
     return network
 
 
@@ -348,9 +352,27 @@ def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[
     return Sections.across(line.centre, lefts, rights, half)
 
 
-def about_lanes(lanes: Sequence[str], what: str) -> str:
-    """Return a warning text that names the first few of several lanes."""
-    return f"{'lanes' if len(lanes) > 1 else 'lane'} {first_of(lanes, LISTED)}: {what}"
+def about_lanes(lanes: Sequence[str], what: str, most: int = LISTED) -> str:
+    """Return a warning text that names several lanes, up to a greatest number."""
+    return f"{'lanes' if len(lanes) > 1 else 'lane'} {first_of(lanes, most)}: {what}"
+
+
+def _report(network: _Network, areas: set[str]) -> None:
+    """Report lanes whose links or neighbours are missing, or whose borders are on the wrong sides."""
+    missing: list[str] = []
+    both: list[str] = []
+    for line in network.lines:
+        named = [joint.lane for joint in (*line.before, *line.after)]
+        named += [*line.left_beside, *line.right_beside]
+        absent = (one for one in named if one not in network.index and one not in areas)
+        missing += [f"{line.ident} to {one}" for one in dict.fromkeys(absent)]
+        twice = {*line.left_beside} & {*line.right_beside}
+        both += [f"{line.ident} and {one}" for one in sorted(twice)]
+    _tell(network, missing, "linked to a missing lane")
+    _tell(network, both, "neighbours on both sides")
+    pairs = zip(network.lines, network.sections, strict=True)
+    turned = [line.ident for line, sections in pairs if sections.is_crossed()]
+    _tell(network, turned, "its left border is on the right, so its width is negative")
 
 
 def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
@@ -431,6 +453,7 @@ _Joined = tuple[int, str, int, str]
 def _joints(network: _Network) -> set[_Joined]:
     joints: set[_Joined] = set()
     far: list[str] = []
+    turned: list[str] = []
     for row, line in enumerate(network.lines):
         for own, touched in ((Joint.START, line.before), (Joint.END, line.after)):
             for joint in touched:
@@ -438,11 +461,30 @@ def _joints(network: _Network) -> set[_Joined]:
                 if other is None:
                     continue
                 contact = joint.contact or _contact(network, row, own, other)
+                back = Joint.END if contact == Joint.START else Joint.START
+                if (
+                    network.gap(row, own, other, contact)
+                    > SEAM
+                    >= network.gap(row, own, other, back)
+                ):
+                    contact = back
+                    turned.append(f"{line.ident} to {joint.lane}")
                 if network.gap(row, own, other, contact) > GAP:
                     far.append(f"{line.ident} to {joint.lane}")
                 else:
                     joints |= {(row, own, other, contact), (other, contact, row, own)}
     _tell(network, far, f"not joined as declared: their ends are more than {GAP} m apart")
+    _tell(network, turned, "linked to the far end: the end that touches counts")
+    against = {
+        " and ".join(sorted((network.lines[row].ident, network.lines[other].ident)))
+        for row, end, other, contact in joints
+        if network.exits(row, end) == network.exits(other, contact)
+        and all(
+            network.lines[lane].type in TRAFFIC and not network.lines[lane].both
+            for lane in (row, other)
+        )
+    }
+    _tell(network, sorted(against), "linked, but their traffic meets head on")
     return joints
 
 

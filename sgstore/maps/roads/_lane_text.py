@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 FORMAT: Final = "sgstore lanes"
 VERSION: Final = 1
 
-MAX_CHARACTERS: Final = 128 << 20
+MAX_CHARACTERS: Final = 64 << 20
 MAX_LANES: Final = 100_000
 MAX_SIGNALS: Final = 100_000
 MAX_SECTIONS: Final = 4_000_000

@@ -134,6 +134,8 @@ class Lanelet:
     speed_limit: float = math.nan
     stop_line: tuple[Place, ...] | None = None
     """Points of the stop line; empty: it is at the end of the lanelet."""
+    directions: tuple[str, str] = ("", "")
+    """``same`` or ``opposite`` for the left and right neighbour; empty: unknown."""
 
 
 @dataclass(slots=True)
@@ -150,6 +152,8 @@ class TrafficScenario:
         By their ids.
     junction_of : dict
         Id of a lanelet → id of its intersection.
+    incoming : list
+        Ids of intersections, each with the id of a lanelet that leads into it.
     lost : list of str
         Dropped parts with the reasons.
     more_lost : int
@@ -163,6 +167,7 @@ class TrafficScenario:
     signs: dict[str, ScenarioSign] = field(default_factory=dict[str, ScenarioSign])
     lanelets: dict[str, Lanelet] = field(default_factory=dict[str, Lanelet])
     junction_of: dict[str, str] = field(default_factory=dict[str, str])
+    incoming: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
     lost: list[str] = field(default_factory=list[str])
     more_lost: int = 0
     states: int = 0
@@ -535,7 +540,13 @@ def _lanelet(scenario: TrafficScenario, node: _Node) -> None:
         node.refs("trafficLightRef"),
         _float(limit, "speedLimit") if limit else math.nan,
         None if stop_line is None else tuple(_point(point) for point in stop_line.all("point")),
+        (_direction(node, "adjacentLeft"), _direction(node, "adjacentRight")),
     )
+
+
+def _direction(node: _Node, tag: str) -> str:
+    found = node.get(tag)
+    return "" if found is None else found.attributes.get("drivingDir", "")
 
 
 def _light(scenario: TrafficScenario, node: _Node) -> None:
@@ -571,6 +582,7 @@ def _sign(scenario: TrafficScenario, node: _Node) -> None:
 def _intersection(scenario: TrafficScenario, node: _Node) -> None:
     ident = _ident(node)
     for incoming in node.all("incoming"):
+        scenario.incoming += [(ident, lanelet) for lanelet in incoming.refs("incomingLanelet")]
         for way in ("successorsLeft", "successorsStraight", "successorsRight"):
             for lanelet in incoming.refs(way):
                 scenario.junction_of.setdefault(lanelet, ident)

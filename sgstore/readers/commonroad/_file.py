@@ -134,10 +134,10 @@ def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterato
 def _steps(scenario: TrafficScenario) -> list[int]:
     """Return the time steps of a scenario with obstacle states, in order.
 
-    A scenario with only static obstacles has one step.
+    A scenario with only static obstacles, or only lanelets, has one step.
     """
     moving = {step for one in scenario.obstacles.values() if not one.static for step in one.states}
-    if not moving and scenario.obstacles:
+    if not moving and (scenario.obstacles or scenario.lanelets):
         return [0]
     return sorted(moving)
 

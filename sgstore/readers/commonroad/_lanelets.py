@@ -152,7 +152,47 @@ def map_text(scenario: TrafficScenario) -> str:
         )
         if which
     ]
-    return lane_text(plain, [*notes, *warnings], [*_signals(scenario, plain)], crosswalks)
+    notes += _contradictions(scenario)
+    signals = [*_signals(scenario, plain, notes)]
+    return lane_text(plain, [*notes, *warnings], signals, crosswalks)
+
+
+def _contradictions(scenario: TrafficScenario) -> Iterator[str]:
+    """Yield references to missing parts, and neighbours in another direction than declared."""
+    used: set[str] = set()
+    for lanelet in scenario.lanelets.values():
+        used |= {*lanelet.lights}
+        absent = [f"traffic sign {one}" for one in lanelet.signs if one not in scenario.signs]
+        absent += [f"traffic light {one}" for one in lanelet.lights if one not in scenario.lights]
+        yield from (f"lane {lanelet.ident}: its {what} is missing" for what in absent)
+        yield from _turned_neighbours(scenario, lanelet)
+        if lanelet.speed_limit <= 0:
+            yield f"lane {lanelet.ident}: its speed limit is {lanelet.speed_limit:g} m/s: left out"
+    yield from (
+        f"traffic light {name}: no lane refers to it"
+        for name in scenario.lights
+        if name not in used
+    )
+    refs = [*scenario.incoming, *((place, name) for name, place in scenario.junction_of.items())]
+    for intersection, name in dict.fromkeys(refs):
+        if name not in scenario.lanelets:
+            yield f"intersection {intersection}: its lane {name} is missing"
+
+
+def _turned_neighbours(scenario: TrafficScenario, lanelet: Lanelet) -> Iterator[str]:
+    for name, declared in zip(lanelet.beside, lanelet.directions, strict=True):
+        other = scenario.lanelets.get(name)
+        if other is not None and declared in {"same", "opposite"}:
+            same = float(_way(lanelet) @ _way(other)) > 0
+            if same != (declared == "same"):
+                what = f"its neighbour {name} does not run in the {declared} direction"
+                yield f"lane {lanelet.ident}: {what}, as declared"
+
+
+def _way(lanelet: Lanelet) -> Floats:
+    """Return the vector from the start to the end of a lanelet."""
+    end, start = (np.add(lanelet.left[at], lanelet.right[at]) for at in (-1, 0))
+    return end - start
 
 
 def _evened(left: Floats, right: Floats) -> tuple[Floats, Floats]:
@@ -208,10 +248,12 @@ def _limit(scenario: TrafficScenario, lanelet: Lanelet) -> float:
     return min((one for one in limits if 0 < one < 1000), default=math.nan)
 
 
-def _signals(scenario: TrafficScenario, lanes: Sequence[PlainLane]) -> Iterator[PlainSignal]:
+def _signals(
+    scenario: TrafficScenario, lanes: Sequence[PlainLane], notes: list[str]
+) -> Iterator[PlainSignal]:
     """Yield the traffic signs and lights of the lanes that refer to them, and the stop lines."""
     row_of = {lane.name: row for row, lane in enumerate(lanes)}
-    stops = _stops(scenario, lanes, row_of)
+    stops = _stops(scenario, lanes, row_of, notes)
     users: dict[str, list[int]] = {}
     for lanelet in scenario.lanelets.values():
         if lanelet.ident in row_of:
@@ -236,7 +278,10 @@ def _signals(scenario: TrafficScenario, lanes: Sequence[PlainLane]) -> Iterator[
 
 
 def _stops(
-    scenario: TrafficScenario, lanes: Sequence[PlainLane], row_of: dict[str, int]
+    scenario: TrafficScenario,
+    lanes: Sequence[PlainLane],
+    row_of: dict[str, int],
+    notes: list[str],
 ) -> dict[int, float]:
     """Return the position of the stop line along each lane that has a stop line; m."""
     found: dict[int, float] = {}
@@ -249,6 +294,8 @@ def _stops(
         if len(lanelet.stop_line) > 1:
             told[row] = np.array(lanelet.stop_line)
     for row, places in zip(told, PlainLane.painted_across(lanes, [*told.values()]), strict=True):
+        if row not in places:
+            notes.append(f"lane {lanes[row].name}: its stop line is not on it; its end counts")
         found[row] = places.get(row, found[row])
     return found
 

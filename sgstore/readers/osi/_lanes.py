@@ -217,12 +217,24 @@ class OsiLanes:
             self.warnings += warnings
             return "", ""
         rows = self._rows(lines, plain)
+        signals = [*signals]
+        warnings += self._missing(signals, borders)
         named = {
             one.name: _plain_signal(one, [row for lane in one.lanes for row in rows.get(lane, ())])
-            for one in reversed([*signals])
+            for one in reversed(signals)
         }
         found = [one for one in reversed(named.values()) if one.lanes and len(one.name) <= MAX_NAME]
         return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
+
+    def _missing(self, signals: Iterable[LaneSignal], borders: _LaneBoundaries) -> Iterator[str]:
+        """Yield boundaries of lanes and lanes of signals that are missing."""
+        if borders.missing:
+            yield f"boundaries of lanes are missing: {', '.join(borders.missing)}"
+        lanes = self._told["lane"].keys() | self._told["logical_lane"].keys()
+        for signal in {one.name: one for one in signals}.values():
+            absent = [str(lane) for lane in signal.lanes if lane not in lanes]
+            if absent:
+                yield f"{signal.kind} {signal.name}: its lanes {', '.join(absent)} are missing"
 
     def _rows(self, lines: Sequence[LaneLine], plain: Sequence[PlainLane]) -> dict[int, list[int]]:
         """Return the lanes of the road map made from each OSI lane: OSI lane id → row numbers."""
@@ -283,6 +295,7 @@ class _LaneBoundaries:
     ) -> None:
         self.told = told
         self.place = place
+        self.missing: dict[str, None] = {}
         self._lines: dict[int, Floats] = {}
         self._logical: dict[int, tuple[Floats, Floats]] = {}
 
@@ -292,6 +305,7 @@ class _LaneBoundaries:
         for ident in map(_number, idents):
             boundary = self.told["lane_boundary"].get(ident)
             if boundary is None:
+                self.missing[f"lane_boundary {ident}"] = None
                 continue
             if ident not in self._lines:
                 self._lines[ident] = self.place(p.position for p in boundary.boundary_line)
@@ -315,6 +329,7 @@ class _LaneBoundaries:
         for ident in map(_number, idents):
             boundary = self.told["logical_lane_boundary"].get(ident)
             if boundary is None:
+                self.missing[f"logical_lane_boundary {ident}"] = None
                 continue
             if ident not in self._logical:
                 line = self.place(p.position for p in boundary.boundary_line)
