@@ -47,7 +47,7 @@ STORE: Final = "drives.sgstore"
 
 
 @dataclass(frozen=True)
-class Entry:
+class FirstLookEntry:
     """Finding of a first look, with the lines that reproduce it.
 
     Attributes
@@ -77,7 +77,7 @@ class FirstLook:
         Recordings of the sample.
     skipped : int
         Number of recordings that are not in the sample.
-    sections : dict of str to list of Entry
+    sections : dict of str to list of FirstLookEntry
         Findings by the heading of their section.
     unanswered : dict of str to list of str
         Reason → patterns and rules without an answer in any trace.
@@ -88,7 +88,9 @@ class FirstLook:
     store: Store
     outcomes: list[TraceOutcome]
     skipped: int
-    sections: dict[str, list[Entry]] = field(default_factory=dict[str, list[Entry]])
+    sections: dict[str, list[FirstLookEntry]] = field(
+        default_factory=dict[str, list[FirstLookEntry]]
+    )
     unanswered: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
     missing: dict[str, int] = field(default_factory=dict[str, int])
 
@@ -141,7 +143,7 @@ class FirstLook:
         missing = Counter(self.missing).most_common(2 * ENTRIES)
         yield "Missing data", [f"{what} (recordings: {many})" for what, many in missing]
 
-    def _card(self, one: Entry) -> str:
+    def _card(self, one: FirstLookEntry) -> str:
         lines = "".join(
             f"<dt>{face}</dt><dd><code>{html.escape(line)}</code></dd>"
             for face, line in one.lines.items()
@@ -213,7 +215,7 @@ def evaluate(look: FirstLook, each: Each = lambda items, _: items) -> None:
         }
 
 
-def _rare(look: FirstLook, each: Each) -> list[Entry]:
+def _rare(look: FirstLook, each: Each) -> list[FirstLookEntry]:
     """Return the patterns of the library with the fewest matches, and note those without an answer."""
     found: list[tuple[int, str, str, Interval]] = []
     asked = [one for one in patterns().values() if one.kind in {"concept", "scenario"}]
@@ -228,7 +230,7 @@ def _rare(look: FirstLook, each: Each) -> list[Entry]:
         if spans:
             found.append((len(spans), one.name, one.sentence, spans[0]))
     return [
-        Entry(
+        FirstLookEntry(
             name,
             f"{sentence} Matches: {many}; the first in {span.trace} at {span.start:.1f} s.",
             f"{span.trace}#{span.start_seq}",
@@ -243,17 +245,17 @@ def _rare(look: FirstLook, each: Each) -> list[Entry]:
     ]
 
 
-def _critical(store: Store) -> list[Entry]:
+def _critical(store: Store) -> list[FirstLookEntry]:
     """Return the most critical scenes."""
     spec = PrioritySpec(Priority.risk, tuple(MEASURES), SelectionUnit.clip, CLIP_S)
     ordered = prioritize(ChosenFrames(STORE, store), spec)
-    entries: list[Entry] = []
+    entries: list[FirstLookEntry] = []
     for place, unit, *_, reason in ordered.rows():
         if place > ENTRIES:
             break
         frame = str(unit).rpartition("-")[0]  # of town#380-399
         entries.append(
-            Entry(
+            FirstLookEntry(
                 f"{place}. {unit}",
                 str(reason),
                 frame,
@@ -268,9 +270,9 @@ def _critical(store: Store) -> list[Entry]:
     return entries
 
 
-def _rules(look: FirstLook, each: Each) -> list[Entry]:
+def _rules(look: FirstLook, each: Each) -> list[FirstLookEntry]:
     """Return the violated rules of the library, and note those without an answer."""
-    entries: list[tuple[int, Entry]] = []
+    entries: list[tuple[int, FirstLookEntry]] = []
     for one in each([one for one in patterns().values() if one.is_check], "rules"):
         verdicts = [*look.store.check(one.text)]
         violated = [verdict for verdict in verdicts if verdict.verdict == "false"]
@@ -288,7 +290,7 @@ def _rules(look: FirstLook, each: Each) -> list[Entry]:
             "Python": f'for verdict in store.check("{one.name}"): print(verdict)',
             "CI": f"sgstore check {STORE} {one.name} --require --junit rules.xml",
         }
-        found = Entry(one.name, f"{one.sentence} {text}", frame, lines)
+        found = FirstLookEntry(one.name, f"{one.sentence} {text}", frame, lines)
         entries.append((-len(violated), found))
     return [entry for _, entry in sorted(entries, key=lambda row: (row[0], row[1].title))]
 
