@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import html
+import shlex
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
@@ -260,9 +261,9 @@ def _critical(store: Store) -> list[FirstLookEntry]:
                 str(reason),
                 frame,
                 {
-                    "CLI": f"sgstore show {STORE} {frame}",
+                    "CLI": shlex.join(["sgstore", "show", STORE, frame]),
                     "SQL": _sql_of(store, frame),
-                    "Python": f'store.show("{frame}")',
+                    "Python": f"store.show({frame!r})",
                     "CI": f"sgstore prioritize {STORE} --unit clip --limit {ENTRIES} -o critical.lock",
                 },
             )

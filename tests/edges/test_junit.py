@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as Xml
 
@@ -114,3 +115,28 @@ def test_a_file_that_cannot_be_written_is_an_error_and_leaves_the_old(
     assert run(["check", str(store), "-e", RULES, "--junit", str(tmp_path / "no" / "x.xml")]) == 1
     assert run(["check", str(store), "-e", "CHECK", "--junit", str(tmp_path / "old.xml")]) == 2
     assert (tmp_path / "old.xml").read_text() == "old"
+
+
+def test_violations_are_results_for_code_scanning(store: Path, tmp_path: Path) -> None:
+    command = ["check", str(store), "-e", RULES, "--sarif", str(tmp_path / "checks.sarif")]
+    assert run([*command, "--json", "-o", str(tmp_path / "checks.json")]) == 0
+
+    verdicts = json.loads((tmp_path / "checks.json").read_text())
+    document = json.loads((tmp_path / "checks.sarif").read_text())
+    (found,) = document["runs"]
+    rules = {rule["id"] for rule in found["tool"]["driver"]["rules"]}
+    spans = [
+        (one["check"], one["trace"], s["start"]) for one in verdicts for s in one["violations"]
+    ]
+    results = [
+        (one["ruleId"], one["properties"]["trace"], one["properties"]["start"])
+        for one in found["results"]
+    ]
+    notices = found["invocations"][0]["toolExecutionNotifications"]
+
+    assert document["version"] == "2.1.0"
+    assert rules == {one["check"] for one in verdicts}
+    assert results == spans
+    assert len(notices) == sum(one["verdict"] in {"unknown", "pending"} for one in verdicts)
+    _, *arguments = shlex.split(found["results"][0]["properties"]["command"])
+    assert run([*arguments, "-o", str(tmp_path / "a.png")]) == 0

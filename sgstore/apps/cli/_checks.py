@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -24,9 +24,10 @@ from sgstore.apps.cli._options import (
     say_unknown,
 )
 from sgstore.apps.cli._output import say
+from sgstore.apps.cli._sarif import write_sarif
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from sgstore.collection import CollectionChecks
     from sgstore.matches import Interval
@@ -44,6 +45,7 @@ def check(
     explain: bool = False,
     require: bool = False,
     junit: Path | None = None,
+    sarif: Path | None = None,
     library: bool = False,
     *,
     whole: CollectionOptions,
@@ -65,6 +67,8 @@ def check(
         End with exit code 4 if a trace violates a check.
     junit : FILE
         Also write the verdicts as JUnit XML, for build servers.
+    sarif : FILE
+        Also write the violations as SARIF 2.1.0, for code scanning.
     library
         Check all properties of the library, in one run.
     """
@@ -79,18 +83,55 @@ def check(
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask) as opened:
             asked_of = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
-            return _reported(asked_of, ask, explain=explain, require=require, junit=junit)
-    run = ask.opened(store).check(text, sgsm_compat=statements.sgsm_compat, **values)
-    return _reported(run, ask, explain=explain, require=require, junit=junit)
+            files = ReportFiles(str(store), junit, sarif, _recordings(opened.traces()))
+            return _reported(asked_of, ask, files, explain=explain, require=require)
+    opened = ask.opened(store)
+    run = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
+    files = ReportFiles(str(store), junit, sarif, _recordings(map(asdict, opened.traces())))
+    return _reported(run, ask, files, explain=explain, require=require)
+
+
+def _recordings(traces: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """Return the recording of each trace."""
+    return {one["name"]: Path(str(one.get("path") or one["name"])).as_posix() for one in traces}
+
+
+@dataclass(frozen=True)
+class ReportFiles:
+    """Files that ``check`` writes for other programs, and the data that they need.
+
+    Attributes
+    ----------
+    store : str
+    junit, sarif : Path or None
+    recordings : dict of str to str
+        Trace name → its recording.
+    """
+
+    store: str
+    junit: Path | None
+    sarif: Path | None
+    recordings: dict[str, str]
+
+    def __bool__(self) -> bool:
+        """True if there is a file to write."""
+        return self.junit is not None or self.sarif is not None
+
+    def write(self, verdicts: Sequence[Verdict]) -> None:
+        """Write the files."""
+        if self.junit is not None:
+            write_junit(self.junit, verdicts)
+        if self.sarif is not None:
+            write_sarif(self.sarif, verdicts, self.store, self.recordings)
 
 
 def _reported(
     run: CheckRun | CollectionChecks,
     ask: AskOptions,
+    files: ReportFiles,
     *,
     explain: bool,
     require: bool,
-    junit: Path | None,
 ) -> int:
     """Print the verdicts of CHECK statements, or their explanation, and return the exit code."""
     from sgstore.temporal import columns_returned, verdict_columns, verdict_rows
@@ -106,7 +147,7 @@ def _reported(
 
     def counted() -> Iterator[Verdict]:
         for verdict in run:
-            if junit is not None or verdict.reason:
+            if files or verdict.reason:
                 kept.append(verdict)
             if verdict.absent_frames:
                 absent[verdict.check] = absent.get(verdict.check, 0) + verdict.absent_frames
@@ -133,9 +174,8 @@ def _reported(
     say_unknown((one.check, one.trace, one.reason) for one in kept)
     for one, frames in absent.items():
         say(f"{one} is true, and an entity is absent in {frames} frame{'s' * (frames != 1)}")
-    if junit is not None:
-        write_junit(junit, kept)
-    if tally["false"] and not require and junit is None and ask.for_people:
+    files.write(kept)
+    if tally["false"] and not require and not files and ask.for_people:
         say(f"exit code 0; --require makes it {NO_MATCH}")
     return NO_MATCH if require and tally["false"] else 0
 

@@ -1,0 +1,96 @@
+"""Violations as SARIF 2.1.0 for code scanning: one result per violation.
+
+Source: OASIS Standard, "Static Analysis Results Interchange Format (SARIF) Version 2.1.0", 2020.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import quote
+
+from sgstore.base.output_files import write_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+    from pathlib import Path
+
+    from sgstore.temporal import Verdict
+
+_SCHEMA: Final = "https://json.schemastore.org/sarif-2.1.0.json"
+_INFO: Final = "https://pypi.org/project/sgstore/"
+
+
+def write_sarif(
+    path: Path, verdicts: Iterable[Verdict], store: str, recordings: Mapping[str, str]
+) -> None:
+    """Write violations as a SARIF file: a rule for each check, a result for each violation.
+
+    A trace that cannot answer is a notification, not a result.
+
+    Parameters
+    ----------
+    path : Path
+    verdicts : iterable of Verdict
+    store : str
+        Store in the command that shows a violation.
+    recordings : mapping of str to str
+        Trace name → its recording.
+
+    Raises
+    ------
+    ExportError
+        The file cannot be written; an existing file stays unchanged.
+    """
+    from importlib.metadata import version
+
+    rules: dict[str, dict[str, Any]] = {}
+    results: list[dict[str, Any]] = []
+    notices: list[dict[str, Any]] = []
+    for one in verdicts:
+        rules.setdefault(one.check, {"id": one.check})
+        if one.verdict in {"unknown", "pending"}:
+            text = f"{one.check} is {one.verdict} for {one.trace}"
+            text = f"{text}: {one.reason}" if one.reason else text
+            notices.append({"level": "note", "message": {"text": text}})
+        results += (
+            {
+                "ruleId": one.check,
+                "level": "error",
+                "message": {"text": f"{span.trace}, {span.start:.3f} to {span.end:.3f} s"},
+                "locations": [_location(span.trace, recordings.get(span.trace, span.trace))],
+                "partialFingerprints": {"violation": f"{one.check}/{span.trace}#{span.start_seq}"},
+                "properties": {
+                    "trace": span.trace,
+                    "start": span.start,
+                    "end": span.end,
+                    "frames": span.frames,
+                    "values": {name: str(value) for name, value in span.values.items()},
+                    "command": shlex.join(
+                        ["sgstore", "show", store, f"{span.trace}#{span.start_seq}"]
+                    ),
+                },
+            }
+            for span in one.violations
+        )
+    driver = {
+        "name": "sgstore check",
+        "version": version("sgstore"),
+        "informationUri": _INFO,
+        "rules": [*rules.values()],
+    }
+    run = {
+        "tool": {"driver": driver},
+        "invocations": [{"executionSuccessful": True, "toolExecutionNotifications": notices}],
+        "results": results,
+    }
+    document = {"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}
+    write_bytes(path, json.dumps(document, indent=1).encode() + b"\n")
+
+
+def _location(trace: str, recording: str) -> dict[str, Any]:
+    return {
+        "physicalLocation": {"artifactLocation": {"uri": quote(recording)}},
+        "logicalLocations": [{"name": trace, "kind": "object"}],
+    }
