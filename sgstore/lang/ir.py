@@ -362,6 +362,8 @@ class SignalCall:
     frames : bool
         True if ``by``, or the result, counts frames; otherwise they are times.
     type : Type
+    ahead : int
+        Length of the part of a window after the frame; ns or frames.
     """
 
     word: str
@@ -369,10 +371,11 @@ class SignalCall:
     by: int = 0
     frames: bool = False
     type: Type = Type.number
+    ahead: int = 0
 
 
 WINDOWS: Final = ("min_over", "max_over", "avg_over", "sum_over")
-"""Functions over a window of the last frames."""
+"""Functions over a window of the last frames, or of frames on both sides."""
 
 ANGLES: Final = frozenset(
     {"heading", "pitch", "roll", "bearing", "rel_heading", "apparent_heading", "heading_error"}

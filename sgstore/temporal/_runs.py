@@ -331,7 +331,7 @@ class RunFinder:
 
     def _is_of_rows(self, value: b.Bound) -> bool:
         match value:
-            case b.SignalCall(word=word, operand=operand) if word in b.WINDOWS:
+            case b.SignalCall(word=word, operand=operand) if word in b.WINDOWS and not value.ahead:
                 plain = not b.is_temporal(operand) and self._is_of_rows(operand)
                 return plain and b.nodes_of(operand) == self._window_nodes
             case _ if b.is_formula(value):

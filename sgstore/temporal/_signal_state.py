@@ -75,6 +75,11 @@ class SignalState:
                         hint="join conditions by AND, OR, NOT, IMPLIES",
                     )
             for course in _courses(test.expression):
+                if course.ahead:
+                    raise QueryError(
+                        f"the window of {course.word}() has later frames, which a monitor does not have",
+                        hint=f"end the window at the frame: {course.word}(x, 2s)",
+                    )
                 self.places.setdefault(course, len(self.places))
             for condition, formula in test.formulas.items():
                 self.conditions[condition] = Progression(formula)

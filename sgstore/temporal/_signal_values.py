@@ -119,7 +119,9 @@ class SignalValues:
                 return self._delta(self.signal(test.signals[course.operand]), course)
             case word if word in b.WINDOWS:
                 signal = self.signal(test.signals[course.operand])
-                return over_columns(word, signal, self.window_starts(course))
+                return over_columns(
+                    word, signal, self.window_starts(course), self.window_ends(course)
+                )
             case "run_length":
                 return self._run_length(self.condition(course.operand, test), frames=course.frames)
             case "since_true":
@@ -157,6 +159,19 @@ class SignalValues:
             return np.maximum(here - (course.by - 1), begun)
         then = times - course.by - self.clock.tolerance
         return np.maximum(np.searchsorted(times, then, "left"), begun)
+
+    def window_ends(self, course: b.SignalCall) -> Ints | None:
+        """Return, for each frame, the frame after its time window, (F,). ``None``: windows end at the frame."""
+        if not course.ahead:
+            return None
+        times, frames = self.clock.times, len(self.clock.times)
+        here = np.arange(frames)
+        gaps = np.append(np.where(self.clock.gap_before, here, frames)[1:], frames)
+        over = np.minimum.accumulate(gaps[::-1])[::-1]
+        if course.frames:
+            return np.minimum(here + course.ahead + 1, over)
+        then = times + course.ahead + self.clock.tolerance
+        return np.minimum(np.searchsorted(times, then, "right"), over)
 
     def _delta(self, now: Column, course: b.SignalCall) -> Column:
         times = self.clock.times

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     Places = NDArray[np.int32 | np.int64]
 
 
-def over_columns(word: str, column: Column, first: Places) -> Column:
-    """Return, for each frame, an aggregate of the known values in the time window that ends there.
+def over_columns(word: str, column: Column, first: Places, end: Places | None = None) -> Column:
+    """Return, for each frame, an aggregate of the known values in its time window.
 
     Parameters
     ----------
@@ -36,6 +36,8 @@ def over_columns(word: str, column: Column, first: Places) -> Column:
         (B, F) the values.
     first : (F,) int
         The first frame of each window.
+    end : (F,) int, optional
+        The frame after the last one of each window. ``None``: the window ends at its frame.
 
     Returns
     -------
@@ -43,7 +45,7 @@ def over_columns(word: str, column: Column, first: Places) -> Column:
         (B, F); unknown if the window has no known value.
     """
     frames = len(first)
-    end = np.arange(1, frames + 1)
+    end = np.arange(1, frames + 1) if end is None else end
     shape = (*np.shape(column.values)[:-1], frames)
     values = np.broadcast_to(np.asarray(column.values, np.float64), shape)
     known = np.broadcast_to(column.known, shape)

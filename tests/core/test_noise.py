@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from sgstore.query import Store
+
 PERIOD = 0.1
 FRAMES = 150
 
@@ -166,3 +168,51 @@ def test_noise_can_be_set(tmp_path: Path) -> None:
         (outcome,) = store.ingest(path, config=sgstore.Config(noise=0.0))
         assert not any("noise" in words for words in outcome.warnings)
         assert store.find("MATCH (v) WHERE v.stands").count() == 0
+
+
+def test_windows_around_a_frame_equal_their_definition(open_town: Store) -> None:
+    rows = open_town.find(
+        "MATCH (e:Ego) RETURN frame.t AS t, e.speed AS v, min_over(e.speed, -1s..0.5s) AS low,"
+        " avg_over(e.speed, -3frames..2frames) AS mean"
+    ).rows()
+    t, v = np.array([row.t for row in rows]), np.array([row.v for row in rows])
+    near = [v[(t >= at - 1.001) & (t <= at + 0.501)] for at in t]
+    np.testing.assert_array_equal([row.low for row in rows], [part.min() for part in near])
+    mean = [v[max(0, i - 3) : i + 3].mean() for i in range(len(v))]
+    np.testing.assert_allclose([row.mean for row in rows], mean, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("query", "same"),
+    [
+        ("EVENTUALLY[-2s, 1s] p", "ONCE[0s, 2s] p OR EVENTUALLY[0s, 1s] p"),
+        ("ALWAYS[-2s, 1s] p", "HISTORICALLY[0s, 2s] p AND ALWAYS[0s, 1s] p"),
+        ("EVENTUALLY[-3s, -1s] p", "ONCE[1s, 3s] p"),
+        ("ONCE[-2s, 1s] p", "EVENTUALLY[0s, 2s] p OR ONCE[0s, 1s] p"),
+    ],
+)
+def test_bounds_on_both_sides_join_two_operators(open_town: Store, query: str, same: str) -> None:
+    found, expected = (
+        open_town.find(
+            f"MATCH (e:Ego) WHERE {text.replace('p', 'e.speed > 5')} RETURN frame.id AS f"
+        ).rows()
+        for text in (query, same)
+    )
+    assert found
+    assert found == expected
+
+
+@pytest.mark.parametrize(
+    ("condition", "words"),
+    [
+        ("e.speed > 5 UNTIL[-2s, 1s] e.speed < 3", "a bound of UNTIL cannot be negative"),
+        ("EVENTUALLY[2s, -1s] e.speed > 5", "the end of the bound is before its start"),
+        ("min_over(e.speed, -1s..3frames) > 1", "in time or in frames"),
+        ("-1s..1s > 3", "window of min_over"),
+    ],
+)
+def test_wrong_bounds_name_their_cause(open_town: Store, condition: str, words: str) -> None:
+    with pytest.raises(sgstore.QueryError, match=words):
+        open_town.find(f"MATCH (e:Ego) WHERE {condition}")
+    with pytest.raises(sgstore.QueryError, match="ends at the frame"):
+        open_town.check("CHECK ALWAYS min_over(ego.speed, -1s..1s) >= 0")

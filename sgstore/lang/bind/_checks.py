@@ -12,7 +12,7 @@ from sgstore.lang.bind._queries import chosen, refuse_strange, refuse_unused
 from sgstore.lang.bind._results import bind_column
 from sgstore.lang.bind._sequences import StepScope
 from sgstore.lang.bind._symbols import RESERVED, Session, Symbol, SymbolTable
-from sgstore.lang.bind._temporal import settled
+from sgstore.lang.bind._temporal import refuse_ahead, settled
 from sgstore.lang.bind._world_scope import looks_less
 from sgstore.lang.catalog import Catalog, Type
 from sgstore.lang.syntax import tree as s
@@ -92,6 +92,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
     names = SymbolTable(session, scope)
     quantifiers = tuple(_quantifier(one, names, scope) for one in written.quantifiers)
     formula = settled(names.condition(written.formula), session)
+    refuse_ahead(formula, written.span, names)
     reset = None
     if written.reset is not None:
         reset = settled(names.condition(written.reset), session)

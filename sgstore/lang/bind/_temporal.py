@@ -145,7 +145,14 @@ def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
     word = _WINDOWS[normalize_name(e.name)]
     value = names.number(e.arguments[0])
     _refuse_nested(e, value, names)
-    by = _how_far(e, names)
+    ahead = b.Length(0, frames=False)
+    if isinstance(window := e.arguments[1], s.FrameWindow):
+        by, ahead = length(window.before, names), length(window.ahead, names)
+        if by.frames != ahead.frames:
+            names.session.refuse("a window must be in time or in frames, not both", window.span)
+        by = replace(by, amount=by.amount + by.frames)
+    else:
+        by = _how_far(e, names)
     if by.frames and not by.amount:
         names.session.refuse(
             f"{word}() needs at least one frame",
@@ -158,7 +165,26 @@ def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
             e.arguments[0].span,
             "average directions with atan2(avg_over(sin(radians(x)), 2s), avg_over(cos(radians(x)), 2s))",
         )
-    return b.SignalCall(word, value, by.amount, by.frames)
+    return b.SignalCall(word, value, by.amount, by.frames, ahead=ahead.amount)
+
+
+def refuse_window(e: s.FrameWindow, names: SymbolTable) -> b.Bound:
+    """Raise an error for a window outside of a function over time."""
+    names.session.refuse(
+        "-1s..1s is a window of min_over, max_over, avg_over or sum_over",
+        e.span,
+        "write min_over(x, -1s..1s)",
+    )
+
+
+def refuse_ahead(found: b.Bound, span: TextSpan, names: SymbolTable) -> None:
+    """Raise an error for a window with later frames in a check, which must decide without them."""
+    if any(isinstance(part, b.SignalCall) and part.ahead for part in b.walk(found)):
+        names.session.refuse(
+            "a window of a CHECK ends at the frame",
+            span,
+            "write min_over(x, 2s), or EVENTUALLY[-1s, 1s] p for a condition",
+        )
 
 
 def _run_length(e: s.Call, names: SymbolTable) -> b.SignalCall:

@@ -195,6 +195,9 @@ def _over_time(value: Tense | SignalCall | StepTime | OverMatch, indent: str) ->
         case SignalCall(word=word, operand=operand):
             back = word in {"delta", *WINDOWS}
             by = f", {_length(value.by, frames=value.frames)}" if back else ""
+            if back and value.ahead:
+                before = value.by - value.frames
+                by = f", -{_length(before, frames=value.frames)}..{_length(value.ahead, frames=value.frames)}"
             counted = " in frames" if word in {"run_length", "since_true"} and value.frames else ""
             return f"{word}({value_text(operand, indent)}{by}){counted}"
         case StepTime(step=step):

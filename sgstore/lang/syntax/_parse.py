@@ -299,7 +299,16 @@ def _listed(machine: Tables, names: list[str]) -> str:
         left -= {"NOT"}
     if left >= _STARTS:
         said += ["a value", "a condition"]
-        left -= _STARTS | {"NAME", "LPAR", "LSQB", "COUNT", "AGGREGATE", "DURATION", "TEMPORAL"}
+        left -= _STARTS | {
+            "NAME",
+            "LPAR",
+            "LSQB",
+            "COUNT",
+            "AGGREGATE",
+            "DURATION",
+            "TEMPORAL",
+            "WINDOW",
+        }
         left -= {"CASE", "HAPPENS"}
         left -= {"SIGN", "NOT"}
     elif {"SIGN", "STAR"} <= left:

@@ -84,6 +84,12 @@ def _length(text: str, span: TextSpan) -> s.Duration:
     return s.Duration(amount, found[2].lower(), span)
 
 
+def rule_window(span: TextSpan, children: Children) -> s.FrameWindow:
+    """Return the syntax tree of a window around a frame: ``-1s..1s``."""
+    before, ahead = (part.strip() for part in children[0].text.strip("-").split(".."))
+    return s.FrameWindow(_length(before, span), _length(ahead, span), span)
+
+
 def rule_parameter(span: TextSpan, children: Children) -> s.Parameter:
     return s.Parameter(children[0].text[1:], span)
 
@@ -218,12 +224,53 @@ def rule_temporal(span: TextSpan, children: Children) -> s.Temporal:
     name, place = word.text.upper(), TextSpan(span.start, word.span.end)
     if name == "NEVER":
         operand = s.Logic("NOT", (operand,), place)
-    return s.Temporal(_SYNONYMS.get(name, name), (operand,), place, bound)
+    name = _SYNONYMS.get(name, name)
+    if bound is None or not any(_is_negative(end) for end in bound):
+        return s.Temporal(name, (operand,), place, bound)
+    return _around(name, operand, place, bound)
+
+
+def _is_negative(end: s.Duration | s.Parameter | None) -> bool:
+    return isinstance(end, s.Duration) and end.amount < 0
+
+
+_MIRRORED: Final = {
+    "ALWAYS": "HISTORICALLY",
+    "EVENTUALLY": "ONCE",
+    "HISTORICALLY": "ALWAYS",
+    "ONCE": "EVENTUALLY",
+}
+"""Temporal operators, with the operator of the other direction of time."""
+
+
+def _around(
+    name: str, operand: s.Expression, place: TextSpan, bound: tuple[Any, Any]
+) -> s.Temporal | s.Logic:
+    """Return a temporal operator over frames on both sides: ``EVENTUALLY[-2s, 2s] p``.
+
+    It is the operator with the part of the bound ahead, joined with its mirror image for the part before.
+    """
+    low, high = bound
+    if name not in _MIRRORED:
+        raise BuildError(f"a bound of {name} cannot be negative", place)
+    if not _is_negative(low):
+        raise BuildError("the end of the bound is before its start", place)
+    start = replace(high, amount=-high.amount) if _is_negative(high) else replace(low, amount=0)
+    before = s.Temporal(
+        _MIRRORED[name], (operand,), place, (start, replace(low, amount=-low.amount))
+    )
+    if _is_negative(high):
+        return before
+    nothing = s.Duration(0, high.unit if isinstance(high, s.Duration) else "s", place)
+    ahead = s.Temporal(name, (operand,), place, (nothing, high))
+    return s.Logic("OR" if name in {"EVENTUALLY", "ONCE"} else "AND", (before, ahead), place)
 
 
 def rule_temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
     left, word, bound, right = children
     name = word.text.upper()
+    if bound and any(map(_is_negative, bound)):
+        raise BuildError(f"a bound of {name} cannot be negative", word.span)
     if name == "UNLESS":  # weak until: the right operand releases the left one, and may replace it
         left, right = right, s.Logic("OR", (left, right), word.span)
         name = "RELEASE"
@@ -242,6 +289,9 @@ def rule_bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
 def _end(text: str, span: TextSpan) -> s.Duration | s.Parameter:
     if text.startswith("$"):
         return s.Parameter(text[1:], span)
+    if text.startswith("-"):
+        found = _length(text[1:].strip(), span)
+        return replace(found, amount=-found.amount)
     return _length(text, span)
 
 

@@ -42,6 +42,15 @@ class Duration:
 
 
 @dataclass(frozen=True, slots=True)
+class FrameWindow:
+    """Time around a frame, ``-1s..2s``: ``before`` and ``ahead`` of it."""
+
+    before: Duration
+    ahead: Duration
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
 class Parameter:
     """Query parameter ``$name``. Its value is passed with the query."""
 
@@ -233,6 +242,7 @@ Expression = (
     | Temporal
     | OverExpression
     | HappensExpression
+    | FrameWindow
 )
 
 
