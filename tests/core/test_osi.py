@@ -1106,12 +1106,21 @@ def test_odd_host_ids(
     assert any(word in warning for warning in report.warnings) if word else not report.warnings
 
 
-def test_a_host_that_changes_is_said_and_the_first_is_the_ego(tmp_path: Path) -> None:
-    frames = [{"moving": [car(1), car(2)], "host": 1 + i // 2} for i in range(4)]
-    info, _, report = read(record(tmp_path / "a.mcap", frames))
+def test_the_ego_follows_a_host_that_changes(tmp_path: Path) -> None:
+    hosts = [1, 1, None, 2, 2, 77, 1]
+    frames = [{"moving": [car(1), car(2)], "host": host} for host in hosts]
+    path = record(tmp_path / "a.mcap", frames)
+    info, blocks, report = read(path)
+
+    def egos(blocks: list[FrameBlock]) -> list[str]:
+        idents = [ident for block in blocks for ident in block.entities.ident]
+        return [idents[node] for block in blocks for node in block.ego.tolist()]
 
     assert info.ego == "1"
-    assert report.warnings == ["several host vehicles (ids 1, 2); the first one is the ego"]
+    assert egos(blocks) == ["1", "1", "1", "2", "2", "2", "1"]
+    assert report.warnings == ["several host vehicles (ids 1, 2); the ego is that of each message"]
+    with open_trace(path, ego="2") as trace:
+        assert egos(list(trace.blocks())) == ["2"] * 7
 
 
 def test_a_truth_split_over_messages_of_one_time_is_one_frame(tmp_path: Path) -> None:

@@ -142,6 +142,34 @@ def test_lights_show_what_the_file_beside_says(tmp_path: Path) -> None:
         open_trace(fcd)
 
 
+def test_sizes_of_vehicles_come_from_their_types_or_a_warning_follows(tmp_path: Path) -> None:
+    kinds_of = {"a": "sedan", "b": "liner", "c": "odd", "d": "DEFAULT_VEHTYPE", "e": "liner"}
+    things = [vehicle(one, 9 * i, 0, type=kind) for i, (one, kind) in enumerate(kinds_of.items())]
+    things[4] = vehicle("e", 50, 0, type="liner@x", length=7.0)
+    path = written(tmp_path / "drive.fcd.xml", export(step(0, *things)))
+    _, blocks, report = read(path)
+
+    assert told(states(blocks)[0], "d", "length", "width") == [5.0, 1.8]
+    assert [warning.split("'")[1] for warning in report.warnings if "no size" in warning] == [
+        *("liner", "odd", "sedan")
+    ]
+    types = (
+        '<vType id="sedan" length="4.1" width="1.7"/><vType id="liner" vClass="bus" length="18"/>'
+    )
+    written(tmp_path / "drive.rou.xml", f"<routes>{types}</routes>")
+    _, blocks, report = read(path)
+
+    frame = states(blocks)[0]
+    assert [told(frame, one, "length", "width") for one in "abe"] == [
+        *([4.1, 1.7], [18.0, 2.5], [7.0, 2.5])
+    ]
+    assert kinds(blocks)["b"] == "bus"
+    assert [warning for warning in report.warnings if "'liner'" in warning] == []
+    written(tmp_path / "drive.rou.xml", "<routes>")
+    with pytest.raises(TraceError, match="vehicle types cannot be read"):
+        open_trace(path)
+
+
 def test_files_in_gzip_are_read_as_they_are(tmp_path: Path) -> None:
     plain = written(tmp_path / "drive.fcd.xml", drive(20))
     packed, net = tmp_path / "packed.fcd.xml.gz", tmp_path / "town.net.xml.gz"

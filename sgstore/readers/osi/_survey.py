@@ -179,7 +179,7 @@ class Cast:
         hosts = [host for host in self.hosts if host in self.names]
         if len(hosts) > 1:
             told = ", ".join(str(host) for host in hosts[:LISTED])
-            notes.append(f"several host vehicles (ids {told}); the first one is the ego")
+            notes.append(f"several host vehicles (ids {told}); the ego is that of each message")
         if hosts:
             return hosts[0]
         named = [
@@ -320,7 +320,9 @@ class OsiSurvey(Survey[OsiLead]):
     statics : Statics
         The static objects.
     ego : int or None
-        Id of the ego.
+        Id of the first ego.
+    follows : bool
+        True if the host vehicle of each message is the ego.
     signals : dict
         First bulb of each traffic light with assigned lanes → its signal in the map of the lanes.
     """
@@ -331,6 +333,7 @@ class OsiSurvey(Survey[OsiLead]):
         self.cast = Cast()
         self.statics = Statics()
         self.ego: int | None = None
+        self.follows = False
         self.signals: dict[int, LaneSignal] = {}
         self._maps: dict[int, type[Any]] = {}
         self._map_refs: list[Ref] = []
@@ -358,6 +361,7 @@ class OsiSurvey(Survey[OsiLead]):
     def find_ego(self) -> str:
         """Find the ego among the moving objects, and return its id text."""
         self.ego = self.cast.ego(self.wanted, self.about_ego)
+        self.follows = not self.wanted and self.ego in self.cast.hosts
         return "" if self.ego is None else self.cast.idents()[self.ego]
 
     def role(self, channel: int) -> str:

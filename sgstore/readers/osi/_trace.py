@@ -44,7 +44,7 @@ from sgstore.readers.osi._schema import (
     part_class,
     time_of,
 )
-from sgstore.readers.osi._survey import OsiSurvey, is_key, keys_of, schema_name
+from sgstore.readers.osi._survey import OsiSurvey, hosts_of, is_key, keys_of, schema_name
 
 if TYPE_CHECKING:
     from sgstore.mcap import Messages, Recording
@@ -181,6 +181,8 @@ class OsiRawFrame:
         Node id of each moving object, without duplicates.
     objects : list of bytes
         The moving objects.
+    host : int or None
+        Id of the host vehicle in its messages.
     """
 
     time_ns: int
@@ -190,6 +192,7 @@ class OsiRawFrame:
     own: tuple[float, ...] = NO_INPUTS
     nodes: list[int] = field(default_factory=list[int])
     objects: list[bytes] = field(default_factory=list[bytes])
+    host: int | None = None
 
 
 class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
@@ -289,18 +292,19 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         turned = usable & (np.abs(values[:, _HEADING]) > math.pi)
         values[turned, _HEADING] = np.remainder(values[turned, _HEADING] + np.pi, 2 * np.pi) - np.pi
         node = np.array([node for frame in frames for node in frame.nodes], np.int64)
-        ego = self._nodes.get(self._ego, -1) if self._ego is not None else -1
-        of_ego, stands = node == ego, np.full(len(node), -1, np.int64)
+        stands = np.full(len(node), -1, np.int64)
         whole = bool(usable.all())
         kinds = self._other_kinds(frames, node, np.where(usable, codes, -1), objects)
         done: list[FrameRows] = []
         start = 0
         for frame in frames:
             rows = slice(start, start + len(frame.objects))
+            self._ego = self._ego if frame.host is None else frame.host
+            ego = -1 if self._ego is None else self._nodes.get(self._ego, -1)
             one = FrameRows(
                 time_ns=frame.time_ns,
                 log_time_ns=frame.log_time_ns,
-                ego=ego if of_ego[rows].any() else -1,
+                ego=ego if ego in frame.nodes else -1,
                 node=node[rows],
                 values=values[rows],
                 lights=lights[rows],
@@ -380,6 +384,9 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
                     frame.nodes.append(node)
                     frame.objects.append(content)
         frame.heads = self._lights.rows()
+        if self._survey.follows and frame.host is None and message is not None:
+            known = self._survey.cast.names
+            frame.host = next((host for host in hosts_of(message) if host in known), None)
         if self._controls is NO_INPUTS and not self._has_controls:
             return
         data = getattr(message, "host_vehicle_data", None)

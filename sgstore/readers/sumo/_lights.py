@@ -41,11 +41,16 @@ def lights_beside(path: Path) -> Path | None:
 
     For ``drive.fcd.xml``, this is ``drive.tls.xml``.
     """
+    return file_beside(path, "tls")
+
+
+def file_beside(path: Path, kind: str) -> Path | None:
+    """Return the path of the SUMO file of a kind next to a recording, or ``None``."""
     name = path.name
     for ending in (*ENDINGS, ".fcd"):
         if name.lower().endswith(ending):
             name = name[: -len(ending)]
-    found = [path.with_name(f"{name}.tls{ending}") for ending in ENDINGS]
+    found = [path.with_name(f"{name}.{kind}{ending}") for ending in ENDINGS]
     return next((one for one in found if one.is_file()), None)
 
 

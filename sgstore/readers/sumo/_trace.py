@@ -1,10 +1,10 @@
 """Reader of SUMO floating-car data: ``sumo --fcd-output drive.fcd.xml``.
 
 A frame is a time step, at its own time. SUMO stores the centre of the front bumper, and a direction clockwise
-from north; in sgstore, the position is the centre of the box. Time steps do not contain the size of a vehicle.
-It is SUMO's default for its kind, unless attributes ``length``, ``width`` and ``height`` exist. The type name
-determines the kind of a vehicle. The states of traffic lights come from a separate file, ``drive.tls.xml``;
-their positions come from the road map.
+from north; in sgstore, the position is the centre of the box. The size of a vehicle is in the attributes
+``length``, ``width`` and ``height``, or in its ``vType`` in ``drive.rou.xml`` or ``drive.add.xml``. The default
+is that of SUMO for its kind. The type name or the ``vClass`` determines the kind. The states of traffic lights
+come from a separate file, ``drive.tls.xml``; their positions come from the road map.
 
 Source: SUMO documentation, "FCDOutput", "Vehicle Type Parameter Defaults" and "Vehicle Signaling" (Eclipse,
 EPL-2.0).
@@ -24,11 +24,13 @@ from sgstore.model.world import LARGEST
 from sgstore.readers._base import FramesTrace, TraceMessage, light_places
 from sgstore.readers.sumo._file import STEP, time_ns
 from sgstore.readers.sumo._lights import LightStates, lights_beside
+from sgstore.readers.sumo._types import VehicleType, read_types, types_beside
 
 if TYPE_CHECKING:
     from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Recording
-    from sgstore.model.world import Channel
+    from sgstore.model.world import Channel, TraceReport
+    from sgstore.readers._base import _FramesDecoder
 
 MAX_ENTITIES: Final = 1_000_000
 
@@ -57,6 +59,7 @@ _WORDS: Final = (
     *((word, "car") for word in ("passenger", "taxi", "car", "default_vehtype", "vehtype")),
 )
 """Part of a type name → kind; the first match counts."""
+_SIZE: Final = ("length", "width", "height")
 _SIGNALS: Final = {"light_right": 0x1, "light_left": 0x2, "light_brake": 0x8}
 _BACK: Final = 0x80
 _SPECIAL: Final = (("emergency", "emergency"), ("police", "emergency"), ("taxi", "taxi"))
@@ -81,16 +84,25 @@ class SumoTrace(FramesTrace):
     name: ClassVar[str] = "sumo"
 
     def __init__(self, recording: Recording, *, ego: str = "", digest: str = "") -> None:
+        self._types = read_types(types_beside(recording.path))
         super().__init__(recording, ego=ego, digest=digest)
         beside = lights_beside(recording.path)
         self._lights = None if beside is None else LightStates(beside)
         self._signals: dict[str, tuple[float, float, float]] = {}
-        if beside is not None:
-            self.info = replace(self.info, mapping=digest_of(beside))
+        files = [*([beside] if beside else []), *types_beside(recording.path)]
+        if files:
+            self.info = replace(self.info, mapping="+".join(map(digest_of, files)))
 
     def start(self) -> None:
         """Reset the reader, before the messages are read again from the first one."""
         self._owners: dict[str, str] = {}
+        self._guessed: set[str] = set()
+
+    def decoder(self, report: TraceReport) -> _FramesDecoder:
+        """Return a new decoder. It reports the vehicle types without a size."""
+        found = super().decoder(report)
+        self._warnings = report.warnings
+        return found
 
     def on_map(self, road_map: RoadMap | None) -> None:
         """Find the positions of the traffic lights in the road map."""
@@ -106,12 +118,18 @@ class SumoTrace(FramesTrace):
         """Convert a SUMO time step to a frame."""
         time = time_ns(message.data)
         frame = Frame(message.log_time_ns if time is None else time)
-        step = _TimeStep(frame, self._owners)
+        step = _TimeStep(frame, self._owners, self._types)
         try:
             parser = MarkupParser(step.start, most=MAX_ENTITIES, whose="recordings")
             parser.feed(message.data, last=True)
         except MarkupError as error:
             raise ValueError(str(error)) from error
+        for name in sorted(step.guessed - self._guessed):
+            what = "has no size; SUMO's default for its kind counts: put its vType into"
+            self._warnings.append(
+                f"vehicle type {name!r} {what} a file NAME.rou.xml beside the recording"
+            )
+        self._guessed |= step.guessed
         for name, place in self._signals.items():
             shown = None if self._lights is None else self._lights.of(name, frame.time_ns)
             if shown is not None:
@@ -134,8 +152,9 @@ class _TimeStep:
     SUMO may have a vehicle and a person with the same name. ``owners``: the first element with each name.
     """
 
-    def __init__(self, frame: Frame, owners: dict[str, str]) -> None:
-        self._frame, self._owners = frame, owners
+    def __init__(self, frame: Frame, owners: dict[str, str], types: dict[str, VehicleType]) -> None:
+        self._frame, self._owners, self._types = frame, owners, types
+        self.guessed: set[str] = set()
         self._idents: set[str] = set()
 
     def start(self, tag: str, told: dict[str, str], _depth: int) -> None:
@@ -150,12 +169,17 @@ class _TimeStep:
         self._idents.add(ident)
         walks = tag == "person"
         type_name = told.get("type", "")
-        meaning = (
-            TypeMeaning("prop", "", tag)
-            if tag == "container"
-            else meaning_of(type_name, walks=walks)
-        )
+        known = self._types.get(type_name) or self._types.get(type_name.partition("@")[0])
+        meaning = meaning_of(type_name, walks=walks)
+        if tag == "container":
+            meaning = TypeMeaning("prop", "", tag)
+        elif known is not None and known.vehicle_class and type_name.lower() not in type_meanings():
+            meaning = meaning_of(known.vehicle_class, walks=walks)
         size = SIZES.get(meaning.kind, (math.nan,) * 3)
+        if known is not None:
+            size = tuple(known.sizes.get(one, own) for one, own in zip(_SIZE, size, strict=True))
+        elif "length" not in told and type_name and not type_name.startswith("DEFAULT_"):
+            self.guessed.add(type_name)
         length = _number(told, "length", size[0])
         width, height = _number(told, "width", size[1]), _number(told, "height", size[2])
         heading = math.radians(90.0 - _number(told, "angle"))

@@ -1,0 +1,68 @@
+"""Vehicle types of SUMO (sizes and classes) from the route file next to a recording.
+
+Source: SUMO documentation, "Definition of Vehicles, Vehicle Types, and Routes" (Eclipse, EPL-2.0).
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from sgstore.base.markup import MarkupError, MarkupParser, number
+from sgstore.errors import TraceError
+from sgstore.model.world import LARGEST
+from sgstore.readers.sumo._file import opened
+from sgstore.readers.sumo._lights import file_beside
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+MAX_TYPES: Final = 1_000_000
+"""Maximum number of vehicle types in a file."""
+_SIZES: Final = ("length", "width", "height")
+_PIECE: Final = 1 << 20
+
+
+class VehicleType(NamedTuple):
+    """Vehicle type of SUMO: its class, such as ``passenger``, and its known sizes; m."""
+
+    vehicle_class: str
+    sizes: dict[str, float]
+
+
+def types_beside(path: Path) -> list[Path]:
+    """Return the paths of the SUMO files with vehicle types next to a recording.
+
+    For ``drive.fcd.xml``, these are ``drive.rou.xml`` and ``drive.add.xml``.
+    """
+    return [one for kind in ("rou", "add") if (one := file_beside(path, kind)) is not None]
+
+
+def read_types(paths: list[Path]) -> dict[str, VehicleType]:
+    """Read the vehicle types of SUMO files: id → type.
+
+    Raises
+    ------
+    TraceError
+        A file cannot be read.
+    """
+    types: dict[str, VehicleType] = {}
+
+    def start(tag: str, attributes: dict[str, str], _depth: int) -> None:
+        if tag == "vType" and "id" in attributes:
+            sizes = {name: number(attributes[name]) for name in _SIZES if name in attributes}
+            known = {name: size for name, size in sizes.items() if 0 < size <= LARGEST}
+            types[attributes["id"]] = VehicleType(attributes.get("vClass", ""), known)
+            if len(types) > MAX_TYPES:
+                raise MarkupError(f"more than {MAX_TYPES:,} vehicle types")
+
+    for path in paths:
+        parser = MarkupParser(start, most=None, whose="recordings")
+        try:
+            with opened(path) as file:
+                while piece := file.read(_PIECE):
+                    parser.feed(piece)
+            parser.feed(b"", last=True)
+        except (MarkupError, OSError, EOFError, zlib.error) as error:
+            raise TraceError(f"vehicle types cannot be read: {error}", path=path) from error
+    return types
