@@ -93,6 +93,7 @@ READERS: Final = Registry(
     "sgstore.readers",
     _in(
         "readers",
+        sgstore="osi._recorded:RecordedTrace",
         osi="osi._trace:OsiTrace",
         carla="carla._trace:CarlaTrace",
         autoware="autoware._trace:AutowareTrace",

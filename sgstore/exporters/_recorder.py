@@ -1,4 +1,4 @@
-"""Recorder of a live simulator run as one MCAP file: frames as OSI, the road map, and sensor data.
+"""Recorder of a live simulator run as one MCAP file: frames as OSI and exactly, the road map, sensor data.
 
 Log times are simulation times; they join sensors and frames to the nanosecond. The file has a
 temporary name until it is finished; memory does not grow with its length.
@@ -6,6 +6,7 @@ temporary name until it is finished; memory does not grow with its length.
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
 TRUTH: Final = "ground_truth"
 MAP_TOPIC: Final = "ground_truth_map"
 """Topics of the frames and of the road map, as used by other producers."""
+
+FRAMES, FRAMES_SCHEMA = "sgstore/frames", "sgstore.Frame"
+"""Topic and schema of the exact frames, because OSI lacks some values."""
 
 PROTOBUF: Final = "protobuf"
 _JSON_SCHEMA: Final = b'{"type": "object", "properties": {"timestamp": {"type": "object"}}}'
@@ -142,6 +146,8 @@ class Recorder:
                 self._write(MAP_TOPIC, schema, time_ns, data)
         schema = (SENSOR_VIEW, PROTOBUF, types()[2])
         self._write(TRUTH, schema, time_ns, self._osi.message(frame))
+        exact = json.dumps(frame.as_dict(), allow_nan=False, separators=(",", ":")).encode()
+        self._write(FRAMES, (FRAMES_SCHEMA, "jsonschema", _JSON_SCHEMA), time_ns, exact, "json")
         self._times = (self._times[0] if self._times else time_ns, time_ns)
         self._frames += 1
 

@@ -72,6 +72,7 @@ __all__ = ["REMEMBERED", "Entity", "Frame", "Replay", "Stepper", "check_entities
 _NAN: Final = math.nan
 _LIGHT: Final = 1
 NUMBERS: Final = (*POSE, *INPUTS)
+_TEXTS: Final = ("ident", "special", "subkind", "type_name", "map_ref", "trailer")
 WHOLE: Final = ("lights", "light_state", "derived")
 """Columns of :attr:`Entity.numbers` and :attr:`Entity.whole`, named as in ``States``."""
 _ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
@@ -326,6 +327,70 @@ class Frame:
                 own=valid_attributes(own) or None,
             )
         )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the frame as plain values for JSON. Unknown numbers are ``None``, angles are in radians.
+
+        Examples
+        --------
+        >>> frame = sgstore.Frame(5, ego="hero")
+        >>> frame.add("hero", "car", 1.5, 0)
+        >>> sgstore.Frame.from_dict(frame.as_dict()).entities == frame.entities
+        True
+        """
+        entities: list[dict[str, Any]] = []
+        for entity in self.entities:
+            told = {name: getattr(entity, name) for name in _TEXTS if getattr(entity, name)}
+            told |= {"kind": KINDS[entity.kind], "static": entity.static, "whole": [*entity.whole]}
+            told["numbers"] = [None if math.isnan(one) else one for one in entity.numbers]
+            entities.append(told | ({"own": dict(entity.own)} if entity.own else {}))
+        told = {"time_ns": self.time_ns, "ego": self.ego, "entities": entities}
+        return told | {"events": [*map(list, self.events)], "recorded": sorted(self.recorded)}
+
+    @classmethod
+    def from_dict(cls, told: Mapping[str, Any]) -> Frame:
+        """Return the frame of plain values, the inverse of :meth:`as_dict`.
+
+        Raises
+        ------
+        ValueError
+            A value is malformed, or a kind is unknown.
+        KeyError
+            A value is missing.
+        TypeError
+            A value has another type.
+
+        Examples
+        --------
+        >>> sgstore.Frame.from_dict({"time_ns": 5, "ego": "", "entities": [], "events": [], "recorded": []})
+        Frame(5, ego='', 0 entities)
+        """
+        frame = cls(int(told["time_ns"]), str(told["ego"]))
+        frame.recorded = frozenset(map(str, told["recorded"]))
+        for event in told["events"]:
+            frame.happened(*map(str, event))
+        for one in told["entities"]:
+            numbers = tuple(_NAN if number is None else float(number) for number in one["numbers"])
+            lights, state, derived = map(int, one["whole"])
+            if len(numbers) != len(NUMBERS) or math.inf in map(abs, numbers):
+                raise ValueError(f"an entity has {len(numbers)} numbers, or an infinite one")
+            if not (-1 <= lights < 1 << len(VEHICLE_LIGHTS) and -1 <= state < len(LIGHT_STATES)):
+                raise ValueError(f"an entity has impossible lights: {lights}, {state}")
+            texts = {name: str(one.get(name, "")) for name in _TEXTS}
+            frame.entities.append(
+                Entity(
+                    kind=_kind_code(str(one["kind"])),
+                    static=bool(one["static"]),
+                    numbers=(
+                        *frame._plausible(texts["ident"], numbers[: len(POSE)]),
+                        *numbers[len(POSE) :],
+                    ),
+                    whole=(lights, state, derived),
+                    own=valid_attributes(dict(one.get("own") or {})) or None,
+                    **texts,
+                )
+            )
+        return frame
 
     def _plausible(self, ident: str, pose: tuple[float, ...]) -> tuple[float, ...]:
         """Return pose and motion values without implausible ones, which are reported as lost."""

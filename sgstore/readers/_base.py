@@ -911,6 +911,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
             np.array([e.whole[0] for e in rows], np.int64),
             np.array([e.whole[1] for e in rows], np.int64),
             driven=_driven(moving),
+            own={node: dict(entity.own) for node, entity in moving.items() if entity.own},
             kinds={
                 node: (_meaning(entity), entity.type_name)
                 for node, entity in moving.items()

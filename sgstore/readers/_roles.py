@@ -44,6 +44,7 @@ _SCHEMAS: Final = {
     "commonroad.Step": STATES,
     "sumo.Timestep": STATES,
     "carla.RecorderFrame": STATES,
+    "sgstore.Frame": STATES,
     "py123d.Map": MAP,
     "py123d.Frame": STATES,
     "av2.Map": MAP,

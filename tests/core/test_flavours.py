@@ -33,9 +33,11 @@ import sgstore
 from sgstore import Frame, SceneGraphGenerator
 from sgstore.base import plugins
 from sgstore.errors import TraceError
+from sgstore.exporters import Recorder
 from sgstore.ingest import ingest
 from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config
+from sgstore.model.vocabulary import ENTITY_KINDS, KINDS
 from sgstore.model.world import Channel, FrameBlock, States, TraceInfo, TraceReport
 from sgstore.readers import (
     READERS,
@@ -88,7 +90,26 @@ def steps(path: Path) -> Path:
     return commonroad_scenarios.as_mcap(path, source)
 
 
+def recorded(path: Path, frames: int = 25) -> Path:
+    """A car behind a prop that moves, with inputs and an event, as the recorder of a live run writes them."""
+    still = dict.fromkeys(("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"), 0.0)
+    with Recorder(path, map_text=a_map(a_road("1", line(100))), map_name="town.xodr") as recorder:
+        for i in range(frames):
+            frame = Frame(i * 10**8, ego="hero")
+            about = {"length": 4.5, "width": 1.9, "height": 1.5, "special": "taxi"}
+            inputs = {"steer": 0.1, "hand_brake": False, "lights": ["light_fog", "light_interior"]}
+            frame.add("hero", "car", i / 3, 0.1, 0.7, heading=i / 7, **about, **inputs)
+            frame.add("can", "prop", 9.0 - i, 2.0, 0.2, subkind="barrel", type_name="static.prop.x")
+            frame.add("rail", "barrier", 30.0, 5.0, 0.5, subkind="rail", static=True)
+            frame.add("lamp", "traffic_light", 40.0, 5.0, 3.0, light_state="flashing", **still)
+            if i == 7:
+                frame.happened("collision", "hero", "can")
+            recorder.frame(frame)
+    return path
+
+
 EXAMPLES = {
+    "sgstore": recorded,
     "osi": lambda path: recordings.drive(path, frames=25, chunk_size=3000),
     "carla": lambda path: carla_recordings.drive(path, frames=25, chunk_size=3000),
     "autoware": lambda path: autoware_recordings.drive(path, frames=25, chunk_size=3000),
@@ -200,6 +221,48 @@ def test_reading_again_gives_the_same(example: Path) -> None:
         assert trace.info.digest == read(example)[0].digest
     for name in States.__dataclass_fields__:
         np.testing.assert_array_equal(column(first, name), column(second, name))
+
+
+def test_a_recorder_gives_its_input_unchanged(tmp_path: Path) -> None:
+    """Every kind and every value, to the last bit."""
+    rng, frames = np.random.default_rng(3), []
+    names = [*"xyz", "heading", "pitch", "roll", *("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate")]
+    for step in range(4):
+        frame = Frame(step * 10**8, ego="car 0")
+        for number, kind in enumerate(ENTITY_KINDS):
+            numbers = dict(zip(names, rng.normal(0, 3, len(names)).tolist(), strict=True))
+            more: dict[str, Any] = {"subkind": "own", "type_name": f"x.{kind}", "map_ref": "m7"}
+            more |= {"special": "electric", "lights": ["light_special1"], "gear": -1, "brake": 0.3}
+            more |= {"light_state": "red_yellow"} if kind == "traffic_light" else {}
+            frame.add(f"{kind} {number}", kind, **numbers, **more, length=2.0, hand_brake=True)
+            frame.add(f"{kind} point", kind, step, 0.0)
+        frame.add("house", "building", 3.0, 4.0, static=True, subkind="church")
+        frame.happened("collision", "car 0", "prop point")
+        frames.append(frame)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        for frame in frames:
+            recorder.frame(frame)
+
+    with open_trace(tmp_path / "a.mcap") as trace:
+        assert trace.info.flavour == "sgstore"
+        made = [trace.frame(message) for message in messages_of(tmp_path / "a.mcap", trace)]
+        (block,) = trace.blocks()
+    assert repr([one.as_dict() for one in made]) == repr([one.as_dict() for one in frames])
+    assert all(one.events == frame.events for one, frame in zip(made, frames, strict=True))
+    kinds = dict(
+        zip(block.entities.ident, (KINDS[code] for code in block.entities.kind), strict=True)
+    )
+    assert kinds == {entity.ident: KINDS[entity.kind] for entity in frames[0].entities}
+    x = [one.numbers[0] for one in frames[0].entities if not one.static]
+    assert block.states.x[: block.offsets[1]].tolist() == x
+    assert len(block.events) == 4
+
+
+def messages_of(path: Path, trace: Any) -> list[TraceMessage]:
+    (channel,) = (one for one in trace.info.channels if one.schema == "sgstore.Frame")
+    with path.open("rb") as stream:
+        found = make_reader(stream).iter_messages(topics=[channel.topic])
+        return [TraceMessage(channel, message.log_time, message.data) for _, _, message in found]
 
 
 # One more flavour is one file -----------------------------------------------------------------------------
@@ -541,7 +604,7 @@ def test_a_flavour_that_cannot_be_loaded_is_named_only_where_it_is_needed(
 def test_what_nobody_reads_is_answered_with_the_flavours_there_are(tmp_path: Path) -> None:
     with pytest.raises(
         TraceError,
-        match=r"flavour known \(osi, carla, autoware, foxglove, commonroad, sumo, .*\).*'world' \(toybox",
+        match=r"flavour known \(sgstore, osi, carla, autoware, foxglove, .*\).*'world' \(toybox",
     ):
         open_trace(toybox(tmp_path / "toys.mcap"))
 

@@ -154,6 +154,7 @@ def test_sensors_are_joined_to_frames_by_their_time(tmp_path: Path) -> None:
     assert done.written.messages == {
         "ground_truth_map": 1,
         "ground_truth": frames,
+        "sgstore/frames": frames,
         "/ego/front/image": frames,
         "/ego/front/calibration": 1,
         "/ego/roof/points": frames,

@@ -192,6 +192,7 @@ def _read_map(path: Path, lost: list[str]) -> bytes:
         LookupError,
         AttributeError,
         RecursionError,
+        OverflowError,
         MapError,
         TraceError,
     ) as error:

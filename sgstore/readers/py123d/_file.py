@@ -39,7 +39,15 @@ EGO_TYPE: Final = "EGO_VEHICLE"
 _BOX_KEY, _EGO_KEY, _LIGHT_KEY = "box_detections_se3", "ego_state_se3", "traffic_light_detections"
 _STATES: Final = ("green", "yellow", "red", "off", "unknown")
 _SCHEMA: Final = b'{"type":"object"}'
-_FAULTS: Final = (ValueError, TypeError, LookupError, AttributeError, MapError, TraceError)
+_FAULTS: Final = (
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    OverflowError,
+    MapError,
+    TraceError,
+)
 
 
 class Py123dFile(NumberedFile):
@@ -254,7 +262,7 @@ class _Lights:
         names = [f"{_LIGHT_KEY}.{name}" for name in ("timestamp_us", "lane_id", "status")]
         try:
             table = read_arrow_file(path, names, lost.append)
-            self._times = _times_of(table, _LIGHT_KEY)
+            times = _times_of(table, _LIGHT_KEY)
             lanes, states = (_column(table, _LIGHT_KEY, name) for name in ("lane_id", "status"))
         except TraceError as error:
             lost.append(f"states of traffic lights: {error.reason}")
@@ -264,8 +272,8 @@ class _Lights:
             self._shown.append(
                 {str(lane): _STATES[code] for lane, code in pairs if code is not None and code < 5}
             )
-        order = np.argsort(self._times, kind="stable")
-        self._times, self._shown = self._times[order], [self._shown[row] for row in order.tolist()]
+        order = np.argsort(times, kind="stable")
+        self._times, self._shown = times[order], [self._shown[row] for row in order.tolist()]
 
     def at(self, time_ns: int) -> dict[str, str]:
         """Return the states at a time: lane → state."""

@@ -58,7 +58,7 @@ def read_lanes(table: Any, lost: list[str]) -> Lanes:
         try:
             lines.append(_line(name, lane, layers[_LANE], crossings))
             points += len(lane["left_boundary"]) + len(lane["right_boundary"])
-        except (ValueError, TypeError, LookupError, AttributeError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
             lost.append(f"lane {name} cannot be used: {error}"[:200])
     if points > MAX_POINTS:
         raise MapError(f"more than {MAX_POINTS:,} points")

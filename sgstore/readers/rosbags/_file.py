@@ -67,10 +67,14 @@ class RosbagFile(MessageFile):
             self._bag: Ros1Bag | SqliteBag = Ros1Bag(path, self._losses.append)
         else:
             self._bag = SqliteBag(path, log_files(path) or [path], self._losses.append)
-        definitions = Definitions(self._bag, self._losses.append)
         self._convert: dict[int, Callable[[bytes], bytes]] = {}
-        for number, topic in self._bag.topics.items():
-            self._add_topic(number, topic, definitions)
+        try:
+            definitions = Definitions(self._bag, self._losses.append)
+            for number, topic in self._bag.topics.items():
+                self._add_topic(number, topic, definitions)
+        except BaseException:
+            self._bag.close()
+            raise
         found = np.bincount(self._bag.channel, minlength=len(self.channels) + 1).tolist()
         self.counts = {number: found[number] for number in self.channels}
 

@@ -59,11 +59,20 @@ class Ros1Bag:
         self._file = open_regular(path)
         self._places: list[tuple[int, int, int]] = []  # Chunk (-1: none), position, and length.
         self._chunk = lru_cache(maxsize=4)(self._read_chunk)
+        try:
+            told = np.array(self._index(lose), np.int64).reshape(-1, 2)
+        except BaseException:
+            self._file.close()
+            raise
+        self.channel, self.times = told[:, 0], told[:, 1]
+
+    def _index(self, lose: Callable[[str], None]) -> list[tuple[int, int]]:
+        """Find all topics and messages, and return topic and time of each message."""
         columns: list[tuple[int, int]] = []
         numbers: dict[int, int] = {}
         odd = 0
         if self._file.read(len(MAGIC)) != MAGIC:
-            raise TraceError("it does not begin like a bag of ROS 1", path=path)
+            raise TraceError("it does not begin like a bag of ROS 1", path=self.path)
         for chunk, header, place, length in self._records(lose):
             conn = _whole(header.get("conn"))
             if header.get("op") == bytes([_CONNECTION]):
@@ -80,8 +89,7 @@ class Ros1Bag:
                 odd += 1
         if odd:
             lose(f"{odd} messages without a connection or a time")
-        told = np.array(columns, np.int64).reshape(-1, 2)
-        self.channel, self.times = told[:, 0], told[:, 1]
+        return columns
 
     def close(self) -> None:
         """Close the file."""

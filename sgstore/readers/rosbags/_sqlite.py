@@ -115,7 +115,11 @@ class SqliteBag:
 
     def _add(self, file: Path, columns: list[tuple[int, int]], lose: Callable[[str], None]) -> None:
         connection = _opened(file)
-        topics = self._read_topics(connection)
+        try:
+            topics = self._read_topics(connection)
+        except BaseException:
+            connection.close()
+            raise
         self._files.append((len(self._rows), connection))
         rows = connection.execute("SELECT rowid, topic_id, timestamp FROM messages ORDER BY rowid")
         odd = 0
