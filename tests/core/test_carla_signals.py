@@ -354,6 +354,47 @@ def crossing() -> RoadMap:
     )
 
 
+def twins(seed: int) -> tuple[RoadMap, dict[int, Light], dict[int, str]]:
+    """A map with twin signals, lights as CARLA places them, and the signal of each light.
+
+    A light is 0.25 m in front of its signal. Those of every twentieth pole are moved sideways.
+    """
+    rng = np.random.default_rng(seed)
+    told: list[tuple[float, float, float, float]] = []
+    for pole in range(120):
+        side, turn = rng.uniform(-9, 9), rng.normal(0, 0.02)
+        moved = 0.0 if pole % 20 else 0.7 * float(rng.choice([-6, -4, 4, 6]))
+        for twin in range(int(rng.integers(1, 4))):
+            told.append((10.0 + 40 * (pole // 3), side + 0.03 * twin, turn, moved))
+            told[-1] = (told[-1][0] + rng.normal(0, 0.02), *told[-1][1:])
+    signals = [
+        element(
+            "signal", id=f"s{i}", s=s, t=t, zOffset=5, hOffset=turn, type="1000001", dynamic="yes"
+        )
+        for i, (s, t, turn, _) in enumerate(told)
+    ]
+    road_map = read_map(a_map(a_road("1", line(2000.0), signals="".join(signals))), "twins")
+    rows = {name: row for row, name in enumerate(road_map.nodes.name)}
+    lights: dict[int, Light] = {}
+    truth: dict[int, str] = {}
+    for i, ident in enumerate(rng.permutation(len(told)).tolist()):
+        row, moved, nodes = rows[f"s{i}"], told[i][3], road_map.nodes
+        heading = float(nodes.heading[row])
+        x = float(nodes.x[row]) + 0.25 * math.cos(heading) - moved * math.sin(heading)
+        y = float(nodes.y[row]) + 0.25 * math.sin(heading) + moved * math.cos(heading)
+        lights[ident], truth[ident] = Light(x, y, float(nodes.z[row]), heading), f"s{i}"
+    return road_map, lights, truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_twin_lights_have_their_own_signals_also_where_carla_moved_them(seed: int) -> None:
+    road_map, lights, truth = twins(seed)
+    found = signals_of(lights, road_map)
+
+    wrong = [ident for ident, signal in truth.items() if found.get(ident) != signal]
+    assert len(wrong) <= 0.003 * len(truth), len(truth)
+
+
 def test_a_light_is_the_signal_that_stands_where_it_stands_and_faces_its_way() -> None:
     road_map = crossing()
     nodes = road_map.nodes

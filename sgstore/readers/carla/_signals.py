@@ -5,8 +5,8 @@ A light has at most one signal, and a signal at most one light. The steps are:
 1. *by position*: CARLA places a light :data:`FORWARD` in front of its map position, in the signal's own axes.
    If all lights of a world have another common offset, it is learned: the median over lights and signals
    without other candidates. The offset with the most matches is used first;
-2. *by remaining signals*: a light within :data:`SAME_PLACE` of a free signal;
-3. *by sideways offset*: CARLA moves lights on the road sideways until they are off the road;
+2. *by sideways offset*: CARLA moves lights on the road sideways until they are off the road;
+3. *by remaining signals*: a light within :data:`SAME_PLACE` of a free signal;
 4. *by lanes*: the signal of the lanes in the light's trigger boxes, or of their successors.
 
 The sum of squared distances over all lights is minimised. A common shift adds the same amount to every
@@ -196,11 +196,11 @@ def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
         best, first = (rule if first else best), False
         found |= matches
     rules = [best] if not first else [best, best._replace(turn=TURNS[1])]
-    left = [_assigned(_near(lights, signals, rule, SAME_PLACE, found)) for rule in rules]
-    found |= max(left, key=len)
     for rule in rules:
         aside = _near(lights, signals, rule, ASIDE, found)
-        found |= _alone(aside.take(np.abs(aside.ahead) <= SAME_SPOT))
+        found |= _assigned(aside.take(np.abs(aside.ahead) <= SAME_SPOT))
+    left = [_assigned(_near(lights, signals, rule, SAME_PLACE, found)) for rule in rules]
+    found |= max(left, key=len)
     return found
 
 
@@ -240,12 +240,6 @@ def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, in
     ahead, left = float(np.median(sure.ahead)), float(np.median(sure.left))
     agree = np.hypot(sure.ahead - ahead, sure.left - left) <= SAME_SPOT
     return _Rule(turn, ahead, left) if agree.mean() >= 0.5 else None
-
-
-def _alone(near: _Near) -> dict[int, int]:
-    """Return the pairs of a traffic light and a map signal that are the only candidates of each other."""
-    sure = near.take(_only(near.light) & _only(near.signal))
-    return dict(zip(sure.light.tolist(), sure.signal.tolist(), strict=True))
 
 
 def _only(rows: Rows) -> Bools:
