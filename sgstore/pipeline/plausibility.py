@@ -244,7 +244,9 @@ class Plausibility:
         self._kinds = np.concatenate([self._kinds, entities.kind.astype(np.int64)])
         self._times = np.concatenate([self._times, block.time_ns])
         missing = np.flatnonzero(block.ego < 0)
-        self._shares["ego"] += len(block) - len(missing)
+        present = np.flatnonzero(block.ego >= 0)
+        if len(present):
+            self._shares["ego"] = int(block.seq[present[-1]]) + 1
         if len(missing):
             self._happen("ego missing", -1, int(block.seq[missing[0]]), "the frame has no ego")
             self._events["ego missing"].times += len(missing) - 1
@@ -578,7 +580,11 @@ class Plausibility:
         }
         if shares["exact"]:
             rare.add("rounded positions")
-        if not shares["ego"]:  # The reader reports it.
+        ego = events.get("ego missing")
+        # The reader reports a recording without an ego. At the end, an ego can leave first.
+        if ego is not None and (
+            not shares["ego"] or (ego.frame >= shares["ego"] and ego.times < STANDING)
+        ):
             rare.add("ego missing")
         for kind in rare & events.keys():
             del events[kind]

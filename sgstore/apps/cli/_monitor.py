@@ -78,6 +78,7 @@ def monitor(
     """
     from sgstore.lang.syntax import joined
     from sgstore.model.config import Config
+    from sgstore.pipeline.plausibility import Plausibility
     from sgstore.temporal import Monitor, opened
 
     asked, values = statements.asked(checks)
@@ -86,6 +87,8 @@ def monitor(
     longest = seconds_of(duration, "--duration") if duration else None
     cameras = _sensors(sensors, shown=serve and trace.startswith("carla://"))
     with opened(trace, settings, road_map=reading.road_map, ego=ego, sensors=cameras) as source:
+        checked = Plausibility(source.road_map)
+        source.frames = checked.watched(source.frames)
         watch = partial(
             Monitor,
             joined([*chain.from_iterable(asked.values())]),
@@ -102,7 +105,10 @@ def monitor(
             watched = watch(on_event=write)
             verdicts = watched.run(source.frames, duration_s=longest)
     losses = [*source.losses, *(loss.reason for loss in watched.generator.losses)]
-    for warning in [*source.warnings, *losses]:
+    found = checked.findings()
+    known = [one.value for one in found]
+    warnings = [one for one in source.warnings if one not in known]
+    for warning in [*warnings, *map(str, found), *losses]:
         say(warning)
     for verdict in verdicts:
         _write_verdict(verdict, as_json=as_json)
