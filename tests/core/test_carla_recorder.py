@@ -17,7 +17,6 @@ from recorder_logs import begin, packet, rows
 import sgstore
 from sgstore.errors import TraceError
 from sgstore.ingest import ingest, recordings
-from sgstore.model.config import Config
 from sgstore.model.vocabulary import KINDS, LIGHT_STATES
 from sgstore.readers import open_trace, read_message
 
@@ -90,6 +89,16 @@ def test_the_ego_is_named_by_role_or_id(log: Path) -> None:
     assert read(log, ego="hero")[0].ego == "7"
     with pytest.raises(TraceError, match="no vehicle or walker has the id or role 'x'"):
         open_trace(log, ego="x")
+
+
+def test_positions_can_be_origins(log: Path) -> None:
+    _, (block,), _ = read(log, mapping="carla_origins")
+    _, (boxes,), _ = read(log)
+    hero = np.flatnonzero(block.states.node == 1)[4]
+    states = block.states
+    assert [states.x[hero], states.y[hero], states.z[hero]] == pytest.approx([4, 0, 0])
+    own = {"origin_x": 4.0, "origin_y": 0.0, "origin_z": 0.0}
+    assert states.own[hero] == boxes.states.own[hero] == own
 
 
 def test_a_folder_needs_no_option_and_other_logs_are_left(log: Path) -> None:
@@ -170,10 +179,12 @@ def test_the_distances_of_scenario_runner(data: Path, tmp_path: Path) -> None:
         told = [row for row in csv.DictReader(file) if row["in_metric"] == "1"]
     want = {int(row["frame"]) - 1: float(row["distance_m"]) for row in told}
     store = tmp_path / "a.sgstore"
-    config = Config(mapping="carla_origins")
-    (outcome,) = ingest(store, [path], config=config)
+    (outcome,) = ingest(store, [path])
     assert outcome.status == "added"
-    query = "MATCH (a:Car {ident: '174'}), (b:Car {ident: '175'}) RETURN frame.seq, dist(a, b)"
+    apart = "+".join(f"pow(a.origin_{axis} - b.origin_{axis}, 2)" for axis in "xyz")
+    query = (
+        f"MATCH (a:Car {{ident: '174'}}), (b:Car {{ident: '175'}}) RETURN frame.seq, sqrt({apart})"
+    )
     rows = sgstore.open(store).find(f"USING SCOPE world {query}")
     found = {row[0]: row[1] for row in rows}
     assert len(want) == 752

@@ -157,6 +157,11 @@ class CarlaRecorderTrace(FramesTrace):
             type_name=one["type"],
             **more,
         )
+        if not more.get("static") and "box" in one:
+            x, y, z = one["location"]
+            own = {"origin_x": x, "origin_y": 0.0 - y, "origin_z": z}
+            entity = frame.entities.pop()
+            frame.entities.append(entity._replace(own={**(entity.own or {}), **own}))
 
     def _add_light(self, frame: Frame, one: dict[str, Any]) -> None:
         """Add a traffic light to a frame. Its box is an area on the road, and is left out."""

@@ -1,4 +1,4 @@
-"""Reader of recordings by sgstore's ``Recorder``. Beside OSI messages, they have exact frames as JSON.
+"""Reader of recordings by sgstore's ``Recorder``, which contain OSI messages and exact frames as JSON.
 
 OSI has no fields for some values, such as the kind of a prop, the steering input, and the controls of other
 vehicles.
