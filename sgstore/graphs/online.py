@@ -674,6 +674,7 @@ def _map_node(road_map: RoadMap, node: int) -> Attributes:
     }
     numbers["heading"] = math.degrees(numbers["heading"])
     about: Attributes = {"kind": KINDS[nodes.kind[row]], "is_ego": False, "is_static": True}
+    about |= road_map.own.get(row, {})
     about |= {name: text for name, text in texts.items() if text} | _numbers(numbers)
     if about["kind"] not in MAP_KINDS:
         about |= _STILL

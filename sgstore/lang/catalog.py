@@ -446,6 +446,21 @@ def own_attribute(name: str, kind: Type) -> Attribute:
     return Attribute(name, kind, {}, "of a client's own", DisplayUnit.own, whole=whole)
 
 
+_OF_SIGN: Final = {
+    **dict.fromkeys(("text", "unit", "country", "type", "subtype"), Type.text),
+    **dict.fromkeys(("value", "width", "height"), Type.number),
+}
+_OF_MARKING: Final = {
+    **dict.fromkeys(("type", "color"), Type.text),
+    "width": Type.number,
+    "change": Type.boolean,
+}
+MAP_OWN: Final[Mapping[str, Type]] = {
+    **{f"landmark_{name}": kind for name, kind in _OF_SIGN.items()},
+    **{f"{side}_marking_{n}": k for side in ("left", "right") for n, k in _OF_MARKING.items()},
+}
+"""Attributes without a column of the signs and lanes of a map."""
+
 RECORDED_OWN: Final[Mapping[str, Type]] = {
     **dict.fromkeys(("ang_vel_x", "ang_vel_y"), Type.number),
     **dict.fromkeys(
@@ -453,6 +468,7 @@ RECORDED_OWN: Final[Mapping[str, Type]] = {
     ),
     **dict.fromkeys((f"{CONTROL}{name}" for name in ("hand_brake", "reverse")), Type.boolean),
     **dict.fromkeys(("manual_gear", f"{CONTROL}manual_gear"), Type.boolean),
+    **MAP_OWN,
 }
 """Attributes without a column that recordings usually have. They are valid in every store."""
 

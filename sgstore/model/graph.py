@@ -366,7 +366,8 @@ class LaneDistances:
         parts: Iterable[tuple[int, str, int, float, float]] = (),
         courses: Iterable[tuple[int, float, float, float | None]] = (),
     ) -> None:
-        self._columns, self._parts = (lane, other, start), tuple(parts)
+        places = [part for part in parts if not part[1].startswith("{")]  # others are attributes
+        self._columns, self._parts = (lane, other, start), tuple(places)
         self._courses = tuple(courses)
 
     @cached_property

@@ -34,7 +34,6 @@ from sgstore.model.world import (
     States,
     derivable_ns,
     leaps,
-    own_column,
     valid_attributes,
     without_implausible,
 )
@@ -1001,7 +1000,7 @@ def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> 
 
 def _own(frames: list[FrameRows]) -> NDArray[np.object_]:
     """Return the attributes without a column, one mapping or ``None`` per row of the frames."""
-    column = own_column([None] * sum(map(len, frames)))
+    column = np.full(sum(map(len, frames)), None, object)
     start = 0
     for frame in frames:
         for node, told in frame.own.items():

@@ -372,6 +372,9 @@ def _map_records(connection: DuckDBPyConnection, map_id: int) -> MapRecords:
     )
     relation = codes_of(connection, "relation")[edges["relation"]]
     parts = connection.execute(_MAP_PLACES, where).fetchall()
+    for node, what, *_ in parts:
+        if what.startswith("{"):
+            nodes[node] = json.loads(what) | nodes[node]
     courses = connection.execute(_MAP_COURSES, where).fetchall()
     starts = LaneDistances(along, other, reach["start"].astype(np.float64), parts, courses)
     return MapRecords(nodes.__getitem__, src, relation, dst, starts)

@@ -127,7 +127,8 @@ def test_a_light_lies_once_or_more_on_each_lane_that_it_controls_and_in_junction
 
 
 def test_lanes_without_sections_have_no_places(data: Path) -> None:
-    assert not len(town(data, "Town02").without_sections.places)
+    places = town(data, "Town02").without_sections.places
+    assert all(what.startswith("{") for what in places.what)  # attributes
 
 
 # How far it is: against Dijkstra ---------------------------------------------------------------

@@ -404,3 +404,30 @@ def test_crosswalks_have_the_corners_of_carla(maps: tuple[RoadMap, Any]) -> None
     }
 
     assert {(x + 0.0, y + 0.0) for x, y in theirs} == ours
+
+
+@pytest.mark.parametrize("town", TOWNS)
+def test_markings_are_those_of_libcarla(data: Path, town: str) -> None:
+    """LibCarla tells the marking at each point; ours is the longest one of the lane."""
+    text = (data / "maps" / f"{town}.xodr").read_text(encoding="utf-8")
+    ours = read_map(text, town)
+    of = {
+        ours.nodes.name[row]: about for row, about in ours.own.items() if ours.nodes.lane_type[row]
+    }
+    told: dict[tuple[str, str], list[tuple[str, float]]] = {}
+    for point in carla.Map(town, text).generate_waypoints(2.0):
+        name = f"{point.road_id}/{point.section_id}/{point.lane_id}"
+        for side in ("left", "right"):
+            theirs = getattr(point, f"{side}_lane_marking")
+            kind = str(theirs.type).lower(), round(theirs.width, 3)
+            told.setdefault((name, side), []).append(kind)
+    same = [
+        (
+            of.get(name, {}).get(f"{side}_marking_type", "none").replace(" ", ""),
+            round(of.get(name, {}).get(f"{side}_marking_width", 0.0), 3),
+        )
+        == max(kinds, key=kinds.count)
+        for (name, side), kinds in told.items()
+    ]
+    assert len(same) > 100
+    assert np.mean(same) > 0.97

@@ -222,6 +222,7 @@ class PaperMap(RoadMap):
         self, *patches: Patch, objects: tuple[tuple[str, str], ...] = (), at: Place = Place()
     ) -> None:
         self.name, self.text, self.digest, self.warnings = "paper", "", "paper", ()
+        self.own = {}
         roads = list(dict.fromkeys(p.road for p in patches if p.road))
         junctions = list(dict.fromkeys(p.junction for p in patches if p.junction))
         kinds = ["off_road", *(p.kind for p in patches)]

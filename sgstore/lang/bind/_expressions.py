@@ -19,6 +19,7 @@ from sgstore.lang.catalog import (
     FRAME_ATTRIBUTES,
     NODE_ATTRIBUTES,
     PAIR_NAMES,
+    RECORDED_OWN,
     TRACE_ATTRIBUTES,
     Attribute,
     DisplayUnit,
@@ -41,6 +42,7 @@ from sgstore.model.vocabulary import (
     labels,
     normalize_name,
     relation_named,
+    suggestion,
 )
 
 if TYPE_CHECKING:
@@ -196,12 +198,16 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
         Unknown attribute, or not an attribute of these kinds.
     """
     kinds = names.scope.kinds(key).every
-    possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds] + [*names.session.own]
+    own = names.session.own
+    possible = [a.name for a in NODE_ATTRIBUTES.values() if a.kinds & kinds]
+    possible += [one for one in own if one not in RECORDED_OWN]
     found = NODE_ATTRIBUTES.get(normalize_name(name)) or _own_attribute(name, names.session.own)
     if found is None and names.session.online and name.startswith(CONTROL):
         found = own_attribute(name, Type.number)  # A client can command any key.
     if found is None:
         hint = said_of("attributes", name) or _no_attribute(name)
+        like = suggestion(name, [*possible, *RECORDED_OWN])
+        hint = hint or (f"did you mean '{like}'?" if like in RECORDED_OWN else None)
         names.session.unknown("attribute", name, span, possible, hint)
     if not found.kinds & kinds:
         what = " or ".join(sorted(kinds)) if len(kinds) <= 3 else "node of these kinds"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from sgstore.base.quoting import literal, quoted
-from sgstore.lang.catalog import DERIVED, Attribute, DisplayUnit, Home, Type
+from sgstore.lang.catalog import DERIVED, MAP_OWN, Attribute, DisplayUnit, Home, Type
 from sgstore.lang.ir import FrameAttribute, TraceAttribute
 from sgstore.lang.sql._select import Select, nested
 from sgstore.model.pair_numbers import low_and_high_sql
@@ -164,6 +164,23 @@ def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = 
     on += ends or ['":o"."relation" IS NULL']
     on.append(f'":o"."attribute" = {literal(attribute.name)}')
     rows = Select([f"any_value({value})"], ['"attribute" AS ":o"'], on)
+    if attribute.name in MAP_OWN and not edge:
+        return f"coalesce(({rows.text()}), {_map_own_text(attribute, frame, node)})"
+    return f"({rows.text()})"
+
+
+def _map_own_text(attribute: Attribute, frame: str, node: str) -> str:
+    """Return the SQL expression of an attribute of a lane or sign, from the places of its map."""
+    told = f'json_extract_string(":p"."what", {literal(f"$.{attribute.name}")})'
+    kind = "VARCHAR" if attribute.type is Type.text else _NATIVE[attribute.type]
+    on = [
+        f'":f"."frame_id" = {frame}',
+        '":p"."map_id" = ":f"."map_id"',
+        f'":p"."node_id" = {node}',
+        '":p"."what" LIKE \'{%\'',
+    ]
+    tables = ['"frame" AS ":f", "map_place" AS ":p"']
+    rows = Select([f"any_value(CAST({told} AS {kind}))"], tables, on)
     return f"({rows.text()})"
 
 

@@ -8,11 +8,15 @@ for a double line the one on one's own side counts. A border without a mark allo
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import math
+from collections import Counter
+from itertools import pairwise
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.maps.opendrive._nodes import wide_pairs
+from sgstore.maps.opendrive._nodes import FIRST_LANE, wide_pairs
 from sgstore.maps.roads import LaneChanges, MapPlaces
 from sgstore.model.vocabulary import DRIVING
 
@@ -120,6 +124,63 @@ def _records(document: Document, name: str) -> dict[int, list[tuple[float, str, 
             record = (offset, mark.strip().lower(), attribute.strip().lower())
             records.setdefault(raw, []).append(record)
     return records
+
+
+def read_markings(document: Document, lanes: LaneTable) -> dict[int, dict[str, Any]]:
+    """Return the markings of lanes as attributes of their nodes: type, colour, width, permitted lane change.
+
+    Left and right are those of traffic on the lane. Of several markings along a border, the longest one counts.
+    """
+    element = "road/laneSection/lane/roadMark"
+    table = document[element]
+    offsets, widths = (
+        document.rough_numbers(element, name, default).tolist()
+        for name, default in (("sOffset", 0.0), ("width", math.nan))
+    )
+    names = zip(lanes.section.tolist(), lanes.ident.tolist(), strict=True)
+    row_of = {name: row for row, name in enumerate(names)}
+    marks: dict[tuple[int, int], list[tuple[float, tuple[str, str, str, float]]]] = {}
+    for raw, offset, width, about in zip(
+        table.parent, offsets, widths, table.attributes, strict=True
+    ):
+        own = int(lanes.row[raw])
+        section, ident = (
+            (int(lanes.centre[raw]), 0)
+            if own < 0
+            else (int(lanes.section[own]), int(lanes.ident[own]))
+        )
+        texts = (("type", "none"), ("color", "standard"), ("laneChange", ""))
+        kind, color, change = (about.get(n, d).strip().lower()[:_LONGEST] for n, d in texts)
+        if math.isfinite(offset):
+            told = (offset, (kind, color, change, width if 0 <= width <= _WIDEST else -1.0))
+            marks.setdefault((section, ident), []).append(told)
+    found: dict[int, dict[str, Any]] = {}
+    for (section, ident), records in marks.items():
+        length = float(lanes.sections.end[section] - lanes.sections.start[section])
+        records.sort(key=itemgetter(0))
+        cuts = [min(max(offset, 0.0), length) for offset, _ in records] + [length]
+        totals: Counter[tuple[str, str, str, float]] = Counter()
+        for (_, told), (start, end) in zip(records, pairwise(cuts), strict=True):
+            totals[told] += end - start  # pyright: ignore[reportArgumentType]
+        kind, color, change, width = totals.most_common(1)[0][0]
+        outer = (1, -1) if ident == 0 else (ident, ident + (1 if ident > 0 else -1))
+        for row in (row_of[section, one] for one in outer if (section, one) in row_of):
+            # Outside is right for a lane on the right of its road's direction.
+            forward = bool(lanes.forward[row])
+            is_left = (lanes.ident[row] == ident) == ((lanes.ident[row] < 0) != forward)
+            side = "left" if is_left else "right"
+            allowed = permitted(kind, change, ident)[bool(is_left != forward)]
+            about = {"type": kind, "color": color, "change": allowed, "width": width}
+            found.setdefault(FIRST_LANE + row, {}).update(
+                {f"{side}_marking_{n}": v for n, v in about.items() if v != -1.0}
+            )
+    return found
+
+
+_WIDEST: Final = 10.0
+"""Greatest width of a marking; m."""
+_LONGEST: Final = 40
+"""Longest text of a marking; characters."""
 
 
 def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:

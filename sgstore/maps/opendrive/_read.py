@@ -17,7 +17,11 @@ from sgstore.errors import MapError
 from sgstore.maps.opendrive._contradictions import contradictions
 from sgstore.maps.opendrive._document import Document, Record, Spoiled, read_document
 from sgstore.maps.opendrive._flows import flows
-from sgstore.maps.opendrive._lane_changes import read_broad_lines, read_lane_changes
+from sgstore.maps.opendrive._lane_changes import (
+    read_broad_lines,
+    read_lane_changes,
+    read_markings,
+)
 from sgstore.maps.opendrive._lanes import heights, read_lanes, surface
 from sgstore.maps.opendrive._network import Network
 from sgstore.maps.opendrive._nodes import (
@@ -177,6 +181,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         stop_lines=signals.stop_lines(first_signal),
         courses=LaneCourses.of(every, heights(document, lanes, every)),
         broad_lines=read_broad_lines(document, lanes, ribbons),
+        own=read_markings(document, lanes) | dict(enumerate(signals.about, first_signal)),
         variant=signals.told,
     )
 

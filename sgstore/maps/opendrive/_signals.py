@@ -9,9 +9,10 @@ contradicts if all named lanes come out of the junction while other lanes lead i
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -178,12 +179,15 @@ class Signals:
     told : str
         Configured kinds, and the interpretation of orientations if it differs from the standard and
         matters; empty if neither applies.
+    about : list of dict
+        Text, value, unit, type and size of each signal in the file, as attributes.
     """
 
     nodes: MapNodes
     lanes: list[Stops]
     codes: list[str]
     told: str = ""
+    about: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
     def edges(self, first: int) -> Edge:
         """Return the map edges ``controlsTrafficOf`` from signals to lanes."""
@@ -215,6 +219,7 @@ def read_signals(document: Document, plan: PlanView, network: Network, signs: Si
         [s for p in parts for s in p.lanes],
         [code for p in parts for code in p.codes],
         " ".join(filter(None, (parts[0].told, other))),
+        [about for part in parts for about in part.about],
     )
 
 
@@ -347,7 +352,24 @@ def _elements(
         lanes.append(own | referred.get(name, frozenset()))
     columns = node_columns(document, plan, kind, rows)
     nodes = MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns)
-    return Signals(nodes, lanes, codes, repr(told) if told else "")
+    about: list[dict[str, Any]] = [
+        {
+            f"landmark_{name}": a[name].strip()[:_LONGEST]
+            for name in _TOLD
+            if a.get(name, "").strip()
+        }
+        for a in attributes
+    ]
+    for name in ("value", "width", "height"):
+        numbers = document.rough_numbers(kind, name, math.nan)[rows]
+        for row in np.flatnonzero(np.isfinite(numbers)).tolist():
+            about[row][f"landmark_{name}"] = float(numbers[row])
+    return Signals(nodes, lanes, codes, repr(told) if told else "", about)
+
+
+_TOLD: Final = ("text", "unit", "country", "type", "subtype")
+_LONGEST: Final = 200
+"""Longest text of a signal; characters."""
 
 
 def _stops(lanes: frozenset[int], place: tuple[int, float]) -> Stops:
@@ -384,16 +406,20 @@ def _signal_objects(document: Document, plan: PlanView, reach: _Reach) -> Signal
     kinds: list[str] = []
     limits: list[float] = []
     lanes: list[Stops] = []
+    about: list[dict[str, Any]] = []
     s = document.rough_numbers(kind, "s")
     for row in rows.tolist():
         attributes = table.attributes[row]
         limit = _SPEED_OBJECT.match(attributes.get("name", ""))
         kinds.append("speed_limit" if limit else "stop_sign")
         limits.append(speed(limit[1], "km/h") if limit else np.nan)
+        about.append({"landmark_type": "274" if limit else "206"})
+        if limit:
+            about[-1] |= {"landmark_text": limit[1], "landmark_value": float(limit[1])}
         left = attributes.get("orientation", "") == "+"
         place = (int(table.road[row]), float(s[row]))
         lanes.append(_stops(reach.on_side(place, left=left), place))
     ids = [table.attributes[row].get("id", "") for row in rows.tolist()]
     columns = node_columns(document, plan, kind, rows)
     nodes = MapNodes.of(kinds, ids, speed_limit=np.array(limits), **columns)
-    return Signals(nodes, lanes, [""] * len(ids))
+    return Signals(nodes, lanes, [""] * len(ids), about=about)

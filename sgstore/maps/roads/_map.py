@@ -302,6 +302,8 @@ class RoadMap:
         Curvature and slope of the lanes, metre by metre. Empty for a map without sections.
     broad_lines : MapPlaces
         Broad markings at the sides of lanes.
+    own : mapping of int to mapping
+        Row of a lane or signal → its attributes without a column: markings, and text and size of a sign.
     variant : str
         Difference from the map that the text describes.
     """
@@ -325,6 +327,7 @@ class RoadMap:
     stop_lines: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     courses: LaneCourses = field(default_factory=LaneCourses.none)
     broad_lines: MapPlaces = field(default_factory=MapPlaces.none)
+    own: Mapping[int, Mapping[str, Any]] = field(default_factory=dict[int, "Mapping[str, Any]"])
     variant: str = ""
 
     def __post_init__(self) -> None:
@@ -566,7 +569,8 @@ class RoadMap:
         Empty for a map without sections, as :attr:`reach`.
         """
         nodes, lanes = self.nodes, slice(1, 1 + self._lanes)
-        if not self._lanes or _MERGED in self.variant:
+        is_merged = _MERGED in self.variant
+        if not self._lanes or (is_merged and not self.own):
             return MapPlaces.none()
         what = [KINDS[int(code)] for code in nodes.kind]
         columns = {
@@ -587,6 +591,13 @@ class RoadMap:
         signals = signal_places(self.ribbons, names["junction"], what, applies, self.stops)
         crossed = crosswalk_places(self.ribbons, crosswalks, shapes, z, STOREY)
         table = chained([*wholes, crossed, signals])
+        # Attributes are JSON texts, each at the first place of its part.
+        first = dict(zip(table.part[::-1].tolist(), range(len(table))[::-1], strict=True))
+        parts = [part for part, told in self.own.items() if told and part in first]
+        about = taken(table, np.array([first[part] for part in parts], np.int64))
+        texts = (json.dumps(self.own[part], ensure_ascii=False, sort_keys=True) for part in parts)
+        about = replace(about, what=tuple(texts))
+        table = about if is_merged else chained([table, about])
         return MapPlaces.of(table.part, table.what, table.lane, table.start, table.end)
 
     def _on_roundabouts(self) -> MapPlaces:

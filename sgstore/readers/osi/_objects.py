@@ -342,7 +342,14 @@ def own_attributes(content: bytes, message: type[Any], *, is_ego: bool) -> dict[
     with suppress(*DECODE_ERRORS):
         thing = message.FromString(content)
         if is_ego and any(thing.base.orientation_rate.HasField(name) for name in ("roll", "pitch")):
-            found |= _spin(thing.base.orientation, thing.base.orientation_rate)
+            turn, rate = thing.base.orientation, thing.base.orientation_rate
+            sin, cos, roll = (
+                math.sin(turn.yaw),
+                math.cos(turn.yaw),
+                rate.roll * math.cos(turn.pitch),
+            )
+            found["ang_vel_x"] = math.degrees(cos * roll - sin * rate.pitch)
+            found["ang_vel_y"] = math.degrees(sin * roll + cos * rate.pitch)
         for source, text in identifiers(thing) if marked else ():
             name, _, value = text.removeprefix(ATTRIBUTE).partition("=")
             if (
@@ -352,16 +359,6 @@ def own_attributes(content: bytes, message: type[Any], *, is_ego: bool) -> dict[
             ):
                 found[name] = json.loads(value)
     return found
-
-
-def _spin(turn: Any, rate: Any) -> dict[str, float]:
-    """Return the angular velocity about the map's x and y axes; degrees/s."""
-    roll = rate.roll * math.cos(turn.pitch)
-    sin, cos = math.sin(turn.yaw), math.cos(turn.yaw)
-    return {
-        "ang_vel_x": math.degrees(cos * roll - sin * rate.pitch),
-        "ang_vel_y": math.degrees(sin * roll + cos * rate.pitch),
-    }
 
 
 def _meanings(told: Any, bit: int) -> NDArray[np.int64]:
