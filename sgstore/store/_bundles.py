@@ -93,7 +93,7 @@ class BundleSource:
         access = Access(self.path)
         threads = os.cpu_count() or 1
         with (
-            scratch(spill_folder(), memory=default_memory(), threads=threads) as connection,
+            scratch(spill_folder(), memory=_memory(), threads=threads) as connection,
             access.attached(connection, to.parent),
         ):
             _copied(connection, ["store"], to, traces, maps or {})
@@ -130,6 +130,11 @@ class BundleSource:
             _join(sources, to, traces, maps, whole=True)
 
 
+def _memory() -> int:
+    """Return the memory of the database for a bundle, so that the process stays below the default memory."""
+    return default_memory() * 5 // 8
+
+
 def _join(
     sources: Sequence[Path],
     to: Path,
@@ -140,7 +145,7 @@ def _join(
 ) -> None:
     threads = os.cpu_count() or 1
     with (
-        scratch(spill_folder(), memory=default_memory(), threads=threads) as connection,
+        scratch(spill_folder(), memory=_memory(), threads=threads) as connection,
         translated(to),
     ):
         names = [f"store {number}" for number in range(len(sources))]

@@ -552,6 +552,22 @@ def test_a_store_that_is_packed_and_unpacked_is_the_same(
     assert tables_of(tmp_path / "again.sgstore") == tables_of(path)
 
 
+def test_the_database_of_a_bundle_leaves_memory_for_its_process(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    scratch = _bundles.scratch
+
+    def seen(spill: Path, *, memory: int, threads: int) -> Any:
+        asked.append(memory)
+        return scratch(spill, memory=memory, threads=threads)
+
+    monkeypatch.setattr(_bundles, "scratch", seen)
+    pack(path, tmp_path / "c")
+
+    assert 0 < max(asked) <= 0.7 * _bundles.default_memory()
+
+
 def test_what_is_there_is_left_as_it_is(path: Path, tmp_path: Path) -> None:
     pack(path, tmp_path / "c", bundle_traces=3)
     before = sorted((tmp_path / "c").rglob("*"))
