@@ -244,8 +244,7 @@ class TraceGroup:
         cls, about: Mapping[int, Sequence[Any]], clock: Mapping[str, Ints], gaps: str
     ) -> TraceGroup:
         """Return the frames of some traces. ``about``: id → name, start (ns), frame period (ns)."""
-        names = "frame_id", "seq", "time_ns", "log_time_ns"
-        columns = [clock[name] for name in names]
+        columns = [clock[name] for name in ("frame_id", "seq", "time_ns", "log_time_ns")]
         known = np.isin(trace_of(columns[0]), [*about])
         if not known.all():
             columns = [column[known] for column in columns]
@@ -269,8 +268,20 @@ class TraceGroup:
             breaks = steps > np.repeat(longest, np.diff(starts))
             breaks |= np.diff(columns[1], prepend=columns[1][:1] - 1) != 1
         breaks[first] = True
-        names = [one[0] for one in told]
-        return cls(ids, begins, periods, names, starts, *columns, ticks, np.cumsum(breaks))
+        frame_ids, numbers, times, log_times = columns
+        return cls(
+            ids,
+            begins,
+            periods,
+            [one[0] for one in told],
+            starts,
+            frame_ids,
+            numbers,
+            times,
+            log_times,
+            ticks,
+            np.cumsum(breaks),
+        )
 
     @classmethod
     def alone(cls, trace: TraceReader) -> TraceGroup:
@@ -363,10 +374,17 @@ class TraceGroup:
         rows = slice(int(self.starts[place]), int(self.starts[place + 1]))
         period = int(self.periods[place])
         clock = Clock(self.ticks[rows], self.runs[rows], period, tolerance_ns(period))
-        frames = (one[rows] for one in (self.frame_ids, self.numbers, self.times, self.log_times))
-        about = int(self.ids[place]), self.names[place], *frames, int(self.begins[place]), clock
-        relations = {name: self.part(one, place) for name, one in self.relations.items()}
-        return TraceReader(*about, relations)
+        return TraceReader(
+            trace_id=int(self.ids[place]),
+            name=self.names[place],
+            frame_ids=self.frame_ids[rows],
+            numbers=self.numbers[rows],
+            times=self.times[rows],
+            log_times=self.log_times[rows],
+            start=int(self.begins[place]),
+            clock=clock,
+            relations={name: self.part(one, place) for name, one in self.relations.items()},
+        )
 
     def part(self, relation: TimedRelation, place: int) -> TimedRelation:
         """Return the part of a table for one trace."""
