@@ -613,6 +613,7 @@ def test_the_page_of_flavours_names_them_all() -> None:
     page = PAGE.read_text(encoding="utf-8")
     for reader in READERS:
         assert f"`{reader.name}`" in page
+    page = PAGE.with_name("source_foxglove.md").read_text(encoding="utf-8")
     for mapping in shipped():
         assert f"`{mapping}`" in page
     (example,) = re.findall(r"```toml\n(\[scene\].*?)```", page, re.DOTALL)
