@@ -1,8 +1,8 @@
 """Mapping of a Foxglove scene: a TOML file with the names of the fields for kind, id, speed and ego.
 
 A ``foxglove.SceneUpdate`` is made for drawing. Its boxes lack types, speeds and the ego. Every producer stores
-these facts in its own way, so a mapping describes them. ``docs/source_foxglove.md`` explains the file. The included
-mappings are ``foxglove_*.toml``.
+these facts in its own way, so a mapping describes them. ``docs/source_foxglove.md`` explains the file. The
+included mappings are ``foxglove_*.toml``.
 """
 
 from __future__ import annotations
