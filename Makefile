@@ -12,7 +12,7 @@ TOOL   := PYTHONPATH=$(FOLDERS) $(BIN)/python
 # compile all packages again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers py123d maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -37,6 +37,7 @@ help:
 	@echo "make soak-explorer  the same, the readers being pages of one explorer"
 	@echo "make pyg     PyTorch Geometric reads what is exported for it, and a small network learns from it (downloads torch)"
 	@echo "make viewers  Rerun's reader looks at what is exported for it (downloads Rerun)"
+	@echo "make py123d   logs by 123D's own writer beside what we read of them (downloads 1.6 GB)"
 	@echo "make maps    the package lanelet2 and SUMO beside what we make of their maps and recordings (downloads both)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make cluster  1,000 random questions of collections, by each engine; S3, and faults of all (hours; installs ray, pyspark, obstore, moto)"
@@ -163,6 +164,11 @@ viewers: $(VENV)/.base
 	@test -x build/viewers/bin/python || $(BIN)/python -m venv build/viewers || $(BIN)/python -m virtualenv -q build/viewers
 	@build/viewers/bin/python -m pip install -q --disable-pip-version-check -e '.[rerun,viz,arrow]' pytest hypothesis foxglove-schemas-protobuf
 	build/viewers/bin/python -m pytest tests/edges/test_export_rerun.py tests/edges/test_export_viewers.py
+
+py123d: $(VENV)/.base
+	@test -x build/py123d/bin/python || $(BIN)/python -m venv build/py123d || $(BIN)/python -m virtualenv -q build/py123d
+	@build/py123d/bin/python -m pip install -q --disable-pip-version-check -e '.[arrow]' py123d==0.7.0
+	build/py123d/bin/python tests/reference/oracle_py123d.py
 
 # Likewise: readers of maps and simulators, each the oracle of what we read of it.
 maps: $(VENV)/.base
