@@ -703,11 +703,15 @@ def _block(
     skip = sum(len(frame) for frame in window[:skipped])
     rows = slice(skip, skip + int(offsets[-1]))
     columns = _columns(window, np.array([frame.seconds for frame in window]))
+    own = _own(frames)
     if smoother is None:
         values, derived, impossible = derive(*columns, rows)
         roster.impossible += impossible
     else:
-        values, derived = smoother.fill(*columns, rows)
+        values, derived, more = smoother.fill(*columns, rows)
+        own[:] = [
+            {**(told or {}), **one} if one else told for told, one in zip(own, more, strict=True)
+        ]
     nodes = np.concatenate([frame.node for frame in frames])
     ego = np.array([frame.ego for frame in frames], np.int64)
     entities, scenery = roster.take(known, frames[-1].returned)
@@ -722,7 +726,7 @@ def _block(
             lights=np.concatenate([frame.lights for frame in frames]),
             light_state=np.concatenate([frame.light_state for frame in frames]).astype(np.int8),
             derived=derived,
-            own=_own(frames),
+            own=own,
             **_controls(nodes, ego, frames, counts),
         ),
         ego=ego,

@@ -12,6 +12,7 @@ step divides a track. A single position far off its neighbours is left out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -20,6 +21,8 @@ import numpy as np
 from sgstore.model.world import POSE, SMOOTHED, STANDS, UNREAL_ACCELERATION, UNREAL_TURN
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from sgstore.model.world import Bools, Floats, Ints
 
 ESTIMATED: Final = 120
@@ -58,6 +61,10 @@ SPINNING: Final = np.radians(120.0)
 _X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = (
     POSE.index(name) for name in ("x", "heading", "vx", "ax", "yaw_rate")
 )
+
+
+FROM_POSITIONS: Final = ("position_speed", "position_accel", "position_yaw_rate")
+"""Attributes with motion from positions, of bodies with recorded motion; m/s, m/s², degrees/s."""
 
 
 class Noise(NamedTuple):
@@ -327,19 +334,23 @@ class Smoother:
     ----------
     unreal : (2,) int64
         Number of impossible accelerations and yaw rates.
+    apart : (5001,) int64
+        Counts of differences between recorded speeds and speeds of positions, in steps of 0.01 m/s.
     """
 
     noise: Noise
     period: float
     unreal: Ints = field(default_factory=lambda: np.zeros(2, np.int64))
+    apart: Ints = field(default_factory=lambda: np.zeros(5001, np.int64))
     _stands: dict[int, bool] = field(default_factory=dict[int, bool])
 
     def fill(
         self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
-    ) -> tuple[Floats, Ints]:
-        """Return the values of rows without gaps of motion, and their bits ``derived``.
+    ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
+        """Return the values of rows without gaps of motion, their bits ``derived``, and further attributes.
 
-        Parameters and result are those of :func:`sgstore.readers._blocks.derive`.
+        Parameters and result are those of :func:`sgstore.readers._blocks.derive`. The attributes are motion
+        from positions, of rows whose motion is recorded.
         """
         tracks = Tracks.of(node, frame, seconds, values, self.noise.jitter, self.period)
         half = self.noise.half(self.period)
@@ -359,7 +370,34 @@ class Smoother:
         speed = np.hypot(calm.slope[:, 0], calm.slope[:, 1])
         stands = self._standing(node[rows], frame[rows], speed[at])
         found[stands & np.isfinite(found[:, 2]), 2] = 0.0  # The height of boxes trembles, too.
-        return self._filled(values[rows], found, fixed[rows], stands)
+        filled, derived = self._filled(values[rows], found, fixed[rows], stands)
+        return filled, derived, self._second(values[rows], found)
+
+    def _second(self, values: Floats, found: Floats) -> list[Mapping[str, float] | None]:
+        """Return speed and acceleration from positions as attributes of rows with recorded velocities."""
+        heading = values[:, _HEADING]
+        table = np.column_stack(
+            [
+                np.linalg.norm(found[:, :3], axis=1),
+                found[:, 3] * np.cos(heading) + found[:, 4] * np.sin(heading),
+                np.degrees(found[:, 6]),
+            ]
+        )
+        recorded = np.isfinite(values[:, _VELOCITY])
+        speed = np.linalg.norm(values[:, _VELOCITY : _VELOCITY + 3], axis=1)
+        apart = np.abs(speed - table[:, 0])
+        apart = np.clip(np.rint(100 * apart[np.isfinite(apart)]), 0, len(self.apart) - 1)
+        self.apart += np.bincount(apart.astype(np.int64), minlength=len(self.apart))
+        return [
+            {
+                name: value
+                for name, value in zip(FROM_POSITIONS, row, strict=True)
+                if math.isfinite(value)
+            }
+            if told
+            else None
+            for row, told in zip(table.tolist(), recorded.tolist(), strict=True)
+        ]
 
     def _filled(
         self, values: Floats, found: Floats, fixed: Bools, stands: Bools
@@ -394,6 +432,10 @@ class Smoother:
         """Return the noise and the numbers of impossible values as warnings of a report."""
         noise, (hard, spun) = self.noise, self.unreal.tolist()
         found = [f"positions have a noise of {max(noise):.2g} m: missing motion is smoothed"]
+        if count := int(self.apart.sum()):
+            usual, most = np.searchsorted(np.cumsum(self.apart), [0.5 * count, 0.95 * count]) / 100
+            words = f"{usual:.2g} m/s (median), {most:.2g} m/s (95 %)"
+            found.append(f"recorded speeds differ from those of positions by {words}")
         if hard:
             found.append(f"{hard} accelerations above {UNREAL:g} m/s² are impossible")
         if spun:

@@ -36,7 +36,13 @@ def driven(t: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
 
 
 def recorded(
-    path: Path, sigma: float, *, frames: int = FRAMES, wander: bool = False, parked: int = 6
+    path: Path,
+    sigma: float,
+    *,
+    frames: int = FRAMES,
+    wander: bool = False,
+    parked: int = 6,
+    velocity: tuple[float, float] | None = None,
 ) -> tuple[NDArray[Any], Path]:
     """Write a recording without velocities: an ego, and parked cars. Return the speed of the ego."""
     rng = np.random.default_rng(7)
@@ -49,6 +55,8 @@ def recorded(
             slow = keys[:, i // 5] * (1 - a) + keys[:, i // 5 + 1] * a
             off = slow if wander else rng.normal(0, sigma, (parked + 1, 2))
             cars = [moved(1, x[i] + off[0, 0], y[i] + off[0, 1])]
+            if velocity:
+                cars[0].base.velocity.x, cars[0].base.velocity.y = velocity
             cars += [
                 moved(k + 2, 15.0 * k + off[k + 1, 0], 8.0 + off[k + 1, 1]) for k in range(parked)
             ]
@@ -158,6 +166,18 @@ def test_impossible_motion_is_marked(tmp_path: Path) -> None:
         )
         assert store.find("MATCH (e:Ego) WHERE e.unreal_accel").count() == 0
         assert store.find("MATCH (e:Ego) WHERE NOT e.stands AND moving(e)").count() == 60
+
+
+def test_recorded_motion_is_kept_beside_motion_from_positions(tmp_path: Path) -> None:
+    _, path = recorded(tmp_path / "a.mcap", 0.1, velocity=(5.0, 0.0))
+    with sgstore.open(tmp_path / "s.sgstore", create=True) as store:
+        (outcome,) = store.ingest(path, config=sgstore.Config(noise=0.1))
+        assert any("recorded speeds differ" in words for words in outcome.warnings)
+        (row,) = store.find(
+            "MATCH (e:Ego) WHERE frame.seq = 20 RETURN e.speed AS v, e.position_speed AS p"
+        ).rows()
+        assert row.v == 5.0
+        assert abs(row.p - 12) < 0.5
 
 
 def test_noise_can_be_set(tmp_path: Path) -> None:

@@ -50,6 +50,24 @@ def test_what_is_told_in_the_map_stands_there_with_its_motion(tmp_path: Path) ->
     assert blocks[0].time_ns[:2].tolist() == [1_000_000_000, 1_100_000_000]
 
 
+def test_existence_and_covariance_are_attributes(stack: Stack, tmp_path: Path) -> None:
+    covariance = [0.0] * 36
+    covariance[0], covariance[1], covariance[7], covariance[35] = 0.25, -0.125, 0.5, 0.0625
+    stack.transform(1.0, "map", "base_link", (0, 0, 0), 0.0)
+    for t in (1.0, 1.5):
+        sure = thing("car", 20, 1, name="sure", existence=0.75, covariance=covariance)
+        stack.objects(t, [sure, thing("car", 30, 5, name="plain")], "Tracked")
+    stack.end()
+    with sgstore.open(tmp_path / "s.sgstore", create=True) as store:
+        store.ingest(stack.path)
+        rows = store.find(
+            "MATCH (v:Car) WHERE v.existence_probability > 0.5 RETURN v.ident AS i, v.covariance_x AS x,"
+            " v.covariance_xy AS xy, v.covariance_y AS y, v.covariance_heading AS h,"
+            " v.existence_probability AS p"
+        ).rows()
+    assert {tuple(row) for row in rows} == {(hex_of("sure"), 0.25, -0.125, 0.5, 0.0625, 0.75)}
+
+
 def test_what_is_detected_by_a_sensor_is_carried_into_the_map_and_followed(stack: Stack) -> None:
     def ego_at(t: float) -> tuple[complex, complex]:
         """Place, and the way ahead, on a circle."""

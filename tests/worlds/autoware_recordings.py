@@ -106,7 +106,7 @@ def _told(one: dict[str, Any], sort: str) -> dict[str, Any]:
             "position": xyz(one["x"], one["y"], one.get("z", 0.75)),
             "orientation": turned(one.get("heading", 0.0)),
         },
-        "covariance": _NOTHING,
+        "covariance": one.get("covariance", _NOTHING),
     }
     spin = xyz(0, 0, one.get("yaw_rate", 0.0))
     twist = {"twist": {"linear": xyz(*one.get("v", ())), "angular": spin}, "covariance": _NOTHING}
@@ -116,7 +116,7 @@ def _told(one: dict[str, Any], sort: str) -> dict[str, Any]:
     corners = [xyz(*corner) for corner in one.get("corners", ())]
     size = one.get("size", (4.5, 1.9, 1.5))
     told = {
-        "existence_probability": 1.0,
+        "existence_probability": one.get("existence", 0.0),
         "classification": classes,
         "shape": {
             "type": one.get("shape", 2 if corners else 0),

@@ -104,7 +104,25 @@ def _columns(predicted: bool) -> tuple[str, ...]:  # noqa: FBT001 (one of two de
         "shape.type",
         "kinematics.orientation_availability",
         "kinematics.has_twist",
+        "existence_probability",
+        *(f"{_TOLD[predicted]}.covariance[{place}]" for place in _COVARIANCES.values()),
     )
+
+
+_COVARIANCES: Final = {
+    "covariance_x": 0,
+    "covariance_xy": 1,
+    "covariance_y": 7,
+    "covariance_heading": 35,
+}
+"""Attributes with covariances of the pose in the axes of the objects, and their places; m², rad²."""
+
+
+def _perceived(objects: Floats) -> list[dict[str, float]]:
+    """Return existence probability and covariances of each object. Zeros are unknown."""
+    names = ("existence_probability", *_COVARIANCES)
+    rows = objects[:, -len(names) :].tolist()
+    return [{name: value for name, value in zip(names, row, strict=True) if value} for row in rows]
 
 
 @dataclass(slots=True)
@@ -115,7 +133,7 @@ class AutowareRawFrame:
     ----------
     time_ns, log_time_ns : int
     node : (n,) int64
-    objects : (n, 19) float64
+    objects : (n, 25) float64
         Columns of the objects after their classes.
     axes : str
         Axes of the objects.
@@ -174,6 +192,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
     """
 
     sure_kinds: ClassVar[bool] = False
+    measures: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -502,6 +521,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
             np.full(len(node), -1, np.int64),
             controls=controls if wanted == ego else (NAN,) * 5,
             driven=driven if (node == ego).any() else {},
+            own=dict(zip(node.tolist(), _perceived(frame.objects[usable]), strict=False)),
             kinds=frame.kinds,
         )
         return rows.with_heads(self._heads(frame.lights))
