@@ -55,7 +55,7 @@ FORWARD: Final = 0.25
 SAME_SPOT: Final = 0.1
 """Tolerance of this position; m."""
 SAME_PLACE: Final = 1.0
-"""Maximum distance of a light from a free signal; m."""
+"""Maximum distance of a light or sign from a free signal; m."""
 ASIDE: Final = 10.0
 """Maximum sideways offset of a light in CARLA: ten times a fifth of a lane of 5 m; m."""
 SAME_WAY: Final = math.pi / 4
@@ -66,9 +66,6 @@ LEARNT_FROM: Final = 3
 """Minimum number of lights for a learned offset."""
 LEARNT_WITHIN: Final = 5.0
 """Maximum distance of these lights from their signals; m."""
-
-SAME_PLACE: Final = 1.0
-"""Maximum distance of a sign from its signal in the map; m."""
 
 MOST_NAMED: Final = 5
 """Maximum number of lights or lanes in a warning."""

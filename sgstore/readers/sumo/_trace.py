@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from sgstore.base.markup import MarkupError, MarkupParser
 from sgstore.graphs.online import Frame
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Recording
     from sgstore.model.world import Channel, TraceReport
-    from sgstore.readers._base import _FramesDecoder
 
 MAX_ENTITIES: Final = 1_000_000
 
@@ -98,7 +97,7 @@ class SumoTrace(FramesTrace):
         self._owners: dict[str, str] = {}
         self._guessed: set[str] = set()
 
-    def decoder(self, report: TraceReport) -> _FramesDecoder:
+    def decoder(self, report: TraceReport) -> Any:
         """Return a new decoder. It reports the vehicle types without a size."""
         found = super().decoder(report)
         self._warnings = report.warnings
