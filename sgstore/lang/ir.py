@@ -607,8 +607,9 @@ class Result:
 
     @property
     def chooses(self) -> bool:
-        """True if the query returns only some of the rows, because of ``SKIP`` or ``LIMIT``."""
-        return self.limit is not None or self.top is not None or self.skip > 0
+        """True if ``SKIP``, ``LIMIT``, or ``HAVING`` without groups, chooses among the rows of the query."""
+        chosen = self.limit is not None or self.top is not None or self.skip > 0
+        return chosen or (self.having is not None and not self.aggregated)
 
     def changed(self, change: Callable[[Bound], Bound]) -> Result:
         """Return a copy of the result clause with a function applied to every expression."""

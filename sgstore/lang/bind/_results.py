@@ -111,41 +111,47 @@ def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
         )
 
 
-def _of_each(value: b.Bound) -> bool:
-    """True if an expression uses values of single matches outside an aggregate such as ``COUNT``."""
+def _of_each(value: b.Bound, *, matches: bool = False) -> bool:
+    """True if an expression uses values of single matches outside an aggregate such as ``COUNT``.
+
+    ``matches``: values over a match are allowed.
+    """
     if isinstance(value, b.Operation):
-        return any(_of_each(operand) for operand in value.operands)
+        return any(_of_each(operand, matches=matches) for operand in value.operands)
+    if isinstance(value, b.OverMatch | b.StepTime):
+        return not matches
     return not isinstance(value, b.Aggregate | b.GroupKey | b.Value | b.Choices)
 
 
 def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) -> b.Bound | None:
-    """Return the bound ``HAVING`` condition on groups of matches or on intervals, or None."""
+    """Return the bound ``HAVING`` condition on groups of matches, matches or intervals, or None."""
     if written is None:
         return None
     session = names.session
-    if result.form in {"intervals", "clips"}:
-        own: dict[str, b.Bound] = {
-            name: b.GroupKey(name, Type.text if name == "trace" else Type.number)
-            for name in result.names
-        }
-        found = settled(replace(names, aliases=own).condition(written), session)
-        if b.is_counted(found) or _of_each(found):
+    listed = result.form in {"intervals", "clips"}
+    own: dict[str, b.Bound] = {column.name: column.value for column in result.columns}
+    ends = result.names if listed else ()
+    for name in ends:
+        own[name] = b.GroupKey(name, Type.text if name == "trace" else Type.number)
+    found = settled(replace(names, aliases=own).condition(written), session)
+    of_match = any(isinstance(part, b.OverMatch | b.StepTime) for part in b.walk(found))
+    found = _of_groups(found, _group_keys(result.columns))
+    if listed:
+        if b.is_counted(found) or _of_each(found, matches=True):
             session.refuse(
                 f"after HAVING, {result.form} have only their ends as values",
                 written.span,
-                f"name one of: {', '.join(own)}; write conditions on matches after WHERE",
+                f"name one of: {', '.join(ends)}; write conditions on matches after WHERE",
             )
         return found
-    own = {column.name: column.value for column in result.columns}
-    found = settled(replace(names, aliases=own).condition(written), session)
-    found = _of_groups(found, _group_keys(result.columns))
-    if not b.is_counted(found) and not result.aggregated:
+    grouped = b.is_counted(found) or result.aggregated
+    if not grouped and not of_match:
         session.refuse(
             "HAVING chooses among groups of matches, but this query has no aggregate",
             written.span,
             "write conditions on matches after WHERE, before RETURN",
         )
-    if _of_each(found):
+    if _of_each(found, matches=not grouped):
         session.refuse(
             "HAVING can use only aggregates and returned values",
             written.span,

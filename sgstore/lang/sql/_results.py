@@ -290,6 +290,8 @@ class _RowStatement:
         else:
             select.join(nested(relation, ":rows"), [])
         select.distinct = self.result.distinct or self.result.framed
+        if self.result.having is not None and not self.result.aggregated:
+            select.where.append(self._text(self.result.having))
         if self.result.aggregated:
             listed = enumerate(self.result.columns, start=1)
             select.group = [str(place) for place, column in listed if not is_counted(column.value)]
@@ -418,7 +420,10 @@ class _IntervalStatement:
     def __init__(self, query: Query, writer: SqlBuilder, span: Span | None) -> None:
         self.query, self.result = query, query.result
         self.writer, self.span = writer, span
+        having = [] if self.result.having is None else [*leaves(self.result.having)]
+        self.unnamed = list(dict.fromkeys(having))  # values that only HAVING uses
         kept = [value for column in self.result.columns for value in _kept(column.value)]
+        kept += self.unnamed
         distinct = enumerate(dict.fromkeys(kept))
         self.keys = {value: quoted(f"key {number}") for number, value in distinct}
         # In a trace, an id has only one kind.
@@ -428,7 +433,7 @@ class _IntervalStatement:
     def statement(self) -> SqlStatement:
         columns = self.result.columns
         wanted = [leaf for column in columns for leaf in leaves(column.value)]
-        spans = self._spans(wanted)
+        spans = self._spans([*wanted, *self.unnamed])
         clips = self.result.form == "clips"
         own = self._clip_columns() if clips else self._interval_columns()
         told = dict(own) | {column.name: self._shown(column) for column in columns}
@@ -472,8 +477,7 @@ class _IntervalStatement:
         """Return the SQL of the ``HAVING`` condition on an interval, from its columns."""
 
         def leaf(found: Leaf) -> str:
-            assert isinstance(found, GroupKey)  # noqa: S101 - guaranteed by the binder
-            return columns[found.name]
+            return columns[found.name] if isinstance(found, GroupKey) else self.keys[found]
 
         return expression_text(condition, leaf, self.writer.values)
 

@@ -1,0 +1,68 @@
+"""``HAVING`` with values over a match, and their names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from sgstore.errors import QueryError
+
+if TYPE_CHECKING:
+    from sgstore.query import Store
+
+NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
+LEAST = "MIN(gap(e, v)) OVER match"
+FORMS = {
+    "rows": f"{NEAR} RETURN frame.seq, v.name, {LEAST} AS least",
+    "distinct rows": f"{NEAR} RETURN DISTINCT v.name, {LEAST} AS least",
+    "whole matches": f"{NEAR} RETURN *, {LEAST} AS least",
+    "intervals": f"{NEAR} RETURN v.name, INTERVALS, {LEAST} AS least",
+    "clips": f"{NEAR} RETURN v.name, CLIPS(-1s, 1s), {LEAST} AS least",
+    "a sequence": f"{NEAR} AS a THEN WITHIN 3s MATCH (e)-[:near]->(v) RETURN v.name, {LEAST} AS least",
+    "intervals of a sequence": f"{NEAR} AS a THEN WITHIN 3s MATCH (e)-[:near]->(v)"
+    f" RETURN v.name, INTERVALS, {LEAST} AS least",
+}
+
+
+def rows(text: str, store: Store) -> list[tuple[Any, ...]]:
+    return [tuple(row) for row in store.find(text).rows()]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_having_chooses_by_a_value_over_the_match(form: str, open_town: Store) -> None:
+    text = FORMS[form]
+    wanted = [row for row in rows(text, open_town) if row[-1] < 1]
+
+    assert wanted
+    assert rows(f"{text} HAVING least < 1", open_town) == wanted
+    assert rows(f"{text} HAVING {LEAST} < 1", open_town) == wanted
+    if form != "whole matches":
+        others = [row for row in wanted if "car 2" not in row]
+        assert rows(f"{text} HAVING 1 - least > 0 AND v.name <> 'car 2'", open_town) == others
+    unnamed = text.replace(f", {LEAST} AS least", "")
+    assert rows(f"{unnamed} HAVING {LEAST} < 1", open_town) == [row[:-1] for row in wanted]
+
+
+def test_frames_and_counts_are_those_of_the_chosen_rows(open_town: Store) -> None:
+    matches = open_town.find(f"{FORMS['rows']} HAVING least < 1")
+    seqs = [row[0] for row in rows(f"{FORMS['rows']} HAVING least < 1", open_town)]
+
+    assert [frame.seq for frame in matches.frames()] == list(dict.fromkeys(seqs))
+    assert matches.count() == len(set(seqs))
+
+
+def test_steps_have_times_after_having(open_town: Store) -> None:
+    text = (
+        f"{NEAR} AS a THEN WITHIN 3s MATCH (e)-[:near]->(v) AS c RETURN v.name, t(c) - t(a) AS took"
+    )
+    wanted = [row for row in rows(text, open_town) if row[1] < 0.5]
+
+    assert rows(f"{text} HAVING took < 0.5", open_town) == wanted
+    assert rows(f"{text} HAVING t(c) - t(a) < 0.5", open_town) == wanted
+
+
+@pytest.mark.parametrize("form", ["", ", INTERVALS", ", COUNT(*) AS n"])
+def test_a_value_of_one_frame_is_still_refused(form: str, open_town: Store) -> None:
+    with pytest.raises(QueryError):
+        open_town.find(f"{NEAR} RETURN v.name{form} HAVING v.speed > 2")
