@@ -670,12 +670,16 @@ class MatchStage:
     paths : tuple of PathValue
     ways : tuple of PathWay
         In a rewritten query: one pattern for each combination of path lengths.
+    apart : tuple of (str, str)
+        Own nodes, each with a node of an earlier stage that it must differ from, unless that one is NULL.
+        The scope does not use the earlier node.
     """
 
     scope: Scope
     optional: bool
     paths: tuple[PathValue, ...] = ()
     ways: tuple[PathWay, ...] = ()
+    apart: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,6 +71,11 @@ def joined(
     return found
 
 
+def written(key: str) -> str:
+    """Return the name in the query for a node key. A variable of a repetition has one key for each round."""
+    return key.partition("~")[0]
+
+
 def _with(
     found: JoinedBindings,
     variables: tuple[str, ...],
@@ -88,7 +93,7 @@ def _with(
     kept = np.ones(len(rows), np.bool_)
     for at, name in enumerate(found.variables):
         for column, other in enumerate(new):
-            if name in apart and other in apart:
+            if name in apart and other in apart and written(name) != written(other):
                 kept &= bindings[:, at] != added[:, column]
     places = np.column_stack((found.places[rows], others))
     return JoinedBindings(names, bindings[kept], places[kept])

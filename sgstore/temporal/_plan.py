@@ -427,8 +427,8 @@ def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str
 
 
 def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the named nodes and edges that alternative steps of a sequence share."""
-    happen = [step for step in query.steps if query.alternatives and not step.absent]
+    """Return the named nodes and edges that the steps of a sequence share, also in one repetition only."""
+    happen = [step for step in query.steps if query.spans and not step.absent]
     nodes = (node for step in happen for node in step.scope.nodes.values())
     edges = (edge.key for step in happen for edge in step.scope.edges if edge.named)
     named = (node.key for node in nodes if node.role == "named" or not node.kinds.other)

@@ -21,6 +21,7 @@ from sgstore.lang.ir import (
 from sgstore.model.world import seconds_of
 from sgstore.temporal._binding_truth import Valuation
 from sgstore.temporal._formula import And, Formula
+from sgstore.temporal._joint_bindings import written
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues
 from sgstore.temporal._match_values_monitor import MatchValues
 from sgstore.temporal._plan import asks_of_steps, plan_of_steps, tied_in_steps
@@ -207,7 +208,8 @@ def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]
     for name, node in zip(names, key, strict=True):
         known = both.get(name)
         if known is None:
-            if name in apart and any(n == node for v, n in one.items() if v in apart):
+            others = (v for v, n in one.items() if n == node and v in apart)
+            if name in apart and any(written(v) != written(name) for v in others):
                 return None
             both[name] = node
         elif known != node:

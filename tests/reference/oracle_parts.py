@@ -24,6 +24,7 @@ from oracle import (
     difference,
     free_names,
     named_nodes,
+    only_ego,
     relations_of,
     remembered,
     shown,
@@ -88,13 +89,21 @@ class Row(Search):
     def found(self, block: s.Block) -> list[tuple[Binding, Binding]]:
         """Matches of a block beside what is bound, each with its paths."""
         if not paths_in(block):
-            return [(binding, {}) for binding in self.matches(block, self.binding)]
+            found = self.matches(block, self.binding)
+            return [(binding, {}) for binding in found if self.differs(block, binding)]
         if any(self.binding.get(name, "") is None for name in free_names(block)):
             return []
         bare = replace(block, where=None)
         apart = tuple(name for name in free_names(block) if name in self.binding)
         found = self.matches(bare, self.binding, apart)
-        return [(b, p) for b in found for p in self.along(block, b)]
+        return [(b, p) for b in found if self.differs(block, b) for p in self.along(block, b)]
+
+    def differs(self, block: s.Block, binding: Binding) -> bool:
+        """Whether the nodes of a block are none of the variables before; but ``(:Ego)`` is the ego."""
+        egos = {n for n, node in named_nodes(block) if node.label and only_ego(node.label)}
+        own = {n for n, _ in named_nodes(block)} - self.binding.keys() - egos
+        before = {node for name, node in self.binding.items() if name[:1] != "#"}
+        return not self.injective or not any(binding[name] in before for name in own)
 
     def along(self, block: s.Block, binding: Binding) -> Iterator[Binding]:
         """The paths of a match of which the condition is true: each a list of nodes."""

@@ -177,13 +177,16 @@ LIMITS: Final[Mapping[str, Interval]] = {
 """Smallest and largest value of attributes and of numbers of two entities, in the units of the language."""
 
 
+_ANY: Final = (-math.inf, math.inf)
+
+
 def limits(value: b.Bound) -> Interval:
     """Return the smallest and the largest value that a number can have in a recording."""
     match value:
         case b.Value(value=int() | float() as number):
             return float(number), float(number)
         case b.NodeAttribute(attribute=one) | b.EdgeAttribute(attribute=one):
-            found = None if one.name == "gap" else LIMITS.get(one.name)
+            found = None if one.name == "gap" else LIMITS.get(one.name)  # may be below 0
         case b.FrameAttribute(attribute=one) | b.TraceAttribute(attribute=one):
             found = None if one.table or b.is_passed_on(value) else LIMITS.get(one.name)
         case b.PairNumber(function=name):
@@ -200,7 +203,7 @@ def limits(value: b.Bound) -> Interval:
             found = COMPUTED[word]([limits(one) for one in operands])
         case _:
             found = None
-    return found or (-math.inf, math.inf)
+    return found or _ANY
 
 
 def check_comparison(e: s.Expression, found: b.Bound, names: SymbolTable) -> b.Bound:
@@ -226,7 +229,10 @@ def check_comparison(e: s.Expression, found: b.Bound, names: SymbolTable) -> b.B
     numbers = [float(one.value or 0) for one in others if one.type is Type.number]
     holds, hint = "", ""
     if numbers and not isinstance(left, b.Value):
-        low, high = limits(left)
+        if isinstance(left, b.NodeAttribute):
+            low, high = LIMITS.get(left.attribute.name, _ANY)
+        else:
+            low, high = limits(left)
         below, above = max(numbers) < low, min(numbers) > high
         if below or above:
             never = {"=": True, "<": below, "<=": below, ">": above, ">=": above}.get(word, False)

@@ -15,6 +15,7 @@ from sgstore.lang.bind._datasets import asked
 from sgstore.lang.bind._expressions import parameter
 from sgstore.lang.bind._functions import FUNCTIONS
 from sgstore.lang.bind._patterns import ALL_BINDERS, bind_block
+from sgstore.lang.bind._renaming import names_returned
 from sgstore.lang.bind._results import bind_columns, bind_result
 from sgstore.lang.bind._sequences import bind_sequence
 from sgstore.lang.bind._stages import StageBinder
@@ -142,7 +143,8 @@ def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
 
 def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
     """Return the bound query of a sequence of steps (patterns that match one after another)."""
-    found = bind_sequence(match.sequence, session, bind_block)
+    returned = names_returned(match.returns)
+    found = bind_sequence(match.sequence, session, bind_block, returned)
     names = SymbolTable(session, found.scope(), found.meanings)
     result = bind_result(match.returns, names)
     found.take_in_ego(names.scope)

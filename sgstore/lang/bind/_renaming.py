@@ -153,6 +153,32 @@ def names_written(sequence: s.SequenceClause) -> frozenset[str]:
     return frozenset(found)
 
 
+def names_of_group(group: s.GroupStep) -> frozenset[str]:
+    """Return the variables of a group of steps that are not the ego by their label."""
+    egos = {
+        node.name
+        for step in _steps_in(group)
+        for path in step.block.paths
+        for node in path.nodes
+        if isinstance(node.label, s.Label) and node.label.name.lower() == "ego"
+    }
+    alone = s.SequenceClause((group,), (), group.span)
+    return names_written(alone) - egos - {THE_EGO, *RESERVED}
+
+
+def _steps_in(group: s.GroupStep) -> Iterator[s.StepClause]:
+    for step in (one for sequence in group.alternatives for one in sequence.steps):
+        if isinstance(step, s.GroupStep):
+            yield from _steps_in(step)
+        elif isinstance(step, s.StepClause):
+            yield step
+
+
+def names_returned(returns: s.Returns | None) -> frozenset[str]:
+    """Return the variables that a ``RETURN`` clause uses."""
+    return frozenset(_spoken_of(returns, ())) if returns is not None else frozenset()
+
+
 def renamed(step: s.StepClause, names: Mapping[str, str]) -> s.StepClause:
     """Return a copy of a sequence step with renamed variables."""
     return _renamed(step, names) if names else step

@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang.bind._expressions import parameter
-from sgstore.lang.bind._renaming import names_written, own_names, renamed, values_given
+from sgstore.lang.bind._renaming import (
+    names_of_group,
+    names_written,
+    own_names,
+    renamed,
+    values_given,
+)
 from sgstore.lang.bind._symbols import RESERVED, ScopeBuilder, Session, Symbol, SymbolTable
 from sgstore.lang.bind._temporal import length, settled
 from sgstore.lang.library import patterns
@@ -22,7 +28,7 @@ from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.errors import TextSpan
     from sgstore.lang.library import NamedPattern
@@ -185,14 +191,29 @@ class _WrittenSteps:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenGroup:
-    """Group of alternative step sequences in brackets, with its number of repetitions."""
+    """Group of alternative step sequences in brackets, with its number of repetitions.
+
+    ``fresh`` are the variables of the group alone. If there are some, each repetition has its own steps
+    (``rounds``) and its own bindings of these variables.
+    """
 
     group: s.GroupStep
     alternatives: list[_WrittenSteps]
+    fresh: frozenset[str] = frozenset()
+
+    @property
+    def rounds(self) -> list[list[_WrittenSteps]]:
+        """Alternatives of each repetition that has steps of its own."""
+        size = len(self.alternatives) // (self.group.high if self.fresh else 1)
+        every = self.alternatives
+        return [every[first : first + size] for first in range(0, len(every), size)]
 
 
 def bind_sequence(
-    sequence: s.SequenceClause, session: Session, bind_block: Callable[[s.Block, SymbolTable], None]
+    sequence: s.SequenceClause,
+    session: Session,
+    bind_block: Callable[[s.Block, SymbolTable], None],
+    returned: frozenset[str] = frozenset(),
 ) -> BoundSequence:
     """Return the bound steps and links of a ``MATCH``, with names resolved and scenarios replaced by steps.
 
@@ -202,6 +223,8 @@ def bind_sequence(
     session : Session
     bind_block : function
         Function of the binder that binds paths and a condition.
+    returned : frozenset of str
+        Variables that ``RETURN`` uses.
 
     Raises
     ------
@@ -209,7 +232,7 @@ def bind_sequence(
         A step or a link is not allowed at its place.
     """
     found = BoundSequence(session)
-    written = _spelled_out(sequence, session, 0)
+    written = _spelled_out(sequence, session, 0, returned)
     ways = _ways(written, [], sequence.span, session)
     for steps, links in ways:
         _check_absent(steps, links, session)
@@ -259,13 +282,13 @@ def _ways_on(written: _WrittenGroup, before: list[_Way], session: Session) -> li
     """Return the given step sequences, extended by all repetitions and alternatives of a group."""
     group, found = written.group, list[_Way]()
     again = s.LinkClause("then", None, None, group.span)
-    open_ended = before
+    open_ended, rounds = before, written.rounds
     for number in range(1, group.high + 1):
         if number > 1:
             open_ended = [(steps, [*links, (again, None)]) for steps, links in open_ended]
         open_ended = [
             way
-            for one in written.alternatives
+            for one in rounds[(number - 1) % len(rounds)]
             for way in _ways(one, open_ended, group.span, session)
         ]
         if number >= group.low:
@@ -293,11 +316,23 @@ def _bind_steps(
                 )
             _bind_step(one, found, bind_block)
         else:
-            _bind_group(one, found, bind_block, again=again or one.group.high > 1)
+            for alternatives in one.rounds:
+                _forget(one.fresh, found)
+                _bind_group(alternatives, found, bind_block, again=again or one.group.high > 1)
+            _forget(one.fresh, found)
+
+
+def _forget(names: frozenset[str], found: BoundSequence) -> None:
+    """Remove variables of a repetition, which are new in the next one."""
+    symbols = {name: found.meanings.pop(name) for name in names & found.meanings.keys()}
+    keys = {symbol.node or symbol.edge for symbol in symbols.values()}
+    found.known = {key: node for key, node in found.known.items() if key not in keys}
+    found.edges = [edge for edge in found.edges if edge.key not in keys]
+    found.partial -= names
 
 
 def _bind_group(
-    written: _WrittenGroup,
+    alternatives: Sequence[_WrittenSteps],
     found: BoundSequence,
     bind_block: Callable[[s.Block, SymbolTable], None],
     *,
@@ -312,7 +347,7 @@ def _bind_group(
     edges, ends, partial = list(found.edges), dict(found.ends), set(found.partial)
     told: list[tuple[dict[str, b.Node], dict[str, Symbol], set[str]]] = []
     taken = set(keys)
-    for one in written.alternatives:
+    for one in alternatives:
         # The same name is the same node in all alternatives, so it has the same key.
         found.known, found.meanings, session.keys = dict(known), dict(meanings), set(keys)
         found.edges, found.ends, found.partial = list(edges), dict(ends), set(partial)
@@ -340,8 +375,13 @@ def _either(nodes: list[b.Node]) -> b.Node:
     return replace(nodes[0], kinds=kinds)
 
 
-def _spelled_out(sequence: s.SequenceClause, session: Session, depth: int) -> _WrittenSteps:
-    """Return the steps and links of a sequence, with named scenarios replaced by their own steps."""
+def _spelled_out(
+    sequence: s.SequenceClause, session: Session, depth: int, outside: frozenset[str]
+) -> _WrittenSteps:
+    """Return the steps and links of a sequence, with named scenarios replaced by their own steps.
+
+    ``outside`` are the variables that the query uses outside the sequence.
+    """
     steps: list[_Written | _WrittenGroup] = []
     links: list[tuple[s.LinkClause, Mapping[str, Any] | None]] = []
     taken = names_written(sequence)
@@ -352,12 +392,19 @@ def _spelled_out(sequence: s.SequenceClause, session: Session, depth: int) -> _W
             steps.append(_Written(step, None, ""))
             continue
         if isinstance(step, s.GroupStep):
-            alternatives = [_spelled_out(one, session, depth) for one in step.alternatives]
-            steps.append(_WrittenGroup(step, alternatives))
+            others = (*sequence.steps[:number], *sequence.steps[number + 1 :])
+            around = outside | names_written(replace(sequence, steps=others))
+            fresh = names_of_group(step) - around if step.high > 1 else frozenset[str]()
+            alternatives = [
+                _spelled_out(one, session, depth, around)
+                for _ in range(step.high if fresh else 1)
+                for one in step.alternatives
+            ]
+            steps.append(_WrittenGroup(step, alternatives, fresh))
             continue
         shipped = _shipped(step, session)
         if shipped is not None:
-            inner = _spelled_out(shipped, session, depth + 1)
+            inner = _spelled_out(shipped, session, depth + 1, outside | taken)
             inner = _with_own_names(step, inner, _parameters_shipped(step), taken, session)
             about = {"name": step.name, "called": step.name_span}
             steps += inner.changed(lambda one, about=about: replace(one, **about)).steps
@@ -369,7 +416,7 @@ def _spelled_out(sequence: s.SequenceClause, session: Session, depth: int) -> _W
         body = definition.body
         assert isinstance(body, s.SequenceClause)  # noqa: S101 - it was found as a scenario
         values = _values(step, definition, session)
-        inner = _spelled_out(body, session, depth + 1)
+        inner = _spelled_out(body, session, depth + 1, outside | taken)
         formals = (formal.name for formal in definition.parameters)
         inner = _with_own_names(step, inner, formals, taken, session).given(values)
         called = definition.name

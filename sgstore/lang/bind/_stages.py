@@ -58,6 +58,33 @@ class StagedScope(ScopeBuilder):
 
 
 @dataclass(slots=True)
+class _Match:
+    """Bound ``MATCH`` clause of a query, with the variables of earlier clauses."""
+
+    scope: ScopeBuilder
+    paths: list[b.PathValue]
+    earlier: dict[str, b.Node]
+    optional: bool = field(kw_only=True)
+
+    def finished(self, ego: b.Node | None) -> b.MatchStage:
+        """Return the final stage. Its nodes differ from the ego if any clause uses it."""
+        earlier = self.earlier | ({} if ego is None else {ego.key: ego})
+        apart = tuple(
+            (key, other)
+            for key, node in self.scope.nodes.items()
+            for other, old in earlier.items()
+            if other not in self.scope.outer and _may_be_same(node.kinds, old.kinds)
+        )
+        apart = apart if self.scope.session.injective else ()
+        return b.MatchStage(self.scope.finished(), self.optional, tuple(self.paths), apart=apart)
+
+
+def _may_be_same(one: b.Kinds, other: b.Kinds) -> bool:
+    """True if two variables can be the same node. Two that must be the ego are not compared."""
+    return bool(one.other & other.other or (one.ego & other.ego and (one.other or other.other)))
+
+
+@dataclass(slots=True)
 class _With:
     """Bound ``WITH`` clause of a query, with the nodes before and after it."""
 
@@ -109,7 +136,7 @@ class StageBinder:
     ) -> None:
         self._session, self._bind_block, self._bind_columns = session, bind_block, bind_columns
         self._span = match.later[0].span if match.later else match.span
-        self._stages: list[tuple[ScopeBuilder, bool, list[b.PathValue]] | _With] = []
+        self._stages: list[_Match | _With] = []
         first = ScopeBuilder(session)
         self._told = StagedScope(session, first=first)
         self.names = SymbolTable(session, self._told)
@@ -131,8 +158,10 @@ class StageBinder:
         scope = names.scope
         self._refuse_many(scope, names.paths)
         scope.where = [self._checked(part) for part in scope.where]
-        self._stages.append((scope, optional, names.paths))
         told = self._told
+        known = (symbol.node for symbol in self.names.meanings.values())
+        earlier = {key: told.nodes[key] for key in known if key is not None}
+        self._stages.append(_Match(scope, names.paths, earlier, optional=optional))
         self._session.maybe |= set(scope.nodes) if optional else set()
         told.nodes |= scope.nodes
         told.edges += [edge for edge in scope.edges if edge.named]
@@ -317,8 +346,7 @@ class StageBinder:
             if isinstance(part, _With):
                 found.append(part.finished(ego))
             else:
-                scope, optional, paths = part
-                found.append(b.MatchStage(scope.finished(), optional, tuple(paths)))
+                found.append(part.finished(ego if found else None))
         return tuple(found)
 
 

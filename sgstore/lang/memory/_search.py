@@ -369,6 +369,8 @@ class _Joining:
         for search, paths in self._ways:
             at = _row(view, row.nodes, row.edges, row.passed)
             for _ in search.run(at):
+                if any(at.nodes[key] == row.nodes.get(other) for key, other in self._stage.apart):
+                    continue
                 ways = [tuple(at.nodes[key] for key in keys) for keys in paths]
                 key = tuple(at.nodes[key] for key in self._nodes), *ways
                 key += tuple(at.edges[key][0] for key in self._edges)

@@ -139,6 +139,11 @@ def _joined(
     select.columns += [f"{more}.{column}" for column in own]
     select.join(f'{quoted(rows.name)} AS ":rows"', [])
     on = [f'{more}.{column} = ":rows".{column}' for column in ('"frame_id"', *columns_of(outer))]
+    on += [
+        f'{more}.{quoted(f"{key}.id")} IS DISTINCT FROM ":rows".{quoted(f"{other}.id")}'
+        for key, other in stage.apart
+        if key in nodes and other in rows.nodes
+    ]
 
     def leaf(found: Leaf) -> str:
         table = '":rows"' if is_passed_on(found) and found not in paths else more
