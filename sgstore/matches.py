@@ -342,12 +342,16 @@ class Matches(Tabular):
         >>> store.find("MATCH (e:Ego) WHERE e.heading < 200").mistakes
         ('e.heading < 200 always holds; it lies between -180 and 180 degrees: write -160',)
         """
-        from sgstore.lang.help import compared_in_query
+        from sgstore.lang.help import compared_in_query, unknown_in_or
 
         with self._compiled() as compiled:
             compared = compared_in_query(compiled.bound)
             texts = notes_in(self._file, compared, self._text, self._parameters)
-            return compiled.bound.doubts + texts
+
+            def ask(sql: str, values: list[object]) -> Sequence[tuple[Any, ...]]:
+                return self._file.rows(sql, values).values
+
+            return compiled.bound.doubts + texts + unknown_in_or(compiled.bound, ask)
 
     def _absent(self, compiled: Compiled) -> tuple[str, ...]:
         """Return a note on a part of the pattern that no frame of the store has, if nothing matches."""

@@ -280,7 +280,7 @@ class Operation:
 class BlockValue:
     """Pattern in braces, as in ``EXISTS {…}``, ``COUNT {…}`` or ``MIN {… | value}``.
 
-    ``number`` is unique in the query.
+    ``number`` is unique in the query. ``source`` is its text in the query, with its place.
     """
 
     word: str
@@ -288,6 +288,7 @@ class BlockValue:
     value: Bound | None
     type: Type
     number: int
+    source: tuple[str, int] | None = field(default=None, compare=False)
 
     @property
     def inside(self) -> tuple[Bound, ...]:

@@ -455,9 +455,14 @@ def suggestion(name: str, known: Iterable[str], alike: float = 0.6) -> str | Non
 
     ``None`` means no similarity of at least ``alike`` (0 to 1).
     """
-    by_folded = {normalize_name(candidate): candidate for candidate in known}
+    by_folded: dict[str, list[str]] = {}
+    for candidate in known:
+        by_folded.setdefault(normalize_name(candidate), []).append(candidate)
     close = difflib.get_close_matches(normalize_name(name), by_folded, n=1, cutoff=alike)
-    return by_folded[close[0]] if close else None
+    if not close:
+        return None
+    same = by_folded[close[0]]  # such as cut_in and CutIn
+    return max(same, key=lambda one: difflib.SequenceMatcher(None, name, one).ratio())
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.lang.help import in_words
 from sgstore.lang.sql import value_text
 from sgstore.temporal._check_plan import CheckPlan, base_name
 from sgstore.temporal._formula import (
@@ -136,13 +137,13 @@ def condition_text(plan: Plan, name: str) -> str:
     name = base_name(name)
     meanings = plan.meanings if isinstance(plan, CheckPlan) else {}
     if name in meanings:
-        return value_text(meanings[name]).removeprefix("(").removesuffix(")")
+        return value_text(in_words(meanings[name])).removeprefix("(").removesuffix(")")
     if name in plan.margins:
-        return value_text(plan.margins[name]).removeprefix("(").removesuffix(")")
+        return value_text(in_words(plan.margins[name])).removeprefix("(").removesuffix(")")
     if name in plan.tests:
-        return value_text(plan.tests[name].expression)
+        return value_text(in_words(plan.tests[name].expression))
     ask = plan.atoms[name]
-    where = [value_text(part) for part in ask.query.scope.where]
+    where = [value_text(in_words(part)) for part in ask.query.scope.where]
     told = " ".join(" AND ".join(where).split())
     return told or f"exists_now({', '.join(ask.variables)})"
 

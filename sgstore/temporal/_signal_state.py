@@ -11,6 +11,7 @@ import numpy as np
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
 from sgstore.lang.bind import FUTURE
+from sgstore.lang.help import in_words
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import value_text
 from sgstore.model.world import JUMP_NS, longest_step_ns, tolerance_ns
@@ -65,7 +66,7 @@ class SignalState:
             for condition, formula in test.quantities.items():
                 if any(isinstance(part, Next | Previous | Until | Since) for part in walk(formula)):
                     raise QueryError(
-                        f"robustness({value_text(condition)}) is not of this frame alone",
+                        f"robustness({value_text(in_words(condition))}) is not of this frame alone",
                         hint="a monitor has the margins of checks: CHECK ALWAYS … ROBUSTNESS",
                     )
             for part in b.walk(test.expression):

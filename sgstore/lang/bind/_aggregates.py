@@ -118,7 +118,22 @@ def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
         if name == "collect" and operand.type not in function.of:
             session.refuse(f"{e.name}() takes values", e.arguments[0].span)
     share = _share(e.arguments[1], e, names) if function.share else 0.0
+    _note_habits(e, operand, share, names)
     return b.Aggregate(name, operand, e.distinct, function.gives or operand.type, share)
+
+
+def _note_habits(e: s.Call, operand: b.Bound, share: float, names: SymbolTable) -> None:
+    """Note a share in place of a percentage, and sums of angles."""
+    written = names.session.text[e.span.start : e.span.end]
+    if 0 < share <= 0.01:
+        names.session.doubt(
+            f"{written} is a percentile of {share * 100:g} %; write {share * 1e4:g}"
+        )
+    if normalize_name(e.name) in {"avg", "sum", "stddev"} and b.is_angle(operand):
+        names.session.doubt(
+            f"{written} adds angles, which repeat after 360 degrees; a mean direction is"
+            " degrees(atan2(AVG(sin(radians(x))), AVG(cos(radians(x)))))"
+        )
 
 
 def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:

@@ -401,7 +401,8 @@ def _canonical(value: b.Bound, other: b.Bound, span: TextSpan, names: SymbolTabl
         word = _kind(value.value, span, names)
     if word is None:
         lane = "for a lane, write l.type" if value.value in LANE_TYPES else None
-        names.session.unknown(_what(other), value.value, span, known, lane)
+        hint = lane or (said_of("labels", value.value) if _what(other) == "kind" else None)
+        names.session.unknown(_what(other), value.value, span, known, hint)
     return b.Value(word, Type.text, closed=True)
 
 

@@ -26,7 +26,7 @@ from sgstore.model.pair_numbers import (
     PAIR_FUNCTIONS,
     PART_DIST,
 )
-from sgstore.model.vocabulary import entity_kinds, normalize_name, relation_named
+from sgstore.model.vocabulary import entity_kinds, normalize_name, relation_named, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -157,7 +157,9 @@ def _no_function(name: str) -> str | None:
         return f"it is an attribute: x.{NODE_ATTRIBUTES[word].name}"
     if any(normalize_name(known) == word for known in patterns()):
         return f"it is a sequence of the library: MATCH {name}()"
-    return None
+    sequences = [known for known, one in patterns().items() if one.kind in {"concept", "scenario"}]
+    near = suggestion(name, sequences, 0.9)
+    return f"did you mean the sequence MATCH {near}()?" if near else None
 
 
 def _expect(e: s.Call, low: int, high: int, names: SymbolTable) -> None:

@@ -85,7 +85,8 @@ class Need:
         if self.event:
             return f"it does not record events of the kind {self.event}"
         if self.attribute is None:
-            return "it has no ego"
+            every = self.kinds is None or self.kinds.ego == b.ego_kinds().ego
+            return "it has no ego" if every else "its ego is of another kind, or it has none"
         of = "" if self.kinds is None else f" of {self.node}"
         return f"{self.attribute.name}{of} never has a value"
 

@@ -16,6 +16,7 @@ from sgstore.lang.bind._symbols import RESERVED, THE_EGO, Binders, Session, Symb
 from sgstore.lang.bind._temporal import refuse_window, tense, timespan
 from sgstore.lang.bind._world_scope import whole_block
 from sgstore.lang.catalog import Type
+from sgstore.lang.syntax import said_of
 from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import (
     RELATION_ALIASES,
@@ -62,7 +63,9 @@ def _block(e: s.BlockExpression, names: SymbolTable) -> b.Bound:
     value = inner.number(e.value) if e.value is not None else None
     kind = Type.boolean if e.word == "EXISTS" else Type.number
     session.blocks += 1
-    block = b.BlockValue(e.word, inner.scope.finished(), value, kind, session.blocks)
+    text = " ".join(session.text[e.span.start : e.span.end].split())
+    source = None if session.calls or session.shipped else (text, e.span.start)
+    block = b.BlockValue(e.word, inner.scope.finished(), value, kind, session.blocks, source)
     found = whole_block(block, session.blocks + 1)
     session.blocks += sum(isinstance(part, b.BlockValue) for part in b.walk(found)) - 1
     return found
@@ -236,7 +239,7 @@ def _labelled(label: s.Label, session: Session) -> b.Kinds:
                 label.span,
                 f"write -[:{label.name}]->",
             )
-        session.unknown("label", label.name, label.span, labels())
+        session.unknown("label", label.name, label.span, labels(), said_of("labels", label.name))
     every = frozenset(kinds)
     return b.Kinds(every & entity_kinds(), every)
 
@@ -262,8 +265,8 @@ def _related(label: s.Label, session: Session) -> frozenset[str]:
                 label.span,
                 f"write (x:{label.name})",
             )
-        session.unknown(
-            "relation", label.name, label.span, (*known_names("relation"), *RELATION_ALIASES)
-        )
+        known = (*known_names("relation"), *RELATION_ALIASES)
+        said = said_of("relations", label.name)
+        session.unknown("relation", label.name, label.span, known, said)
     session.relations.add(relation)
     return frozenset({relation})

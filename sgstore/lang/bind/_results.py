@@ -42,6 +42,11 @@ def bind_result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
         before=item.before if item else 0,
         after=item.after if item else 0,
     )
+    if form == "clips" and result.before > 0:
+        names.session.doubt(
+            f"the clips begin {result.before / 1e9:g} s after the first frame of each match; for time"
+            f" before it write CLIPS(-{result.before / 1e9:g}s, …)"
+        )
     result = replace(result, having=_having(returns.having, result, inner))
     _check_result(result, returns, names.session)
     if result.aggregated or result.form in {"intervals", "clips"}:

@@ -7,8 +7,10 @@ from sgstore.lang.help._notes import (
     compared_in_check,
     compared_in_query,
     notes_on,
+    unknown_in_or,
 )
 from sgstore.lang.help._pattern_parts import PatternPart, has_nodes, parts_of, separable
+from sgstore.lang.help._pattern_text import in_words
 from sgstore.lang.help._why_not import WhyNot, WhyNotSteps, events_in, looked_up, why_not
 
 __all__ = [
@@ -21,10 +23,12 @@ __all__ = [
     "compared_in_query",
     "events_in",
     "has_nodes",
+    "in_words",
     "looked_up",
     "notes_on",
     "parts_of",
     "separable",
+    "unknown_in_or",
     "why_not",
     "words",
 ]

@@ -10,7 +10,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.quoting import quoted
 from sgstore.lang import ir as b
+from sgstore.lang.catalog import Home
 from sgstore.lang.help._pattern_text import Writer
 from sgstore.lang.help._why_not import growing, part_text
 from sgstore.lang.sql import Select, nested
@@ -217,3 +219,23 @@ def _alone(part: b.Node | b.Edge | b.Bound, scope: b.Scope) -> b.Scope:
     distinct = frozenset(pair for pair in scope.distinct if {*pair} <= keys)
     where = () if isinstance(part, b.Node | b.Edge) else (part,)
     return b.Scope(nodes, {}, tuple(edges), where, distinct)
+
+
+def unknown_in_or(query: b.Query, ask: Ask) -> tuple[str, ...]:
+    """Return notes on attributes in ``OR`` that are unknown for all entities: unknown counts as false there."""
+    conditions = [one for scope in query.patterns for one in scope.where]
+    either = [part for one in conditions for part in b.walk(one) if _is_or(part)]
+    used = [leaf for part in either for leaf in b.walk(part) if isinstance(leaf, b.NodeAttribute)]
+    columns = {leaf.attribute.name: leaf.attribute.columns.get(Home.state) for leaf in used}
+    return tuple(
+        f"{name} is unknown for all entities of the store; a condition on it in OR counts as false"
+        for name, column in columns.items()
+        if column is not None
+        and not ask(
+            Select(["1"], ['"state"'], [f"{quoted(column)} IS NOT NULL"], limit=1).text(), []
+        )
+    )
+
+
+def _is_or(part: b.Bound) -> bool:
+    return isinstance(part, b.Operation) and part.word == "OR"

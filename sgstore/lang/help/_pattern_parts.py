@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import QueryNameError
 from sgstore.lang import ir as b
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Type
-from sgstore.lang.help._pattern_text import Writer, label_written
+from sgstore.lang.help._pattern_text import Writer, in_words, label_written
 from sgstore.lang.sql import value_text
 from sgstore.model.vocabulary import RELATIONS
 
@@ -165,7 +165,11 @@ def _told(
 
 
 def _written(condition: b.Bound, writer: Writer) -> str:
-    return value_text(condition) if b.is_temporal(condition) else writer.expression(condition)
+    return (
+        value_text(in_words(condition))
+        if b.is_temporal(condition)
+        else writer.expression(condition)
+    )
 
 
 def _label(edge: b.Edge) -> str:

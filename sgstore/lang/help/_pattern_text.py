@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.errors import TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang.catalog import FRAME_ATTRIBUTES, DisplayUnit
 from sgstore.lang.operators import INFIX, ROUNDINGS
@@ -214,6 +215,24 @@ class Writer:
         else:
             text = f"{parts[0]} {word}"
         return f"({text})" if inner else text
+
+
+def in_words(value: b.Bound) -> b.Bound:
+    """Return an expression with the text of the query in place of each pattern in braces.
+
+    In scope ``world``, several patterns stand for one of the query.
+    """
+    blocks = b.blocks_of(value)
+    alone = all(isinstance(part, b.Operation | b.BlockValue) for part in b.walk(value))
+    sources = {block.source for block in blocks} if alone else set()
+    if len(sources) == 1 and (source := sources.pop()) is not None:
+        return b.GroupKey(source[0], value.type)
+    if not isinstance(value, b.BlockValue):
+        return b.with_operands(value, in_words)
+    place = TextSpan(0, 0)
+    nodes = {key: b.Node(key, kinds, "named", place) for key, kinds in value.scope.outer.items()}
+    text = Writer(b.Scope(nodes, {}, (), (value,), frozenset())).expression(value)
+    return b.GroupKey(text, value.type)
 
 
 def _constant(value: b.Value, *, inner: bool) -> str:
