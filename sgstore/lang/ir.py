@@ -757,6 +757,14 @@ def is_passed_on(value: Bound) -> TypeGuard[FrameAttribute]:
     return isinstance(value, FrameAttribute) and value.attribute.name.startswith(PASSED)
 
 
+def items_of(value: Bound) -> Type | None:
+    """Return the type of the items of a collected list. ``None`` means another value."""
+    if isinstance(value, Aggregate) and value.type is Type.list and value.operand is not None:
+        return value.operand.type
+    listed = is_passed_on(value) and value.type is Type.list and not is_path(value)
+    return Type(value.attribute.meaning) if listed else None
+
+
 def is_path(value: Bound) -> bool:
     """True if the expression is a placeholder for a named path."""
     return is_passed_on(value) and value.attribute.name.rpartition(" ")[2][0] == "p"

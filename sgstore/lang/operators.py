@@ -181,6 +181,10 @@ def _member(parts: Sequence[str]) -> str:
     return f"{operand_text(value)} IN ({', '.join(items)})" if items else "FALSE"
 
 
+def _is_listed(value: Any, items: Sequence[Any]) -> bool:
+    return value in items
+
+
 def _edges_between(nodes: Sequence[int]) -> int:
     return len(nodes) - 1
 
@@ -581,6 +585,8 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     "%": _strict(_division("%"), _remainder, _over_columns(np.fmod), infix=True, partial=True),
     "negative": _strict("(- {0})", operator.neg, np.negative),
     "length": _strict("(len({0}) - 1)", _edges_between, _no_columns),
+    "size": _strict("len({0})", len, _no_columns),
+    "is in": _strict("list_contains({1}, {0})", _is_listed, _no_columns),
     "float32": _strict(
         "CAST(TRY_CAST({0} AS FLOAT) AS DOUBLE)", float32, _float32_columns, partial=True
     ),

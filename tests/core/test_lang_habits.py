@@ -89,3 +89,34 @@ def test_the_deciding_condition_is_in_the_words_of_the_query(open_town: Store) -
     (row, *_) = verdict_rows(verdict, margin=True)
     told = " ".join(map(str, row))
     assert f"{block} < 1" in told
+
+
+NEAR = "MATCH (e:Ego)-[:near]->(v:Vehicle)"
+LISTS = f"{NEAR} WITH e, collect(v.name) AS names"
+
+
+def test_a_collected_list_has_a_length_and_members(open_town: Store) -> None:
+    every = open_town.find(f"{LISTS} RETURN frame.seq, names").rows()
+    for condition, test in {
+        "length(names) > 1": lambda names: len(names) > 1,
+        "'car 2' IN names": lambda names: "car 2" in names,
+        "NOT 'car 2' IN names AND length(names) = 1": lambda names: (
+            names not in (["car 2"],) and len(names) == 1
+        ),
+    }.items():
+        found = open_town.find(f"{LISTS} WHERE {condition} RETURN frame.seq, names").rows()
+        assert found == [row for row in every if test(row[1])]
+        assert found
+
+
+def test_a_list_of_a_group_can_be_tested(open_town: Store) -> None:
+    text = f"{NEAR} RETURN v.name AS name, collect(frame.seq) AS seqs, length(collect(v.x)) AS many"
+    every = open_town.find(text).rows()
+
+    assert all(len(row.seqs) == row.many for row in every)
+    found = open_town.find(f"{text} HAVING 57 IN seqs AND length(seqs) > 5").rows()
+    assert found
+    assert found == [row for row in every if 57 in row.seqs and row.many > 5]
+    for wrong in ("'a' IN seqs", "length(name) > 2"):
+        with pytest.raises(QueryError):
+            open_town.find(f"{text} HAVING {wrong}")

@@ -445,6 +445,9 @@ def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
         found = _in_dataset(operand, e.choices, names)
         return b.Operation("NOT", (found,), Type.boolean) if e.negated else found
     choices = names.bind(e.choices)
+    if (items := b.items_of(choices)) is not None and items is operand.type:
+        listed = b.Operation("is in", (operand, choices), Type.boolean)
+        return b.Operation("NOT", (listed,), Type.boolean) if e.negated else listed
     if not isinstance(choices, b.Choices):
         hint = "write IN ['a', 'b']"
         if isinstance(e.choices, s.Parameter):

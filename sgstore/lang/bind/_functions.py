@@ -325,6 +325,8 @@ def _path_function(e: s.Call, names: SymbolTable) -> b.Bound:
     """Return the bound form of ``nodes(p)``, the list of nodes of a path, or of ``length(p)``."""
     _expect(e, 1, 1, names)
     found = names.bind(e.arguments[0])
+    if normalize_name(e.name) == "length" and b.items_of(found) is not None:
+        return b.Operation("size", (found,), Type.number)
     if not b.is_path(found):
         hint = "MATCH p = (a)-[:near*1..2]->(b) RETURN length(p), nodes(p)"
         names.session.refuse(f"{e.name}() takes a path that has a name", e.arguments[0].span, hint)

@@ -362,7 +362,13 @@ def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribu
     precision = precision_of(value)
     word = "" if precision is None else precision.value
     called = f"{b.PASSED}{name} {session.numbers}"
-    return b.passed_on(called, value.type, word, stored=is_stored(value))
+    found = b.passed_on(called, value.type, word, stored=is_stored(value))
+    items = b.items_of(value)  # a list passed on keeps the type of its items
+    return (
+        found
+        if items is None
+        else replace(found, attribute=replace(found.attribute, meaning=items))
+    )
 
 
 def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTable) -> None:
