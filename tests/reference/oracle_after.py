@@ -153,7 +153,7 @@ def over(e: Any, members: list[At]) -> Any:  # noqa: PLR0911 - a case each
         listed = list(shown(tuple(known)))
         return sorted(listed) if e.distinct else listed
     if not known:
-        return None
+        return 0 if name == "sum" else None
     if name in {"min", "max"}:
         return min(known) if name == "min" else max(known)
     if name in {"sum", "avg"}:

@@ -279,7 +279,7 @@ def aggregated(e: Any, members: list[Row]) -> Any:
     if e.name.lower() == "count":
         return len(known)
     if not known:
-        return None
+        return 0 if e.name.lower() == "sum" else None
     return {"min": min, "max": max, "sum": math.fsum}[e.name.lower()](known)
 
 

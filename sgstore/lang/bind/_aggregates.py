@@ -1,7 +1,7 @@
 """Aggregate functions of the query language: ``COUNT``, ``AVG``, ``collect`` and others, over all matches.
 
-They are allowed after ``RETURN``. Unknown values are ignored. Without values, ``COUNT`` is 0, ``collect`` is
-an empty list, and the others are NULL.
+They are allowed after ``RETURN``. Unknown values are ignored. Without values, ``COUNT`` and ``SUM`` are 0,
+as in blocks, ``collect`` is an empty list, and the others are NULL.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ AGGREGATES: Final[dict[str, AggregateFunction]] = {
     "min": AggregateFunction(_called("min({0})"), _ORDERED, None),
     "max": AggregateFunction(_called("max({0})"), _ORDERED, None),
     "avg": AggregateFunction(_called("avg({0})")),
-    "sum": AggregateFunction(_called("sum({0})")),
+    "sum": AggregateFunction(_called("coalesce(sum({0}), 0)")),
     "stddev": AggregateFunction(_called("stddev_samp({0})")),
     "median": AggregateFunction(lambda inner, _: _quantile(inner, 0.5)),
     "percentile": AggregateFunction(_quantile, share=True),

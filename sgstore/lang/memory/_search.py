@@ -506,7 +506,7 @@ AGGREGATE: Final[Mapping[str, Callable[[list[Any], b.Aggregate], Any]]] = {
     "count": lambda values, _: len(values),
     "min": lambda values, _: min(values, default=None),
     "max": lambda values, _: max(values, default=None),
-    "sum": lambda values, _: math.fsum(values) if values else None,
+    "sum": lambda values, _: math.fsum(values),
     "avg": lambda values, _: fmean(values) if values else None,
     "stddev": lambda values, _: stdev(values) if len(values) > 1 else None,
     "median": _quantile,
