@@ -173,7 +173,9 @@ class Steps:
             time_ns = np.concatenate([before.time_ns[last], time_ns])
             values = np.concatenate([before.values[last], values])
             fresh = np.concatenate([np.zeros(int(last.sum()), np.bool_), fresh])
-        order = np.argsort(node, kind="stable")
+        # Numbers of 16 bits are sorted by radix.
+        small = len(node) and node.max() < 1 << 16
+        order = np.argsort(node.astype(np.uint16) if small else node, kind="stable")
         columns = (node, frame, time_ns, values, fresh)
         rows = BodyRows(*(column[order] for column in columns))
         same = (rows.node[1:] == rows.node[:-1]) & rows.fresh[1:] & (rows.values[1:, LIGHT] < 0)
@@ -260,14 +262,16 @@ def add_contradictions(steps: Steps, kinds: Ints, tally: Tally) -> None:
     tally : Tally
     """
     joined = steps.known & (steps.frames == 1)
-    values, at = steps.rows.values, steps.at
-    ends = values[at], values[at + 1]
+    motion = steps.rows.values[:, : YAW_RATE + 1]
+    ends = motion[steps.at], motion[steps.at + 1]
     mean, change = (ends[0] + ends[1]) / 2, ends[1] - ends[0]
     with np.errstate(all="ignore"):
         velocity = steps.away[:, :2] / steps.seconds[:, None]
         speed = np.hypot(*velocity.T)
         _velocities(steps, joined, mean, velocity, tally)
-        _headings(steps, joined & np.isin(kinds[steps.node], _VEHICLE), velocity, tally)
+        fast = joined & (speed > COURSE)
+        fast[fast] = np.isin(kinds[steps.node[fast]], _VEHICLE)
+        _headings(steps, fast, velocity, tally)
         change[:, HEADING] = wrapped(change[:, HEADING])
         # A faster turn can be the noise of a body that stands.
         change[np.abs(change[:, HEADING]) > 1, HEADING] = np.nan
@@ -319,21 +323,23 @@ def _velocities(steps: Steps, joined: Bools, mean: Floats, velocity: Floats, tal
     tally.add("velocity", steps, read, bad, speeds, factor, *causes)
 
 
-def _headings(steps: Steps, vehicles: Bools, velocity: Floats, tally: Tally) -> None:
+def _headings(steps: Steps, moving: Bools, velocity: Floats, tally: Tally) -> None:
     """Compare the headings of vehicles with their directions of movement."""
-    heading, speed = steps.rows.values[steps.at, HEADING], np.hypot(*velocity.T)
-    moving = vehicles & (speed > COURSE) & np.isfinite(heading)
-    course = np.arctan2(velocity[:, 1], velocity[:, 0])
+    row = np.flatnonzero(moving)
+    heading, (x, y) = steps.rows.values[steps.at[row], HEADING], velocity[row].T
+    course, speed = np.arctan2(y, x), np.hypot(x, y)
     apart = np.abs(wrapped(heading - course))
-    bad = moving & (apart > ASKEW)
     # A vehicle can drive backwards, but not fast.
-    reverse = bad & (apart > np.pi - ASKEW) & (speed < BACKWARDS)
-    bad &= ~reverse
-    shown = np.degrees(wrapped(heading)), np.degrees(course)
+    is_reverse = (apart > np.pi - ASKEW) & (speed < BACKWARDS)
+    bad, reverse = np.zeros((2, len(moving)), np.bool_)
+    reverse[row[is_reverse]] = True
+    bad[row[(apart > ASKEW) & ~is_reverse]] = True
+    shown = np.full((2, len(moving)), np.nan)
+    shown[:, row] = np.degrees(wrapped(heading)), np.degrees(course)
     if reverse.any():
-        tally.add("reverse", steps, reverse, reverse, shown)
+        tally.add("reverse", steps, reverse, reverse, (shown[0], shown[1]))
     vx, vy = steps.rows.values[steps.at[bad], VX : VX + 2].T
-    heading, course = heading[bad], course[bad]
+    heading, course = np.radians(shown[:, bad])
     # Only the direction of the state is exact enough, because degrees magnify its error.
     exact = np.arctan2(vy, vx)
     exact[np.abs(wrapped(exact - course)) > ASKEW] = np.nan
@@ -345,7 +351,7 @@ def _headings(steps: Steps, vehicles: Bools, velocity: Floats, tally: Tally) -> 
             (IN_DEGREES, heading - np.degrees(exact)),
         )
     ]
-    tally.add("heading", steps, moving, bad, shown, *causes)
+    tally.add("heading", steps, moving, bad, (shown[0], shown[1]), *causes)
 
 
 def _rates(
