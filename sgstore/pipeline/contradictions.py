@@ -48,6 +48,9 @@ AGREEING: Final = 10
 STANDING: Final = 5
 """Least number of rows in which a body reports a speed and does not move at all."""
 
+RANDOM: Final = 0.82
+"""Least share of the headings off the movement. Of random headings 84 % are; noise reaches 80 %."""
+
 SHARE: Final = 0.8
 """Least share of the contradicting rows that agree."""
 
@@ -75,7 +78,8 @@ _BINS: Final = 10
 """Votes for a factor: bins of 10 % (a tenth of the natural logarithm)."""
 
 _DEGREES: Final = 5.0
-"""Votes for an angle: bins of 5°."""
+_HALF: Final = 36
+"""Votes for an angle: bins of 5°, and their number in half a turn."""
 
 FROZEN, STILL = 900, 901
 MIRRORED, SWAPPED, REVERSED, LEFT, RIGHT, OWN_AXES = 902, 903, 904, 905, 906, 907
@@ -344,7 +348,7 @@ def _headings(steps: Steps, moving: Bools, velocity: Floats, tally: Tally) -> No
     exact = np.arctan2(vy, vx)
     exact[np.abs(wrapped(exact - course)) > ASKEW] = np.nan
     causes = [
-        base + np.rint(np.degrees(wrapped(angle - 1e-9)) / _DEGREES)
+        base + (np.rint(np.degrees(wrapped(angle)) / _DEGREES) + _HALF) % (2 * _HALF) - _HALF
         for base, angle in (
             (OFFSET, heading - course),
             (MIRROR, heading + course),
@@ -416,9 +420,17 @@ def _agreed(
     if whole.rows < compared / 2:
         return []
     verdict = _verdict(quantity, whole, compared)
-    if verdict is None and quantity == "heading" and whole.rows > 2 * AGREEING:
+    if verdict is None and quantity == "heading" and whole.rows > max(20, RANDOM * compared):
         verdict = "heading", "headings do not follow the movement"
     return [(node, whole, verdict)] if verdict else []
+
+
+def _alike(cause: int) -> tuple[int, ...]:
+    """Return the bins of a factor or an angle and its neighbours."""
+    base = (cause + 500) // 1_000 * 1_000
+    if not base:
+        return cause - 1, cause, cause + 1
+    return tuple(base + (cause - base + i + _HALF) % (2 * _HALF) - _HALF for i in (-1, 0, 1))
 
 
 def _verdict(quantity: str, vote: Vote, compared: int) -> tuple[str, str] | None:
@@ -427,7 +439,7 @@ def _verdict(quantity: str, vote: Vote, compared: int) -> tuple[str, str] | None
     if quantity == "velocity" and causes[FROZEN] >= STANDING:
         return "frozen", f"speed {vote.values[0]:.3g} m/s is recorded, but it does not move"
     wide = {
-        c: n if FROZEN <= c <= OWN_AXES else sum(causes[c + i] for i in (-1, 0, 1))
+        c: n if FROZEN <= c <= OWN_AXES else sum(causes[one] for one in _alike(c))
         for c, n in causes.items()
     }
     cause = max(wide, key=lambda one: (wide[one], causes[one]), default=None)

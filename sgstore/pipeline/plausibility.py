@@ -514,7 +514,7 @@ class Plausibility:
                 words = "to the place of another body" if is_swapped else "between two frames"
                 self._happen(kind, move.node, frame, f"it jumps {length:.4g} m {words}")
         for node, (frame, value) in self._grown.items():
-            if self._steady[node] < AGREEING:
+            if self._steady[node] < _STEADY:
                 self._happen("size jump", node, frame, value)
 
     def _see_bodies(self, block: FrameBlock) -> None:
@@ -725,6 +725,8 @@ _SHOWN: Final = (
     *("x", "y", "heading", "pitch", "roll", "length", "width", "height", "az"),
     *("throttle", "brake", "steer"),
 )
+_STEADY: Final = 3
+"""Number of small changes of a size that mark it as measured."""
 _USUAL: Final = 30.0
 """Speed of the bodies that are compared with each other's places; m/s."""
 _MOST_MOVES: Final = 10_000

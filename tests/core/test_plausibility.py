@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from builders import PaperMap, Patch
-from implausible import FAULTS, KINDS, WRITERS, Body, Drive, Moment, drive, frames
+from implausible import FAULTS, KINDS, WRITERS, Body, Drive, Moment, drive, frames, noisy
 from test_cli_ingest import sgstore
 
 from sgstore.graphs.online import Frame
@@ -84,6 +84,19 @@ def test_each_kind_of_fault_is_found_in_each_flavour(
         assert all(
             0 <= one.frame < len(good()) and f"frame {one.frame}" in str(one) for one in found
         )
+
+
+def test_the_noise_of_measured_data_raises_no_alarm(tmp_path: Path) -> None:
+    for seed in range(40 if LONG else 8):
+        for size in (0.05, 0.15, 0.3):
+            assert found_in("online", noisy(good(), size, seed), tmp_path) == []
+
+
+def test_faults_are_found_in_measured_data(tmp_path: Path) -> None:
+    for name in ("velocity in km/h", "heading off by 180", "teleport", "swapped ids"):
+        found = found_in("online", noisy(with_fault(name), 0.05, 1), tmp_path)
+
+        assert {one.kind for one in found} & FAULTS[name][2], name
 
 
 def test_a_finding_names_the_body_and_the_frame_in_which_it_begins(tmp_path: Path) -> None:

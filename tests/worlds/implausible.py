@@ -579,3 +579,14 @@ FAULTS: dict[str, tuple[Callable[[Drive], None], set[str], set[str]]] = {
     ),
     "throttle in percent": (pedal, {"carla", "online"}, {"control range"}),
 }
+
+
+def noisy(of: Drive, size: float, seed: int) -> Drive:
+    """Return a drive with the noise of measured data; ``size``: standard deviation of positions, m."""
+    random = np.random.default_rng(seed)
+    measured = copy.deepcopy(of)
+    for body in each(measured):
+        for name, share in (("x", 1), ("y", 1), ("heading", 0.4), ("vx", 3), ("vy", 3), ("ax", 9)):
+            setattr(body, name, getattr(body, name) + random.normal(0, share * size))
+        body.size = tuple(max(0.3, v * (1 + random.normal(0, size / 2))) for v in body.size)
+    return measured
