@@ -238,6 +238,17 @@ def test_positions_beyond_their_road_are_warnings(s: float) -> None:
         assert f"s = {s:g} m is beyond the road" in warning
 
 
+def test_a_validity_that_names_missing_lanes_is_a_warning() -> None:
+    def said(start: int, end: int) -> tuple[str, ...]:
+        valid = element("validity", fromLane=start, toLane=end)
+        one = element("signal", valid, id="x", s=5, t=0, type="1000001", orientation="+")
+        return straight(signals=one).warnings
+
+    assert said(-1, -1) == said(-2, -1) == said(0, 0) == ()
+    (warning,) = said(7, 5)
+    assert "<signal> 'x': its validity names missing lanes 5 to 7" in warning
+
+
 def test_references_to_missing_parts_and_ids_that_occur_twice_are_warnings() -> None:
     twice = placed("signal", 5) + placed("signal", 9)
     road_map = read(

@@ -13,6 +13,7 @@ import numpy as np
 
 from sgstore.maps.opendrive._lanes import odd_sections
 from sgstore.maps.opendrive._nodes import junction_of
+from sgstore.maps.opendrive._piecewise import last_before
 from sgstore.maps.opendrive._plan_view import PlanView, poses
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ def contradictions(document: Document, lanes: LaneTable, plan: PlanView) -> list
         *_sections(document, lanes),
         *_widths(document, lanes),
         *_beyond(document),
+        *_validities(document, lanes),
         *_references(document),
         *_doubled(document),
         *_junctions(document),
@@ -124,6 +126,28 @@ def _beyond(document: Document) -> Iterator[str]:
                 f"road {document.road_ids[road]!r}, {name}: its s = {s[row]:g} m is beyond"
                 f" the road, which has {length[road]:g} m"
             )
+
+
+def _validities(document: Document, lanes: LaneTable) -> Iterator[str]:
+    """Yield signals whose validity names only lanes that are missing at their position."""
+    for kind in ("road/signal", "road/signalReference"):
+        table, valid = document[kind], document[f"{kind}/validity"]
+        if not len(valid):
+            continue
+        road, s = table.road[valid.of], document.rough_numbers(kind, "s")[valid.of]
+        section = last_before(lanes.sections.road, lanes.sections.start, road, s)
+        ends = [document.rough_numbers(f"{kind}/validity", name) for name in ("fromLane", "toLane")]
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        start = np.searchsorted(lanes.section, section)
+        stop = np.searchsorted(lanes.section, section, side="right")
+        for row in np.flatnonzero(~((low <= 0) & (high >= 0))).tolist():
+            here = lanes.ident[start[row] : stop[row]]
+            if not ((here >= low[row]) & (here <= high[row])).any():
+                name = table.attributes[valid.parent[row]].get("id", "")
+                yield (
+                    f"road {document.road_ids[road[row]]!r}, <{kind[5:]}> {name!r}: its validity"
+                    f" names missing lanes {low[row]:g} to {high[row]:g}"
+                )
 
 
 def _references(document: Document) -> Iterator[str]:
