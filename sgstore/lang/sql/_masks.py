@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.base.quoting import quoted
 from sgstore.lang.bind import Profile, alias_of, edge_conditions, homes_of, kind_conditions
 from sgstore.lang.catalog import Home
-from sgstore.lang.ir import Bound, Edge, Happened, Node, NodeAttribute, Scope, ego_kinds
+from sgstore.lang.ir import Bound, Edge, Happened, Kinds, Node, NodeAttribute, Scope, ego_kinds
 from sgstore.lang.sql._attributes import Aliases, among, attribute_text
 from sgstore.lang.sql._expressions import (
     Leaf,
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from sgstore.lang.catalog import Catalog
-    from sgstore.lang.ir import BlockValue, Kinds, Query
+    from sgstore.lang.ir import BlockValue, Query
     from sgstore.lang.sql._plan import Gathered
     from sgstore.lang.sql._windows import Window
 
@@ -764,11 +764,10 @@ def _join_lane(
     profile = Profile.of(scope.kinds(edge.dst), sql.catalog)
     if on_map and profile.mapped and profile.places == 1:
         conditions = [*conditions, *(c for c in of_lane if not any(map(is_position, leaves(c))))]
-    of_kind: list[str] = []
+    kinds, of_kind = scope.kinds(edge.src), list[str]()
     if table == "lane_state" and not edge.both:
-        of_kind = kind_conditions(
-            scope.kinds(edge.src), '"l"."kind"', '"l"."is_ego"', entity_kinds()
-        )
+        among = Kinds(kinds.every, kinds.every)
+        of_kind = kind_conditions(among, '"l"."kind"', None, entity_kinds())
 
     def leaf_text(leaf: Leaf) -> str:
         if isinstance(leaf, NodeAttribute):
@@ -780,6 +779,9 @@ def _join_lane(
     for part, mask in stored_rows(sql.catalog, table, '"l"').items():
         select = Select([*keys, f'{mask} AS "mask"'], [f'{quoted(part)} AS "l"'])
         select.where = [*sql.within('"l"."bucket"'), *of_kind, *where]
+        if table == "lane_state" and not edge.both and kinds.one_a_frame:
+            on = ['"g"."bucket" = "l"."bucket"', '"g"."node_id" = "l"."node_id"']
+            select.join(nested(_ego(sql), "g"), on)
         if on_map:
             select.join('"bucket" AS "b"', ['"b"."bucket" = "l"."bucket"'])
             select.join(
