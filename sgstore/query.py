@@ -487,7 +487,8 @@ class Store:
         frame : int, str or FrameRef
             ``frame_id``, ``TRACE#SEQ``, ``TRACE@12.3s``, or a result of :meth:`Matches.frames`.
         abstraction : str, optional
-            ``E``, ``EL``, ``ER``, ``RSV``, ``junction``, ``SG``, ``roadscene2vec``, a registered abstraction;
+            ``E``, ``EL``, ``ER``, ``RSV``, ``RSV_related``, ``RSV_curvature``, ``junction``, ``SG``,
+            ``roadscene2vec``, a registered abstraction;
             or a derived set of relations. A derived set keeps all attributes of nodes and edges.
 
         Returns

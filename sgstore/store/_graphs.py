@@ -67,7 +67,8 @@ FROM edge e JOIN {_MASKS} ON e.bucket = w.bucket
 WHERE e.bucket BETWEEN $first >> 6 AND $last >> 6 AND (e.mask & w.mask) <> 0
 """
 _EGO_LANES: Final = f"""
-SELECT l.frame_id, l.lane FROM lane_state l JOIN frame f ON f.frame_id = l.frame_id AND f.ego = l.node_id
+SELECT l.frame_id, l.lane, l.along
+FROM lane_state l JOIN frame f ON f.frame_id = l.frame_id AND f.ego = l.node_id
        JOIN {_WANTED} ON w.frame_id = f.frame_id
 WHERE l.is_primary AND l.bucket BETWEEN $first >> 6 AND $last >> 6
 """
@@ -384,6 +385,7 @@ def _map_columns(connection: DuckDBPyConnection, map_id: int) -> MapColumns:
     where = {"map_id": map_id}
     nodes = connection.execute(_GROUNDS, where).fetchnumpy()
     edges = connection.execute(_GROUND_EDGES, where).fetchnumpy()
+    courses = connection.execute(f"{_MAP_COURSES} ORDER BY lane DESC, start", where).fetchnumpy()
     return MapColumns(
         kind=nodes["kind"].astype(np.int8),
         name=nodes["name"],
@@ -394,6 +396,7 @@ def _map_columns(connection: DuckDBPyConnection, map_id: int) -> MapColumns:
         relation=codes_of(connection, "relation")[edges["relation"]],
         src=edges["src"].astype(np.int64),
         dst=edges["dst"].astype(np.int64),
+        courses=(courses["lane"].astype(np.int64), courses["start"], courses["curvature"]),
     )
 
 
@@ -455,6 +458,8 @@ def _seen(
     }
     ego_lane = np.zeros(frames, np.int64)
     ego_lane[own["frame"]] = own["lane"]
+    ego_along = np.full(frames, np.nan)
+    ego_along[own["frame"]] = filled(own["along"])
     return GraphColumns.sorted(
         frames,
         nodes,
@@ -464,6 +469,7 @@ def _seen(
         dst=edges["dst"].astype(np.int64),
         ego_lane=ego_lane,
         grounds=grounds,
+        ego_along=ego_along,
     )
 
 

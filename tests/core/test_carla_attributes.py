@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from opendrive_maps import a_map, a_road, element, lane, line, mark, section
+from opendrive_maps import a_map, a_road, arc, element, lane, line, mark, section
 from recordings import Recorder, car
 
 import sgstore
@@ -110,3 +110,52 @@ def test_graphs_of_a_store_and_online_have_the_same_attributes(store: Store) -> 
     assert told[0] == told[1]
     assert sum(map(bool, told[0].values())) == 4
     assert store.file.verify().faults == []
+
+
+# Abstractions of CARLASGG --------------------------------------------------------------------------
+
+BEND = a_map(
+    a_road(
+        "1",
+        line(50.0),
+        arc(50.0, -0.06, s=50.0, x=50.0),
+        sections=section(lane(1), lane(0), lane(-1), lane(-2)),
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    folder = tmp_path_factory.mktemp("bent")
+    with Recorder(folder / "drive.mcap") as recorder:
+        recorder.map(BEND)
+        for row, (x, y) in enumerate([(20, -1.75), (40, -1.75), (55, -2.5)]):
+            moving = [car(1, x, y), car(2, x + 8, -5.25), car(3, x - 18, 1.75)]
+            recorder.ground_truth(row / 10, moving[: 3 if row == 0 else 1], host=1)
+    config = configured(pairs={"within": 10.0, "ego_within": 10.0})
+    (outcome,) = ingest(folder / "s.sgstore", [folder / "drive.mcap"], config=config)
+    assert outcome.error is None
+    return sgstore.open(folder / "s.sgstore")
+
+
+def test_objects_without_a_relation_to_the_ego_can_be_left_out(bent: Store) -> None:
+    every = {*bent.graph("drive#0", abstraction="RSV").nodes}
+    related = {*bent.graph("drive#0", abstraction="RSV_related").nodes}
+    # The far car has no relation; its lane is then empty.
+    assert every - related == {"car_2", "Opposing Lane 0"}
+    assert related == {"ego", "car_1", "Ego Lane", "Right 1 of Ego Lane", "Root Road"}
+    alone = {*bent.graph("drive#1", abstraction="RSV_related").nodes}
+    assert alone == {"ego", "Ego Lane", "Root Road"}
+
+
+def test_the_name_of_the_egos_lane_has_its_curvature(bent: Store) -> None:
+    names = [
+        next(
+            name
+            for name in bent.graph(f"drive#{row}", abstraction="RSV_curvature")
+            if name.startswith("Ego")
+        )
+        for row in range(3)
+    ]
+    # The inner lane turns by 7.7 degrees over 2 m to the right: four of five thresholds.
+    assert names == ["Ego Lane@0", "Ego Lane@0", "Ego Lane@-4"]

@@ -69,6 +69,9 @@ class MapColumns:
         Codes of :data:`sgstore.model.vocabulary.RELATIONS`.
     src, dst : (M,) int64
         Node ids, negative.
+    courses : tuple
+        Node id of the lane, start (m) and curvature (1/m) of lane intervals, by lane and start; empty if
+        unknown.
     """
 
     kind: Codes
@@ -80,6 +83,9 @@ class MapColumns:
     relation: Codes
     src: Ints
     dst: Ints
+    courses: tuple[Ints, Floats, Floats] = field(
+        default_factory=lambda: (np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+    )
 
     @classmethod
     def of(cls, road_map: RoadMap) -> MapColumns:
@@ -90,7 +96,11 @@ class MapColumns:
         names = ("name", "lane_type", "road", "junction")
         texts = {name: np.array(getattr(nodes, name), object) for name in names}
         links = {name: getattr(edges, name) for name in ("relation", "src", "dst")}
-        _MAPS[road_map] = columns = cls(kind=nodes.kind, lane=nodes.lane, **texts, **links)
+        course = road_map.courses
+        courses = (-2 - course.lane, course.start, course.curvature)
+        _MAPS[road_map] = columns = cls(
+            kind=nodes.kind, lane=nodes.lane, **texts, **links, courses=courses
+        )
         return columns
 
     @cached_property
@@ -127,6 +137,8 @@ class GraphColumns:
         Node id of the ego's primary lane, or 0.
     grounds : MapColumns or None
         The road map; ``None`` without one.
+    ego_along : (frames,) float64 or None
+        Place of the ego's centre along its primary lane; m. ``None`` or NaN: unknown.
     """
 
     frames: int
@@ -144,6 +156,7 @@ class GraphColumns:
     dst: Ints
     ego_lane: Ints
     grounds: MapColumns | None
+    ego_along: Floats | None = None
 
     @classmethod
     def sorted(cls, frames: int, nodes: Mapping[str, Any], **columns: Any) -> GraphColumns:
@@ -182,6 +195,8 @@ class GraphColumns:
         own = lanes.primary & (lanes.node == frames.ego[lanes.frame])
         ego_lane = np.zeros(len(frames), np.int64)
         ego_lane[lanes.frame[own]] = lanes.lane[own]
+        ego_along = np.full(len(frames), np.nan)
+        ego_along[lanes.frame[own]] = lanes.along[own]
         return cls.sorted(
             len(frames),
             nodes,
@@ -191,6 +206,7 @@ class GraphColumns:
             dst=edges.dst,
             ego_lane=ego_lane,
             grounds=grounds,
+            ego_along=ego_along,
         )
 
     def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
@@ -264,6 +280,7 @@ class GraphColumns:
             **{name: getattr(self, name)[edges] for name in ("relation", "src", "dst")},
             ego_lane=self.ego_lane[frames],
             grounds=self.grounds,
+            ego_along=None if self.ego_along is None else self.ego_along[frames],
         )
         if self in LANES_OF:
             LANES_OF[some] = LANES_OF[self].taken(number)

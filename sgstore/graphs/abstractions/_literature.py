@@ -16,6 +16,8 @@ These rules apply where our graphs have more than those of the literature:
   ``Opposing Lane k`` (CARLASGG's word, for both directions), ordered by the distance of its nearest
   entity from the ego, then by node id. If the ego's place or lane is unknown, the label is
   ``Lane``. All lanes are in ``Root Road``. Off-road entities are in ``Off Road``.
+* ``RSV_related``, ``RSV_curvature``: ``RSV`` with CARLASGG's ``filter_if_no_relation``, and with the
+  curvature in the name of the ego's lane.
 * ``junction``: lanes, roads and junctions of the map. The sections of a road are merged, as in
   CARLASGG: its lanes have names such as ``Lane 5_-1``. Names do not count for the class: a driving
   lane is labelled ``Lane``, another lane with its type. Therefore the same scene in another place
@@ -25,8 +27,9 @@ These rules apply where our graphs have more than those of the literature:
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -50,12 +53,12 @@ from sgstore.model.vocabulary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from sgstore.graphs.abstractions._columns import GraphColumns, MapColumns, Part
-    from sgstore.model.world import Bools, Ints
+    from sgstore.model.world import Bools, Floats, Ints
 
 
 ROOT_ROAD: Final = -(1 << 40)
@@ -94,6 +97,83 @@ def in_lanes(seen: GraphColumns) -> Labelled:
 def road_scene(seen: GraphColumns) -> Labelled:
     """Abstraction ``RSV``: the traffic objects with their relations, and their lanes relative to the ego."""
     return _with_lanes(seen, related=True)
+
+
+def related_scene(seen: GraphColumns) -> Labelled:
+    """Abstraction ``RSV_related``: ``RSV`` with the objects related to the ego, and the lanes with them."""
+    found = road_scene(replace(seen, **_rows(seen, _OF_NODES, _related_to_ego(seen))))
+    inside = (found.src >= 0) & (found.dst < 0)
+    used = np.unique(np.stack([found.frame[inside], found.dst[inside]]), axis=1)
+    rooted = np.unique(used[0][used[1] != OFF_ROAD])
+    wanted = {*zip(*used.tolist(), strict=True), *((one, ROOT_ROAD) for one in rooted.tolist())}
+    return replace(
+        found,
+        **_rows(found, _OF_LABELLED, _among(found.node_frame, found.node, wanted)),
+        **_rows(found, _OF_EDGES, _among(found.frame, found.src, wanted)),
+    )
+
+
+def _related_to_ego(seen: GraphColumns) -> Bools:
+    """Return a mask of the nodes without the objects that have no relation to the ego."""
+    ego = np.full(seen.frames, -1)
+    ego[seen.node_frame[seen.is_ego]] = seen.node[seen.is_ego]
+    frame, src, dst, _ = seen.pairs
+    of_ego = (src == ego[frame]) | (dst == ego[frame])
+    other = np.where(src == ego[frame], dst, src)[of_ego]
+    kept = ~seen.is_traffic | seen.is_ego
+    kept[seen.row_of(frame[of_ego], other)] = True
+    return kept
+
+
+def _among(frame: Ints, node: Ints, wanted: set[tuple[int, int]]) -> Bools:
+    """Return a mask of the objects, and of the map parts that are in a set of (frame, node)."""
+    pairs = zip(frame.tolist(), node.tolist(), strict=True)
+    return np.array([one[1] >= 0 or one in wanted for one in pairs], np.bool_)
+
+
+def _rows(table: Any, names: Sequence[str], kept: Bools) -> dict[str, Any]:
+    return {name: getattr(table, name)[kept] for name in names}
+
+
+_OF_LABELLED: Final = ("node_frame", "node", "node_label")
+_OF_EDGES: Final = ("frame", "src", "label", "dst")
+_OF_NODES: Final = ("node_frame", "node", "kind", "is_ego", "x", "y", "z", "heading")
+
+
+def curved_scene(seen: GraphColumns) -> Labelled:
+    """Abstraction ``RSV_curvature``: ``RSV`` with the bend of the ego's lane in its name, ``Ego Lane@-2``.
+
+    The number counts the thresholds :data:`BENDS` that the turn of the lane over 2 m exceeds; it is positive to
+    the left. Without a known curvature, the name stays ``Ego Lane``.
+    """
+    found, grounds = road_scene(seen), seen.grounds
+    if grounds is None or seen.ego_along is None or not len(grounds.courses[0]):
+        return found
+    lane, start, curvature = grounds.courses
+    known = np.flatnonzero((seen.ego_lane < 0) & np.isfinite(seen.ego_along))
+    far = 1.0 + max(float(start.max()), float(np.max(seen.ego_along[known], initial=0.0)))
+    wanted = -seen.ego_lane[known] * far + np.maximum(seen.ego_along[known], 0.0)
+    at = np.searchsorted(-lane * far + start, wanted, side="right") - 1
+    known, at = known[(at >= 0)], at[at >= 0]
+    same = lane[at] == seen.ego_lane[known]
+    number = np.full(seen.frames, len(BENDS) + 1)
+    number[known[same]] = _bend(curvature[at[same]])
+    names = [f"Ego Lane@{bin_}" for bin_ in range(-len(BENDS), len(BENDS) + 1)]
+    ego = found.labels.index("Ego Lane") if "Ego Lane" in found.labels else -1
+    rows = np.flatnonzero((found.node_label == ego) & (number[found.node_frame] <= len(BENDS)))
+    label = found.node_label.copy()
+    label[rows] = len(found.labels) + len(BENDS) + number[found.node_frame[rows]]
+    return replace(found, labels=(*found.labels, *names), node_label=label)
+
+
+def _bend(curvature: Floats) -> Ints:
+    """Return the number of exceeded thresholds of curvatures, positive to the left."""
+    turn = np.degrees(curvature * 2.0)
+    return np.sign(turn).astype(np.int64) * np.searchsorted(BENDS, np.abs(turn), side="left")
+
+
+BENDS: Final = (1.0, 2.5, 5.0, 7.5, 10.0)
+"""Thresholds of the turn of a lane over 2 m, as in CARLASGG; degrees."""
 
 
 def whole(seen: GraphColumns) -> Labelled:
