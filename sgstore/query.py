@@ -87,7 +87,7 @@ class StoreFrame:
         --------
         >>> frame = store.frame("town#264")
         >>> print(frame.graph())
-        MultiDiGraph with 96 nodes and 636 edges
+        MultiDiGraph with 96 nodes and 634 edges
         >>> print(frame.graph("RSV"))
         MultiDiGraph with 36 nodes and 312 edges
         """
@@ -509,7 +509,7 @@ class Store:
         Examples
         --------
         >>> print(store.graph("town#264"))
-        MultiDiGraph with 96 nodes and 636 edges
+        MultiDiGraph with 96 nodes and 634 edges
         >>> print(store.graph("town@26.4s", "RSV"))
         MultiDiGraph with 36 nodes and 312 edges
         """

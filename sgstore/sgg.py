@@ -44,6 +44,7 @@ from sgstore.graphs.relations import (
     Bodies,
     BodyPairs,
     Crowds,
+    DrivenLanes,
     EdgeRoom,
     EgoPoses,
     Extent,
@@ -71,7 +72,7 @@ from sgstore.model.vocabulary import BEYOND, OWN_RELATIONS, RELATION_CODE, RELAT
 from sgstore.model.world import States
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -127,8 +128,11 @@ class SceneGraphGenerator:
         road_map = road_map if waypoints is None else waypoints.road_map
         self._online: Stepper | None = None
         self._crowds = Crowds()
+        self._driven = DrivenLanes(self._road_map)
         self._survey = (
-            None if road_map is None else LaneContact(road_map, config.lanes.ahead, waypoints)
+            None
+            if road_map is None
+            else LaneContact(road_map, config.lanes.ahead, waypoints, self._driven.lanes_of)
         )
         computed = relations_under(config)
         computed = tuple(one for one in computed if road_map is not None or not one.needs_map)
@@ -211,6 +215,24 @@ class SceneGraphGenerator:
         entities = renamed(frames.entities, self._config.types)
         kinds = np.concatenate([self._kinds[: entities.first], entities.kind])
         return pieces(frames, kinds, self._config, egos)
+
+    def recorded(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
+        """Yield the blocks of a recording with the lanes that its vehicles drive in junctions.
+
+        The lane of a passage is known after its last frame. Blocks are held back until then. Ingest uses this
+        method. Without it, the footprints of a single frame decide the primary lanes.
+
+        Examples
+        --------
+        >>> from sgstore.apps.demo import bundled
+        >>> from sgstore.readers import open_trace
+        >>> generator = sgstore.SceneGraphGenerator(None, sgstore.Config())
+        >>> with open_trace(bundled()) as trace:
+        ...     graphs = [generator.block(block) for block in generator.recorded(trace.blocks())]
+        >>> sum(map(len, graphs))
+        750
+        """
+        yield from self._driven.chosen(blocks)
 
     def block(self, frames: FrameBlock) -> GraphBlock:
         """Return the scene graphs of the next frames for the ego of the frames.
@@ -352,7 +374,8 @@ class SceneGraphGenerator:
         """
         bodies = self._bodies(frames, every)
         rows = every, len(frames.states), len(self._scenery)
-        standing = None if self._survey is None else self._survey.standing(bodies)
+        lane = frames.states.lane[every[: np.searchsorted(every, len(frames.states))]]
+        standing = None if self._survey is None else self._survey.standing(bodies, lane)
         none = np.zeros(0, np.intp), np.zeros(0, np.intp)
         nothing = none, np.zeros(len(frames), np.bool_)
         whole = _World(every, bodies, rows, nothing, nothing, standing)
@@ -572,7 +595,7 @@ class SceneGraphGenerator:
         if self._online is None:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
             shown = map_of_graphs(self._road_map, self._config)
-            self._online = Stepper(fresh, shown, self._config.ego)
+            self._online = Stepper(fresh, shown, DrivenLanes(self._road_map), self._config.ego)
         graphs = self._online.step(frame.meant(self._config.types), egos)
         for graph in self._online.last[0] if self._online.last else ():
             self._crowds.see(graph)

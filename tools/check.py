@@ -60,7 +60,7 @@ TESTS = {
     "readers": "osi osi_* noise carla carla_* carlasgg autoware av2 foxglove commonroad py123d rosbags"
     " sumo cdr flavours stamps identity",
     "rebuild": "rebuilding",
-    "relations": "relations relations_* motion bodies bounds",
+    "relations": "relations relations_* motion bodies bounds driven_lanes",
     "roads": "roads roads_* lane_dist lane_places lane_courses roundabouts",
     "schema": "schema views views_page open_names",
     "recording_ingest": "ingest ingest_many",

@@ -60,6 +60,7 @@ from sgstore.model.world import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+    from sgstore.graphs.relations import DrivenLanes
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import GraphBlock, LaneGaps, LaneStates, SceneGraph, Whole, WorldBlock
     from sgstore.model.vocabulary import TypeMeaning
@@ -655,7 +656,9 @@ class Records:
             standing=self._standing,
             edges=Edges(edges.frame, edges.relation, src, dst),
             about=edge_attributes(
-                chain.from_iterable(_lanes(part.lanes, outer) for part in parts),
+                chain.from_iterable(
+                    _lanes(part.lanes, part.frames.states, outer) for part in parts
+                ),
                 chain.from_iterable(_gaps(part.gaps, outer) for part in parts),
             ),
             map=self._map,
@@ -723,15 +726,21 @@ def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float
     return about | {name: bool(derived >> bit & 1) for bit, name in enumerate(names)}
 
 
-def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
-    """Yield frame, source, target and attributes of each ``isIn`` edge (object on a lane)."""
+def _lanes(
+    lanes: LaneStates, states: States, outer: Ints
+) -> Iterator[tuple[int, int, int, Attributes]]:
+    """Yield frame, source, target and attributes of each ``isIn`` edge (object on a lane).
+
+    While the driven lane is unsure, ``is_primary`` of the likely lanes is unknown.
+    """
+    unsure = lanes.own & np.isin(lanes.node, states.node[states.lane > 0])
     told = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
     columns = (
         *(lanes.frame.tolist(), _outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
         *(number(column).tolist() for column in told),
-        *(lanes.primary.tolist(), lanes.own.tolist()),
+        *(lanes.primary.tolist(), lanes.own.tolist(), unsure.tolist()),
     )
-    for frame, node, lane, overlap, offset, error, along, primary, own in zip(
+    for frame, node, lane, overlap, offset, error, along, primary, own, either in zip(
         *columns, strict=True
     ):
         numbers = {
@@ -740,7 +749,8 @@ def _lanes(lanes: LaneStates, outer: Ints) -> Iterator[tuple[int, int, int, Attr
             "heading_error": math.degrees(error),
             "along": along,
         }
-        yield frame, node, lane, _numbers(numbers) | {"is_primary": primary, "is_own": own}
+        known = {"is_own": own} if either else {"is_primary": primary, "is_own": own}
+        yield frame, node, lane, _numbers(numbers) | known
 
 
 def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attributes]]:
@@ -796,6 +806,8 @@ class Stepper:
         Makes a new generator.
     road_map : RoadMap or None
         The map of the graphs.
+    driven : DrivenLanes
+        Choice of the lanes that vehicles drive in junctions.
     ego : str
         Default ego for frames without an ego.
 
@@ -808,9 +820,13 @@ class Stepper:
     """
 
     def __init__(
-        self, make: Callable[[], Generator], road_map: RoadMap | None, ego: str = ""
+        self,
+        make: Callable[[], Generator],
+        road_map: RoadMap | None,
+        driven: DrivenLanes,
+        ego: str = "",
     ) -> None:
-        self._make = make
+        self._make, self._driven = make, driven
         self._generator = make()
         self._ego = ego
         self._records = Records(road_map)
@@ -843,6 +859,7 @@ class Stepper:
             self._generator, self._inner, self._introduced = self._make(), {}, 0
             new = [entity for entity, _ in self._standing.values()]
         block = self._kept(self._block(frame, moving, new))
+        block = self._driven.now(block, self._outer[block.states.node])
         for row, entity in enumerate(new):
             self._records.stand(self._standing[entity.ident][1], block.scenery, row)
         here = {entity.ident for entity in moving}

@@ -151,7 +151,7 @@ class LaneStates:
     heading_error : float64
         Heading of the entity less the lane's direction, in (-π, π]; rad.
     primary : bool
-        True for the primary lane, chosen by: centre inside, then heading, then overlap.
+        True for the primary lane: in a junction the driven lane, else by centre, heading and overlap.
     along : float64
         Position of the box centre along the lane's centre line, from the lane's start; m. It can lie beyond
         both ends.
@@ -691,8 +691,8 @@ class SceneGraph:
 
         Examples
         --------
-        >>> graph = store.file.graph("town#173")
-        >>> round(graph.curvature(1), 3)  # a left turn
+        >>> graph = store.file.graph("town#425")
+        >>> round(graph.curvature(0), 3)  # a left turn
         0.046
         """
         return self._course(node)[0]
@@ -745,7 +745,7 @@ class SceneGraph:
         --------
         >>> graph = store.file.graph("town#264")
         >>> print(graph.to_networkx())
-        MultiDiGraph with 96 nodes and 636 edges
+        MultiDiGraph with 96 nodes and 634 edges
         """
         import networkx as nx  # imports in half a second: only on demand
 

@@ -484,6 +484,9 @@ class States:
         Node id of the carrier or towing vehicle; -1: none; :data:`UNTOLD`: not yet computed.
     own : object
         Attributes without a column, as a mapping (name → number, text or truth value), or ``None``.
+    lane : int64
+        Node id of the lane that the entity drives in a junction. Its negative: other lanes are as likely.
+        0: not chosen, the footprint decides.
     """
 
     node: Ints
@@ -513,6 +516,7 @@ class States:
     derived: Ints
     carrier: Ints
     own: NDArray[np.object_]
+    lane: Ints
 
     def __post_init__(self) -> None:
         for column in fields(self):
@@ -540,6 +544,7 @@ class States:
             "derived": np.zeros(n, np.int64),
             "carrier": np.full(n, UNTOLD),
             "own": np.full(n, None, object),
+            "lane": np.zeros(n, np.int64),
         }
         return cls(
             **{

@@ -14,6 +14,7 @@ from array import array
 from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -501,8 +502,8 @@ class SegmentReader:
                     place=place,
                 )
                 segments.append(stack.enter_context(segment))
-            while block := first or next(blocks, None):
-                first = None
+            kept = (_kept(segments, block) for block in chain([first], blocks))
+            for block in generator.recorded(kept):
                 self._append(generator, block, group, segments)
                 tally.see(block)
                 self._on_block(tally.frames, _reached(block, trace.info.size), trace.info.size)
@@ -515,13 +516,11 @@ class SegmentReader:
         group: list[_EgoView],
         segments: list[Segment],
     ) -> None:
-        # Origins do not depend on the ego, so all segments store the same numbers.
-        kept, *_ = [segment.as_kept(block) for segment in segments]
-        egos = [kept.ego]
+        egos = [block.ego]
         if self._job.config.egos:
             egos = [_ego_of(block, one) for one in group]
-        for piece in generator.pieces(kept, len(egos)):
-            first = int(piece.seq[0] - kept.seq[0]) if len(piece) else 0
+        for piece in generator.pieces(block, len(egos)):
+            first = int(piece.seq[0] - block.seq[0]) if len(piece) else 0
             here = [ego[first : first + len(piece)] for ego in egos]
             graphs = generator.one_by_one(piece, here)
             for one, segment in zip(group, segments, strict=True):
@@ -564,6 +563,12 @@ class SegmentReader:
     def _meant(self, block: FrameBlock) -> FrameBlock:
         """Return a block of frames after applying the configured mapping from type names to kinds."""
         return replace(block, entities=renamed(block.entities, self._job.config.types))
+
+
+def _kept(segments: Sequence[Segment], block: FrameBlock) -> FrameBlock:
+    """Return a block as all segments store it: origins do not depend on the ego."""
+    kept, *_ = [segment.as_kept(block) for segment in segments]
+    return kept
 
 
 def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:

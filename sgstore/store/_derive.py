@@ -64,8 +64,14 @@ WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id
 """
 _STATES: Final = f"""
 SELECT frame_id, node_id, coalesce(lights, -1) AS lights, derived, coalesce(carrier, -1) AS carrier,
-       coalesce(enum_code(light_state)::INTEGER, -1) AS light_state, {", ".join(_NUMBERS)}
-FROM known_state WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id, node_id
+       coalesce(enum_code(light_state)::INTEGER, -1) AS light_state, coalesce(lane, 0) AS lane,
+       {", ".join(_NUMBERS)}
+FROM known_state LEFT JOIN (
+  SELECT frame_id, node_id,
+         max(lane) FILTER (is_primary) * CASE count(*) FILTER (is_own) WHEN 1 THEN 1 ELSE -1 END AS lane
+  FROM known_lane_state WHERE bucket >= $low AND bucket < $high GROUP BY frame_id, node_id
+) USING (frame_id, node_id)
+WHERE frame_id >= $low << 6 AND frame_id < $high << 6 ORDER BY frame_id, node_id
 """
 _ENTITIES: Final = """
 SELECT e.node_id, enum_code(e.kind) AS kind, e.is_static, coalesce(e.ident, '') AS ident,
@@ -433,6 +439,7 @@ class _StateReader:
                 light_state=np.append(self._lights, np.int8(-1))[states["light_state"]],
                 derived=states["derived"].astype(np.int64),
                 carrier=states["carrier"].astype(np.int64),
+                lane=states["lane"].astype(np.int64),
                 **self._placed(states, _NUMBERS),
             ),
             ego=frames["ego"].astype(np.int64),

@@ -37,8 +37,15 @@ if TYPE_CHECKING:
 SAMPLE = Path(str(files("sgstore"))) / "apps" / "sample" / "town.mcap"
 MORE_DATA = ("esmini/traffic_lights.mcap", "esmini/highway_merge.mcap")
 FLOATS = [
-    f.name for f in fields(States) if f.name not in {"node", "lights", "light_state", "derived"}
+    f.name
+    for f in fields(States)
+    if f.name not in {"node", "lights", "light_state", "derived", "lane"}
 ]
+DRIVEN = """
+SELECT frame_id, node_id,
+       any_value(lane) FILTER (is_primary) * if(count(*) FILTER (is_own) = 1, 1, -1) AS lane
+FROM inside.lane_state GROUP BY ALL"""
+"""The primary lane of each state; positive if it is not the only own lane."""
 
 
 def states_of(columns: dict[str, Any], origin: dict[str, float]) -> States:
@@ -50,7 +57,8 @@ def states_of(columns: dict[str, Any], origin: dict[str, float]) -> States:
     }
     for axis in ("x", "y", "z"):
         known[axis] = known[axis] + origin[axis]
-    return States.of(node=columns["node_id"].astype(np.int64), **known)
+    lane = np.ma.filled(columns.get("lane", np.zeros(len(columns["node_id"]), np.int64)), 0)
+    return States.of(node=columns["node_id"].astype(np.int64), lane=lane.astype(np.int64), **known)
 
 
 def read_back(store: StoreFile) -> list[FrameBlock]:
@@ -62,7 +70,8 @@ def read_back(store: StoreFile) -> list[FrameBlock]:
         "SELECT seq, time_ns, log_time_ns, coalesce(ego, -1) AS ego FROM inside.frame ORDER BY seq"
     )
     state = store.arrays(
-        "SELECT * EXCLUDE (kind, light_state) FROM inside.state ORDER BY frame_id, node_id"
+        "SELECT * EXCLUDE (kind, light_state) FROM inside.state"
+        f" LEFT JOIN ({DRIVEN}) USING (frame_id, node_id) ORDER BY frame_id, node_id"
     )
     entity = store.arrays(
         "SELECT * REPLACE (kind::VARCHAR AS kind, coalesce(map_ref, '') AS map_ref)"

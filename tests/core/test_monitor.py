@@ -159,9 +159,11 @@ def test_edges_watched_go_over_time_as_in_a_store(share: int, town: Drive) -> No
     for number, (pattern, _, asked) in enumerate(edge_questions(random.Random(4))):
         conditions = [one.removeprefix("ONCE[0frames, 0frames] ") for one in asked]
         conditions = [one for one in conditions if one.startswith("(")]
+        # Online, the lane in a junction may be unknown.
+        conditions = [one for one in conditions if "r.primary" not in one and "r.is_own" not in one]
         made.setdefault(pattern, []).extend(conditions[(number + share) % 16 :: 16])
     changes = ["delta(r.offset, 1s) > 0.5", "prev(r.heading_error) < r.heading_error"]
-    made["(v:Vehicle)-[r:isIn]->(e:Lane)"] = [*changes, "ALWAYS[0s, 1s] r.primary"]
+    made["(v:Vehicle)-[r:isIn]->(e:Lane)"] = [*changes, "ALWAYS[0s, 1s] r.overlap > 0.5"]
 
     assert town.compare_edges(list(made.items())) > 100
 

@@ -354,6 +354,10 @@ def test_the_sample_driven_step_by_step_gives_what_the_store_has(town_store: Pat
     assert compared == math.ceil(60 * BLOCKS / 8)
 
 
+OF_OWN_LANES = {"leads", "follows"}
+"""Relations that follow from driven lanes, which need the past online and the future in a recording."""
+
+
 def columns(graph: GraphBlock, row: int, idents: list[str]) -> dict[str, set[Any]]:
     """What is in the graph of one frame of a block, by the simulator's ids of entities."""
 
@@ -369,15 +373,15 @@ def columns(graph: GraphBlock, row: int, idents: list[str]) -> dict[str, set[Any
     within = zip(lanes.node[lane].tolist(), lanes.lane[lane].tolist(), strict=True)
     return {
         "nodes": {name(n) for n in (*moving.tolist(), *there.node[there.frame == row].tolist())},
-        "edges": {(name(a), RELATIONS[r], name(b)) for a, r, b in edges if a >= 0},
+        "edges": {
+            (name(a), RELATIONS[r], name(b))
+            for a, r, b in edges
+            if a >= 0 and RELATIONS[r] not in OF_OWN_LANES
+        },
         "lanes": {
             (name(a), b, *map(float, rest))
             for (a, b), *rest in zip(
-                within,
-                number(lanes.overlap[lane]),
-                number(lanes.offset[lane]),
-                lanes.primary[lane],
-                strict=True,
+                within, number(lanes.overlap[lane]), number(lanes.offset[lane]), strict=True
             )
         },
     }
@@ -386,10 +390,12 @@ def columns(graph: GraphBlock, row: int, idents: list[str]) -> dict[str, set[Any
 def shown(graph: SceneGraph) -> dict[str, set[Any]]:
     """The same of a graph that came online."""
     name = {n: a["ident"] if n >= 0 else n for n, a in graph.nodes.items()}
-    kept = ("overlap", "lane_offset", "is_primary")
+    kept = ("overlap", "lane_offset")
     return {
         "nodes": set(name.values()),
-        "edges": {(name[a], r, name[b]) for a, r, b, _ in graph.edges if a >= 0},
+        "edges": {
+            (name[a], r, name[b]) for a, r, b, _ in graph.edges if a >= 0 and r not in OF_OWN_LANES
+        },
         "lanes": {
             (name[a], b, *(float(attributes[k]) for k in kept))
             for a, relation, b, attributes in graph.edges

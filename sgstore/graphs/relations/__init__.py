@@ -9,6 +9,7 @@ frame.
 
 from sgstore.graphs.relations._contact import contacts, contacts_of
 from sgstore.graphs.relations._crowds import NEAR, TOUCHING, Crowds, pieces
+from sgstore.graphs.relations._driven_lanes import DrivenLanes
 from sgstore.graphs.relations._extent import Areas, EgoPoses, Extent
 from sgstore.graphs.relations._following import gaps
 from sgstore.graphs.relations._graph_filter import Keeping, renamed
@@ -51,6 +52,7 @@ __all__ = [
     "Bodies",
     "BodyPairs",
     "Crowds",
+    "DrivenLanes",
     "EdgeRoom",
     "EgoPoses",
     "Extent",

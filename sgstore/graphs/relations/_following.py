@@ -5,10 +5,10 @@
 Vehicles take part, also parked ones, on lanes for traffic that they face along (by less than a
 right angle). A vehicle that never moves follows no other. A trailer does not follow its tractor.
 
-*Own lanes* are the primary lane of an entity and some other lanes of its junction, where lanes
-overlap: those that contain its centre and, for a vehicle, have its direction (:data:`SAME_WAY`).
-Therefore a vehicle at the entry of a junction is on all ways that begin there. They are stored,
-because the distance along the lanes (``lane_dist``) depends on them.
+*Own lanes* are the primary lane of an entity. While the driven lane in a junction is not sure, they
+are also the lanes of the junction that contain its centre and, for a vehicle, have its direction
+(:data:`SAME_WAY`). They are stored, because the distance along the lanes (``lane_dist``) depends on
+them.
 
 *The next one ahead* is the first vehicle after the vehicle's centre along the lane. If there is
 none on this lane, the search continues along ``travelsTo``, also through junctions. At a fork each

@@ -6,11 +6,12 @@ footprints that have moved: traffic often waits, parks or queues, and scenery ne
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.tables import begins
 from sgstore.graphs.relations._following import next_ahead, own_hits
 from sgstore.graphs.relations._lane_net import Centrelines, LaneNet
 from sgstore.graphs.relations._scene import (
@@ -26,6 +27,8 @@ from sgstore.maps.roads import OFF_ROAD, LaneHits, RoadMap
 from sgstore.model.vocabulary import DRIVING, RELATION_CODE, VEHICLES, are_entities
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from sgstore.graphs.relations._extent import Areas
@@ -33,6 +36,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Entities, Floats, Ints, States
 
     Rows = NDArray[np.intp]
+    LookUp = Callable[[Floats, Floats], LaneHits]
 
 
 ON_OR_OFF: Final = kinds_mask((*VEHICLES, "person", "animal", "prop"))
@@ -55,6 +59,8 @@ class LaneContact:
         Search distance along the lanes; m.
     waypoints : Waypoints, optional
         Waypoints of the map, if it has any.
+    lanes_of : callable, optional
+        Replaces :meth:`RoadMap.lanes_of`.
 
     Attributes
     ----------
@@ -67,14 +73,21 @@ class LaneContact:
     of the previous block: its memory grows with the number of distinct entities, not with time.
     """
 
-    def __init__(self, road_map: RoadMap, ahead: float, waypoints: Waypoints | None = None) -> None:
+    def __init__(
+        self,
+        road_map: RoadMap,
+        ahead: float,
+        waypoints: Waypoints | None = None,
+        lanes_of: LookUp | None = None,
+    ) -> None:
         nodes, lines = road_map.nodes, Centrelines(road_map.ribbons)
         self._map = road_map
         self._waypoints = waypoints
         self._ahead = ahead
         self._net = LaneNet(road_map)
         self._reach = SignalReach(road_map, self._net, lines, ahead)
-        self._footing = _Footing(road_map, lines)
+        self._same = nodes.first_sections()
+        self._footing = _Footing(road_map, lines, lanes_of or road_map.lanes_of)
         self.driving = np.array([kind in DRIVING for kind in nodes.lane_type], np.bool_)
         # (K,): column of the parent of each map node, or -1.
         edges = road_map.edges
@@ -125,9 +138,13 @@ class LaneContact:
         at = int(np.argmin(apart))
         return columns[at] if apart[at] <= SAME_PLACE else None
 
-    def standing(self, bodies: Bodies) -> Standing:
-        """Return the map parts (lanes, crosswalks) below the objects of a block of frames."""
+    def standing(self, bodies: Bodies, lane: Ints) -> Standing:
+        """Return the map parts (lanes, crosswalks) below the objects of a block of frames.
+
+        ``lane`` are the driven lanes of the first objects, as in ``States``.
+        """
         hits, along, parts = self._footing.of(bodies)
+        hits, sure = driven(hits, lane, self._same)
         if self._waypoints is not None:
             rows, nodes = self._waypoints.of(hits, along, bodies)
             rows, nodes = np.concatenate([parts[0], rows]), np.concatenate([parts[1], nodes])
@@ -139,7 +156,7 @@ class LaneContact:
         off_road = np.flatnonzero(
             ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])
         )
-        own = own_hits(self._net, bodies, hits)
+        own = own_hits(self._net, bodies, hits) & (hits.primary | ~sure)
         return Standing(hits, along, own, parts, off_road)
 
     def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> MapContext:
@@ -191,6 +208,23 @@ class LaneContact:
         return present & kept
 
 
+def driven(hits: LaneHits, lane: Ints, same: Ints) -> tuple[LaneHits, Bools]:
+    """Return the touched lanes with the driven lane as the primary one, and a mask of the sure choices.
+
+    ``same`` is the first section of the same lane, as a column, for each map node. A driven lane
+    that the footprint does not touch does not count, unless it touches another section.
+    """
+    lane = np.append(lane, np.zeros(int(hits.row.max(initial=-1)) + 1, np.int64))[hits.row]
+    fits = np.flatnonzero((lane != 0) & (same[-1 - hits.lane] == same[np.abs(lane) - 1]))
+    other = hits.lane[fits] != -np.abs(lane[fits])
+    fits = fits[np.lexsort((-hits.overlap[fits], other, hits.row[fits]))]
+    fits = fits[begins(hits.row[fits])]
+    known = np.isin(hits.row, hits.row[fits])
+    primary = hits.primary & ~known
+    primary[fits] = True
+    return replace(hits, primary=primary), known & (lane < 0)
+
+
 def _appended(table: tuple[Ints, Ints], lines: list[tuple[int, int]]) -> tuple[Ints, Ints]:
     keys, values = np.array(lines, np.int64).reshape(-1, 2).T
     return np.append(table[0], keys), np.append(table[1], values)
@@ -203,8 +237,8 @@ Table = tuple["NDArray[Any]", ...]
 class _Footing:
     """Cache of lanes and crosswalks below objects. A result is used again until the object moves."""
 
-    def __init__(self, road_map: RoadMap, lines: Centrelines) -> None:
-        self._map = road_map
+    def __init__(self, road_map: RoadMap, lines: Centrelines, lanes_of: LookUp) -> None:
+        self._map, self._lanes_of = road_map, lanes_of
         self._lines = lines
         self._node: Ints = np.zeros(0, np.int64)
         self._box = np.zeros((0, 6))
@@ -232,7 +266,7 @@ class _Footing:
 
     def _ask(self, rows: Rows, box: Floats) -> tuple[Table, Table]:
         boxes, bottom = box[rows, :5], box[rows, 5]
-        hits = self._map.lanes_of(boxes, bottom)
+        hits = self._lanes_of(boxes, bottom)
         walkers, crosswalks = self._map.crosswalks_of(boxes, bottom)
         order = np.argsort(walkers, kind="stable")
         return (

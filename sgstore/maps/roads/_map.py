@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 FARTHEST: Final = 200.0
 """Greatest search distance along the lanes from one entity to another; m. The view ``pairs`` uses it too."""
-_CELL: Final = 32.0
+_CELL: Final = 8.0
 """Cell size of the grid that finds bodies far from all crosswalks; m."""
 _MOST_CELLS: Final = 1 << 16
 _PREPARED: Final = Lock()
@@ -93,6 +93,8 @@ Geometries = NDArray[np.object_]
 
 _FIRST_LANE: Final = OFF_ROAD - 1
 _QUADRANT: Final = np.pi / 4
+_ROUNDING: Final = 1e-3
+"""Difference of overlaps and headings that is rounding: equal lanes stay equal in a turned world."""
 _MOST_PRESENT: Final = 1 << 24
 """Greatest number of (node, point) pairs processed at once."""
 _CORNERS: Final = 8
@@ -363,8 +365,9 @@ class RoadMap:
         footprint's centre. The heading error in a bend is taken there, too.
         """
         touches = self._index.touches(np.asarray(boxes, np.float64), np.asarray(z, np.float64))
-        quadrant = np.floor(np.abs(touches.heading_error) / _QUADRANT)
-        order = np.lexsort((touches.lane, -touches.overlap, quadrant, ~touches.inside, touches.row))
+        quadrant = np.floor(np.abs(touches.heading_error) / _QUADRANT + _ROUNDING)
+        overlap = np.round(touches.overlap / _ROUNDING)
+        order = np.lexsort((touches.lane, -overlap, quadrant, ~touches.inside, touches.row))
         first = np.diff(touches.row[order], prepend=-1) != 0
         primary = np.zeros(len(order), np.bool_)
         primary[order[first]] = True

@@ -83,12 +83,12 @@ class Ribbons:
         return bend
 
     def between(self, lane: Ints, along: Floats, column: Floats) -> Floats:
-        """Interpolate a column of cross sections at given positions along lanes.
+        """Interpolate a column of cross sections, or a stack of columns, at positions along lanes.
 
         ``lane`` and ``along`` as in :meth:`at`.
         """
         before, share = self._place(self.along, np.ones(len(self)), lane, along)
-        return column[before] + share * (column[before + 1] - column[before])
+        return column[..., before] + share * (column[..., before + 1] - column[..., before])
 
     def height(self, lane: Ints, along: Floats) -> Floats:
         """Return the road heights at given positions along lanes; m."""

@@ -1,0 +1,450 @@
+"""Lanes that vehicles drive through junctions, chosen by path.
+
+Lanes of a junction overlap, so that one footprint fits several of them. The *driven lane* is on the
+cheapest way along ``travelsTo`` over all frames of a passage. A way costs its evidence (overlap,
+heading, offset) for each metre driven, and much more where its lanes are not linked.
+
+In a recording, a passage is decided after its last frame: :meth:`DrivenLanes.chosen` holds blocks
+back until then. A passage of more than :data:`MOST_STATES` states of the recording is decided in
+parts, so that memory does not grow with time. Where blocks end does not matter. In online mode only
+the past counts (:meth:`DrivenLanes.now`): the costs so far make the choice stable.
+
+A choice is *unsure* if a lane that is not linked to it costs almost the same, such as at the entry
+of a junction in online mode. At equal costs the lower lane counts.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from sgstore.base.tables import begins, chained, spread, taken
+from sgstore.graphs.relations._lane_net import LaneNet
+from sgstore.graphs.relations._scene import IS_VEHICLE, joined
+from sgstore.model.vocabulary import RELATION_CODE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from sgstore.maps.roads import LaneHits, RoadMap
+    from sgstore.model.world import Bools, Codes, Floats, FrameBlock, Ints
+
+    Rows = NDArray[np.intp]
+
+
+MOST_STATES: Final = 1 << 17
+"""States of a recording, from the first to the last frame of a passage that is decided as a whole."""
+
+APART: Final = 3
+"""Frames without a vehicle near junctions that end its passage."""
+
+CELL: Final = 2.0
+"""Edge of a square of the grid of junctions; m."""
+
+FAR: Final = 1e9
+"""Greatest number of a row or column of the grid."""
+
+HOPS: Final = 3
+"""Links between lanes of successive frames: short lanes have no frame."""
+
+SIDE: Final = 2.0
+"""Cost of a change to the lane beside: as of 2 m with the centre on the border."""
+
+MISS: Final = 3.0
+"""Cost of a lane that the vehicle does not touch."""
+
+JUMP: Final = 100.0
+"""Cost of a change to a lane that is not linked."""
+
+SURE: Final = 0.3
+"""Difference of costs above which a choice is sure."""
+
+EQUAL: Final = 1e-3
+"""Difference of costs that is rounding."""
+
+LEAST: Final = 0.01
+"""Least weight of a frame: evidence of a vehicle that stands."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidates:
+    """Lanes that vehicles near junctions touch, by vehicle, frame and lane; shape (n,).
+
+    Attributes
+    ----------
+    node : int64
+        Vehicle.
+    seq, row : int64
+        Number of the frame and of the state in the trace.
+    inside : bool
+        True if the vehicle touches a lane for traffic of a junction in this frame.
+    lane : int64
+        Lane, counted from 0.
+    x, y : float64
+        Place of the vehicle; m.
+    cost : float64
+        Mismatch of footprint and lane for each metre; of earlier frames in online mode, the sum.
+    """
+
+    node: Ints
+    seq: Ints
+    row: Ints
+    inside: Bools
+    lane: Ints
+    x: Floats
+    y: Floats
+    cost: Floats
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+
+_NO_NUMBERS: Final = np.zeros(0, np.int64)
+_NO_VALUES: Final = np.zeros(0)
+_NONE: Final = _Candidates(
+    *(_NO_NUMBERS, _NO_NUMBERS, _NO_NUMBERS, np.zeros(0, np.bool_), _NO_NUMBERS),
+    *(_NO_VALUES, _NO_VALUES, _NO_VALUES),
+)
+
+
+class _Junctions:
+    """Grid of the junctions of a map, and the links of its lanes."""
+
+    def __init__(self, road_map: RoadMap) -> None:
+        self.road_map = road_map
+        net, edges, count = LaneNet(road_map), road_map.edges, len(road_map.ribbons)
+        self.traffic, self.widths = net.traffic, np.maximum(net.widths, 1.0)
+        self.lanes: Bools = net.traffic & (net.junction >= 0)
+        self._count = count
+        of = {name: edges.relation == RELATION_CODE[name] for name in _BESIDE}
+        src, dst = -2 - edges.src, -2 - edges.dst
+        opposed = src[of["opposes"]] * count + dst[of["opposes"]]
+        beside = of["toLeftOf"] | of["toRightOf"]
+        beside &= (src >= 0) & (dst >= 0)
+        self._beside = np.setdiff1d(src[beside] * count + dst[beside], opposed)
+        first, lane = np.arange(count), np.arange(count)
+        linked = [first * count + lane]
+        for _ in range(HOPS):
+            owner, lane = net.onward(lane)
+            first = first[owner]
+            linked.append(first * count + lane)
+        self._linked = np.unique(np.concatenate(linked))
+        self._cells = self._grid()
+
+    def _grid(self) -> Ints:
+        """Return the squares near lanes of junctions."""
+        of, lanes = self.road_map.ribbons, np.flatnonzero(self.lanes)
+        owner, number = spread(
+            np.zeros(len(lanes), np.int64), 2 + (of.lengths[lanes] / CELL).astype(np.int64)
+        )
+        lane, along = lanes[owner], number * CELL
+        borders = (of.left_x, of.left_y, of.right_x, of.right_y)
+        left_x, left_y, right_x, right_y = of.between(lane, along, np.stack(borders))
+        found = [
+            np.floor(
+                np.stack([a * left_x + (1 - a) * right_x, a * left_y + (1 - a) * right_y]) / CELL
+            )
+            for a in (0.0, 0.5, 1.0)
+        ]
+        x, y = np.concatenate(found, axis=1)
+        _, once = np.unique(_square(x, y), return_index=True)
+        x, y = x[once], y[once]
+        return np.unique([_square(x + dx, y + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)])
+
+    def near(self, x: Floats, y: Floats) -> Bools:
+        """Return a mask of the places near lanes of junctions."""
+        return _among(self._cells, _square(np.floor(x / CELL), np.floor(y / CELL)))
+
+    def toll(self, src: Ints, dst: Ints) -> Floats:
+        """Return the cost of driving from lane to lane between two frames."""
+        key = src * self._count + dst
+        beside = np.where(_among(self._beside, key), SIDE, JUMP)
+        return np.where(_among(self._linked, key), 0.0, beside)
+
+
+_BESIDE: Final = ("toLeftOf", "toRightOf", "opposes")
+
+
+def _square(column: Floats, line: Floats) -> Ints:
+    """Return a number for each square of the grid. Few distant squares share a number."""
+    places = np.clip(np.nan_to_num(np.stack([column, line])), -FAR, FAR).astype(np.int64)
+    return places[0] << 32 ^ places[1]
+
+
+def _among(keys: Ints, wanted: Ints) -> Bools:
+    if not len(keys):
+        return np.zeros(len(wanted), np.bool_)
+    return keys[np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)] == wanted
+
+
+class DrivenLanes:
+    """Choice of the lanes that vehicles drive in the junctions of a map, for one trace.
+
+    Parameters
+    ----------
+    road_map : RoadMap or None
+        ``None`` means a trace without lanes.
+    """
+
+    def __init__(self, road_map: RoadMap | None) -> None:
+        self._map = road_map
+        self._kinds: Codes = np.zeros(0, np.int8)
+        self._open = _NONE
+        self._states = 0
+        self._asked = deque["_Lookups"]()
+
+    @cached_property
+    def _junctions(self) -> _Junctions | None:
+        junctions = None if self._map is None else _Junctions(self._map)
+        return junctions if junctions is not None and junctions.lanes.any() else None
+
+    def chosen(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
+        """Yield the blocks of a recording, with the driven lanes of their states."""
+        if self._junctions is None:
+            yield from blocks
+            return
+        waiting, lane = deque["FrameBlock"](), np.zeros(0, np.int64)
+        for block in chain(blocks, [None]):
+            if block is not None:
+                found = self._candidates(self._junctions, block, block.states.node)
+                self._open = _sorted([self._open, found])
+                lane = np.append(lane, np.zeros(len(block.states), np.int64))
+                waiting.append(block)
+            first = self._states - len(lane)
+            for row, driven in self._decided(self._junctions, block):
+                lane[row - first] = driven
+            settled = int(self._open.row.min(initial=self._states)) - first
+            while waiting and len(waiting[0].states) <= settled:
+                ready = waiting.popleft()
+                count = len(ready.states)
+                yield _with_lanes(ready, lane[:count])
+                self._asked.popleft()
+                lane, settled = lane[count:], settled - count
+
+    def _decided(
+        self, junctions: _Junctions, block: FrameBlock | None
+    ) -> Iterator[tuple[Ints, Ints]]:
+        """Decide the passages that are over. Yield rows of states and their lanes, as in ``States``.
+
+        ``block`` is the last block so far; ``None`` means that the recording is over.
+        """
+        again = True
+        while again and len(self._open):
+            of = self._open
+            run = np.cumsum(begins(of.node) | (np.diff(of.seq, prepend=0) > APART))
+            first = of.row[begins(run)][run - 1]
+            late = of.row - first >= MOST_STATES
+            run = np.cumsum(begins(run, late))
+            last = np.flatnonzero(np.append(run[1:] != run[:-1], True))
+            over = np.append(of.node[last[1:]] == of.node[last[:-1]], False)
+            if block is None:
+                over[:] = True
+            elif len(block):
+                over |= of.seq[last] < block.seq[-1] - APART
+            over = over[run - 1] & ~late
+            again = bool(late.any())
+            self._open = taken(of, ~over)
+            passages = _Passages(junctions, *_filled(taken(of, over), run[over]))
+            cost = passages.of.cost * passages.metres
+            yield passages.chosen(passages.onward(cost) + passages.back(cost) - cost)
+
+    def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
+        """Return the lanes that footprints of the last yielded block touch, as :class:`RoadMap` does."""
+        known = self._asked[0] if self._asked else self._map
+        if known is None:
+            raise ValueError("lanes need a map")
+        return known.lanes_of(boxes, z)
+
+    def now(self, block: FrameBlock, node: Ints) -> FrameBlock:
+        """Return the next frame of the online mode, with the driven lanes of its states.
+
+        Parameters
+        ----------
+        block : FrameBlock
+            Of one frame.
+        node : (N,) int64
+            Numbers of the entities that stay the same over all frames.
+        """
+        if self._junctions is None:
+            return block
+        start = self._states
+        found = self._candidates(self._junctions, block, node)
+        recent = taken(self._open, self._open.seq >= int(block.seq[0]) - APART)
+        of = _sorted([recent, found])
+        passages = _Passages(self._junctions, of, np.cumsum(begins(of.node)))
+        here = of.row >= start
+        cost = passages.onward(np.where(here, of.cost * passages.metres, of.cost))
+        row, driven = passages.chosen(cost)
+        lane = np.zeros(len(block.states), np.int64)
+        lane[row[row >= start] - start] = driven[row >= start]
+        over = ~here & np.isin(of.node, found.node)
+        self._open = taken(replace(of, cost=cost - passages.least(cost)), ~over)
+        self._asked.clear()
+        return _with_lanes(block, lane)
+
+    def _candidates(self, junctions: _Junctions, block: FrameBlock, node: Ints) -> _Candidates:
+        """Return the lanes that the vehicles of the next block touch near junctions."""
+        states, entities = block.states, block.entities
+        self._kinds = np.concatenate([self._kinds[: entities.first], entities.kind])
+        start, self._states = self._states, self._states + len(states)
+        rows = np.flatnonzero(IS_VEHICLE[self._kinds[states.node]])
+        rows = rows[junctions.near(states.x[rows], states.y[rows])]
+        rows = rows[np.argsort(node[rows], kind="stable")]
+        of = states.take(rows)
+        box = np.stack([of.x, of.y, of.heading, of.length, of.width], axis=1)
+        box = np.column_stack([box, of.z - np.nan_to_num(of.height) / 2])
+        # A vehicle that stands is looked up once.
+        moved = begins(node[rows], *box.view(np.int64).T)
+        self._asked.append(_Lookups(junctions.road_map, box[moved]))
+        hits = self._asked[-1].hits
+        owner, hit = joined(hits.row, np.cumsum(moved) - 1)
+        lane, row = -2 - hits.lane[hit], rows[owner]
+        inside = np.bincount(owner, weights=junctions.lanes[lane], minlength=len(rows)) > 0
+        aside = np.abs(hits.offset) / junctions.widths[-2 - hits.lane]
+        cost = 1 - hits.overlap + np.abs(hits.heading_error) + np.minimum(aside, 1.0)
+        return _Candidates(
+            node[row],
+            block.seq[block.frame_of[row]],
+            start + row,
+            inside[owner],
+            lane,
+            of.x[owner],
+            of.y[owner],
+            np.nan_to_num(cost, nan=1.0)[hit],
+        )
+
+
+class _Lookups:
+    """Lanes below the footprints of a block, looked up for the choice and used again for the graphs."""
+
+    def __init__(self, road_map: RoadMap, box: Floats) -> None:
+        self._map, self._box = road_map, box
+        self.hits = road_map.lanes_of(box[:, :5], box[:, 5])
+        keys = _keys(box)
+        self._order = np.argsort(keys, kind="stable")
+        self._keys = keys[self._order]
+
+    def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
+        """Return the lanes that footprints touch, as :meth:`RoadMap.lanes_of` does."""
+        if not len(self._keys):
+            return self._map.lanes_of(boxes, z)
+        box = np.column_stack([boxes, z])
+        place = np.searchsorted(self._keys, _keys(box))
+        twin = self._order[np.minimum(place, len(self._keys) - 1)]
+        same = (self._box[twin].view(np.int64) == box.view(np.int64)).all(axis=1)
+        known, new = np.flatnonzero(same), np.flatnonzero(~same)
+        asked = self._map.lanes_of(boxes[new], z[new])
+        owner, index = joined(self.hits.row, twin[known])
+        both = chained(
+            [
+                replace(taken(self.hits, index), row=known[owner]),
+                replace(asked, row=new[asked.row]),
+            ]
+        )
+        return taken(both, np.argsort(both.row, kind="stable"))
+
+
+def _keys(box: Floats) -> Ints:
+    """Return a number for each footprint. Few footprints share a number."""
+    return (box.view(np.int64) * _ODD).sum(axis=1)
+
+
+_ODD: Final = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1, 0x2545F491])
+
+
+def _sorted(tables: Sequence[_Candidates]) -> _Candidates:
+    of = chained(tables)
+    return taken(of, np.lexsort((of.lane, of.seq, of.node)))
+
+
+def _filled(of: _Candidates, run: Ints) -> tuple[_Candidates, Ints]:
+    """Add the lanes that a vehicle leaves and touches again in a passage, at a high cost."""
+    new = begins(run, of.seq)
+    frame, first = np.cumsum(new) - 1, np.flatnonzero(new)
+    order = np.lexsort((frame, of.lane, run))
+    lane, at = of.lane[order], frame[order]
+    again = np.flatnonzero(~begins(run[order], lane) & (np.diff(at, prepend=0) > 1))
+    owner, missed = spread(at[again - 1] + 1, np.diff(at, prepend=0)[again] - 1)
+    more = replace(
+        taken(of, first[missed]), lane=lane[again][owner], cost=np.full(len(missed), MISS)
+    )
+    of, run = chained([of, more]), np.append(run, run[first[missed]])
+    order = np.lexsort((of.lane, of.seq, run))
+    return taken(of, order), run[order]
+
+
+def _with_lanes(block: FrameBlock, lane: Ints) -> FrameBlock:
+    return replace(block, states=replace(block.states, lane=lane))
+
+
+class _Passages:
+    """Passages of vehicles through junctions: candidates by passage, frame and lane.
+
+    Parameters
+    ----------
+    junctions : _Junctions
+    of : _Candidates
+    run : (n,) int64
+        Number of the passage of each candidate, ascending.
+    """
+
+    def __init__(self, junctions: _Junctions, of: _Candidates, run: Ints) -> None:
+        self.of, self._junctions = of, junctions
+        new = begins(run, of.seq)
+        self._first, self._frame = np.flatnonzero(new), np.cumsum(new) - 1
+        count = np.diff(self._first, append=len(of))
+        goes_on = ~begins(run[self._first])
+        self._step = self._frame - self._frame[begins(run)][np.cumsum(begins(run)) - 1]
+        before = np.maximum(self._frame - 1, 0)
+        many = np.where(goes_on[self._frame], count[before], 0)
+        # Pairs of a candidate and one of the frame before.
+        self._dst, self._src = spread(self._first[before], many)
+        self._toll = junctions.toll(of.lane[self._src], of.lane[self._dst])
+        x, y = of.x[self._first], of.y[self._first]
+        metres = np.hypot(np.diff(x, prepend=0.0), np.diff(y, prepend=0.0))
+        metres = np.where(goes_on, np.maximum(metres, LEAST), 1.0)
+        self.metres = np.nan_to_num(metres, nan=LEAST)[self._frame]
+
+    def onward(self, cost: Floats) -> Floats:
+        """Return the least cost of the ways from the start of a passage to each candidate."""
+        return _summed(cost, self._step, self._src, self._dst, self._toll)
+
+    def back(self, cost: Floats) -> Floats:
+        """Return the least cost of the ways from each candidate to the end of its passage."""
+        return _summed(cost, -self._step, self._dst, self._src, self._toll)
+
+    def least(self, cost: Floats) -> Floats:
+        """Return the least cost among the candidates of the same frame, for each candidate."""
+        return np.minimum.reduceat(cost, self._first)[self._frame] if len(cost) else cost
+
+    def chosen(self, cost: Floats) -> tuple[Ints, Ints]:
+        """Return the states in junctions, and their lanes as in ``States``."""
+        lane, more = self.of.lane, cost - self.least(cost)
+        best = np.flatnonzero(more <= EQUAL)
+        best = best[begins(self._frame[best])]
+        chosen, toll = lane[best][self._frame], self._junctions.toll
+        others = (toll(lane, chosen) == JUMP) & (toll(chosen, lane) == JUMP) & (more < SURE)
+        others &= self._junctions.traffic[lane]
+        unsure = np.bincount(self._frame, weights=others, minlength=len(best)) > 0
+        driven = np.where(unsure, 2 + lane[best], -2 - lane[best])
+        return self.of.row[best][self.of.inside[best]], driven[self.of.inside[best]]
+
+
+def _summed(cost: Floats, step: Ints, src: Rows, dst: Rows, toll: Floats) -> Floats:
+    """Return the cost of the cheapest chain of pairs that ends at each candidate, step by step."""
+    total, order = cost.copy(), np.lexsort((dst, step[dst]))
+    src, dst, toll = src[order], dst[order], toll[order]
+    heads = np.flatnonzero(begins(dst))
+    ends = np.append(heads, len(dst))
+    for a, b in pairwise([*np.flatnonzero(begins(step[dst[heads]])).tolist(), len(heads)]):
+        pairs = slice(ends[a], ends[b])
+        ways = total[src[pairs]] + toll[pairs]
+        total[dst[heads[a:b]]] += np.minimum.reduceat(ways, heads[a:b] - heads[a])
+    return total
