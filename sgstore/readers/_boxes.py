@@ -20,7 +20,6 @@ from sgstore.readers._blocks import UPRIGHT
 if TYPE_CHECKING:
     from sgstore.mcap import Recording
     from sgstore.model.world import Floats
-    from sgstore.readers._base import MessageDecoder
 
 EGO: Final = "ego"
 """Id of an ego that a log does not name."""
@@ -148,7 +147,7 @@ class BoxesTrace(FramesTrace):
             name = next(filter(None, names), recording.path.stem)
             self.info = replace(self.info, map_name=f"{name}{OF_LANES}")
 
-    def decoder(self, report: Any) -> MessageDecoder[Any]:
+    def decoder(self, report: Any) -> Any:
         """Return a new decoder of frames, and add the remark of the log to a report."""
         note = next((c.metadata.get(NOTE, "") for c in self.recording.channels.values()), "")
         report.warnings += [note] if note else []

@@ -77,7 +77,7 @@ def frames(path: Path) -> dict[int, dict[str, tuple[float, ...]]]:
 
 
 def _rows(names: list[str], block: FrameBlock, rows: slice) -> dict[str, tuple[float, ...]]:
-    columns = [name for name in States.__dataclass_fields__ if name != "node"]
+    columns = [name for name in States.__dataclass_fields__ if name not in {"node", "own"}]
     values = np.array([getattr(block.states, name)[rows] for name in columns], float).T
     ids = [names[node] for node in block.states.node[rows]]
     return {ident: tuple(np.nan_to_num(v, nan=-99)) for ident, v in zip(ids, values, strict=True)}

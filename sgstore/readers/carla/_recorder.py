@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from sgstore.maps.roads import RoadMap
     from sgstore.mcap import Recording
     from sgstore.model.world import Channel
-    from sgstore.readers._base import MessageDecoder
 
 ORIGINS: Final = "carla_origins"
 """Mapping that keeps the origins of actors as positions."""
@@ -102,7 +101,7 @@ class CarlaRecorderTrace(FramesTrace):
         if road_map is not None and self._places:
             self._signals = signals_of(self._places, road_map)
 
-    def decoder(self, report: TraceReport) -> MessageDecoder[Any]:
+    def decoder(self, report: TraceReport) -> Any:
         """Return a new decoder of frames, and add the warnings about traffic lights to a report."""
         self._report = report
         if self._road_map is not None:
