@@ -361,6 +361,17 @@ def test_lanes_may_be_changed_as_the_rule_says_else_as_the_lines_do(
     assert pairs(made(logical_street(rule=rule, lines=lines)), "laneChange") == expected
 
 
+def test_lanes_that_contradict_their_boundaries_are_warnings() -> None:
+    truth = logical_street()
+    truth.logical(4, (100, 190), ((22,), (21,)), moves=2, successor=((77, True),))
+    truth.logical(5, (100, 150), ((22, 99), (21,)), moves=2)
+    said = "\n".join(made(truth).warnings)
+
+    assert "lane 4: s from 100 to 190 m, but its boundaries from 100 to 150 m" in said
+    assert "4 to 77: linked to a missing lane" in said
+    assert "boundaries of lanes are missing: logical_lane_boundary 99" in said
+
+
 def test_traffic_on_logical_lanes_moves_as_they_say() -> None:
     against = made(logical_street(left_moves=3))
     both = made(logical_street(left_moves=4))

@@ -95,6 +95,8 @@ _RULES: Final = {
 
 _LONGEST: Final = 100
 """Maximum length of a road name; characters."""
+_BEYOND: Final = 1.0
+"""Greatest length of a lane beyond its boundaries that is no contradiction; m."""
 _JUMP: Final = 1e-3
 """Minimum distance of a jump in a border; m."""
 _FAR: Final = 1e8
@@ -227,7 +229,8 @@ class OsiLanes:
         return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
 
     def _missing(self, signals: Iterable[LaneSignal], borders: _LaneBoundaries) -> Iterator[str]:
-        """Yield boundaries of lanes and lanes of signals that are missing."""
+        """Yield lanes that contradict their boundaries, and missing boundaries and lanes."""
+        yield from borders.notes
         if borders.missing:
             yield f"boundaries of lanes are missing: {', '.join(borders.missing)}"
         lanes = self._told["lane"].keys() | self._told["logical_lane"].keys()
@@ -296,6 +299,7 @@ class _LaneBoundaries:
         self.told = told
         self.place = place
         self.missing: dict[str, None] = {}
+        self.notes: list[str] = []
         self._lines: dict[int, Floats] = {}
         self._logical: dict[int, tuple[Floats, Floats]] = {}
 
@@ -445,6 +449,11 @@ def _logical_line(lane: Any, borders: _LaneBoundaries) -> LaneLine:
         raise ValueError("it has no boundary with points on each side")
     # A lane exists only where both borders exist.
     start, end = max(left_s[0], right_s[0]), min(left_s[-1], right_s[-1])
+    if (lane.HasField("start_s") and lane.start_s < start - _BEYOND) or (
+        lane.HasField("end_s") and lane.end_s > end + _BEYOND
+    ):
+        what = f"s from {lane.start_s:g} to {lane.end_s:g} m, but its boundaries from {start:g} to {end:g} m"
+        borders.notes.append(f"lane {lane.id.value}: {what}")
     start = max(start, lane.start_s) if lane.HasField("start_s") else start
     end = min(end, lane.end_s) if lane.HasField("end_s") else end
     if not abs(lane.start_s) + abs(lane.end_s) < _FAR or not end > start:
