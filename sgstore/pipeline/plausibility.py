@@ -87,6 +87,9 @@ FAR: Final = 1e6
 ASIDE: Final = 30.0
 """Greatest distance of the ego from all lanes; m. Parking areas are nearer."""
 
+ON_LANES: Final = 0.5
+"""Greatest share of moving vehicles on no lane. It is 0.22 in Argoverse 2, and 0.5 to 1 in mirrored axes."""
+
 SAMPLED: Final = 10
 """One frame in this number is compared with the map, and searched for doubled bodies."""
 
@@ -343,6 +346,7 @@ class Plausibility:
         found = [
             self._finding(one.kind, one.node, one.frame, one.nodes, one.rows, one.value)
             for one in (judged(self._tally) if contradicting >= STANDING else ())
+            if one.kind not in self._events
         ]
         found += self._lost(losses) if losses else ()
         if self._moves or self._grown:
@@ -667,6 +671,13 @@ class Plausibility:
             self._events["off the map"] = _Event(node, frame, value, int(outside.sum()), nodes)
         moving = places[np.hypot(places[:, 9], places[:, 10]) > COURSE]
         hits = road_map.lanes_of(moving[:, 4:9], np.full(len(moving), np.nan))
+        apart = np.setdiff1d(np.arange(len(moving)), hits.row)
+        if len(apart) > max(AGREEING, ON_LANES * len(moving)):
+            node, frame = moving[apart[0], :2].astype(int).tolist()
+            nodes = {int(one) for one in moving[apart, 0]}
+            value = f"{len(apart)} of {len(moving)} places of moving vehicles are on no lane"
+            event = _Event(node, frame, value, len(apart), nodes)
+            self._events.setdefault("off the map", event)
         row, error = hits.row[hits.primary], np.abs(hits.heading_error[hits.primary])
         against = moving[row[error > 3 * np.pi / 4]]
         nodes = {int(one) for one in against[:, 0]}

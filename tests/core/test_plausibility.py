@@ -169,6 +169,15 @@ def test_lights_without_lanes_and_places_off_the_map_are_found() -> None:
     assert on_street(street(mirrored=True)) == ["off the map"]
 
 
+def test_vehicles_beside_the_lanes_are_found() -> None:
+    beside = street()
+    for moment in beside:
+        for body in moment.bodies.values():
+            body.y = 12.0
+
+    assert on_street(beside) == ["off the map"]
+
+
 def test_vehicles_against_their_lanes_are_found() -> None:
     back = street()
     for moment in back:
