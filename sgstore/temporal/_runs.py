@@ -29,7 +29,7 @@ from sgstore.temporal._offline import (
     times_of,
 )
 from sgstore.temporal._signal_values import Clock, SignalValues
-from sgstore.temporal._trace_group import ascending, ordering
+from sgstore.temporal._trace_group import ascending, ordering, places_of
 from sgstore.temporal._windows import over_columns
 
 if TYPE_CHECKING:
@@ -144,20 +144,7 @@ class FrameLine:
 
     def places(self, ids: Ints) -> Ints:
         """Return the array index of each frame id, shape (R,). -1 means not present."""
-        if not len(self.ids):
-            return np.full(len(ids), -1)
-        traces = trace_of(ids)
-        first = np.flatnonzero(np.diff(traces, prepend=-1))
-        owners = np.searchsorted(self.traces, traces[first])
-        start = self.starts[np.minimum(owners, len(self.traces) - 1)]
-        found = np.repeat(start, np.diff(first, append=len(ids))) + seq_of(ids)
-        np.minimum(found, len(self.ids) - 1, out=found)
-        elsewhere = np.flatnonzero(self.ids[found] != ids)
-        if len(elsewhere):  # of another trace, or of a missing frame
-            wanted = ids[elsewhere]
-            there = np.minimum(np.searchsorted(self.ids, wanted), len(self.ids) - 1)
-            found[elsewhere] = np.where(self.ids[there] == wanted, there, -1)
-        return found
+        return places_of(ids, self.ids, self.traces, self.starts)
 
 
 @dataclass(frozen=True)

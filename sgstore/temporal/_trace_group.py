@@ -323,21 +323,7 @@ class TraceGroup:
 
     def places(self, frame_ids: Ints) -> Ints:
         """Return the index of each frame. -1 means that the group does not have it."""
-        if not len(self.frame_ids):
-            return np.full(len(frame_ids), -1)
-        traces = trace_of(frame_ids)
-        first = np.flatnonzero(np.diff(traces, prepend=-1))
-        owners = np.minimum(np.searchsorted(self.ids, traces[first]), len(self.ids) - 1)
-        found = np.repeat(self.starts[owners], np.diff(first, append=len(traces)))
-        found += seq_of(frame_ids)
-        np.minimum(found, len(self.frame_ids) - 1, out=found)
-        elsewhere = np.flatnonzero(self.frame_ids[found] != frame_ids)
-        if len(elsewhere):  # of another trace, or of a missing frame
-            wanted = frame_ids[elsewhere]
-            there = np.searchsorted(self.frame_ids, wanted)
-            there = np.minimum(there, len(self.frame_ids) - 1)
-            found[elsewhere] = np.where(self.frame_ids[there] == wanted, there, -1)
-        return found
+        return places_of(frame_ids, self.frame_ids, self.ids, self.starts)
 
     def table(self, buckets: Ints, keys: Keys, masks: Ints) -> TimedRelation:
         """Return the table of matches from rows of buckets, node ids and masks of frames, unsorted."""
@@ -397,6 +383,31 @@ class TraceGroup:
             relation.frames[rows] - self.starts[place],
             tuple(value[rows] for value in relation.values),
         )
+
+
+def places_of(wanted: Ints, frame_ids: Ints, traces: Ints, starts: Ints) -> Ints:
+    """Return the index of each wanted frame id among ascending frame ids. -1 means not present.
+
+    Parameters
+    ----------
+    wanted : (R,) int64
+    frame_ids : (F,) int64
+    traces, starts : (T,) int64
+        Trace ids, and the first frame of each trace.
+    """
+    if not len(frame_ids):
+        return np.full(len(wanted), -1)
+    owners = trace_of(wanted)
+    first = np.flatnonzero(np.diff(owners, prepend=-1))
+    start = starts[np.minimum(np.searchsorted(traces, owners[first]), len(traces) - 1)]
+    found = np.repeat(start, np.diff(first, append=len(wanted))) + seq_of(wanted)
+    np.minimum(found, len(frame_ids) - 1, out=found)
+    elsewhere = np.flatnonzero(frame_ids[found] != wanted)
+    if len(elsewhere):  # of another trace, or of a missing frame
+        some = wanted[elsewhere]
+        there = np.minimum(np.searchsorted(frame_ids, some), len(frame_ids) - 1)
+        found[elsewhere] = np.where(frame_ids[there] == some, there, -1)
+    return found
 
 
 def _bits(masks: Ints) -> NDArray[np.uint8]:
