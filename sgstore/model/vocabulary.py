@@ -112,9 +112,8 @@ RELATION_ENDS: Final[Mapping[str, Sequence[tuple[str, str]]]] = {
     **dict.fromkeys(("laneChange", "opposes", "conflictsWith"), _BETWEEN_LANES),
     **dict.fromkeys(SIDES, _BETWEEN_ENTITIES + _BETWEEN_LANES),
     **dict.fromkeys(("controlsTrafficOf", "mayAffect"), (("signal", "lane"),)),
-    **dict.fromkeys((*PROXIMITY, *DIRECTIONS, "overlaps"), _BETWEEN_ENTITIES),
+    **dict.fromkeys((*PROXIMITY, *DIRECTIONS, "overlaps", "sees"), _BETWEEN_ENTITIES),
     **dict.fromkeys(("leads", "follows", "tows"), (("vehicle", "vehicle"),)),
-    "sees": (("ego", "other"),),
 }
 """Built-in relations → pairs of source and target. A *body* is an entity that is not a signal.
 

@@ -24,7 +24,7 @@ IMPOSSIBLE = {
     "(e:Ego)-[:isIn]->(:Junction)": "write (e:Ego)-[:isIn*3]->(:Junction)",
     "(l:Lane)-[:isIn]->(v:Vehicle)": "write (l:Lane)<-[:isIn]-(v:Vehicle)",
     "(l:Lane)-[:controlsTrafficOf]->(:TrafficLight)": "<-[:controlsTrafficOf]-",
-    "(v:Vehicle)-[:sees]->(ego)": "write (v:Vehicle)<-[:sees]-(ego)",
+    "(l:Lane)-[:sees]->(ego)": "entity to entity",
     "(v:Vehicle)-[:near]->(l:Lane)": "-[:isIn]->",
     "(v)-[:near]->(x)-[:isIn]->(:Road)": "write (x)-[:isIn*2]->(:Road)",
     "(p:Person)-[:leads]->(v:Car)": "vehicle to vehicle",

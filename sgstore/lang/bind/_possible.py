@@ -43,8 +43,6 @@ _OWN: Final = frozenset(OWN_ENTITY_KINDS)
 _KINDS: Final = frozenset(OWN_KINDS)
 """Built-in kinds. Kinds that clients add can be at any end."""
 _WORDS: Final[Mapping[str, b.Kinds]] = {
-    "ego": b.Kinds(_OWN, frozenset()),
-    "other": b.Kinds(frozenset(), _OWN),
     "entity": b.Kinds(_OWN, _OWN),
     "body": b.Kinds(_OWN, _OWN - _SIGNALS),
     "vehicle": b.Kinds(frozenset(VEHICLES), frozenset(VEHICLES)),
@@ -79,7 +77,12 @@ def check_edges(written: Sequence[Written], names: SymbolTable) -> None:
         before = dict(kinds)
         for one in written:
             edge = edges[one[3]]
-            src, dst = (kinds.get(key) or names.scope.kinds(key) for key in (edge.src, edge.dst))
+            src, dst = (
+                _sort(names.scope.outer[key])
+                if key in names.scope.outer
+                else kinds.get(key) or names.scope.kinds(key)
+                for key in (edge.src, edge.dst)
+            )
             if not (edge.relations <= _ENDS.keys() and (src.every | dst.every) <= _KINDS):
                 continue
             ends = [pair for name in edge.relations for pair in _ENDS[name]]
@@ -92,9 +95,16 @@ def check_edges(written: Sequence[Written], names: SymbolTable) -> None:
                 return
             if edge.high == 1:
                 sides = zip(*ways, strict=True)
-                kinds[edge.src], kinds[edge.dst] = (reduce(or_, side) for side in sides)
+                for key, side in zip((edge.src, edge.dst), sides, strict=True):
+                    if key not in names.scope.outer:
+                        kinds[key] = reduce(or_, side)
         if kinds == before:
             break
+
+
+def _sort(kinds: b.Kinds) -> b.Kinds:
+    """Return all entities for a node of an outer pattern that can be one: a block can be about some kinds."""
+    return kinds | _WORDS["entity"] if kinds.other & _OWN else kinds
 
 
 def _ways(
@@ -155,7 +165,7 @@ def _told(relation: str) -> str:
     """Return the ends of a relation as text: ``a lane to a road``."""
     pairs = RELATION_ENDS[relation]
     text = ", or from ".join(f"{one} to {other}" for one, other in pairs)
-    return text.replace("|", ", ").replace("body", "entity").replace("other", "entity")
+    return text.replace("|", ", ").replace("body", "entity")
 
 
 LIMITS: Final[Mapping[str, Interval]] = {
