@@ -4,7 +4,7 @@
 
     python tools/real_terms.py real            nuScenes and Argoverse 2: stopped, parked, speed, hard braking
     python tools/real_terms.py words [noise]   Euro NCAP and UN R157 runs: each word against its table
-    python tools/real_terms.py noise           error of speeds of noisy positions against difference quotients
+    python tools/real_terms.py words table     the table of words and families in docs/noise.md
 
 The data are in the folder of shared data (``SGSTORE_DATA``); they are no part of the project.
 ``words noise`` adds σ 0.1 m to all positions and drops every second frame. ``derived``: no velocities.
@@ -323,25 +323,44 @@ def words(sigma: float = 0.0, *, derived: bool = False, out: Any = sys.stdout) -
 def judged(store: Store, table: list[dict[str, str]], out: Any) -> dict[str, Any]:
     """Compare the runs that each word finds with the table of words."""
     figures: dict[str, Any] = {}
-    families: dict[tuple[str, str], list[int]] = defaultdict(lambda: [0, 0, 0])
+    families: dict[str, dict[str, list[int]]] = defaultdict(lambda: defaultdict(lambda: [0, 0, 0]))
     for word in WORDS:
         query = OVERLAPS if word == "overlaps" else patterns()[word].written()
-        hits = {
-            str(row.run) for row in store.find(f"{query} RETURN DISTINCT trace.name AS run").rows()
-        }
+        found = store.find(f"{query} RETURN DISTINCT trace.name AS run").rows()
+        hits = {str(row.run) for row in found}
         want = {"yes": set[str](), "no": set[str](), "either": set[str]()}
         for row in table:
-            want[row[word]].add(row["file"][: -len(".mcap")])
-            families[word, row["family"]][0] += row[word] == "yes"
-            families[word, row["family"]][1] += row["file"][: -len(".mcap")] in hits
+            run = row["file"][: -len(".mcap")]
+            want[row[word]].add(run)
+            cell = families[row["family"]][word]
+            cell[0] += row[word] == "yes"
+            cell[1] += row[word] == "yes" and run in hits
+            cell[2] += row[word] != "yes" and run in hits
         missed, false = sorted(want["yes"] - hits), sorted(want["no"] & hits)
         figures[word] = {"yes": len(want["yes"]), "missed": missed, "false": false}
         recall = 1 - len(missed) / max(1, len(want["yes"]))
         print(f"{word}: yes {len(want['yes'])}, recall {recall:.3f}, false {len(false)}", file=out)
-        print("    missed", *missed, file=out) if missed else None
-        print("    false", *false, file=out) if false else None
-    figures["families"] = dict(families)
-    return figures
+        for name, runs in (("missed", missed), ("false", false)):
+            if runs:
+                print("   ", name, *runs, file=out)
+    return figures | {"families": families}
+
+
+def page(families: dict[str, dict[str, list[int]]]) -> str:
+    """Return the table of words and families: found runs of those that must be found, and other found runs."""
+    lines = [
+        f"| family | {' | '.join(f'`{word}`' for word in WORDS)} |",
+        "|---" * (len(WORDS) + 1) + "|",
+    ]
+    for family, cells in families.items():
+        texts = []
+        for word in WORDS:
+            yes, right, other = cells[word]
+            texts.append(
+                f"{right}/{yes}" * (yes > 0) + " " * (yes > 0 < other) + f"+{other}" * (other > 0)
+            )
+        lines.append(f"| {family} | {' | '.join(texts)} |")
+    return "\n".join(lines)
 
 
 def _collisions(store: Store, truth: dict[str, Any], out: Any) -> None:
@@ -362,4 +381,6 @@ if __name__ == "__main__":
     if what == "real":
         real()
     elif what == "words":
-        words(0.1 if "noise" in sys.argv else 0.0, derived="derived" in sys.argv)
+        found = words(0.1 if "noise" in sys.argv else 0.0, derived="derived" in sys.argv)
+        if "table" in sys.argv:
+            print(page(found["families"]))
