@@ -78,7 +78,7 @@ def noisy(
                     channel.topic, channel.message_encoding, number, channel.metadata
                 )
             data = message.data
-            if schema.name == "osi3.SensorView":
+            if schema.name in {"osi3.SensorView", "osi3.GroundTruth"}:
                 seen += 1
                 if (seen - 1) % every:
                     continue
@@ -88,7 +88,8 @@ def noisy(
                         pool.Add(file)
                     view = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
                 content = view.FromString(data)
-                for one in content.global_ground_truth.moving_object:
+                truth = getattr(content, "global_ground_truth", content)
+                for one in truth.moving_object:
                     dx, dy = rng.normal(0, sigma, 2)
                     one.base.position.x += dx
                     one.base.position.y += dy
