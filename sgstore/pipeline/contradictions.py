@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from sgstore.base.geometry import wrapped
+from sgstore.base.tables import taken
 from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled
 
 if TYPE_CHECKING:
@@ -180,8 +181,7 @@ class Steps:
         # Numbers of 16 bits are sorted by radix.
         small = len(node) and node.max() < 1 << 16
         order = np.argsort(node.astype(np.uint16) if small else node, kind="stable")
-        columns = (node, frame, time_ns, values, fresh)
-        rows = BodyRows(*(column[order] for column in columns))
+        rows = taken(BodyRows(node, frame, time_ns, values, fresh), order)
         same = (rows.node[1:] == rows.node[:-1]) & rows.fresh[1:] & (rows.values[1:, LIGHT] < 0)
         at = np.flatnonzero(same)
         after = at + 1
@@ -527,5 +527,4 @@ _DESCRIBED: Final = {
     "heading": _of_heading,
     "acceleration": _of_acceleration,
     "yaw rate": _of_yaw_rate,
-    "reverse": lambda *_: None,  # It can be true of single vehicles.
 }

@@ -228,7 +228,7 @@ class Plausibility:
         self._shares: Counter[str] = Counter()
         self._doubled: Counter[tuple[int, int]] = Counter()
         self._changed: dict[int, tuple[int, int]] = {}
-        self._orders: dict[int, set[tuple[int, int]]] = {}
+        self._orders: dict[int, set[tuple[str, str]]] = {}
         self._lit: set[int] = set()
         self._lights: dict[int, str] = {}
         self._places: list[Floats] = []
@@ -510,10 +510,9 @@ class Plausibility:
             lengths = np.abs(ends - starts)
             near = np.minimum(max(STRIDE, step), lengths / 2)[:, None]
             met = np.abs(ends[:, None] - starts) < near
-            swapped = (met & met.T).any(axis=1)
-            for move, is_swapped, length in zip(
-                moves, swapped.tolist(), lengths.tolist(), strict=True
-            ):
+            swapped = np.flatnonzero((met & met.T).any(axis=1)).tolist()
+            for row, (move, length) in enumerate(zip(moves, lengths.tolist(), strict=True)):
+                is_swapped = row in swapped
                 kind = "swapped ids" if is_swapped else "teleport"
                 words = "to the place of another body" if is_swapped else "between two frames"
                 self._happen(kind, move.node, frame, f"it jumps {length:.4g} m {words}")
@@ -640,7 +639,9 @@ class Plausibility:
             is_ego = node == block.ego[frame]
             on_wheels = np.isin(self._kinds[node], _VEHICLES)
             self._places.append(
-                np.column_stack([node, block.seq[frame], is_ego, on_wheels, *columns])
+                np.column_stack([node, block.seq[frame], is_ego, on_wheels, *columns]).astype(
+                    np.float64
+                )
             )
 
     def _judge_places(self, road_map: RoadMap) -> None:
@@ -697,7 +698,7 @@ class Plausibility:
         same = (np.diff(rows.node) == 0) & lit[1:] & (shown[:-1] >= 0) & (np.diff(shown) != 0)
         for row in np.flatnonzero(same).tolist():
             node, time, frame = (int(c[row + 1]) for c in (rows.node, rows.time_ns, rows.frame))
-            before, after = LIGHT_STATES[shown[row]], LIGHT_STATES[shown[row + 1]]
+            before, after = (LIGHT_STATES[int(code)] for code in shown[row : row + 2])
             since = self._changed.get(node)
             self._changed[node] = time, frame
             self._orders.setdefault(node, set()).add((before, after))
