@@ -761,8 +761,9 @@ def items_of(value: Bound) -> Type | None:
     """Return the type of the items of a collected list. ``None`` means another value."""
     if isinstance(value, Aggregate) and value.type is Type.list and value.operand is not None:
         return value.operand.type
-    listed = is_passed_on(value) and value.type is Type.list and not is_path(value)
-    return Type(value.attribute.meaning) if listed else None
+    if not is_passed_on(value) or value.type is not Type.list or is_path(value):
+        return None
+    return Type(value.attribute.meaning)
 
 
 def is_path(value: Bound) -> bool:

@@ -316,7 +316,7 @@ def _between(operands: tuple[s.Expression, ...], names: SymbolTable) -> str:
     return names.session.text[operands[0].span.end : operands[1].span.start]
 
 
-def _comparison(e: s.Comparison, names: SymbolTable) -> b.Operation:
+def _comparison(e: s.Comparison, names: SymbolTable) -> b.Bound:
     left, right = names.bind(e.left), names.bind(e.right)
     if e.word in TEXT_TESTS:
         return text_test(e, left, right, names)

@@ -45,8 +45,8 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
         ]
         pending += edges
         joined += [
-            (edge, *path.nodes[number : number + 2], key)
-            for number, (edge, key) in enumerate(edges)
+            (edge, left, right, key)
+            for (edge, key), left, right in zip(edges, path.nodes, path.nodes[1:], strict=False)
         ]
         if path.name is not None:
             name_path(path, keys, [key for _, key in edges], names)

@@ -111,7 +111,7 @@ def _ways(
     edge: b.Edge, src: b.Kinds, dst: b.Kinds, ends: Sequence[tuple[b.Kinds, b.Kinds]]
 ) -> list[tuple[b.Kinds, b.Kinds]]:
     """Return the kinds at both ends that an edge can join; of a repeated edge, only if there are some."""
-    ends = [*ends, *(pair[::-1] for pair in ends)] if edge.both else ends
+    ends = [*ends, *((other, one) for one, other in ends)] if edge.both else ends
     found: list[tuple[b.Kinds, b.Kinds]] = []
     reached = [src]
     for number in range(1, edge.high + 1):
