@@ -147,26 +147,35 @@ class Tracks:
         jitter: float,
         period: float,
     ) -> Tracks:
-        """Return the tracks of frames; arguments as of :func:`smooth`."""
+        """Return the tracks of frames; arguments as of :meth:`Smoother.fill`."""
         order = np.lexsort([frame, node])
         # Whole nanoseconds: differences are then the same in every block.
         clock = np.cumsum(np.rint(np.where(seconds > 0, seconds, 0.0) * 1e9).astype(np.int64))
         torn = np.cumsum(~(seconds > 0))
         at, time = frame[order], clock[frame[order]]
         place = values[order, _X : _X + 3]
-        used = np.isfinite(place[:, :2]).all(axis=1)
+        used: Bools = np.isfinite(place[:, 0]) & np.isfinite(place[:, 1])
         breaks = np.ones(len(order), np.bool_)
         ahead = np.diff(at)
         breaks[1:] = (np.diff(node[order]) != 0) | (ahead > 3) | (np.diff(torn[at]) != 0)
         if len(order) > 3:
-            far = _jumps(time, place[:, :2], np.cumsum(breaks), jitter)
+            far = _jumps(time, place[:, :2], np.cumsum(breaks, dtype=np.int64), jitter)
             # A row with a jump before and behind, but none over it, is an outlier.
             lone = np.flatnonzero(far[:-1] & far[1:]) if len(far) > 1 else np.zeros(0, np.int64)
             lone = lone[_close(time, place[:, :2], lone, jitter)]
             far[lone], far[lone + 1] = False, False
             used[lone] = False
             breaks |= far
-        return cls(order, at, time, place, values[order, _HEADING], np.cumsum(breaks), used, period)
+        return cls(
+            order,
+            at,
+            time,
+            place,
+            values[order, _HEADING],
+            np.cumsum(breaks, dtype=np.int64),
+            used,
+            period,
+        )
 
     def shifted(self, by: int) -> tuple[Ints, Bools]:
         """Return the rows some places later in the same part, and a mask of those that exist."""
@@ -266,12 +275,11 @@ class Fit:
 
     def instead(self, other: Fit, rows: Bools) -> Fit:
         """Return the fit with some rows of another one."""
-        mixed = (
-            np.where(rows[:, None], b, a)
-            for a, b in zip((self.slope, self.bend), (other.slope, other.bend), strict=True)
-        )
         return Fit(
-            *mixed, np.where(rows, other.middle, self.middle), np.where(rows, other.span, self.span)
+            np.where(rows[:, None], other.slope, self.slope),
+            np.where(rows[:, None], other.bend, self.bend),
+            np.where(rows, other.middle, self.middle),
+            np.where(rows, other.span, self.span),
         )
 
 

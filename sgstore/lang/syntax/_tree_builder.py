@@ -219,7 +219,7 @@ _SYNONYMS: Final = {"GLOBALLY": "ALWAYS", "FINALLY": "EVENTUALLY", "NEVER": "ALW
 """Temporal operators of other tools, with the operator of the language. NEVER also negates its operand."""
 
 
-def rule_temporal(span: TextSpan, children: Children) -> s.Temporal:
+def rule_temporal(span: TextSpan, children: Children) -> s.Temporal | s.Logic:
     word, bound, operand = children
     name, place = word.text.upper(), TextSpan(span.start, word.span.end)
     if name == "NEVER":
