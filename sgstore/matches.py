@@ -396,9 +396,10 @@ class Matches(Tabular):
 
         Rows of a small result are kept until the store changes, so that they are not searched twice.
         """
-        with self._file.snapshot(), closing(self._rows(whole=True)) as rows:
+        with self._file.snapshot():
             if self._kept is not None and self._kept[0] is self._catalog():
                 return len(self._kept[1])
+            rows = self._rows(whole=True)
             some = list(islice(rows, KEPT + 1))
             if len(some) <= KEPT:
                 self._kept = self._catalog(), some
@@ -416,9 +417,9 @@ class Matches(Tabular):
         """Return the row at an index, or the rows of a slice, as of a list."""
         if isinstance(place, int):
             return (self.rows() if place < 0 else self.head(place + 1))[place]
-        last = place.stop
-        whole = last is None or min(place.start or 0, last, place.step or 1) < 0
-        return (self.rows() if whole else self.head(last))[place]
+        if place.stop is None or min(place.start or 0, place.stop, place.step or 1) < 0:
+            return self.rows()[place]
+        return self.head(place.stop)[place]
 
     def head(self, number: int = 5) -> list[Row]:
         """Return the first rows.

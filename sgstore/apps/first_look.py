@@ -103,8 +103,7 @@ class FirstLook:
                 one.path.name,
                 one.frames,
                 ", ".join(f"{many} {kind}" for kind, many in sorted(one.entities.items())),
-                str(one.error.reason if hasattr(one.error, "reason") else one.error or "")
-                or (f"losses: {len(one.losses)}" if one.losses else ""),
+                str(one.error or "") or (f"losses: {len(one.losses)}" if one.losses else ""),
             )
             for one in self.outcomes
         ]

@@ -135,7 +135,7 @@ class _Junctions:
             owner, lane = net.onward(lane)
             first = first[owner]
             linked.append(first * count + lane)
-        self._linked = np.unique(np.concatenate(linked))
+        self._linked = np.unique(np.concatenate(linked)).astype(np.int64)
         self._cells = self._grid()
 
     def _grid(self) -> Ints:
@@ -144,7 +144,7 @@ class _Junctions:
         owner, number = spread(
             np.zeros(len(lanes), np.int64), 2 + (of.lengths[lanes] / CELL).astype(np.int64)
         )
-        lane, along = lanes[owner], number * CELL
+        lane, along = lanes[owner], (number * CELL).astype(np.float64)
         borders = (of.left_x, of.left_y, of.right_x, of.right_y)
         left_x, left_y, right_x, right_y = of.between(lane, along, np.stack(borders))
         found = [
@@ -278,7 +278,7 @@ class DrivenLanes:
         found = self._candidates(self._junctions, block, node)
         recent = taken(self._open, self._open.seq >= int(block.seq[0]) - APART)
         of = _sorted([recent, found])
-        passages = _Passages(self._junctions, of, np.cumsum(begins(of.node)))
+        passages = _Passages(self._junctions, of, np.cumsum(begins(of.node), dtype=np.int64))
         here = of.row >= start
         cost = passages.onward(np.where(here, of.cost * passages.metres, of.cost))
         row, driven = passages.chosen(cost)

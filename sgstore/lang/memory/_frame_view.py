@@ -305,8 +305,9 @@ class NodeColumns:
         column = self._columns.get(name)
         if column is None:
             nodes = view.nodes
-            of = attribute_of if name in NOISE_MARKS else dict.get
-            told = [of(nodes[node], name) for node in self.nodes]
+            told = [nodes[node].get(name) for node in self.nodes]
+            if name in NOISE_MARKS:
+                told = [attribute_of(nodes[node], name) for node in self.nodes]
             column = _known(np.array([math.nan if v is None else v for v in told], np.float64))
             if truth:
                 column = Column(column.values == 1, column.known)
