@@ -56,6 +56,7 @@ def states(blocks: list[FrameBlock]) -> dict[tuple[str, int], dict[str, float]]:
                 told = {
                     name: getattr(block.states, name)[row].item()
                     for name in block.states.__dataclass_fields__
+                    if name != "own"
                 }
                 found[idents[int(told["node"])], time] = told
     return found
