@@ -229,6 +229,8 @@ def some_of(values: list[Any], attribute: Attribute) -> Any:
     """A value that occurs; if nothing of the sample has one, one that could."""
     known = [value for value in values if value is not None]
     could = {Type.number: 1.5, Type.text: "none", Type.boolean: True}[attribute.type]
+    if attribute.name == "env.temperature":
+        could = 290.5  # K
     return known[-1] if known else attribute.values[0] if attribute.values else could
 
 
@@ -281,7 +283,7 @@ def test_attribute_in_returned_values(
         wanted += [min(known, default=None), max(known, default=None)]
     if attribute.type is Type.number:
         counts.append(f"SUM({name})")
-        wanted.append(sum(in_store(one, attribute) for one in known) if known else None)
+        wanted.append(sum(in_store(one, attribute) for one in known))
     (row,) = store.find(f"{pattern} RETURN {', '.join(counts)}").rows()
     assert all(map(same, row, wanted)), (row, wanted)
     grouped = store.find(f"{pattern} RETURN {name} AS value, COUNT(*) AS many").rows()

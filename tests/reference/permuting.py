@@ -207,7 +207,8 @@ def block_rows(path: Path, **how: Any) -> list[tuple[str, Any]]:
                 for field in fields(part):
                     value = getattr(part, field.name)
                     if isinstance(value, np.ndarray):
-                        found.append((field.name, (value.dtype.str, value.tobytes())))
+                        raw = value.tolist() if value.dtype.hasobject else value.tobytes()
+                        found.append((field.name, (value.dtype.str, raw)))
                     elif isinstance(value, tuple | str | int):
                         found.append((field.name, value))
             found.append(("messages", _refs(block.messages, topics)))

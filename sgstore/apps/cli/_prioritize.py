@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -213,7 +214,7 @@ def prioritize(
             )
         say_made(made, output)
     # Last, so that the lock exists even if the reader stops after the first rows.
-    out.write(ordered.columns, islice(rows, limit or None), ordered.types)
+    out.write(ordered.columns, islice(rows, min(limit, sys.maxsize) or None), ordered.types)
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:

@@ -171,8 +171,8 @@ def _told(relation: str) -> str:
 LIMITS: Final[Mapping[str, Interval]] = {
     **dict.fromkeys(("heading", "pitch", "roll", "bearing", "rel_heading"), (-180.0, 180.0)),
     **dict.fromkeys(("apparent_heading", "heading_error"), (-180.0, 180.0)),
-    **dict.fromkeys(("throttle", "brake", "cpi"), (0.0, 1.0)),
-    "steer": (-1.0, 1.0),
+    **dict.fromkeys(("throttle", "brake", "steer"), (-10.0, 10.0)),
+    "cpi": (0.0, 1.0),
     **dict.fromkeys(("speed", "length", "width", "height", "speed_limit"), (0.0, math.inf)),
     **dict.fromkeys(("dist", "gap", "ttc", "headway", "rel_speed", "lon_gap"), (0.0, math.inf)),
     **dict.fromkeys(("lat_gap", "closing_time", "dce", "ttce", "dce_3s", "wttc"), (0.0, math.inf)),
@@ -181,10 +181,15 @@ LIMITS: Final[Mapping[str, Interval]] = {
     **dict.fromkeys(("tit", "dce_recorded", "ttce_recorded"), (0.0, math.inf)),
     **dict.fromkeys(("t", "seq", "trace.duration", "trace.period"), (0.0, math.inf)),
     **dict.fromkeys(("lifetime", "trace.frames"), (1.0, math.inf)),
-    "env.temperature": (150.0, 400.0),
-    "env.time_of_day": (0.0, 24.0),
+    "env.temperature": (100.0, 1000.0),
 }
-"""Smallest and largest value of attributes and of numbers of two entities, in the units of the language."""
+"""Smallest and largest value of attributes and of numbers of two entities, in the units of the language.
+
+Readers do not check controls and the weather, so their limits are wide: they are for other units (percent, °C).
+"""
+
+ROUNDED: Final = 0.01
+"""Tolerance of limits on both sides: stored numbers have 32 bits, and angles can be above 180 by it."""
 
 
 _ANY: Final = (-math.inf, math.inf)
@@ -243,7 +248,8 @@ def check_comparison(e: s.Expression, found: b.Bound, names: SymbolTable) -> b.B
             low, high = LIMITS.get(left.attribute.name, _ANY)
         else:
             low, high = limits(left)
-        below, above = max(numbers) < low, min(numbers) > high
+        margin = ROUNDED if math.isfinite(low) and math.isfinite(high) else 0.0
+        below, above = max(numbers) < low - margin, min(numbers) > high + margin
         if below or above:
             never = {"=": True, "<": below, "<=": below, ">": above, ">=": above}.get(word, False)
             holds, hint = "never" if never else "always", _range(low, high, others[0])
@@ -266,10 +272,12 @@ def _range(low: float, high: float, constant: b.Value) -> str:
     )
     if (low, high) == (-180.0, 180.0):
         text += f" degrees: write {(number + 180) % 360 - 180:g}"
+    elif (low, high) == LIMITS["env.temperature"]:
+        text = f"it is in K: write {number + 273.15:g} for {number:g} °C"
+    elif (low, high) == LIMITS["brake"]:
+        text = f"it lies between -1 and 1: write {number / 100:g} for {number:g} %"
     elif (low, high) == (0.0, 1.0) and 1 < number <= 100:
         text += f": write {number / 100:g} for {number:g} %"
-    elif (low, high) == LIMITS["env.temperature"]:
-        text += f" K: write {number + 273.15:g} for {number:g} °C"
     return text
 
 
