@@ -88,19 +88,30 @@ def translated(path: Path) -> Generator[None]:
             raise BusyError(f"{path}: in use by another process for too long") from error
         if (spilled := spill_fault(message)) is not None:
             raise SqlError(spilled) from error
-        if any(os.strerror(code) in message for code in _FULL):
-            raise DiskFullError(f"{path}: {_DISK_FULL}") from error
+        if (full := _without_room(message)) is not None:
+            raise DiskFullError(f"{path}: {full}") from error
         raise StoreError(f"{path}: {_reason(message)}") from error
 
 
-_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _DISK_FULL: Final = "the disk is full; free space, and run it again"
+_FULL: Final = {
+    errno.ENOSPC: _DISK_FULL,
+    errno.EDQUOT: _DISK_FULL,
+    errno.EFBIG: "stopped at the limit of the file size (ulimit -f); raise it, or ask for less",
+}
+"""Error codes of a write without room, with their messages."""
+
+
+def _without_room(message: str) -> str | None:
+    """Return the words for a DuckDB error at a write without room; ``None`` for other errors."""
+    found = (words for code, words in _FULL.items() if os.strerror(code) in message)
+    return next(found, None)
 
 
 def os_fault(message: str, error: OSError) -> StoreError:
     """Return a store error for an operating system error. A full disk has its own class and words."""
     if error.errno in _FULL:
-        return DiskFullError(f"{message}: {_DISK_FULL}")
+        return DiskFullError(f"{message}: {_FULL[error.errno]}")
     return StoreError(f"{message}: {error.strerror}")
 
 

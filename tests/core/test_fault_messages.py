@@ -50,11 +50,11 @@ def store(made: Path, tmp_path: Path) -> Path:
 # A full disk --------------------------------------------------------------------------------------
 
 
-def test_a_full_disk_has_our_words(store: Path) -> None:
+def test_a_write_without_room_has_our_words(store: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))  # the nearest to a full disk
     try:
-        with pytest.raises(StoreError, match="the disk is full; free space, and run it again"):
+        with pytest.raises(StoreError, match="stopped at the limit of the file size"):
             StoreFile(store).remove("a")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

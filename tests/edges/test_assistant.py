@@ -191,7 +191,7 @@ QUESTIONS = (
         "Is the ego always slower than 14 m/s?",
         "check",
         {"rule": "ALWAYS ego.speed < 14"},
-        r"slow \| town \| true",
+        r"town \| true",
         then=(("CHECK name: ALWAYS", "CHECK slow: ALWAYS ego.speed < 14"),),
         errors=1,
     ),
@@ -495,7 +495,9 @@ def test_clips_are_cut_into_the_folder_and_nowhere_else(
             tools.export_clips(query, name)
     with pytest.raises(ExportError, match="no export format"):
         tools.export_clips(query, "y", form="mpeg")
-    assert tools.export_clips("MATCH (e:Ego) WHERE e.speed > 300", "none").text == "nothing"
+    assert tools.export_clips("MATCH (e:Ego) WHERE e.speed > 300", "none").text.startswith(
+        "nothing"
+    )
     with (
         StoreTools(town_store) as reading,
         pytest.raises(ExportError, match="with --write-to"),
