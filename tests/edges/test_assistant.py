@@ -192,8 +192,6 @@ QUESTIONS = (
         "check",
         {"rule": "ALWAYS ego.speed < 14"},
         r"town \| true",
-        then=(("CHECK name: ALWAYS", "CHECK slow: ALWAYS ego.speed < 14"),),
-        errors=1,
     ),
     Asked(
         "The mean speed by kind?",
