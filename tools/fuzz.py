@@ -53,6 +53,7 @@ from recordings import bulb, car, ground_truth, house, sign
 import sgstore
 import sgstore.mcap._reader as mcap_file
 from sgstore.errors import TraceError
+from sgstore.exporters import Recorder
 from sgstore.ingest import ingest
 from sgstore.model.world import States
 from sgstore.readers import open_trace
@@ -187,7 +188,20 @@ def sample(flavour: str) -> Sample:
     return found
 
 
+def exact(path: Path) -> None:
+    """Frames as the recorder writes them, with inputs and an event."""
+    with Recorder(path) as recorder:
+        for i in range(FRAMES):
+            frame = sgstore.Frame(i * 10**8, ego="hero")
+            frame.add("hero", "car", i / 3, 0.1, 0.7, length=4.5, width=1.9, height=1.5, steer=0.1)
+            frame.add("can", "prop", 9.0 - i, 2.0, 0.2, subkind="barrel")
+            if i == 2:
+                frame.happened("collision", "hero", "can")
+            recorder.frame(frame)
+
+
 WRITERS: dict[str, Callable[[Path], Any]] = {
+    "sgstore": exact,
     "osi": osi,
     "osi views": osi_views,
     "foxglove protobuf": lambda path: foxglove(path, "protobuf"),

@@ -158,5 +158,5 @@ def test_a_broken_text_of_lanes_is_refused_with_the_reason(text: str, reason: st
 def test_the_length_of_a_text_of_lanes_is_bounded() -> None:
     text = lane_text(TWO) + " " * (128 << 20)
 
-    with pytest.raises(MapError, match="a text of lanes may have 134,217,728"):
+    with pytest.raises(MapError, match="a text of lanes may have 67,108,864"):
         parse_map(text, "long")

@@ -457,11 +457,12 @@ RULES = {
     "Result": parts.MERGED,
     "Query": {
         *("scope", "result", "relations", "injective", "ego", "unknown_is_false"),
-        *("steps", "links", "alternatives", "policy", "gaps", "stages", "world"),
+        *("steps", "links", "alternatives", "policy", "gaps", "stages", "world", "doubts"),
     },
     "BoundCheck": {
         *("name", "scope", "quantifiers", "formula", "reset", "relations", "injective", "ego"),
         *("unknown_is_false", "end", "gaps", "robustness", "returns", "world", "range", "limit"),
+        "doubts",
     },
     "Scope": {"nodes", "outer", "edges", "where", "distinct"},
     "Aggregate": {"word", "operand", "distinct", "type", "share"},
