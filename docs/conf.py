@@ -53,6 +53,7 @@ CONTENTS = {
     ),
     "Read and write": (
         "docs/flavours",
+        "docs/noise",
         *("docs/source_osi", "docs/source_carla", "docs/source_autoware", "docs/source_foxglove"),
         *("docs/source_av2", "docs/source_py123d", "docs/source_rosbags", "docs/source_sumo"),
         *("docs/source_commonroad", "docs/source_lanelet2"),

@@ -76,7 +76,7 @@ def _columns(node: dict[str, Any]) -> set[str] | None:
     table = node.get("from_table") or {}
     plain = (
         table.get("type") == "BASE_TABLE"
-        and table["qualified_name"]["path"] in (["edges"], ["main", "edges"])
+        and _path(table) in (["edges"], ["main", "edges"])
         and not (table["sample"] or table["column_name_alias"] or table["at_clause"])
         and not (node["sample"] or node["qualify"] or node["cte_map"]["map"])
         and all(m["type"] in {"ORDER_MODIFIER", "LIMIT_MODIFIER"} for m in node["modifiers"])
@@ -93,6 +93,13 @@ def _columns(node: dict[str, Any]) -> set[str] | None:
     grouped = node["group_expressions"] or node["aggregate_handling"] != "STANDARD_HANDLING"
     wanted = names & _OF_MASKS
     return wanted if grouped or all(map(_is_count, node["select_list"])) else None
+
+
+def _path(table: dict[str, Any]) -> list[str]:
+    """Return the schema and the name of a table, in the form of any version of DuckDB."""
+    if "qualified_name" in table:
+        return table["qualified_name"]["path"]
+    return [*filter(None, (table.get("schema_name"),)), table.get("table_name", "")]
 
 
 def _expressions(part: Any) -> Iterator[dict[str, Any]]:
