@@ -39,23 +39,23 @@ def sources(a: Store | Collection, b: Store | Collection) -> list[str]:
     Returns
     -------
     list of str
-        One line for each different setting, for the maps and for the versions.
+        One line for each different setting, for the maps and for the versions. A collection knows its maps.
     """
     found: list[dict[str, set[str]]] = []
     for store in (a, b):
         values: dict[str, set[str]] = {}
         for one in store.info():
             about = one if isinstance(one, dict) else asdict(one)
-            for name in ("version", "map"):
-                values.setdefault(name, set()).add(str(about.get(name, "")))
+            for name in about.keys() & {"version", "map"}:
+                values.setdefault(name, set()).add(str(about[name]))
             for name, value in _leaves(about.get("settings") or {}, ""):
                 values.setdefault(f"setting {name}", set()).add(json.dumps(value))
         found.append(values)
     was, now = found
     return [
-        f"{name} differs: {_listed(was.get(name))} in A, {_listed(now.get(name))} in B"
-        for name in dict.fromkeys([*was, *now])
-        if was.get(name) != now.get(name)
+        f"{name} differs: {_listed(was[name])} in A, {_listed(now[name])} in B"
+        for name in sorted(was.keys() & now.keys())
+        if was[name] != now[name]
     ]
 
 
@@ -68,8 +68,8 @@ def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any
             yield f"{prefix}{name}", value
 
 
-def _listed(values: set[str] | None) -> str:
-    return first_of(sorted(values or ["default"], key=natural), 3)
+def _listed(values: set[str]) -> str:
+    return first_of(sorted(values, key=natural), 3)
 
 
 def scenes(a: Classed, b: Classed) -> ReportTable:
