@@ -128,7 +128,7 @@ class _Junctions:
         opposed = src[of["opposes"]] * count + dst[of["opposes"]]
         beside = of["toLeftOf"] | of["toRightOf"]
         beside &= (src >= 0) & (dst >= 0)
-        self._beside = np.setdiff1d(src[beside] * count + dst[beside], opposed)
+        self._beside: Ints = np.setdiff1d(src[beside] * count + dst[beside], opposed)
         first, lane = np.arange(count), np.arange(count)
         linked = [first * count + lane]
         for _ in range(HOPS):
