@@ -104,6 +104,8 @@ _FULL: Final = {
 
 def _without_room(message: str) -> str | None:
     """Return the words for a DuckDB error at a write without room; ``None`` for other errors."""
+    if os.strerror(errno.EFBIG) in message and "duckdb_temp" in message:
+        return None  # temporary data of a sandbox: its memory is too small, not the disk
     found = (words for code, words in _FULL.items() if os.strerror(code) in message)
     return next(found, None)
 
