@@ -27,7 +27,7 @@ from sgstore.apps.cli._output import say
 from sgstore.apps.cli._sarif import write_sarif
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from sgstore.collection import CollectionChecks
     from sgstore.matches import Interval
@@ -83,17 +83,12 @@ def check(
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask) as opened:
             asked_of = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
-            files = ReportFiles(str(store), junit, sarif, _recordings(opened.traces()))
+            files = ReportFiles(str(store), junit, sarif, opened.traces)
             return _reported(asked_of, ask, files, explain=explain, require=require)
     opened = ask.opened(store)
     run = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
-    files = ReportFiles(str(store), junit, sarif, _recordings(map(asdict, opened.traces())))
+    files = ReportFiles(str(store), junit, sarif, opened.traces)
     return _reported(run, ask, files, explain=explain, require=require)
-
-
-def _recordings(traces: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """Return the recording of each trace."""
-    return {one["name"]: Path(str(one.get("path") or one["name"])).as_posix() for one in traces}
 
 
 @dataclass(frozen=True)
@@ -104,14 +99,14 @@ class ReportFiles:
     ----------
     store : str
     junit, sarif : Path or None
-    recordings : dict of str to str
-        Trace name → its recording.
+    traces : function
+        Returns the traces of the store.
     """
 
     store: str
     junit: Path | None
     sarif: Path | None
-    recordings: dict[str, str]
+    traces: Callable[[], Iterable[Any]]
 
     def __bool__(self) -> bool:
         """True if there is a file to write."""
@@ -122,7 +117,14 @@ class ReportFiles:
         if self.junit is not None:
             write_junit(self.junit, verdicts)
         if self.sarif is not None:
-            write_sarif(self.sarif, verdicts, self.store, self.recordings)
+            write_sarif(self.sarif, verdicts, self.store, dict(map(_recording, self.traces())))
+
+
+def _recording(trace: Any) -> tuple[str, str]:
+    """Return the name of a trace of a store or a collection, and its recording."""
+    if isinstance(trace, dict):
+        return trace["name"], str(trace["uri"])
+    return trace.name, trace.path.as_posix()
 
 
 def _reported(
