@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from dataclasses import asdict
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from sgstore.base.display import first_of
 from sgstore.model.frame_ids import seq_of, trace_of
 from sgstore.model.vocabulary import natural
+from sgstore.query import Store
 from sgstore.temporal import unknown_notes
 from sgstore.testsets.coverage import UNKNOWN, ReportTable, names_of, of_unknown, shared, traces_of
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
     from sgstore.collection import Collection
     from sgstore.model.world import Ints
-    from sgstore.query import Store
     from sgstore.temporal import Verdict
     from sgstore.testsets.coverage import Classed
 
@@ -41,22 +41,25 @@ def sources(a: Store | Collection, b: Store | Collection) -> list[str]:
     list of str
         One line for each different setting, for the maps and for the versions. A collection knows its maps.
     """
-    found: list[dict[str, set[str]]] = []
-    for store in (a, b):
-        values: dict[str, set[str]] = {}
-        for one in store.info():
-            about = one if isinstance(one, dict) else asdict(one)
-            for name in about.keys() & {"version", "map"}:
-                values.setdefault(name, set()).add(str(about[name]))
-            for name, value in _leaves(about.get("settings") or {}, ""):
-                values.setdefault(f"setting {name}", set()).add(json.dumps(value))
-        found.append(values)
-    was, now = found
+    was, now = map(_values_of, (a, b))
     return [
         f"{name} differs: {_listed(was[name])} in A, {_listed(now[name])} in B"
         for name in sorted(was.keys() & now.keys())
         if was[name] != now[name]
     ]
+
+
+def _values_of(store: Store | Collection) -> dict[str, set[str]]:
+    """Return the values of settings, maps and versions that a store has, by name."""
+    if not isinstance(store, Store):
+        return {"map": {row["map"] for row in store.traces()}}
+    found: dict[str, set[str]] = {}
+    for one in store.traces():
+        values = (("map", one.map), ("version", one.version))
+        settings = ((f"setting {n}", json.dumps(v)) for n, v in _leaves(one.settings, ""))
+        for name, value in chain(values, settings):
+            found.setdefault(name, set()).add(value)
+    return found
 
 
 def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
