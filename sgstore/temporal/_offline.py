@@ -434,8 +434,8 @@ def _left(ask: Ask, group: TraceGroup, premises: Premises | None) -> Bools:
     for before in ask.after:
         found &= np.bincount(group.relations[before.name].keys[:, 0], minlength=len(found)) > 0
     if premises is not None:
-        left = (bool(premises.left(one.relations)) for one in _readers(group, found | True))
-        found &= np.fromiter(left, np.bool_)
+        for place in np.flatnonzero(found).tolist():
+            found[place] = bool(premises.left(group.reader(place).relations))
     return found
 
 
