@@ -1007,9 +1007,8 @@ def _own(frames: list[FrameRows]) -> NDArray[np.object_]:
     column = np.full(sum(map(len, frames)), None, object)
     start = 0
     for frame in frames:
-        for node, told in frame.own.items():
-            for row in np.flatnonzero(frame.node == node).tolist():
-                column[start + row] = valid_attributes(told) or None
+        for row, node in enumerate(frame.node.tolist() if frame.own else ()):
+            column[start + row] = valid_attributes(frame.own.get(node, {})) or None
         start += len(frame)
     return column
 
