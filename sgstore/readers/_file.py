@@ -2,22 +2,44 @@
 
 from __future__ import annotations
 
+import zlib
 from types import MappingProxyType
-from typing import TYPE_CHECKING, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
 import numpy as np
 from mcap.records import Channel, Schema
 
 from sgstore.errors import TraceError
-from sgstore.mcap import MESSAGE_HEAD, Loss, Messages
+from sgstore.mcap import MESSAGE_HEAD, RUN_MESSAGES, Loss, Messages, open_regular
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from io import BufferedIOBase
     from pathlib import Path
 
     from mcap.records import Metadata
 
     from sgstore.mcap import Findings, RecordPlace
+
+
+RUN_BYTES: Final = 1 << 20
+"""Approximate maximum size of a run of messages; bytes."""
+
+
+def first_bytes(
+    path: Path,
+    endings: tuple[str, ...],
+    size: int,
+    opened: Callable[[Path], BufferedIOBase] = open_regular,
+) -> bytes:
+    """Return the first bytes of a file; none if it has another suffix, or is unreadable."""
+    if not path.name.lower().endswith(endings):
+        return b""
+    try:
+        with opened(path) as file:
+            return file.read(size)
+    except (OSError, EOFError, zlib.error, TraceError):
+        return b""
 
 
 class MessageFile:
@@ -34,6 +56,8 @@ class MessageFile:
         ``False``: the log time of a message is the time in its data.
     window : tuple of int
         The full range of log times.
+    noun : str
+        Word for the recording in messages.
     profile, compression : str
     metadata, attachments
         Values for an MCAP file with the same contents.
@@ -41,6 +65,7 @@ class MessageFile:
 
     has_log_times = False
     window = (0, (1 << 63) - 1)
+    noun = "file"
     profile, compression = "", "zstd"
     metadata: Final[Mapping[RecordPlace, Metadata]] = MappingProxyType({})
     attachments: tuple[RecordPlace, ...] = ()
@@ -172,24 +197,54 @@ class NumberedFile(MessageFile):
 
 
 def read_numbered(
-    recording: NumberedFile, places: Iterable[tuple[int, int, int]]
+    opened: Callable[[Path], Any], path: Path, places: Iterable[tuple[int, int, int]]
 ) -> Iterator[bytes]:
-    """Yield the bytes of messages, by their numbers and lengths.
+    """Yield the bytes of messages of a file, by their numbers and lengths.
+
+    ``opened``: class of the file, with a method ``message``.
 
     Raises
     ------
     TraceError
         The file cannot be read, or a message does not match, because the file was replaced.
     """
-    for _, offset, length in places:
-        try:
-            data = recording.message(offset) if offset >= 0 else b""
-        except IndexError:
-            data = b""
-        if len(data) != length or not data:
-            reason = f"no message of {length} bytes at {offset} there: the file was replaced"
-            raise TraceError(reason, path=recording.path)
-        yield data
+    with opened(path) as recording:
+        for _, offset, length in places:
+            try:
+                data = recording.message(offset) if offset >= 0 else b""
+            except IndexError:
+                data = b""
+            if len(data) != length or not data:
+                reason = f"no message of {length} bytes at {offset} there"
+                raise TraceError(f"{reason}: the {recording.noun} was replaced", path=path)
+            yield data
+
+
+def grouped(
+    messages: Iterable[tuple[int, int, bytes]],
+) -> Iterator[tuple[dict[int, bytes], list[int]]]:
+    """Yield messages (offset, time, bytes) in groups for a run: bytes by offset, and times."""
+    held: dict[int, bytes] = {}
+    times: list[int] = []
+    size = 0
+    for offset, time_ns, data in messages:
+        held[offset] = data
+        times.append(time_ns)
+        size += len(data)
+        if size > RUN_BYTES or len(held) >= RUN_MESSAGES:
+            yield held, times
+            held, times, size = {}, [], 0
+    if held:
+        yield held, times
+
+
+def numbered_runs(messages: Iterable[tuple[int, int, bytes]], channel: int) -> Iterator[Messages]:
+    """Yield the messages (offset, time, bytes) of one channel in runs, with their numbers as sequence."""
+    first = 0
+    for held, times in grouped(messages):
+        sequence = range(first, first + len(held))
+        yield held_messages(held, times, channel=channel, sequence=sequence)
+        first += len(held)
 
 
 def held_messages(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -18,22 +19,19 @@ from sgstore.base.display import first_of
 from sgstore.errors import TraceError
 from sgstore.mcap import MAGIC, METADATA, McapFile, log_files, messages_at, open_regular
 from sgstore.model.world import TraceReport
+from sgstore.readers._file import read_numbered
 from sgstore.readers.av2._file import Av2File
-from sgstore.readers.av2._file import read_messages as _read_av2_messages
 from sgstore.readers.carla._recorder_file import ENDINGS as _LOG_ENDINGS
 from sgstore.readers.carla._recorder_file import CarlaRecorderFile, is_recorder_log
 from sgstore.readers.carla._recorder_file import read_messages as _read_recorder_messages
 from sgstore.readers.commonroad._file import ENDINGS as _SCENARIO_ENDINGS
 from sgstore.readers.commonroad._file import CommonRoadFile, is_scenario
-from sgstore.readers.commonroad._file import read_messages as _read_scenario_messages
 from sgstore.readers.osi._file import ENDINGS as _OSI_ENDINGS
 from sgstore.readers.osi._file import OsiFile
 from sgstore.readers.osi._file import read_messages as _read_osi_messages
 from sgstore.readers.py123d._file import Py123dFile
-from sgstore.readers.py123d._file import read_messages as _read_py123d_messages
 from sgstore.readers.rosbags._file import ENDINGS as _BAG_ENDINGS
 from sgstore.readers.rosbags._file import RosbagFile
-from sgstore.readers.rosbags._file import read_messages as _read_bag_messages
 from sgstore.readers.sumo._file import ENDINGS as _SUMO_ENDINGS
 from sgstore.readers.sumo._file import SumoFile, is_fcd
 from sgstore.readers.sumo._file import read_messages as _read_steps
@@ -190,23 +188,25 @@ def _format_of(
 ) -> tuple[Callable[[Path], RecordingFile], Callable[..., Iterator[bytes | memoryview]]]:
     """Return the functions that open a file of this format, and that read single messages of it."""
     if (files := log_files(path)) is not None:
-        return _FOLDERS.get(files[0].name, (Av2File, _read_av2_messages))
+        return _numbered(_FOLDERS.get(files[0].name, Av2File))
     if is_scenario(path):
-        return CommonRoadFile, _read_scenario_messages
+        return _numbered(CommonRoadFile)
     if is_fcd(path):
         return SumoFile, _read_steps
     if is_recorder_log(path):
         return CarlaRecorderFile, _read_recorder_messages
     if path.name.lower().endswith(_BAG_ENDINGS):
-        return RosbagFile, _read_bag_messages
+        return _numbered(RosbagFile)
     return (OsiFile, _read_osi_messages) if _is_single_channel(path) else (McapFile, messages_at)
 
 
-_FOLDERS: Final[dict[str, tuple[Any, Any]]] = {
-    METADATA: (RosbagFile, _read_bag_messages),
-    "sync.arrow": (Py123dFile, _read_py123d_messages),
-}
-"""First file of a folder → functions that open it, and read single messages of it."""
+_FOLDERS: Final[dict[str, Any]] = {METADATA: RosbagFile, "sync.arrow": Py123dFile}
+"""First file of a folder → class of the recording."""
+
+
+def _numbered(opened: Any) -> tuple[Any, Any]:
+    """Return the class of a file whose messages have numbers, and the function that reads single messages."""
+    return opened, partial(read_numbered, opened)
 
 
 def _is_single_channel(path: Path) -> bool:

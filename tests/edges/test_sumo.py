@@ -79,7 +79,7 @@ def test_a_long_file_is_read_in_pieces_and_a_step_is_found_again(
     path = written(tmp_path / "drive.xml", drive(40))
     whole = read(path)
     monkeypatch.setattr(_file, "_PIECE", 77)
-    monkeypatch.setattr(_file, "_RUN_BYTES", 900)
+    monkeypatch.setattr("sgstore.readers._file.RUN_BYTES", 900)
 
     pieces = read(path)
 

@@ -17,11 +17,10 @@ from sgstore.errors import MapError, TraceError
 from sgstore.mcap import log_files, mark_of
 from sgstore.readers._arrow_files import numbers, read_arrow_file, values
 from sgstore.readers._boxes import EGO, NAME, NOTE, Boxes, interpolated, joined, turned, unit
-from sgstore.readers._file import NumberedFile, read_numbered
+from sgstore.readers._file import NumberedFile
 from sgstore.readers.av2._map import map_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
     from sgstore.model.world import Floats
@@ -95,18 +94,6 @@ class Av2File(NumberedFile):
     def time_of(self, number: int) -> int:
         """Return the time of a sweep by number, from 1; ns."""
         return int(self._times[self._steps[number - 1][0]])
-
-
-def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
-    """Yield the bytes of messages of a log, by their numbers and lengths.
-
-    Raises
-    ------
-    TraceError
-        The log cannot be read, or a message does not match, because a file was replaced.
-    """
-    with Av2File(path) as recording:
-        yield from read_numbered(recording, places)
 
 
 def _runs(times: Any) -> list[Any]:

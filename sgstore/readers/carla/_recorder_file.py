@@ -18,8 +18,8 @@ import numpy as np
 from mcap.records import Schema
 
 from sgstore.errors import TraceError
-from sgstore.mcap import RUN_MESSAGES, Loss, mark_of_open, open_regular
-from sgstore.readers._file import MessageFile, held_messages
+from sgstore.mcap import Loss, mark_of_open, open_regular
+from sgstore.readers._file import MessageFile, first_bytes, numbered_runs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -46,7 +46,6 @@ _BEGIN, _END, _ADDED, _REMOVED, _COLLISIONS, _POSES, _LIGHTS = 0, 1, 2, 3, 5, 6,
 _VEHICLES, _WALKERS, _VEHICLE_LIGHTS, _MOTION, _BOXES = 8, 9, 10, 12, 13
 _MARK: Final = _HEAD.pack(_BEGIN, 24)
 _PIECE: Final = 1 << 20
-_RUN_BYTES: Final = 1 << 20
 _FURTHEST: Final = 1_000_000
 """Maximum number of missing frames at a damaged place."""
 _SIX: Final = np.dtype([("id", "<u4"), ("of", "<f4", 6)])
@@ -68,13 +67,7 @@ _LIGHT: Final = "traffic.traffic_light"
 
 def is_recorder_log(path: Path) -> bool:
     """Return True if a file is a log of CARLA's recorder, by its suffix and first bytes."""
-    if not path.name.lower().endswith(ENDINGS):
-        return False
-    try:
-        with open_regular(path) as file:
-            return file.read(len(_MAGIC)) == _MAGIC
-    except (OSError, TraceError):
-        return False
+    return first_bytes(path, ENDINGS, len(_MAGIC)) == _MAGIC
 
 
 class CarlaRecorderFile(MessageFile):
@@ -123,19 +116,9 @@ class CarlaRecorderFile(MessageFile):
         """Yield all frames of the log as messages. ``offset`` of a message is its position in the file."""
         if not wanted(-1):
             return
-        held: dict[int, bytes] = {}
-        times: list[int] = []
-        size = number = 0
-        for moment in _moments(self._file, report):
-            held[moment.offset] = data = moment.message()
-            times.append(moment.time_ns)
-            size += len(data)
-            number += 1
-            if size > _RUN_BYTES or len(held) >= RUN_MESSAGES:
-                yield _messages(held, times, number)
-                held, times, size = {}, [], 0
-        if held:
-            yield _messages(held, times, number)
+        moments = _moments(self._file, report)
+        messages = ((one.offset, one.time_ns, one.message()) for one in moments)
+        yield from numbered_runs(messages, _CHANNEL)
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
@@ -162,11 +145,6 @@ def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterato
                 reason = f"no frame of {length} bytes at {offset} there: the file was replaced"
                 raise TraceError(reason, path=path)
             yield data
-
-
-def _messages(held: dict[int, bytes], times: list[int], stop: int) -> Messages:
-    sequence = range(stop - len(held), stop)
-    return held_messages(held, times, channel=_CHANNEL, sequence=sequence)
 
 
 def _town(file: BufferedReader) -> str:

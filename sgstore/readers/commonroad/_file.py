@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import MapError, TraceError
 from sgstore.mcap import mark_of_open, open_regular
-from sgstore.readers._file import NumberedFile, read_numbered
+from sgstore.readers._file import NumberedFile, first_bytes
 from sgstore.readers.commonroad._document import (
     MAX_BYTES,
     ROOT,
@@ -26,7 +26,6 @@ from sgstore.readers.commonroad._document import (
 from sgstore.readers.commonroad._lanelets import light_place, map_text, meaning_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
     from pathlib import Path
 
 ENDINGS: Final = (".xml",)
@@ -42,13 +41,7 @@ _HEAD: Final = 4096
 
 def is_scenario(path: Path) -> bool:
     """Return True if a file is a CommonRoad scenario, by its suffix and first XML element."""
-    if not path.name.lower().endswith(ENDINGS):
-        return False
-    try:
-        with open_regular(path) as file:
-            return f"<{ROOT}".encode() in file.read(_HEAD)
-    except (OSError, TraceError):
-        return False
+    return f"<{ROOT}".encode() in first_bytes(path, ENDINGS, _HEAD)
 
 
 class CommonRoadFile(NumberedFile):
@@ -115,20 +108,6 @@ class CommonRoadFile(NumberedFile):
     def time_of(self, number: int) -> int:
         """Return the time of a step by number, from 1; ns."""
         return round(self._steps[number - 1] * self._scenario.step * 1e9)
-
-
-def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
-    """Yield the bytes of messages of a scenario, by their offsets and lengths.
-
-    See :class:`CommonRoadFile`.
-
-    Raises
-    ------
-    TraceError
-        The file cannot be read, or a message does not match, because the file was replaced.
-    """
-    with CommonRoadFile(path) as recording:
-        yield from read_numbered(recording, places)
 
 
 def _steps(scenario: TrafficScenario) -> list[int]:

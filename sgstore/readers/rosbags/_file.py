@@ -6,28 +6,27 @@ the container.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.records import Schema
 
 from sgstore.errors import TraceError
-from sgstore.mcap import MESSAGE_HEAD, RUN_MESSAGES, Loss, Messages, log_files, mark_of
-from sgstore.readers._file import MessageFile
+from sgstore.mcap import Loss, log_files, mark_of
+from sgstore.readers._file import MessageFile, grouped, held_messages
 from sgstore.readers.rosbags._definitions import Definitions
 from sgstore.readers.rosbags._ros1 import Ros1Bag
 from sgstore.readers.rosbags._sqlite import SqliteBag
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from sgstore.mcap import Findings
+    from sgstore.mcap import Findings, Messages
     from sgstore.readers.rosbags._sqlite import Topic
 
 ENDINGS = (".db3", ".bag")
 """Suffixes of such files."""
-_RUN_BYTES = 1 << 20
 
 
 class RosbagFile(MessageFile):
@@ -54,7 +53,7 @@ class RosbagFile(MessageFile):
     """
 
     has_log_times = True
-    profile = "ros2"
+    profile, noun = "ros2", "bag"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -125,60 +124,18 @@ class RosbagFile(MessageFile):
         place = np.zeros(len(self.channels) + 1, np.int64)
         place[names] = np.arange(len(names))
         order = np.lexsort((np.arange(len(times)), place[channel], times))
-        held: dict[int, bytes] = {}
-        size = 0
-        for number in order[times[order] >= 0].tolist():
+        usable = order[times[order] >= 0].tolist()
+        for held, log_times in grouped(self._readable(usable, report)):
+            rows = [*held]
+            yield held_messages(held, log_times, channel=channel[rows].tolist(), sequence=rows)
+
+    def _readable(self, rows: list[int], report: Findings) -> Iterator[tuple[int, int, bytes]]:
+        """Yield number, time and bytes of the readable messages. The others are added to a report."""
+        for number in rows:
+            time_ns = int(self._bag.times[number])
             try:
-                held[number] = data = self.message(number)
+                data = self.message(number)
             except TraceError as error:
-                report.lose(
-                    Loss(
-                        error.reason,
-                        bytes=0,
-                        start_ns=int(times[number]),
-                        end_ns=int(times[number]),
-                    )
-                )
-                continue
-            size += len(data)
-            if size > _RUN_BYTES or len(held) >= RUN_MESSAGES:
-                yield self._run(held)
-                held, size = {}, 0
-        if held:
-            yield self._run(held)
-
-    def _run(self, held: dict[int, bytes]) -> Messages:
-        rows = np.array([*held], np.int64)
-        times = self._bag.times[rows]
-        return Messages(
-            chunk_offset=-1,
-            channel=self._bag.channel[rows],
-            sequence=rows,
-            log_time_ns=times,
-            publish_time_ns=times.astype(np.uint64),
-            offset=rows,
-            length=np.array([len(data) for data in held.values()], np.int64),
-            read=lambda at, _length: memoryview(held[at - MESSAGE_HEAD.itemsize]),
-        )
-
-
-def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
-    """Yield the bytes of messages of a bag, by their numbers and lengths.
-
-    Raises
-    ------
-    TraceError
-        The bag cannot be read, or a message does not match, because the bag was replaced.
-    """
-    with RosbagFile(path) as recording:
-        for _, offset, length in places:
-            try:
-                data: Any = recording.message(offset) if offset >= 0 else b""
-            except IndexError:
-                data = b""
-            if len(data) != length or not data:
-                reason = (
-                    f"no message of {length} bytes with the number {offset}: the bag was replaced"
-                )
-                raise TraceError(reason, path=path)
-            yield data
+                report.lose(Loss(error.reason, bytes=0, start_ns=time_ns, end_ns=time_ns))
+            else:
+                yield number, time_ns, data

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Final
 
 from mcap.records import Schema
 
+from sgstore.base.markup import MarkupError, MarkupParser
 from sgstore.errors import TraceError
-from sgstore.mcap import RUN_MESSAGES, Loss, mark_of_open, open_regular
-from sgstore.readers._file import MessageFile, held_messages
+from sgstore.mcap import Loss, mark_of_open, open_regular
+from sgstore.readers._file import MessageFile, first_bytes, numbered_runs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -37,7 +38,6 @@ ENDINGS: Final = (".xml", ".xml.gz")
 _CHANNEL: Final = 1
 _PIECE: Final = 1 << 20
 _HEAD: Final = 1 << 16
-_RUN_BYTES: Final = 1 << 20
 _BEGIN: Final = re.compile(rb"<timestep\b[^>]{0,1000}?(/?)>")
 _TIME: Final = re.compile(rb"""\stime\s*=\s*["']([0-9.:eE+-]{1,40})["']""")
 _CLOSE: Final = b"</timestep>"
@@ -47,13 +47,7 @@ _DAMAGED: Final = (OSError, EOFError, zlib.error)
 
 def is_fcd(path: Path) -> bool:
     """Return True if a file is SUMO floating-car data, by its suffix and first XML element."""
-    if not path.name.lower().endswith(ENDINGS):
-        return False
-    try:
-        with opened(path) as file:
-            return b"<fcd-export" in file.read(_HEAD)
-    except (*_DAMAGED, TraceError):
-        return False
+    return b"<fcd-export" in first_bytes(path, ENDINGS, _HEAD, opened)
 
 
 def opened(path: Path) -> BufferedIOBase:
@@ -68,6 +62,24 @@ def opened(path: Path) -> BufferedIOBase:
     packed = file.read(2) == _GZIP
     file.seek(0)
     return _Unpacked(file) if packed else file
+
+
+def parse(path: Path, start: Callable[[str, dict[str, str], int], None], what: str) -> None:
+    """Read the XML elements of a SUMO file. ``start`` gets tag, attributes and depth of each element.
+
+    Raises
+    ------
+    TraceError
+        The file cannot be read, or ``start`` refuses an element. ``what`` names its content.
+    """
+    parser = MarkupParser(start, most=None, whose="recordings")
+    try:
+        with opened(path) as file:
+            while piece := file.read(_PIECE):
+                parser.feed(piece)
+        parser.feed(b"", last=True)
+    except (MarkupError, *_DAMAGED) as error:
+        raise TraceError(f"{what} cannot be read: {error}", path=path) from error
 
 
 class _Unpacked(gzip.GzipFile):
@@ -143,23 +155,16 @@ class SumoFile(MessageFile):
         """
         if not wanted(-1):
             return
-        held: dict[int, bytes] = {}
-        times: list[int] = []
-        size = number = 0
+        yield from numbered_runs(self._timed(report), _CHANNEL)
+
+    def _timed(self, report: Findings) -> Iterator[tuple[int, int, bytes]]:
+        """Yield position, time and bytes of each time step that has a time."""
         for place, data in _steps(self._file, report):
             time = time_ns(data)
             if time is None or time < 0:
                 report.lose(Loss("a time step without a time", bytes=len(data)))
-                continue
-            held[place] = data
-            times.append(time)
-            size += len(data)
-            number += 1
-            if size > _RUN_BYTES or len(held) >= RUN_MESSAGES:
-                yield _messages(held, times, number)
-                held, times, size = {}, [], 0
-        if held:
-            yield _messages(held, times, number)
+            else:
+                yield place, time, data
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
@@ -183,11 +188,6 @@ def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterato
                 reason = f"no time step of {length} bytes at {offset} there: the file was replaced"
                 raise TraceError(reason, path=path)
             yield data
-
-
-def _messages(held: dict[int, bytes], times: list[int], stop: int) -> Messages:
-    sequence = range(stop - len(held), stop)
-    return held_messages(held, times, channel=_CHANNEL, sequence=sequence)
 
 
 def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:

@@ -10,13 +10,11 @@ EPL-2.0).
 from __future__ import annotations
 
 import math
-import zlib
 from bisect import bisect_right
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.markup import MarkupError, MarkupParser
-from sgstore.errors import TraceError
-from sgstore.readers.sumo._file import ENDINGS, opened, seconds_of
+from sgstore.base.markup import MarkupError
+from sgstore.readers.sumo._file import ENDINGS, parse, seconds_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,7 +31,6 @@ _STATES: Final = {
     "O": "off",
 }
 """Letter of a link → state of its light; ``s``: red, with an arrow to the right."""
-_PIECE: Final = 1 << 20
 
 
 def lights_beside(path: Path) -> Path | None:
@@ -71,14 +68,7 @@ class LightStates:
         self._times: dict[str, list[int]] = {}
         self._states: dict[str, list[str]] = {}
         self._changes = 0
-        parser = MarkupParser(self._start, most=None, whose="recordings")
-        try:
-            with opened(path) as file:
-                while piece := file.read(_PIECE):
-                    parser.feed(piece)
-            parser.feed(b"", last=True)
-        except (MarkupError, OSError, EOFError, zlib.error) as error:
-            raise TraceError(f"states of lights cannot be read: {error}", path=path) from error
+        parse(path, self._start, "states of lights")
 
     def _start(self, tag: str, told: dict[str, str], depth: int) -> None:
         if depth == 1 and tag != "tlsStates":

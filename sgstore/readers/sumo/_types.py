@@ -5,13 +5,11 @@ Source: SUMO documentation, "Definition of Vehicles, Vehicle Types, and Routes" 
 
 from __future__ import annotations
 
-import zlib
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from sgstore.base.markup import MarkupError, MarkupParser, number
-from sgstore.errors import TraceError
+from sgstore.base.markup import MarkupError, number
 from sgstore.model.world import LARGEST
-from sgstore.readers.sumo._file import opened
+from sgstore.readers.sumo._file import parse
 from sgstore.readers.sumo._lights import file_beside
 
 if TYPE_CHECKING:
@@ -20,7 +18,6 @@ if TYPE_CHECKING:
 MAX_TYPES: Final = 1_000_000
 """Maximum number of vehicle types in a file."""
 _SIZES: Final = ("length", "width", "height")
-_PIECE: Final = 1 << 20
 
 
 class VehicleType(NamedTuple):
@@ -57,12 +54,5 @@ def read_types(paths: list[Path]) -> dict[str, VehicleType]:
                 raise MarkupError(f"more than {MAX_TYPES:,} vehicle types")
 
     for path in paths:
-        parser = MarkupParser(start, most=None, whose="recordings")
-        try:
-            with opened(path) as file:
-                while piece := file.read(_PIECE):
-                    parser.feed(piece)
-            parser.feed(b"", last=True)
-        except (MarkupError, OSError, EOFError, zlib.error) as error:
-            raise TraceError(f"vehicle types cannot be read: {error}", path=path) from error
+        parse(path, start, "vehicle types")
     return types
