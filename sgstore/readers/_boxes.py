@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 EGO: Final = "ego"
 """Id of an ego that a log does not name."""
+EGO_TYPE: Final = "EGO_VEHICLE"
+"""Type of the ego in logs of Argoverse 2 and 123D."""
 NAME, NOTE, ORIGIN = "name", "note", "dataset"
 """Keys of the metadata of a channel: name of the log, remark, and data set."""
 
@@ -127,6 +129,13 @@ def interpolated(times: Any, poses: Floats, at: Any, furthest: float) -> Floats:
     outside = (at < times[0]) | (at > times[-1]) | (gap > furthest)
     mixed[outside] = np.nan
     return mixed
+
+
+def steps_of(times: Any) -> list[Any]:
+    """Return the rows of each time, in order of time. A time below 0 is damage."""
+    order = np.argsort(times, kind="stable")
+    order = order[times[order] >= 0]
+    return np.split(order, np.flatnonzero(np.diff(times[order])) + 1) if len(order) else []
 
 
 class BoxesTrace(FramesTrace):

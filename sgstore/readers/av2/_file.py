@@ -16,7 +16,18 @@ import numpy as np
 from sgstore.errors import MapError, TraceError
 from sgstore.mcap import log_files, mark_of
 from sgstore.readers._arrow_files import numbers, read_arrow_file, values
-from sgstore.readers._boxes import EGO, NAME, NOTE, Boxes, interpolated, joined, turned, unit
+from sgstore.readers._boxes import (
+    EGO,
+    EGO_TYPE,
+    NAME,
+    NOTE,
+    Boxes,
+    interpolated,
+    joined,
+    steps_of,
+    turned,
+    unit,
+)
 from sgstore.readers._file import NumberedFile
 from sgstore.readers.av2._map import map_text
 
@@ -28,7 +39,6 @@ if TYPE_CHECKING:
 FRAME, MAP = "av2.Frame", "av2.Map"
 """Schemas of the messages."""
 POSES: Final = "city_SE3_egovehicle.feather"
-EGO_TYPE: Final = "EGO_VEHICLE"
 EGO_SIZE: Final = (4.877, 2.0, 1.473)
 """Assumed length, width and height of the ego; m."""
 EGO_CENTRE: Final = (1.4, 0.0, 0.7365)
@@ -76,7 +86,7 @@ class Av2File(NumberedFile):
         told = sorted(name for name in files if name.startswith("annotations"))
         lost: list[str] = []
         self._ego, self._boxes, self._times = _read_boxes(files[told[-1]], files[POSES], lost)
-        self._steps = _runs(self._times)
+        self._steps = steps_of(self._times)
         maps = (file for name, file in files.items() if name.startswith("log_map_archive"))
         self._map = next((_read_map(file, lost) for file in maps), b"")
         about = {NAME: path.name} | ({} if self._ego else {NOTE: _ASSUMED})
@@ -94,13 +104,6 @@ class Av2File(NumberedFile):
     def time_of(self, number: int) -> int:
         """Return the time of a sweep by number, from 1; ns."""
         return int(self._times[self._steps[number - 1][0]])
-
-
-def _runs(times: Any) -> list[Any]:
-    """Return the rows of each time, in order of time. A time below 0 is damage."""
-    order = np.argsort(times, kind="stable")
-    order = order[times[order] >= 0]
-    return np.split(order, np.flatnonzero(np.diff(times[order])) + 1) if len(order) else []
 
 
 def _read_boxes(annotations: Path, poses: Path, lost: list[str]) -> tuple[str, Boxes, Any]:

@@ -19,7 +19,17 @@ import numpy as np
 from sgstore.errors import MapError, TraceError
 from sgstore.mcap import log_files, mark_of
 from sgstore.readers._arrow_files import read_arrow_file, values
-from sgstore.readers._boxes import EGO, NAME, Boxes, interpolated, joined, turned, unit
+from sgstore.readers._boxes import (
+    EGO,
+    EGO_TYPE,
+    NAME,
+    Boxes,
+    interpolated,
+    joined,
+    steps_of,
+    turned,
+    unit,
+)
 from sgstore.readers._file import NumberedFile
 from sgstore.readers.py123d._map import Lanes, read_lanes
 from sgstore.readers.py123d._msgpack import unpacked
@@ -33,7 +43,6 @@ FRAME, MAP = "py123d.Frame", "py123d.Map"
 """Schemas of the messages."""
 FURTHEST: Final = 1_000_000_000
 """Maximum time between two states of the ego for an interpolation, and the age of a light; ns."""
-EGO_TYPE: Final = "EGO_VEHICLE"
 
 _BOX_KEY, _EGO_KEY, _LIGHT_KEY = "box_detections_se3", "ego_state_se3", "traffic_light_detections"
 _STATES: Final = ("green", "yellow", "red", "off", "unknown")
@@ -82,9 +91,7 @@ class Py123dFile(NumberedFile):
         about = _metadata(read_arrow_file(files["sync"], (), lost.append), lost)
         self._lights = _Lights(files.get(_LIGHT_KEY), lost)
         self._boxes, self._times = _read_boxes(files, lost)
-        order = np.argsort(self._times, kind="stable")
-        ends = np.flatnonzero(np.diff(self._times[order])) + 1
-        self._steps = np.split(order, ends) if len(order) else []
+        self._steps = steps_of(self._times)
         self._map = _map_of(path, files, about, lost)
         dataset = str(about.get("dataset") or "unknown")
         named = {"/py123d/map": MAP} if self._map.text else {}
