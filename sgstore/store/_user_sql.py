@@ -74,11 +74,10 @@ class UserSql:
     ) -> None:
         self._answer, self._given = answered, given
         self.sql, self.timeout_s = sql, timeout_s
-        self._run = sql  # a faster statement with the same result, if there is one
 
     def batches(self, size: int = BATCH) -> AbstractContextManager[Batches]:
         """Stream the rows of the statement in batches."""
-        return self._answered(lambda x: Batches(x, self._run, size=size, shortened=True))
+        return self._answered(lambda x, sql: Batches(x, sql, size=size, shortened=True))
 
     def rows(self, max_rows: int | None = None) -> Rows:
         """Return the rows of the statement; ``Rows.truncated`` is true if there are more than the limit."""
@@ -99,7 +98,7 @@ class UserSql:
 
     def table(self) -> Any:
         """Return the rows of the statement as an Arrow table, or ``None`` if Arrow is not installed."""
-        with self._answered(lambda connection: table_of(connection, self._run)) as found:
+        with self._answered(table_of) as found:
             return found
 
     def parquet(self, to: Path) -> int:
@@ -111,8 +110,8 @@ class UserSql:
             The file is not writable.
         """
 
-        def write(connection: DuckDBPyConnection) -> int | None:
-            stream = record_batches(connection, self._run)
+        def write(connection: DuckDBPyConnection, sql: str) -> int | None:
+            stream = record_batches(connection, sql)
             return None if stream is None else ParquetTable.write_batches(stream, to)
 
         with self._answered(write) as number:
@@ -123,18 +122,19 @@ class UserSql:
             return ParquetTable.write_rows(batches.columns, values, to, batches.types)
 
     @contextmanager
-    def _answered(self, step: Callable[[DuckDBPyConnection], T]) -> Generator[T]:
+    def _answered(self, step: Callable[[DuckDBPyConnection, str], T]) -> Generator[T]:
+        """Yield the result of a step, a function of a connection and a statement with the rows of this one."""
+
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
-            self._run = self.sql
             counted = None if self._given else counted_edges(self.sql)
             given = [(counted[0], {})] if counted else self._given and self._given()
+            sql = counted[1] if counted else self.sql
             if given:
                 with self._interrupted(connection), self._refused():
                     connection.execute(f"USE {INSIDE}")
                     give(connection, given)
                     connection.execute("USE main")
-            self._run = counted[1] if counted else self.sql
-            return until.enter_context(self._running(connection, step))
+            return until.enter_context(self._running(connection, lambda on: step(on, sql)))
 
         with self._answer(ask, self.sql, public=True) as found:
             yield found
