@@ -511,15 +511,15 @@ class Finder:
         relation, names = group.relations[ask.name], (TRACE, *ask.columns)
         if self._when[number]:
             kept = self._true(group, relation, ask, self._when[number])
-            owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
+            owners = relation.owners
             relation = TimedRelation.ordered(relation.frames[kept], relation.keys[owners[kept]])
         if names != self._columns(number):
-            owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
+            owners = relation.owners
             keys = relation.keys[:, [names.index(name) for name in self._columns(number)]]
             relation = TimedRelation.of(relation.frames, keys[owners])
         if step.hold is None:
             return relation
-        owners = np.repeat(np.arange(len(relation.keys)), np.diff(relation.starts))
+        owners = relation.owners
         places = line.held(owners * line.stride + relation.frames, step.hold)
         return TimedRelation.ordered(line.frame(places), relation.keys[places // line.stride])
 
@@ -530,7 +530,7 @@ class Finder:
         true = np.zeros(len(relation.frames), np.bool_)
         for trace, part, low in _chunks(group, relation):
             bindings = part.keys[:, : len(ask.variables)]
-            owners = np.repeat(np.arange(len(part.keys)), np.diff(part.starts))
+            owners = part.owners
             values = PlanValues(self._plan, trace, ask.variables, bindings)
             here = np.ones(len(owners), np.bool_)
             for formula in formulas:
@@ -545,7 +545,7 @@ class Finder:
     ) -> Iterator[_Part]:
         names = self._named(0)
         for trace, part, _ in _chunks(group, relation):
-            owners = np.repeat(np.arange(len(part.keys)), np.diff(part.starts))
+            owners = part.owners
             line = BindingLine(trace.clock)
             at_row = owners * line.stride + part.frames
             first = np.searchsorted(at_row, line.run_starts(at_row))

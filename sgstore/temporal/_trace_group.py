@@ -47,6 +47,11 @@ class TimedRelation:
     frames: Ints
     values: tuple[Any, ...] = ()
 
+    @property
+    def owners(self) -> Ints:
+        """Index of the binding of each row, (R,)."""
+        return np.repeat(np.arange(len(self.keys)), np.diff(self.starts))
+
     @classmethod
     def of(cls, frames: Ints, keys: Keys, values: Sequence[Any] = ()) -> TimedRelation:
         """Return the table of matches from unsorted rows of frame and node ids. Duplicate rows are dropped.
