@@ -82,7 +82,7 @@ class FirstLook:
         Findings by the heading of their section.
     unanswered : dict of str to list of str
         Reason → patterns and rules without an answer in any trace.
-    missing : dict of str to int
+    missing : Counter
         Missing or lost data → number of recordings.
     """
 
@@ -93,7 +93,7 @@ class FirstLook:
         default_factory=dict[str, list[FirstLookEntry]]
     )
     unanswered: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
-    missing: dict[str, int] = field(default_factory=dict[str, int])
+    missing: Counter[str] = field(default_factory=Counter[str])
 
     def contents(self) -> list[tuple[Any, ...]]:
         """Return a row for each recording: trace, file, frames, entities, and its error or its losses."""
@@ -140,7 +140,7 @@ class FirstLook:
     def _lists(self) -> Iterator[tuple[str, list[str]]]:
         unanswered = self.unanswered.items()
         yield "Questions without an answer", [f"{why}: {first_of(of, 8)}" for why, of in unanswered]
-        missing = Counter(self.missing).most_common(2 * ENTRIES)
+        missing = self.missing.most_common(2 * ENTRIES)
         yield "Missing data", [f"{what} (recordings: {many})" for what, many in missing]
 
     def _card(self, one: FirstLookEntry) -> str:
@@ -189,12 +189,10 @@ def sampled(
     sample = recordings[::every]
     until = max(SECONDS / max(len(sample), 1), CLIP_S)
     outcomes = ingest(store, sample, until=until, on_progress=on_progress)
-    if not any(one.frames for one in outcomes):
+    if not store.exists():
         raise next(one.error for one in outcomes if one.error is not None)
-    look = FirstLook(Store(store), outcomes, len(recordings) - len(sample))
-    for one in outcomes:
-        look.missing = dict(Counter(look.missing) + Counter({*map(_kind_of, _oddities(one))}))
-    return look
+    missing = Counter(kind for one in outcomes for kind in {*map(_kind_of, _oddities(one))})
+    return FirstLook(Store(store), outcomes, len(recordings) - len(sample), missing=missing)
 
 
 def evaluate(look: FirstLook, each: Each = lambda items, _: items) -> None:
