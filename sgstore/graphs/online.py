@@ -960,7 +960,7 @@ class Stepper:
             offsets=np.array([0, len(moving)]),
             states=self._states(moving),
             ego=np.array([-1]),  # The ego is passed separately.
-            entities=_entities(first, new),
+            entities=entities_of(first, new),
             scenery=self._states(standing),
             messages=MessageRefs(none, none, none, none, none),
         )
@@ -1031,7 +1031,8 @@ class GcPaused:
             gc.enable()
 
 
-def _entities(first: int, new: list[Entity]) -> Entities:
+def entities_of(first: int, new: list[Entity]) -> Entities:
+    """Return the table of new entities. ``first``: number of the first one."""
     names = ("ident", "special", "subkind", "type_name", "map_ref", "trailer")
     return Entities(
         first=first,

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from sgstore.graphs.online import entities_of
 from sgstore.model.vocabulary import (
     DRIVING,
     KIND_CODE,
@@ -27,7 +28,7 @@ from sgstore.model.vocabulary import (
     LIGHT_STATES,
     kinds_labelled,
 )
-from sgstore.model.world import INPUTS, POSE, Entities, FrameBlock, MessageRefs, States
+from sgstore.model.world import INPUTS, POSE, FrameBlock, MessageRefs, States
 from sgstore.pipeline.contradictions import (
     AGREEING,
     COURSE,
@@ -307,7 +308,7 @@ class Plausibility:
         columns |= {name: columns[name].astype(np.int64) for name in names[-3:]}
         counts = [sum(not e.static for e in frame.entities) for frame in frames]
         first = len(self._times)
-        none, texts = np.zeros(0, np.int64), ("",) * len(new)
+        none = np.zeros(0, np.int64)
         self.see(
             FrameBlock(
                 seq=np.arange(first, first + len(frames)),
@@ -319,16 +320,7 @@ class Plausibility:
                     **columns,
                 ),
                 ego=np.array([known.get(frame.ego, -1) for frame in frames], np.int64),
-                entities=Entities(
-                    first=len(self._idents),
-                    ident=tuple(entity.ident for entity in new),
-                    kind=np.array([entity.kind for entity in new], np.int8),
-                    special=texts,
-                    subkind=texts,
-                    type_name=texts,
-                    static=np.zeros(len(new), np.bool_),
-                    map_ref=tuple(entity.map_ref for entity in new),
-                ),
+                entities=entities_of(len(self._idents), new),
                 scenery=States.of(node=none),
                 messages=MessageRefs(none, none, none, none, none),
             )
