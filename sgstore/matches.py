@@ -387,9 +387,14 @@ class Matches(Tabular):
 
     def __iter__(self) -> Iterator[Row]:
         with self._file.snapshot():
-            if self._kept is not None and self._kept[0] is self._catalog():
-                return iter(self._kept[1])
-        return self._rows(whole=False)
+            kept = self._kept_rows()
+        return self._rows(whole=False) if kept is None else iter(kept)
+
+    def _kept_rows(self) -> list[Row] | None:
+        """Return the rows that were kept, if the store has not changed since."""
+        if self._kept is None or self._kept[0] is not self._catalog():
+            return None
+        return self._kept[1]
 
     def __len__(self) -> int:
         """Return the number of rows, each match in each frame; see :meth:`count` for frames.
@@ -397,8 +402,8 @@ class Matches(Tabular):
         Rows of a small result are kept until the store changes, so that they are not searched twice.
         """
         with self._file.snapshot():
-            if self._kept is not None and self._kept[0] is self._catalog():
-                return len(self._kept[1])
+            if (kept := self._kept_rows()) is not None:
+                return len(kept)
             rows = self._rows(whole=True)
             some = list(islice(rows, KEPT + 1))
             if len(some) <= KEPT:

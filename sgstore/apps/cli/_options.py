@@ -210,11 +210,11 @@ def _texts(value: Any) -> list[str]:
 
 def _looks_like_store(place: str) -> bool:
     path = Path(place)
-    try:
-        whole = (path / COLLECTION_FILE).is_file()
-    except (OSError, ValueError):  # a query is not a file name
-        return False
-    return whole or path.suffix in completion.STORE_ENDINGS or _is_database(path)
+    return (
+        _is_file(path / COLLECTION_FILE)
+        or path.suffix in completion.STORE_ENDINGS
+        or _is_database(path)
+    )
 
 
 _LIMITED: Final = {"find": "the query", "sql": "the SQL"}
@@ -250,14 +250,21 @@ def _refuse_late_store(verb: Verb, ctx: Any) -> None:
         )
 
 
-def _is_database(place: str | Path) -> bool:
+def _is_file(path: Path) -> bool:
     try:
-        path = Path(place)
-        if not path.is_file():  # opening a pipe would block
-            return False
+        return path.is_file()
+    except (OSError, ValueError):  # a query is not a file name
+        return False
+
+
+def _is_database(place: str | Path) -> bool:
+    path = Path(place)
+    if not _is_file(path):  # opening a pipe would block
+        return False
+    try:
         with path.open("rb") as file:
             return file.read(12)[8:] == b"DUCK"
-    except (OSError, ValueError):  # a query is not a file name
+    except OSError:
         return False
 
 
@@ -658,12 +665,11 @@ class Statements:
             Library patterns take the values of their own parameters; all others belong to the
             texts.
         """
-        from sgstore.lang.library import pattern_named, patterns, statement
+        from sgstore.lang.library import pattern_named, statement
 
         values = parameters_of(self.parameters)
-        named = [one for one in given or () if one in patterns()]
-        texts = [*map(text_or_file, (one for one in given or () if one not in patterns()))]
-        texts = [statement(one, {}, check=True)[0] for one in (*texts, *(self.texts or ()))]
+        named, texts = named_and_texts(given or ())
+        texts += [statement(one, {}, check=True)[0] for one in self.texts or ()]
         if not (named or self.names or texts):
             raise typer.BadParameter("add a CHECK, a FILE or the NAME of a pattern")
         found = {one.name: one for one in map(pattern_named, (*named, *(self.names or ())))}
@@ -771,13 +777,23 @@ def query_of(text: str | None, file: Path | None) -> str:
     return text_or_file(text) if text is not None else text_of(file or Path("-"))
 
 
+def named_and_texts(arguments: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Return the arguments that name patterns of the library, and the statements of the others."""
+    from sgstore.lang.library import patterns, statement
+
+    named, texts = list[str](), list[str]()
+    for one in arguments:
+        if one in patterns():
+            named.append(one)
+        else:
+            texts.append(statement(text_or_file(one), {}, check=True)[0])
+    return named, texts
+
+
 def text_or_file(argument: str) -> str:
     """Return the text of a file if an argument is ``-`` or the name of a file, else the argument itself."""
     path = Path(argument)
-    try:
-        found = path.is_file()
-    except (OSError, ValueError):  # a query is not a file name
-        found = False
+    found = _is_file(path)
     named = path.suffix in {".sgql", ".sql", ".txt"} and not re.search(r"\s", argument)
     return text_of(path) if found or named or argument == "-" else argument
 

@@ -18,10 +18,10 @@ from sgstore.apps.cli._options import (
     StorePath,
     Traces,
     Verbs,
+    named_and_texts,
     parameters_of,
     say_unknown,
     text_of,
-    text_or_file,
 )
 from sgstore.apps.cli._output import say
 from sgstore.base.output_files import without_controls
@@ -101,12 +101,11 @@ def _asked(
     queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
 ) -> dict[str, tuple[str, Mapping[str, Any]]]:
     """Return the queries to plot by lane name, each with the values of its parameters."""
-    from sgstore.lang.library import pattern_named, patterns, statement
+    from sgstore.lang.library import pattern_named
 
     found: dict[str, tuple[str, Mapping[str, Any]]] = {}
-    names = [*(one for one in queries if one in patterns()), *names]
-    texts = [text_or_file(one) for one in queries if one not in patterns()]
-    queries = [statement(one, {}, check=True)[0] for one in texts]
+    named, queries = named_and_texts(queries)
+    names = [*named, *names]
     for number, text in enumerate(queries, start=1):
         found["match" if len(queries) == 1 else f"match {number}"] = text, values
     for file in files:
