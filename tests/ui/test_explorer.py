@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import shutil
 import subprocess
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
+from explorer_page import AXE, NEAR, expect, faults, open_first, search, seen, time_shown
 from thorough import some
 
 from sgstore.apps.demo import RECORDING
@@ -27,114 +27,9 @@ from sgstore.lang.library import patterns
 from sgstore.query import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
 pytestmark = pytest.mark.seconds(60)
-
-sync = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
-pytest.importorskip("uvicorn", reason="the extra [ui] is not installed")
-
-expect = sync.expect
-expect.set_options(timeout=60_000)
-
-NEAR = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
-PICTURES = os.environ.get("SGSTORE_SCREENSHOTS")
-"""Folder for screenshots of the views, to be looked at."""
-
-AXE = Path(__file__).parents[2] / "build" / "page" / "node_modules" / "axe-core" / "axe.min.js"
-"""What finds faults of accessibility; ``tools/vendor.py --check`` installs it."""
-
-
-def chromium() -> str | None:
-    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-    return os.environ.get("SGSTORE_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    program = chromium()
-    if program is None:
-        pytest.skip("no Chromium: apt-get install chromium, or set SGSTORE_CHROMIUM")
-    with sync.sync_playwright() as playwright:
-        options = ["--no-sandbox", "--disable-dev-shm-usage"]
-        try:
-            browser = playwright.chromium.launch(executable_path=program, args=options)
-        except sync.Error as error:
-            pytest.skip(f"{program} does not start: {error.message.splitlines()[0]}")
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("written")
-
-
-@pytest.fixture(scope="module")
-def served(written: Path) -> Iterator[Callable[[Path], str]]:
-    """Serves stores; each address has its token."""
-    children: dict[Path, tuple[subprocess.Popen[str], str]] = {}
-
-    def start(store: Path) -> str:
-        if store not in children:
-            command = [sys.executable, "-m", "sgstore", "serve", str(store)]
-            command += ["--write-to", str(written), "--compare", str(store)]
-            child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-            assert child.stdout is not None
-            children[store] = child, child.stdout.readline().strip()
-        return children[store][1]
-
-    yield start
-    for child, _ in children.values():
-        child.terminate()
-    for child, _ in children.values():
-        child.communicate(timeout=20)
-
-
-@pytest.fixture
-def visit(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Opens pages; at the end nothing was wrong on the console, and no other host was asked."""
-    contexts, wrong, asked = list[Any](), list[str](), list[tuple[str, str]]()
-
-    def opened(address: str, **how: Any) -> Any:
-        context = browser.new_context(viewport={"width": 1440, "height": 900}, **how)
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(60_000)
-
-        def on_console(told: Any) -> None:
-            if told.type in {"error", "warning"}:
-                wrong.append(told.text)
-
-        def on_error(error: Any) -> None:
-            wrong.append(str(error))
-
-        def on_request(request: Any) -> None:
-            asked.append((address, request.url))
-
-        page.on("console", on_console)
-        page.on("pageerror", on_error)
-        page.on("request", on_request)
-        page.goto(address)
-        return page
-
-    yield opened
-    urls = [page.url for context in contexts for page in context.pages]
-    for context in contexts:
-        context.close()
-    assert wrong == []
-    for address, url in asked:
-        host = re.match(r"http://[^/]+/|file:", address)
-        assert host
-        assert url.startswith((host[0], "blob:", "data:"))
-    assert not any("token" in url for url in urls)
-
-
-@pytest.fixture
-def page(visit: Callable[..., Any], served: Callable[[Path], str], town_store: Path) -> Any:
-    page = visit(served(town_store))
-    page.locator(".editor .cm-content").wait_for()
-    return page
 
 
 def test_an_answer_does_not_wait_for_the_one_before_it(
@@ -149,28 +44,6 @@ def test_an_answer_does_not_wait_for_the_one_before_it(
             took.append(time.perf_counter() - begun)
 
     assert min(took[1:]) < 0.03
-
-
-def search(page: Any, query: str) -> None:
-    page.locator(".cm-content").fill(query)
-    page.keyboard.press("Control+Enter")
-    page.locator(".status").wait_for()
-    page.locator(".status .busy").wait_for(state="detached")
-
-
-def open_first(page: Any) -> None:
-    page.locator(".tile").first.click()
-    page.locator(".timeline .lane[data-holds]").first.wait_for()
-
-
-def time_shown(page: Any) -> Any:
-    return page.locator(".transport .time")
-
-
-def seen(page: Any, name: str) -> None:
-    if PICTURES:
-        page.wait_for_timeout(1500)
-        page.screenshot(path=str(Path(PICTURES) / f"{name}.png"))
 
 
 def test_the_library_is_there_before_anything_is_typed(page: Any, town_store: Path) -> None:
@@ -499,22 +372,6 @@ def test_matches_play_in_a_notebook(
     was = frame.locator(".transport .time").inner_text()
     frame.get_by_role("button", name="Play").click()
     expect(frame.locator(".transport .time")).not_to_have_text(was)
-
-
-def faults(page: Any) -> list[str]:
-    """Serious faults of accessibility, by axe."""
-    # The page's policy lets no other script run; what the browser's tools put in is not asked.
-    if not page.evaluate("'axe' in window"):
-        page.evaluate(AXE.read_text(encoding="utf-8"))
-    found = page.evaluate(
-        "axe.run({resultTypes: ['violations']}).then(({violations}) => violations)"
-    )
-    return [
-        f"{one['id']}: {one['help']}: {node['html'][:120]}"
-        for one in found
-        if one["impact"] in {"serious", "critical"}
-        for node in one["nodes"]
-    ]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

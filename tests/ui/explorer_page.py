@@ -1,0 +1,60 @@
+"""Actions on a page of the explorer, shared by the tests in a browser."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+sync = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+pytest.importorskip("uvicorn", reason="the extra [ui] is not installed")
+
+expect = sync.expect
+expect.set_options(timeout=60_000)
+
+NEAR: Final = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
+PICTURES = os.environ.get("SGSTORE_SCREENSHOTS")
+"""Folder for screenshots of the views, to be looked at."""
+
+AXE = Path(__file__).parents[2] / "build" / "page" / "node_modules" / "axe-core" / "axe.min.js"
+"""What finds faults of accessibility; ``tools/vendor.py --check`` installs it."""
+
+
+def search(page: Any, query: str) -> None:
+    page.locator(".cm-content").fill(query)
+    page.keyboard.press("Control+Enter")
+    page.locator(".status").wait_for()
+    page.locator(".status .busy").wait_for(state="detached")
+
+
+def open_first(page: Any) -> None:
+    page.locator(".tile").first.click()
+    page.locator(".timeline .lane[data-holds]").first.wait_for()
+
+
+def time_shown(page: Any) -> Any:
+    return page.locator(".transport .time")
+
+
+def seen(page: Any, name: str) -> None:
+    if PICTURES:
+        page.wait_for_timeout(1500)
+        page.screenshot(path=str(Path(PICTURES) / f"{name}.png"))
+
+
+def faults(page: Any) -> list[str]:
+    """Serious faults of accessibility, by axe."""
+    # The page's policy lets no other script run; what the browser's tools put in is not asked.
+    if not page.evaluate("'axe' in window"):
+        page.evaluate(AXE.read_text(encoding="utf-8"))
+    found = page.evaluate(
+        "axe.run({resultTypes: ['violations']}).then(({violations}) => violations)"
+    )
+    return [
+        f"{one['id']}: {one['help']}: {node['html'][:120]}"
+        for one in found
+        if one["impact"] in {"serious", "critical"}
+        for node in one["nodes"]
+    ]
