@@ -12,6 +12,7 @@ them in ``map_node``. For the last two, table ``node`` holds the frames in which
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cache
@@ -817,6 +818,58 @@ class TableFacts:
         return Attribute(f"{self.name}.{name}", self.columns[name], home, "", table=self.name)
 
 
+_NUMBERS_OF_TOPICS: Final = re.compile(r"U?(TINY|SMALL|BIG|HUGE)?INT(EGER)?|FLOAT|DOUBLE")
+
+
+@dataclass(frozen=True, slots=True)
+class TopicField:
+    """Field of the messages of a topic.
+
+    Attributes
+    ----------
+    name : str
+        ``linear_acceleration.z``
+    declared : str
+        Database type: ``DOUBLE``, ``VARCHAR``, ``DOUBLE[]``, ``JSON``.
+    """
+
+    name: str
+    declared: str
+
+    @property
+    def type(self) -> Type:
+        """Type in query expressions. Lists and JSON are ``list``."""
+        if self.declared.endswith("]") or self.declared in {"JSON", "BLOB"}:
+            return Type.list
+        if _NUMBERS_OF_TOPICS.fullmatch(self.declared):
+            return Type.number
+        return Type.boolean if self.declared == "BOOLEAN" else Type.text
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFacts:
+    """Facts about a topic of a store that the query compiler needs.
+
+    Attributes
+    ----------
+    name : str
+    traces : frozenset of int
+        Ids of the traces that have the topic.
+    stored : bool
+        True if the store has its messages as columns. Otherwise, recordings are read.
+    refused : str
+        Reason if its messages cannot be decoded; else empty.
+    source : function
+        Returns its fields, by name. It can open a recording. Use :func:`sgstore.lang.topics.fields_of`.
+    """
+
+    name: str
+    traces: frozenset[int]
+    stored: bool
+    refused: str
+    source: Callable[[], Mapping[str, TopicField]]
+
+
 @dataclass(frozen=True, slots=True)
 class Catalog:
     """Description of a store for the query compiler: traces, tables, relations and attributes.
@@ -869,6 +922,8 @@ class Catalog:
         Traces that do not meet the needs of a query (:mod:`sgstore.lang.bind._needed_values`) and are left out.
     lacks : dict
         Cache of the traces that do not meet each need.
+    topics : mapping of str to TopicFacts
+        Topics of the recordings of the store, by name.
     part : bool
         True if the store is a part of a collection. Then a missing dataset, ego or derived set belongs to
         other parts, and counts over all parts come from a table.
@@ -904,6 +959,7 @@ class Catalog:
     lacks: dict[Any, frozenset[int]] = field(
         default_factory=dict[Any, frozenset[int]], compare=False, repr=False
     )
+    topics: Mapping[str, TopicFacts] = field(default_factory=dict[str, TopicFacts])
     part: bool = False
     online: bool = False
 
