@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from sgstore.base.display import IN_NOTEBOOK
+from sgstore.base.plugins import VERBS
 from sgstore.errors import StoreError, place_named, url_named
 from sgstore.lang.library import require_sql, statement
 from sgstore.lang.sql import CONSTANTS, about_frame, compile_query, union_parts
@@ -180,7 +181,585 @@ class ClipAnimation:
         write_bytes(path, self.data)
 
 
-class Store:
+class StoreVerbs:
+    """Verbs of a store or a collection, with the words of the command line.
+
+    The signatures and docstrings are the table of verbs: the command line and the tools of assistants take
+    names, defaults and help of their options from here.
+
+    Query texts are queries, names of patterns in the library, or files. Times are texts such as ``2s``, or
+    seconds.
+    """
+
+    def _run(self, verb: str, given: dict[str, Any]) -> Any:
+        """Run the function of a verb with the arguments of its method."""
+        store = given.pop("self")
+        return VERBS.load(verb)(store, **given)
+
+    def select(  # noqa: PLR0913 - the options of the command
+        self,
+        query: str = "",
+        /,
+        *,
+        minimal: bool = False,
+        per_class: int | None = None,
+        rarest: bool = False,
+        stratify: str = "",
+        weakest: str = "",
+        budget: str = "",
+        unit: Literal["frame", "clip", "trace"] = "frame",
+        clip: str | float = "2s",
+        stride: str | float = "",
+        abstraction: str = "RSV",
+        combos: int = 0,
+        of_ego: bool = False,
+        sequences: int = 0,
+        manoeuvres: Sequence[str] = (),
+        within: str | float = "10s",
+        objective: Literal["units", "frames", "seconds", "bytes"] = "units",
+        alpha: float = 1.0,
+        seed: int = 0,
+        parameters: Mapping[str, object] | None = None,
+    ) -> Any:
+        """Select frames, clips or traces for tests, and rate the selection.
+
+        Parameters
+        ----------
+        query : str
+            Select from the frames that match; by default from all.
+        minimal : bool
+            Select the smallest set that keeps all items.
+        per_class : int
+            Each class (stratum) K times.
+        rarest : bool
+            Select the rarest classes first.
+        stratify : str
+            Strata by a value: 'ego.speed > 8'.
+        weakest : str
+            Least value first: 'robustness(ego.speed < 9)'.
+        budget : str
+            At most 600s, 10min, 5GB, 1000frames or 40units.
+        unit : {"frame", "clip", "trace"}
+            Frames, clips, or whole traces.
+        clip : str or float
+            Longest clip of --unit clip.
+        stride : str or float
+            Time between the starts of two clips; clips overlap if it is less than --clip.
+        abstraction : str
+            Abstraction: E, EL, ER, RSV, …
+        combos : int
+            Keep combinations of K features.
+        of_ego : bool
+            Use only features of the ego and of its lanes.
+        sequences : int
+            Keep sequences of K manoeuvres.
+        manoeuvres : sequence of str
+            A manoeuvre of sequences: a pattern of the library, or NAME=QUERY; may be repeated.
+        within : str or float
+            Longest time from the first manoeuvre of a sequence to the last.
+        objective : {"units", "frames", "seconds", "bytes"}
+            Quantity that --minimal minimizes.
+        alpha : float
+            Weight of strata: 1 by frequency, 0 all equal.
+        seed : int
+            Random seed.
+        parameters : mapping of str to value
+            Value of $NAME in the query; write a list as [1, 2]; repeatable.
+
+        Returns
+        -------
+        Selection
+            ``table()`` has the columns ``unit``, ``frames`` and, if items are kept, ``holds``, ``new``.
+
+        Raises
+        ------
+        ConfigError, QueryError
+            The options contradict each other, or a query is invalid.
+
+        Examples
+        --------
+        >>> chosen = store.select(minimal=True, unit="clip", clip="10s", abstraction="EL")
+        >>> print(chosen.table())
+        unit          frames  holds  new
+        ────────────  ──────  ─────  ───
+        town#400-499     100     65   65
+        town#200-299     100     52   52
+        town#300-399     100     44   42
+        town#600-699     100     32   32
+        town#100-199     100     27   27
+        town#500-599     100     25   23
+        town#0-99        100     13   12
+        town#700-749      50      9    8
+        """
+        return self._run("select", locals())
+
+    def prioritize(  # noqa: PLR0913 - the options of the command
+        self,
+        query: str = "",
+        /,
+        *,
+        order: Literal["risk", "diverse", "both", "learned"] = "risk",
+        measures: Sequence[str] = (),
+        budget: str = "",
+        unit: Literal["frame", "clip", "trace"] = "frame",
+        clip: str | float = "2s",
+        abstraction: str = "situation",
+        seed: int = 0,
+        outcomes: str | Path | None = None,
+        learn_outcomes: str | Path | None = None,
+        learn_from: str | Path | Store | None = None,
+        parameters: Mapping[str, object] | None = None,
+    ) -> Any:
+        """Order frames, clips or traces so that tests find failures soon, with reasons.
+
+        Parameters
+        ----------
+        query : str
+            Order the frames that match; by default all.
+        order : {"risk", "diverse", "both", "learned"}
+            Order: most critical first, one of each class first, both, or most likely to fail first.
+        measures : sequence of str
+            A measure of criticality, or an expression, least first; by default closing_time, ttc_mild.
+        budget : str
+            At most 600s, 10min, 5GB, 1000frames or 40units.
+        unit : {"frame", "clip", "trace"}
+            Frames, clips, or whole traces.
+        clip : str or float
+            Longest clip of --unit clip.
+        abstraction : str
+            Classes to distinguish: situations of the ego, or classes of an abstraction.
+        seed : int
+            Random seed.
+        outcomes : str or Path
+            Known outcomes, to measure how early failures come and to learn from.
+        learn_outcomes : str or Path
+            Outcomes to learn from; by default those of --outcomes.
+        learn_from : str, Path or Store
+            Store of the runs of --learn-outcomes; by default STORE.
+        parameters : mapping of str to value
+            Value of $NAME in the query; write a list as [1, 2]; repeatable.
+
+        Returns
+        -------
+        Prioritized
+            ``table()`` has the columns ``place``, ``unit``, ``risk``, the measures and ``reason``.
+
+        Raises
+        ------
+        ConfigError, QueryError
+            A measure is unknown, outcomes to learn from are missing, or a query is invalid.
+
+        Examples
+        --------
+        >>> for place, unit, *_ in store.prioritize(unit="clip", budget="2units").table().rows:
+        ...     print(place, unit)
+        1 town#380-399
+        2 town#500-519
+        """
+        return self._run("prioritize", locals())
+
+    def criticality(self, *, measures: Sequence[str] = (), most: float | None = None) -> Any:
+        """List measures of recorded encounters of two entities: PET, TET, CPI, the closest encounter.
+
+        Parameters
+        ----------
+        measures : sequence of str
+            A measure of criticality: pet; by default all; repeatable.
+        most : float
+            Keep only pairs with a first measure of at most X.
+
+        Returns
+        -------
+        ReportTable
+            ``trace``, ``src``, ``dst``, ``kind``, and each measure.
+
+        Raises
+        ------
+        ConfigError
+            A measure is unknown.
+
+        Examples
+        --------
+        >>> print(store.criticality(measures=["pet"], most=2))
+        trace  src  dst  kind    pet
+        ─────  ───  ───  ──────  ───
+        town     0   40  person  1.3
+        town     0  137  car       2
+        """
+        return self._run("criticality", locals())
+
+    def coverage(  # noqa: PLR0913 - the options of the command
+        self,
+        kind: str = "classes",
+        query: str = "",
+        /,
+        *,
+        by: str | Path | Store | Collection[object] | None = None,
+        unit: Literal["frame", "run", "trace"] = "frame",
+        abstraction: str = "RSV",
+        window: int = 1,
+        incomplete: Literal["equal", "distinct", "drop"] = "equal",
+        slots: str | Path | None = None,
+        items: Literal["classes", "frames", "clips"] = "classes",
+        points: int = 40,
+        k: int = 2,
+        of_ego: bool = False,
+        manoeuvres: Sequence[str] = (),
+        within: str | float = "10s",
+        cells: int = 0,
+        tree: bool = False,
+        depth: int = 4,
+        by_frame: bool = False,
+        missing: bool = False,
+        covered: bool = False,
+        parameters: Mapping[str, object] | None = None,
+    ) -> Any:
+        """Measure what a data set covers: classes, novelty, growth, combinations.
+
+        Parameters
+        ----------
+        kind : str
+            ``classes``, ``growth``, ``combos``, ``sequences``, ``spec``; with ``by`` also ``of``, ``novel``,
+            ``venn``, ``explain``.
+        query : str
+            Use the frames that match, by default all; with ``spec`` each combination of values is a cell.
+        by : str, Path, Store or Collection
+            Frames to compare with: a store, STORE:QUERY or a lock; written like A.
+        unit : {"frame", "run", "trace"}
+            Count frames, runs of frames of one class, or traces with it.
+        abstraction : str
+            Abstraction: E, EL, ER, RSV, …
+        window : int
+            Number of frames that form one class together.
+        incomplete : {"equal", "distinct", "drop"}
+            Windows with missing frames: equal, distinct, or dropped.
+        slots : str or Path
+            TOML file with declared slots.
+        items : {"classes", "frames", "clips"}
+            Classes, frames, or clips of consecutive frames.
+        points : int
+            Number of rows of the curve.
+        k : int
+            Number of features in a combination, or of manoeuvres in a sequence.
+        of_ego : bool
+            Use only features of the ego and of its lanes.
+        manoeuvres : sequence of str
+            A manoeuvre of sequences: a pattern of the library, or NAME=QUERY; may be repeated.
+        within : str or float
+            Longest time from the first manoeuvre of a sequence to the last.
+        cells : int
+            Number of cells, if known.
+        tree : bool
+            Print a decision tree of a few questions instead.
+        depth : int
+            Maximum questions.
+        by_frame : bool
+            Count or compare frame by frame.
+        missing : bool
+            List the missing items, each with a query for it.
+        covered : bool
+            List the covered items, with their frames.
+        parameters : mapping of str to value
+            Value of $NAME in the query; write a list as [1, 2]; repeatable.
+
+        Returns
+        -------
+        ReportTable
+            ``columns``, ``rows``, and ``said``: notes with the denominators.
+
+        Raises
+        ------
+        ConfigError, QueryError, StoreError
+            The kind is unknown, frames to compare with are missing, or a query is invalid.
+
+        Examples
+        --------
+        >>> store.coverage("venn", "MATCH (e:Ego) WHERE e.speed > 8", by="demo.sgstore").rows[1:3]
+        [('A without B', 0, 0, 0), ('B without A', 390, 0, 445)]
+        >>> [f"{share:.3f}" for share in store.coverage("combos", abstraction="EL").column("share")]
+        ['0.607']
+        """
+        return self._run("coverage", locals())
+
+    def diff(
+        self,
+        other: str | Path | Store | Collection[object],
+        query: str = "",
+        /,
+        *,
+        by_frame: bool = False,
+        abstraction: str = "RSV",
+        parameters: Mapping[str, object] | None = None,
+    ) -> Any:
+        """Compare two stores or runs: scenes, verdicts and matches that appeared, vanished or changed.
+
+        Parameters
+        ----------
+        other : str, Path, Store or Collection
+            The later store, or STORE:QUERY, or a lock.
+        query : str
+            Compare by a query, or by 'CHECK …'.
+        by_frame : bool
+            Count or compare frame by frame.
+        abstraction : str
+            Abstraction: E, EL, ER, RSV, …
+        parameters : mapping of str to value
+            Value of $NAME in the query; write a list as [1, 2]; repeatable.
+
+        Returns
+        -------
+        ReportTable
+            ``change`` is the first column: ``appeared``, ``vanished``, ``changed``, ``same``.
+
+        Raises
+        ------
+        ConfigError, QueryError, StoreError
+            Options contradict each other, the query is invalid, or the other store is missing.
+
+        Examples
+        --------
+        >>> store.diff("demo.sgstore", "cut_in").said
+        ['traces with matches: 0 appeared, 0 vanished, 0 changed, 1 same']
+        """
+        return self._run("diff", locals())
+
+    def timeline(
+        self,
+        *queries: str,
+        traces: Sequence[str] = (),
+        to: str | Path | None = None,
+        parameters: Mapping[str, object] | None = None,
+    ) -> Any:
+        """Return lanes of matches and rule violations over time, one lane per entity, for each trace.
+
+        Parameters
+        ----------
+        *queries : str
+            'MATCH …', 'CHECK …', or names of the library.
+        traces : sequence of str
+            Use only this trace; repeatable.
+        to : str or Path
+            Write to this file or folder.
+        parameters : mapping of str to value
+            Value of $NAME in the query; write a list as [1, 2]; repeatable.
+
+        Returns
+        -------
+        list of Timeline
+            Its lanes have ``name``, ``who``, ``verdict``, ``spans`` (start, end, violation) and ``reason``.
+
+        Raises
+        ------
+        QueryError, ExportError
+            A query is invalid, or the picture cannot be written.
+
+        Examples
+        --------
+        >>> (line,) = store.timeline("cut_in")
+        >>> [(lane.name, len(lane.spans)) for lane in line.lanes]
+        [('cut_in', 1)]
+        """
+        return self._run("timeline", locals())
+
+    def report(
+        self,
+        query: str,
+        /,
+        *,
+        to: str | Path = "report.html",
+        limit: int = 100,
+        around: str | float = "2s",
+        pictures: bool = False,
+        parameters: Mapping[str, object] | None = None,
+    ) -> Any:
+        """Write the matches of a query as one HTML page that works without a server or network.
+
+        Parameters
+        ----------
+        query : str
+            A pattern; or checks, whose violations are shown.
+        to : str or Path
+            Write to this file or folder.
+        limit : int
+            Maximum number of results; 0: all.
+        around : str or float
+            Time before and after each match.
+        pictures : bool
+            Add a camera picture for each second of a match.
+        parameters : mapping of str to value
+            Value of $NAME in the query; write a list as [1, 2]; repeatable.
+
+        Returns
+        -------
+        int, bool
+            Number of results in the page, and True if there are more.
+
+        Raises
+        ------
+        QueryError, ExportError
+            The query is invalid, or the page cannot be written.
+
+        Examples
+        --------
+        >>> store.report("cut_in", to="cut_in.html")
+        (1, False)
+        """
+        return self._run("report", locals())
+
+    def export(  # noqa: PLR0913 - the options of the command
+        self,
+        query: str = "",
+        /,
+        *,
+        to: str | Path = "clips",
+        frames: Sequence[str | int] | None = None,
+        lock: str | Path | None = None,
+        form: str = "mcap",
+        before: str | float = "2s",
+        after: str | float = "2s",
+        labels: Sequence[str] = (),
+        with_graph: bool = False,
+        mounts: Sequence[str] = (),
+        rebase_context: bool = False,
+        abstraction: str = "",
+        graphml: bool = False,
+        channels: Sequence[str] = (),
+        clouds: Literal["pcd", "npy", "bin"] = "pcd",
+        parameters: Mapping[str, object] | None = None,
+    ) -> Any:
+        """Cut matches out of their recordings, as clips with the original messages.
+
+        Parameters
+        ----------
+        query : str
+            Export the matches of a query; with none of query, frames and lock all frames.
+        to : str or Path
+            Write to this file or folder.
+        frames : sequence of str or int
+            Instead of a query: a file with a FRAME a line; - is stdin.
+        lock : str or Path
+            Instead of a query: each case of a lock, a clip each.
+        form : str
+            mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, or that of a package.
+        before : str or float
+            Time before each match: 2s, 500ms.
+        after : str or float
+            Time after each match.
+        labels : sequence of str
+            A value for each frame: an expression, or a query that is true where it matches.
+        with_graph : bool
+            mcap: include the scene graphs, as JSON and as drawings.
+        mounts : sequence of str
+            mcap, rrd, with graphs: where a sensor sits on the ego, by the frame_id of its messages; m,
+            degrees; repeatable.
+        rebase_context : bool
+            mcap: move static messages, such as the map, to the start of each clip.
+        abstraction : str
+            nx, pyg, s3c: abstraction of the graphs.
+        graphml : bool
+            nx: also write each frame as GraphML, for Gephi.
+        channels : sequence of str
+            frames: use only this sensor; repeatable.
+        clouds : {"pcd", "npy", "bin"}
+            frames: format of point clouds.
+        parameters : mapping of str to value
+            Value of $NAME in the query; write a list as [1, 2]; repeatable.
+
+        Returns
+        -------
+        list of WrittenClip or WrittenFile
+            Each with ``file`` and ``losses``.
+
+        Raises
+        ------
+        QueryError, ExportError, TraceError
+            The query or an option is invalid, files exist already, or a recording is missing.
+
+        Examples
+        --------
+        >>> [one.file.name for one in store.export("cut_in", to="cut_ins", before="1s", after="1s")]
+        ['town_001.mcap']
+        """
+        return self._run("export", locals())
+
+    def lock(
+        self,
+        cases: Any,
+        to: str | Path | None = None,
+        /,
+        *,
+        split: str = "",
+        payloads: bool = True,
+    ) -> Any:
+        """Return the lock of a selection or an order: its cases with the digests of their content.
+
+        Parameters
+        ----------
+        cases : Selection or Prioritized
+            Result of :meth:`select` or :meth:`prioritize`.
+        to : str or Path
+            Write to this file or folder.
+        split : str
+            Parts that share no recording: train=0.8,test=0.2.
+        payloads : bool
+            Include messages of sensors, which are read from the recordings.
+
+        Returns
+        -------
+        Lock
+            Its ``cases`` and ``traces``.
+
+        Raises
+        ------
+        ConfigError, TraceError
+            The shares are invalid, or a recording is missing.
+
+        Examples
+        --------
+        >>> lock = store.lock(store.select("cut_in", unit="clip"), "tests.lock")
+        >>> len(lock.cases)
+        1
+        """
+        return self._run("lock", locals())
+
+    def verify(
+        self,
+        lock: str | Path | None = None,
+        /,
+        *,
+        payloads: bool | None = None,
+        strict: bool = False,
+    ) -> Any:
+        """Verify that a store has not changed since it was published; or that it has the cases of a lock.
+
+        Parameters
+        ----------
+        lock : str or Path
+            A lock; by default the store itself is verified.
+        payloads : bool
+            Compare the messages of sensors, too; by default only for a lock.
+        strict : bool
+            Count another version of sgstore as a difference.
+
+        Returns
+        -------
+        list
+            Faults of the store; with a lock the differences. An empty list: nothing has changed.
+
+        Raises
+        ------
+        StoreError
+            The store or the lock is not readable.
+
+        Examples
+        --------
+        >>> store.verify()
+        []
+        """
+        return self._run("verify", locals())
+
+
+class Store(StoreVerbs):
     """Store of traces, opened by its path.
 
     The file stays open for a second after a query. It closes at once when another process needs to write, so an

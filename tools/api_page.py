@@ -10,6 +10,7 @@ from typing import Any
 
 import sgstore
 from sgstore.graphs.relations import as_markdown
+from sgstore.query import StoreVerbs
 from sgstore.store import Tabular
 
 PAGE = Path(__file__).parents[1] / "docs" / "api.md"
@@ -80,10 +81,11 @@ def page() -> str:
 
 
 def members(name: str) -> list[tuple[str, Any]]:
-    """Public methods and properties of a class, and those of :class:`sgstore.store.Tabular`."""
+    """Public methods and properties of a class, and those of its documented base class."""
     kind = getattr(sgstore, name)
     found: list[tuple[str, Any]] = []
     shared = vars(Tabular) if issubclass(kind, Tabular) else {}
+    shared = vars(StoreVerbs) if name == "Store" else shared
     for key, held in (vars(kind) | shared).items():
         one = getattr(held, "__func__", held)
         method = inspect.isfunction(one) or isinstance(held, property)

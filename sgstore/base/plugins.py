@@ -161,3 +161,12 @@ ABSTRACTIONS: Final = Registry(
 
 EXPORTERS: Final = Registry("sgstore.exporters", {}, "format")
 """Formats of other packages; :data:`sgstore.exporters.EXPORTERS` lists those of this package."""
+
+_VERBS: Final = (
+    *("select", "prioritize", "criticality", "coverage", "diff"),
+    *("timeline", "report", "export", "lock", "verify"),
+)
+VERBS: Final = Registry(
+    "sgstore.verbs", _in("apps", **{name: f"verbs:{name}" for name in _VERBS}), "verb"
+)
+"""Functions behind verbs of :class:`sgstore.query.StoreVerbs` that need packages above it."""

@@ -41,7 +41,7 @@ from sgstore.lang.syntax import pattern_tables
 from sgstore.matches import UnionMatches
 from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.vocabulary import natural
-from sgstore.query import Store, matches_of
+from sgstore.query import Store, StoreVerbs, matches_of
 from sgstore.store import (
     Example,
     FrameRef,
@@ -96,7 +96,7 @@ class PartialAnswerError(StoreError):
         self.bundles = dict(bundles)
 
 
-class Collection:
+class Collection(StoreVerbs):
     """Collection of many stores, with the query interface of one store.
 
     Parameters

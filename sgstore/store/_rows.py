@@ -43,10 +43,28 @@ _READS: Final = {"SELECT", "EXPLAIN"}
 """Types of statements that only read: WITH, FROM, VALUES, TABLE, DESCRIBE, SHOW and SUMMARIZE are SELECT."""
 
 
+_OTHER_WORDS: Final = {
+    **dict.fromkeys(("pl", "to_polars"), "polars"),
+    **dict.fromkeys(("pd", "pandas", "to_pandas", "to_df", "fetchdf", "dataframe"), "df"),
+    **dict.fromkeys(("to_arrow", "fetch_arrow_table"), "arrow"),
+    "to_csv": "csv",
+    "to_parquet": "parquet",
+}
+"""Names of other libraries → the method of a result."""
+
+
 class Tabular:
     """Base class of query results, with conversion to data frames, Arrow tables and files."""
 
     _joined_tables = staticmethod(as_told)  # for subclasses in other packages
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Raise an error for an unknown attribute, with the right method for names of other libraries."""
+            instead = _OTHER_WORDS.get(name)
+            hint = f"; write {instead}()" if instead else ""
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{hint}")
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         raise NotImplementedError

@@ -41,12 +41,18 @@ class ChosenFrames:
         Ascending; ``None`` means all frames.
     reasons : mapping of str to str
         Traces that cannot answer the query, with the reason.
+    query : str
+        Query that selected them; empty: none.
+    parameters : mapping of str to value
+        Values of ``$name`` in the query.
     """
 
     text: str
     store: Store | Collection
     frame_id: Ints | None = None
     reasons: Mapping[str, str] = field(default_factory=dict[str, str])
+    query: str = ""
+    parameters: Mapping[str, object] = field(default_factory=dict[str, object])
 
     @property
     def left_out(self) -> tuple[str, ...]:

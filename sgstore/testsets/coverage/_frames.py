@@ -9,6 +9,7 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.display import IN_NOTEBOOK, html_table, text_table
 from sgstore.lang.syntax import node_of_kind
 from sgstore.model.vocabulary import KINDS
 
@@ -112,6 +113,16 @@ class ReportTable:
     columns: tuple[str, ...]
     rows: list[Row]
     said: list[str] = field(default_factory=list[str])
+
+    def __str__(self) -> str:
+        """Return the first rows and the notes as text."""
+        some = self.rows[:IN_NOTEBOOK]
+        more = [f"the first {len(some)} rows"] if len(self.rows) > len(some) else []
+        return text_table(self.columns, some, "\n".join([*more, *self.said]))
+
+    def _repr_html_(self) -> str:
+        """Return the first rows and the notes as an HTML table, for notebooks."""
+        return html_table(self.columns, self.rows[:IN_NOTEBOOK], below="; ".join(self.said))
 
     def without(self, *names: str) -> ReportTable:
         """Return the table without the named columns."""

@@ -295,6 +295,10 @@ class Selection:
     strata: dict[str, tuple[int, int]] = field(default_factory=dict[str, tuple[int, int]])
     values: Floats | None = None
 
+    def table(self) -> ReportTable:
+        """Return a table of the selected test cases; see :func:`listed`."""
+        return listed(self)
+
 
 def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
     """Select test cases from some frames by a strategy.

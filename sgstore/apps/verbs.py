@@ -1,0 +1,460 @@
+"""Functions behind the methods of :class:`sgstore.query.StoreVerbs`; the command line uses them, too."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.errors import ConfigError, one_store_needed
+from sgstore.lang.library import statement
+from sgstore.model.world import Clip
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from sgstore.collection import Collection
+    from sgstore.draw import Timeline
+    from sgstore.exporters import WrittenClip, WrittenFile
+    from sgstore.matches import Matches
+    from sgstore.store import Fault
+    from sgstore.testsets.coverage import ChosenFrames, Classed, ReportTable
+    from sgstore.testsets.locks import Difference, Lock
+    from sgstore.testsets.selection import Prioritized, PrioritySpec, Selection, SelectionSpec
+
+    Place = str | Path | Store | Collection
+
+_TIME: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min)?")
+_UNIT: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, None: 1.0}
+
+
+def seconds(value: str | float, option: str) -> float:
+    """Return a time in seconds, from a number or a text such as ``2s``, ``500ms`` or ``1min``.
+
+    Raises
+    ------
+    ConfigError
+        The text is not a time.
+    """
+    if not isinstance(value, str):
+        return float(value)
+    match = _TIME.fullmatch(value.strip())
+    if match is None:
+        raise ConfigError(f"{option} {value!r}: expected a time such as 2s, 500ms or 1min")
+    return float(match[1]) * _UNIT[match[2]]
+
+
+def one_store(store: Store | Collection) -> Store:
+    """Return a store; a collection is an error."""
+    if isinstance(store, Store):
+        return store
+    raise one_store_needed(store.place.url)
+
+
+def chosen_frames(
+    store: Store | Collection, query: str, parameters: Mapping[str, object] | None, name: str = ""
+) -> ChosenFrames:
+    """Return the frames that a verb works on: the matches of a query, or all frames."""
+    from sgstore.testsets.coverage import ChosenFrames, frames_of
+
+    name = name or (str(store.file.path) if isinstance(store, Store) else store.place.url)
+    if not query:
+        if parameters:
+            raise ConfigError("--param (parameters) needs a QUERY")
+        return ChosenFrames(name, store)
+    text, values = statement(query, parameters or {})
+    reasons = store.find(text, **values).reasons
+    found = frames_of(store, text, **values)
+    return ChosenFrames(f"{name}:{query}", store, found, reasons, query, parameters or {})
+
+
+def frames_at(place: Place) -> ChosenFrames:
+    """Return the frames of a store, a collection, or a text such as ``STORE:QUERY``."""
+    from sgstore.testsets.coverage import selection_of
+
+    if isinstance(place, str | Path):
+        return selection_of(str(place))
+    return chosen_frames(place, "", None)
+
+
+def select(store: Store | Collection, *, query: str, parameters: Any, **options: Any) -> Selection:
+    """Select test cases; see :meth:`sgstore.query.StoreVerbs.select`."""
+    from sgstore.testsets.selection import select as choose
+
+    spec = selection_spec(**options)  # reject wrong options before the search
+    return choose(chosen_frames(store, query, parameters), spec)
+
+
+def selection_spec(  # noqa: PLR0913 - the options of the command
+    *,
+    minimal: bool,
+    per_class: int | None,
+    rarest: bool,
+    stratify: str,
+    weakest: str,
+    budget: str,
+    clip: str | float,
+    stride: str | float,
+    within: str | float,
+    manoeuvres: Sequence[str],
+    **same: Any,
+) -> SelectionSpec:
+    """Return the specification of a selection from the options of ``select``."""
+    from sgstore.testsets.selection import Budget, SelectionSpec, SelectionUnit, Strategy
+
+    ways = {
+        Strategy.minimal: minimal,
+        Strategy.rarest: rarest,
+        Strategy.stratify: bool(stratify),
+        Strategy.per_class: per_class is not None and not stratify,
+        Strategy.weakest: bool(weakest),
+    }
+    asked = [way for way, wanted in ways.items() if wanted]
+    if len(asked) > 1:
+        known = "--minimal, --per-class, --rarest, --stratify, --weakest"
+        raise ConfigError(f"expected one of {known}")
+    return SelectionSpec(
+        asked[0] if asked else Strategy.every,
+        SelectionUnit(one_of("--unit", same.pop("unit"), SelectionUnit)),
+        seconds(clip, "--clip"),
+        each=per_class or (0 if stratify else 1),
+        by=stratify or weakest,
+        budget=Budget.parse(budget) if budget else None,
+        stride_s=seconds(stride, "--stride") if stride else None,
+        manoeuvres=tuple(manoeuvres),
+        within_s=seconds(within, "--within"),
+        **same,
+    )
+
+
+def one_of(option: str, value: str, known: Iterable[str]) -> str:
+    """Return a value if it is one of the known ones.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if value not in [*known]:
+        raise ConfigError(f"{option} {value!r}: expected one of {', '.join(known)}")
+    return value
+
+
+def prioritize(
+    store: Store | Collection,
+    *,
+    query: str,
+    parameters: Any,
+    outcomes: str | Path | None,
+    learn_outcomes: str | Path | None,
+    learn_from: Place | None,
+    **options: Any,
+) -> Prioritized:
+    """Order test cases; see :meth:`sgstore.query.StoreVerbs.prioritize`."""
+    from sgstore.testsets.coverage import read_outcomes
+    from sgstore.testsets.selection import prioritize as put_in_order
+
+    spec = priority_spec(**options)
+    if spec.by != "learned" and (learn_outcomes or learn_from):
+        raise ConfigError("--learn-outcomes and --learn-from need --order learned")
+    if learn_from is not None and learn_outcomes is None:
+        raise ConfigError("--learn-from needs --learn-outcomes")
+    known = learn_outcomes or outcomes
+    if spec.by == "learned" and known is None:
+        raise ConfigError("--order learned needs --outcomes or --learn-outcomes")
+    training = None if known is None else read_outcomes(known)
+    source = None if learn_from is None else frames_at(learn_from)
+    chosen = chosen_frames(one_store(store), query, parameters)
+    return put_in_order(chosen, spec, training, source)
+
+
+def priority_spec(
+    *, order: str, measures: Sequence[str], clip: str | float, budget: str, unit: str, **same: Any
+) -> PrioritySpec:
+    """Return the specification of an order from the options of ``prioritize``."""
+    from sgstore.testsets.selection import MEASURES, Budget, Priority, PrioritySpec, SelectionUnit
+
+    return PrioritySpec(
+        Priority(one_of("--order", order, Priority)),
+        tuple(measures or MEASURES),
+        SelectionUnit(one_of("--unit", unit, SelectionUnit)),
+        seconds(clip, "--clip"),
+        budget=Budget.parse(budget) if budget else None,
+        **same,
+    )
+
+
+def criticality(
+    store: Store | Collection, *, measures: Sequence[str], most: float | None
+) -> ReportTable:
+    """List measures of encounters; see :meth:`sgstore.query.StoreVerbs.criticality`."""
+    from sgstore.model.criticality import RECORDED, recorded
+    from sgstore.testsets.coverage import ReportTable
+
+    found = recorded(one_store(store), tuple(measures or RECORDED))
+    first = found.columns.index("kind") + 1
+    rows = [
+        row
+        for row in found.values
+        if most is None or (row[first] is not None and row[first] <= most)
+    ]
+    return ReportTable(found.columns, rows)
+
+
+def coverage(  # noqa: PLR0913 - the options of the command
+    store: Store | Collection,
+    *,
+    kind: str,
+    query: str,
+    by: Place | None,
+    slots: str | Path | None,
+    missing: bool,
+    covered: bool,
+    parameters: Any,
+    **how: Any,
+) -> ReportTable:
+    """Measure coverage; see :meth:`sgstore.query.StoreVerbs.coverage`."""
+    from sgstore.testsets import coverage as of
+
+    one_of("kind", kind, KINDS)
+    if by is None and kind in _COMPARING:
+        raise ConfigError(f"the coverage {kind!r} needs frames to compare with: by=STORE")
+    chosen = chosen_frames(store, "" if kind == "spec" else query, parameters)
+    other = [] if by is None else [frames_at(by)]
+    declared = None if slots is None else of.Specification.read(slots)
+    listed = 2 if missing else 1 if covered else 0
+    if declared is not None and kind in {"spec", "combos"}:
+        return of.slot_coverage(chosen, declared, how["k"] if kind == "combos" else 0)[listed]
+    if kind == "spec":
+        return of.specification(chosen, query, how["cells"], *other)[listed]
+    if kind == "sequences":
+        named, within = of.manoeuvres_named(how["manoeuvres"]), seconds(how["within"], "--within")
+        found = of.sequences(chosen, how["k"], *(other or [None]), named, within)
+        return (found.shares, found.covered, found.missing)[listed]
+    options = how["abstraction"], how["window"], how["incomplete"]
+    both = [
+        of.classed(one, *options, declared[0] if declared else None) for one in (chosen, *other)
+    ]
+    if kind == "combos":
+        pairs = of.combos(both[0], options[0], how["k"], *both[1:], of_ego=how["of_ego"])
+        return (pairs.shares, pairs.covered(), pairs.missing)[listed]
+    return _of_classes(kind, both, **how)
+
+
+def _of_classes(kind: str, both: list[Classed], **how: Any) -> ReportTable:
+    """Return a table of classes of frames, of one selection or of two."""
+    from sgstore.testsets import coverage as of
+
+    items = {"classes": of.novel, "frames": of.novel_frames, "clips": of.novel_clips}
+    novel = items[one_of("--items", how["items"], items)]
+    if kind in {"classes", "growth"}:
+        unit = how["unit"]
+        return (
+            of.classes(both[0], unit)
+            if kind == "classes"
+            else of.growth(both[0], unit, how["points"])
+        )
+    if kind == "explain":
+        about = {"by_frame": how["by_frame"], "depth": how["depth"]}
+        return of.explain(*both, how["abstraction"], **about)[how["tree"]]
+    return {"of": of.covered, "venn": of.venn, "novel": novel}[kind](*both)
+
+
+_COMPARING: Final = ("of", "novel", "venn", "explain")
+KINDS: Final = ("classes", "growth", "combos", "sequences", "spec", *_COMPARING)
+"""Kinds of coverage."""
+
+
+def diff(
+    store: Store | Collection,
+    *,
+    other: Place,
+    query: str,
+    by_frame: bool,
+    abstraction: str,
+    parameters: Any,
+) -> ReportTable:
+    """Compare two stores; see :meth:`sgstore.query.StoreVerbs.diff`."""
+    return compared(
+        chosen_frames(store, "", None),
+        frames_at(other),
+        query,
+        parameters or {},
+        by_frame,
+        abstraction,
+    )
+
+
+def compared(
+    a: ChosenFrames,
+    b: ChosenFrames,
+    query: str,
+    parameters: Mapping[str, object],
+    by_frame: bool,  # noqa: FBT001 - named by the callers
+    abstraction: str,
+) -> ReportTable:
+    """Return the differences of two selections of frames: their scenes, or the results of a query."""
+    from sgstore.testsets import diff as differences
+    from sgstore.testsets.coverage import classed
+
+    if query and by_frame:
+        raise ConfigError("expected one of a query and --by-frame")
+    if not query:
+        compare = differences.by_frame if by_frame else differences.scenes
+        return compare(*(classed(one, abstraction) for one in (a, b)))
+    text, values = statement(query, parameters, check=True)
+    results = differences.verdicts if differences.has_checks(text) else differences.matches
+    return results(a.store, b.store, text, values)
+
+
+def timeline(
+    store: Store | Collection,
+    *,
+    queries: Sequence[str],
+    traces: Sequence[str],
+    to: str | Path | None,
+    parameters: Any,
+) -> list[Timeline]:
+    """Return lanes of matches and violations; see :meth:`sgstore.query.StoreVerbs.timeline`."""
+    from sgstore.draw import draw_timelines, timelines
+
+    asked: dict[str, Any] = {}
+    for number, query in enumerate(queries, start=1):
+        short = query if query.isidentifier() else f"match {number}"
+        asked[short] = statement(query, parameters or {}, check=True)
+    found = timelines(one_store(store), asked, traces)
+    if to is not None:
+        draw_timelines(found, Path(to))
+    return found
+
+
+def report(
+    store: Store | Collection,
+    *,
+    query: str,
+    to: str | Path,
+    limit: int,
+    around: str | float,
+    pictures: bool,
+    parameters: Any,
+) -> tuple[int, bool]:
+    """Write a page of matches; see :meth:`sgstore.query.StoreVerbs.report`."""
+    from sgstore.apps.report import report as write
+
+    text, values = statement(query, parameters or {})
+    around_s, most = seconds(around, "--around"), limit or sys.maxsize
+    opened, page = one_store(store), Path(to)
+    return write(
+        opened, text, page, parameters=values, most=most, around_s=around_s, pictures=pictures
+    )
+
+
+def export(  # noqa: PLR0913 - the options of the command
+    store: Store | Collection,
+    *,
+    query: str,
+    to: str | Path,
+    form: str,
+    frames: Sequence[str | int] | None,
+    lock: str | Path | None,
+    before: str | float,
+    after: str | float,
+    labels: Sequence[str],
+    mounts: Sequence[str],
+    channels: Sequence[str],
+    parameters: Any,
+    progress: Callable[[int, int], None] | None = None,
+    on_matches: Callable[[Matches], None] | None = None,
+    **same: Any,
+) -> list[WrittenClip | WrittenFile]:
+    """Export clips; see :meth:`sgstore.query.StoreVerbs.export`."""
+    from sgstore.exporters import (
+        Export,
+        check_folder,
+        exporter_named,
+        labelled,
+        parse_labels,
+        parse_mounts,
+        write_export,
+    )
+
+    exporter_named(form)  # before the search starts
+    check_folder(Path(to))
+    texts, margins = parse_labels(labels), (seconds(before, "--before"), seconds(after, "--after"))
+    same |= {"mounts": parse_mounts(mounts), "channels": tuple(channels), "progress": progress}
+    if sum((bool(query), frames is not None, lock is not None)) > 1:
+        raise ConfigError("expected one of: a QUERY, --frames, --lock")
+    opened, values = one_store(store), dict(parameters or {})
+    told = {"query": query} if query else {"lock": Path(lock).name} if lock else {}
+    if lock is not None:
+        from sgstore.testsets.locks import cases_of
+
+        clips = [Clip(*case[:3]) for case in cases_of(lock, opened)]
+    elif frames is not None:
+        from sgstore.exporters import around_frames
+
+        clips = around_frames(opened, frames, *margins)
+    else:
+        matches = opened.find(query or EVERY_FRAME, **values)
+        if on_matches is not None:
+            on_matches(matches)
+        clips = list(matches.clips(*margins))
+    if not clips:
+        return []
+    order = Export(opened, tuple(clips), provenance=told, **same)
+    return write_export(labelled(order, texts, **values), to, form)
+
+
+EVERY_FRAME: Final = "MATCH () RETURN FRAMES"
+
+
+def lock(
+    store: Store | Collection,
+    *,
+    cases: Selection | Prioritized,
+    to: str | Path | None,
+    split: str,
+    payloads: bool,
+    progress: Callable[[int, int], None] | None = None,
+) -> Lock:
+    """Return the lock of some cases; see :meth:`sgstore.query.StoreVerbs.lock`."""
+    from sgstore.testsets.selection import (
+        Selection,
+        locked_order,
+        locked_selection,
+        parse_split,
+    )
+    from sgstore.testsets.selection import split as split_up
+
+    del store  # the cases have theirs
+    chosen = cases.units.chosen
+    about: dict[str, Any] = {"parameters": dict(chosen.parameters), "payloads": payloads}
+    about |= {"progress": progress}
+    if isinstance(cases, Selection):
+        parts = split_up(cases, parse_split(split)) if split else {}
+        made = locked_selection(cases, chosen.query, parts, **about)
+    else:
+        made = locked_order(cases, chosen.query, **about)
+    if to is not None:
+        made.write(to)
+    return made
+
+
+def verify(
+    store: Store | Collection, *, lock: str | Path | None, payloads: bool | None, strict: bool
+) -> list[Fault] | list[Difference] | list[tuple[str, str, str]]:
+    """Verify a store, or that it has the cases of a lock; see :meth:`sgstore.query.StoreVerbs.verify`."""
+    if lock is not None:
+        from sgstore.testsets.locks import read_lock
+        from sgstore.testsets.locks import verify as compare
+
+        found = compare(read_lock(lock), store, payloads=payloads is not False)
+        return [one for one in found if strict or one.matters]
+    if isinstance(store, Store):
+        from sgstore.store import verify_file
+
+        return verify_file(store.file.path, recordings=bool(payloads)).faults
+    from sgstore.collection import verify as verify_all
+
+    return verify_all(store.place.url).faults
