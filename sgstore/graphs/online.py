@@ -129,6 +129,9 @@ class Frame:
         one.
     recorded : frozenset of str
         Kinds of events that the frame records. Events of other kinds are unknown.
+    topics : dict of str to message
+        Messages of other topics at this time: ``{"/planner": {"state": "STOP"}}``. A pattern uses their fields
+        as ``topic('/planner').state``. A topic that is absent keeps its last message.
     losses : list of (str, str)
         Id and fault of each implausible number, which is treated as missing: ``("7", "length is -4.5 m")``.
 
@@ -140,7 +143,7 @@ class Frame:
     (1, 'hero')
     """
 
-    __slots__ = ("ego", "entities", "events", "losses", "recorded", "time_ns")
+    __slots__ = ("ego", "entities", "events", "losses", "recorded", "time_ns", "topics")
 
     def __init__(self, time_ns: int, ego: str | int | None = None) -> None:
         self.time_ns = int(time_ns)
@@ -148,6 +151,7 @@ class Frame:
         self.entities: list[Entity] = []
         self.events: list[tuple[str, str, str]] = []
         self.recorded = frozenset(EVENT_KINDS)
+        self.topics: dict[str, Any] = {}
         self.losses: list[tuple[str, str]] = []
 
     def __len__(self) -> int:
@@ -169,6 +173,7 @@ class Frame:
             return self
         frame = Frame(self.time_ns, self.ego)
         frame.events, frame.recorded, frame.losses = self.events, self.recorded, self.losses
+        frame.topics = self.topics
         frame.entities = [
             entity.meant(types.get(entity.type_name.lower())) for entity in self.entities
         ]
@@ -880,7 +885,7 @@ class Stepper:
         happened = self._happened(frame)
         with GcPaused():
             found = [self._records.graph(graph, self._outer, known) for graph in graphs]
-            return [replace(one, events=happened) for one in found]
+            return [replace(one, events=happened, topics=frame.topics) for one in found]
 
     def _happened(self, frame: Frame) -> dict[str, list[tuple[int | None, int | None]]]:
         """Return the events of a frame by kind, with node ids. Every kind recorded so far has an entry."""

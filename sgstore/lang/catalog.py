@@ -11,11 +11,12 @@ them in ``map_node``. For the last two, table ``node`` holds the frames in which
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.model.criticality import RECORDED
@@ -120,6 +121,7 @@ class Type(StrEnum):
     whole = "whole number"  # type of a user-defined attribute in a catalog; in expressions it is a number
     text = "text"
     boolean = "boolean"
+    open = "value of any type"  # of a topic that is not known before the frames arrive
     node = "node"
     edge = "edge"
     list = "list"
@@ -199,6 +201,11 @@ class Attribute:
         """
         every = self.own_kinds >= _ENTITIES
         return self.own_kinds | entity_kinds() if every else self.own_kinds
+
+    @property
+    def topic(self) -> TopicValue | None:
+        """Topic with the value. ``None`` means an attribute of another source."""
+        return TopicValue.of(self.table) if self.table else None
 
     @property
     def of_store(self) -> bool:
@@ -781,6 +788,68 @@ class TraceFacts:
     known: float = math.inf
     uneven: int = sum(UNEVEN.values())
     excluded: frozenset[str] = frozenset()
+
+
+TOPIC: Final = ":topic-value "
+"""Start of the names of relations with the values of a topic at frames."""
+
+TOLERANCE_NS: Final = 1_000_000_000
+"""Largest time between a message of a topic and a frame, without ``USING TOLERANCE``; ns."""
+
+_PART: Final = re.compile(r"\[\d+\]|[^.\[]+|\[")
+
+
+@dataclass(frozen=True, slots=True)
+class TopicValue:
+    """Value of a topic at frames: a field, and the message that counts for a frame.
+
+    Attributes
+    ----------
+    topic, field : str
+    rule : str
+        One of :data:`sgstore.lang.topics.RULES`.
+    tolerance_ns : int or None
+        Largest time between message and frame; ``None`` means unlimited.
+    """
+
+    topic: str
+    field: str
+    rule: str = "last"
+    tolerance_ns: int | None = TOLERANCE_NS
+
+    @property
+    def written(self) -> str:
+        """Value as a query writes it: ``topic('/imu', nearest, 0.1s).angular_velocity.z``."""
+        topic = self.topic.replace("\\", "\\\\").replace("'", "\\'")
+        parts = [f"'{topic}'", *([self.rule] if self.rule != "last" else [])]
+        if self.tolerance_ns is None:
+            parts.append("INF")
+        elif self.tolerance_ns != TOLERANCE_NS:
+            parts.append(f"{self.tolerance_ns / 1e9:.9g}s")
+        path = (
+            part if part.endswith("]") else f".{part if part.isidentifier() else f'`{part}`'}"
+            for part in _PART.findall(self.field)
+        )
+        return f"topic({', '.join(parts)}){''.join(path)}"
+
+    @property
+    def relation(self) -> str:
+        """Name of the relation with the values, a row for each frame."""
+        parts = [self.topic, self.field, self.rule, self.tolerance_ns]
+        return TOPIC + json.dumps(parts, ensure_ascii=False)
+
+    @classmethod
+    def of(cls, relation: str) -> Self | None:
+        """Return the value of a relation with this name. ``None`` means another relation."""
+        told = relation.removeprefix(TOPIC)
+        return None if told == relation else cls(*json.loads(told))
+
+
+@lru_cache(4096)
+def topic_attribute(value: TopicValue, kind: Type) -> Attribute:
+    """Return the attribute of frames for a value of a topic."""
+    home = {Home.state: "value"}
+    return Attribute(value.written, kind, home, "field of a topic", table=value.relation)
 
 
 @dataclass(frozen=True, slots=True)

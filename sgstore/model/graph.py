@@ -543,6 +543,8 @@ class SceneGraph:
     events : mapping of str to sequence of pairs
         Events of the frame: kind → pairs of entity and other entity. A missing kind means that the trace does
         not record it.
+    topics : mapping of str to message
+        Online: messages of the frame by topic; see :attr:`sgstore.Frame.topics`.
     around : callable, optional
         Function that returns the graph with all known data around it; see :meth:`known`.
     out_of_world : int
@@ -574,6 +576,7 @@ class SceneGraph:
         compare=False,
         repr=False,
     )
+    topics: Mapping[str, Any] = field(default_factory=dict[str, Any], compare=False, repr=False)
     around: Callable[[], SceneGraph] | None = field(default=None, compare=False, repr=False)
     out_of_world: int = field(default=0, compare=False, repr=False)
     excluded: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
@@ -593,7 +596,7 @@ class SceneGraph:
         if self.around is None:
             return self
         cut = {"out_of_world": self.out_of_world, "excluded": self.excluded}
-        return replace(self.around(), events=self.events, **cut)
+        return replace(self.around(), events=self.events, topics=self.topics, **cut)
 
     def __repr__(self) -> str:
         size = f"{len(self.nodes)} nodes, {len(self.edges)} edges"

@@ -19,11 +19,13 @@ import duckdb
 from duckdb.func import FunctionNullHandling
 
 from sgstore.errors import ConfigError
+from sgstore.lang.catalog import TOPIC
 from sgstore.model.criticality import FIXED_KINDS, KNOWN, RECORDED
 from sgstore.store._interrupts import interrupted
 from sgstore.store._lease import stamp_of
 from sgstore.store._meetings import RecordedValues
 from sgstore.store._schema import INSIDE
+from sgstore.store._topic_relations import show_topic_values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable
@@ -130,9 +132,13 @@ def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> G
 
 
 def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
-    """Add the SQL function ``recorded()`` and the view ``encounters`` to a connection, if SQL uses them."""
+    """Add the function ``recorded()``, the view ``encounters`` and values of topics, if SQL uses them."""
     path = _paths.get(id(connection))
-    if path is None or _WANTED.search(sql) is None:
+    if path is None:
+        return
+    if TOPIC in sql:
+        show_topic_values(connection, path, sql)
+    if _WANTED.search(sql) is None:
         return
     if any(asked.asking is connection for asked in list(_questions.values())):
         return

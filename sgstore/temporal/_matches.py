@@ -32,17 +32,20 @@ def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[in
     needs : iterable of Need
     """
     found: dict[int, list[str]] = {}
-    every = frozenset(trace.trace_id for trace in catalog.traces)
+    names = {trace.trace_id: trace.name for trace in catalog.traces}
+    every = frozenset(names)
     for need in needs:
         key = catalog.name, need.kinds, need.attribute, need.event, need.lanes
         if key not in catalog.lacks:
-            catalog.lacks[key] = every - _knowing(file, every, need)
+            catalog.lacks[key] = every - _knowing(file, catalog, every, need)
         for trace in catalog.lacks[key]:
-            found.setdefault(trace, []).append(need.reason)
+            found.setdefault(trace, []).append(need.reason_in(names[trace]))
     return {trace: "; ".join(dict.fromkeys(reasons)) for trace, reasons in found.items()}
 
 
-def _knowing(file: StoreFile, every: frozenset[int], need: Need) -> frozenset[int]:
+def _knowing(
+    file: StoreFile, catalog: Catalog, every: frozenset[int], need: Need
+) -> frozenset[int]:
     """Return the ids of the traces that have the required data, or have no entities that need it."""
     if need.event:
         return frozenset(trace for (trace,) in file.rows(told_events(need.event)).values)
@@ -50,6 +53,9 @@ def _knowing(file: StoreFile, every: frozenset[int], need: Need) -> frozenset[in
         return frozenset(trace for (trace,) in file.rows(told_lanes(need.lanes)).values)
     if need.kinds is None:
         assert need.attribute is not None  # noqa: S101 - of a frame something is known
+        if (value := need.attribute.topic) is not None:
+            topic = catalog.topics.get(value.topic)
+            return topic.traces if topic is not None else frozenset()
         (word,) = need.attribute.columns.values()
         rows = file.rows(TOLD_WEATHER, [f"(^|, ){word}=[^,]"]).values
         return frozenset(trace for (trace,) in rows)

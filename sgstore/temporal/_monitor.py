@@ -35,6 +35,7 @@ from sgstore.temporal._sequence_monitor import (
     sequence_monitor,
 )
 from sgstore.temporal._signal_state import StreamClock
+from sgstore.temporal._topic_values import TopicMemory, topics_of
 from sgstore.temporal._valuation import NodeNames, QueryCache
 
 if TYPE_CHECKING:
@@ -265,6 +266,7 @@ class Monitor:
         facts = TraceFacts(0, trace, "", answers, reach)
         catalog = Catalog(traces=(facts,), online=True)
         checks, queries = _bound(text, catalog, parameters or {})
+        self._topics = TopicMemory(topics_of([*checks, *queries]))
         self._egos: list[str] = []
         self._questions: list[QueryCache] = []
         self._scopes: list[tuple[int, bool]] = []
@@ -281,14 +283,14 @@ class Monitor:
             if not reason:
                 ego, questions = self._of_scope(check.ego, world=check.world)
                 watch = CheckMonitor(check, questions, self._pulse, compat=sgsm_compat)
-                self._watches.append((ego, watch, _PendingEvents(of_check(check))))
+                self._watches.append((ego, watch, _PendingEvents(of_check(check), trace)))
             else:
                 self._unknown[check.name] = reason
         self._follows: list[tuple[int, SequenceMonitor, _PendingEvents]] = []
         for name, query in zip(_names(called, len(queries)), queries, strict=True):
             if query.relations <= answers or query.unknown_is_false:
                 ego, questions = self._of_scope(query.ego, world=query.world)
-                waiting = _PendingEvents(of_query(query) if query.steps else ())
+                waiting = _PendingEvents(of_query(query) if query.steps else (), trace)
                 follow = sequence_monitor(name, query, questions, self._pulse)
                 self._follows.append((ego, follow, waiting))
         told = (follow.name for _, follow, _ in self._follows)
@@ -389,6 +391,7 @@ class Monitor:
 
     def _view(self, graph: SceneGraph, here: FrameTime, number: int | None) -> FrameView:
         frame = {"id": here.seq, "seq": here.seq, "time_ns": here.time_ns, "t": here.t}
+        frame |= self._topics.values(here.time_ns, graph.topics)
         trace = {"id": 0, "name": self.trace}
         if number is None:
             return FrameView(graph, frame, trace)
@@ -530,6 +533,8 @@ class _PendingEvents:
     Parameters
     ----------
     needs : iterable of Need
+    trace : str
+        Name of the trace, for the reason.
 
     Attributes
     ----------
@@ -537,8 +542,8 @@ class _PendingEvents:
         Missing data of the trace as text. Entities that never appear need no data.
     """
 
-    def __init__(self, needs: Iterable[Need]) -> None:
-        self._open = list(needs)
+    def __init__(self, needs: Iterable[Need], trace: str) -> None:
+        self._open, self._trace = list(needs), trace
         self._met: set[Need] = set()
         self._events: list[MonitorEvent] = []
         self.reason = ""
@@ -551,7 +556,7 @@ class _PendingEvents:
             return found
         self._open = [need for need in self._open if not self._told(need, people)]
         left = (n for n in self._open if n.attribute is None or n.kinds is None or n in self._met)
-        self.reason = "; ".join(dict.fromkeys(need.reason for need in left))
+        self.reason = "; ".join(dict.fromkeys(need.reason_in(self._trace) for need in left))
         self._events += found
         if self.reason:
             return []
@@ -564,7 +569,8 @@ class _PendingEvents:
         if need.lanes:
             return people.has_lanes(need.lanes)
         if need.kinds is None:
-            return False  # unknown while a trace runs
+            value = need.attribute and need.attribute.topic
+            return value is not None and people.has_topic(value.topic)  # weather stays unknown
         present = people.of(need.kinds)
         if need.attribute is None:
             return bool(present)

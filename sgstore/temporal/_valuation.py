@@ -17,6 +17,7 @@ from sgstore.base.json_text import shortest
 from sgstore.lang.memory import Binding, ScopeSearch, StageSearch, expression
 from sgstore.lang.sql import unnumbered_text
 from sgstore.model.vocabulary import RELATIONS
+from sgstore.temporal._topic_values import message_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -225,6 +226,10 @@ class NodeNames:
     def records(self, kind: str) -> bool:
         """True if the trace records events of a kind."""
         return kind in self._view.graph.events
+
+    def has_topic(self, topic: str) -> bool:
+        """True if the frame has a message of a topic."""
+        return message_of(self._view.graph.topics, topic) is not None
 
     def has_lanes(self, what: str) -> bool:
         """True if the map has values for lanes: ``ways``, ``curvature`` or ``slope``."""

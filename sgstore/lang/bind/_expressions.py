@@ -9,7 +9,7 @@ from sgstore.lang import ir as b
 from sgstore.lang.bind._datasets import CLASSES, abstraction_named, seen_in
 from sgstore.lang.bind._possible import check_comparison
 from sgstore.lang.bind._precision import chosen, compared
-from sgstore.lang.bind._symbols import RESERVED, Binders, SymbolTable, call_hint
+from sgstore.lang.bind._symbols import RESERVED, Binders, SymbolTable, call_hint, of_type
 from sgstore.lang.bind._text_tests import text_test
 from sgstore.lang.catalog import (
     EDGE_ALIASES,
@@ -318,7 +318,11 @@ def _between(operands: tuple[s.Expression, ...], names: SymbolTable) -> str:
 
 def _comparison(e: s.Comparison, names: SymbolTable) -> b.Bound:
     left, right = names.bind(e.left), names.bind(e.right)
+    left, right = of_type(left, right.type), of_type(right, left.type)
+    if left.type is right.type is Type.open and e.word in _ORDERED:
+        left, right = of_type(left, Type.number), of_type(right, Type.number)
     if e.word in TEXT_TESTS:
+        left = of_type(left, Type.text)
         return text_test(e, left, right, names)
     _check_sides(e, left, right, names)
     if left.type is not right.type:
@@ -455,6 +459,7 @@ def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
         if choices.type is Type.text and not isinstance(choices, b.Value):
             hint = "write x.name CONTAINS 'a' to search in a text"
         names.session.refuse("expected a list after IN", e.choices.span, hint)
+    operand = of_type(operand, choices.items[0].type if choices.items else Type.text)
     for item in choices.items:
         if item.type is Type.null:
             names.session.refuse("NULL cannot be in a list", e.choices.span)

@@ -10,7 +10,7 @@ from sgstore.lang.bind._aggregates import AGGREGATES, aggregate, is_aggregate
 from sgstore.lang.bind._datasets import CLASSES, abstraction_named, class_count
 from sgstore.lang.bind._in_range import in_range
 from sgstore.lang.bind._kinds import on_lanes
-from sgstore.lang.bind._symbols import Symbol, SymbolTable
+from sgstore.lang.bind._symbols import Symbol, SymbolTable, of_type
 from sgstore.lang.bind._temporal import course
 from sgstore.lang.catalog import NODE_ATTRIBUTES, PAIR_NAMES, Type
 from sgstore.lang.library import pattern_named, patterns, predicates
@@ -297,6 +297,8 @@ def _extreme(e: s.Call, names: SymbolTable) -> b.Operation:
 def _coalesce(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 1, 100, names)
     found = tuple(names.bind(argument) for argument in e.arguments)
+    types = {f.type for f in found} - {Type.null, Type.open}
+    found = tuple(of_type(one, next(iter(types), Type.open)) for one in found)
     types = {f.type for f in found} - {Type.null}
     if len(types) > 1 or types & {Type.node, Type.list}:
         names.session.refuse("coalesce() takes values of one type", e.span)
@@ -337,7 +339,7 @@ def _path_function(e: s.Call, names: SymbolTable) -> b.Bound:
 
 def _text_function(e: s.Call, names: SymbolTable) -> b.Operation:
     _expect(e, 1, 1, names)
-    found = names.bind(e.arguments[0])
+    found = of_type(names.bind(e.arguments[0]), Type.text)
     if found.type is not Type.text:
         names.session.refuse(f"{e.name}() takes a text", e.arguments[0].span)
     return b.Operation(normalize_name(e.name), (found,), Type.text)
@@ -352,6 +354,13 @@ def _class_count(e: s.Call, names: SymbolTable) -> b.FrameAttribute:
         names.session.refuse(f"{e.name}() takes the name of an abstraction", e.arguments[0].span)
     abstraction = abstraction_named(found.value, e.arguments[0].span, names.session)
     return class_count(abstraction, part=names.session.part)
+
+
+def _whole_message(e: s.Call, names: SymbolTable) -> b.Bound:
+    reason = "a message of a topic is not a value"
+    names.session.refuse(
+        reason, e.span, "write one of its fields: topic('/imu').angular_velocity.z"
+    )
 
 
 def _after_in(e: s.Call, names: SymbolTable) -> b.Bound:
@@ -406,6 +415,7 @@ _FUNCTIONS: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     "known": _known,
     "length": _path_function,
     "nodes": _path_function,
+    "topic": _whole_message,
     "ttclane": _ttc_lane,
     "type": _type,
 }

@@ -17,7 +17,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
-from sgstore.lang.catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit
+from sgstore.lang.catalog import (
+    NODE_ATTRIBUTES,
+    Attribute,
+    DisplayUnit,
+    TopicValue,
+    Type,
+    topic_attribute,
+)
 from sgstore.lang.ir import Bound, NodeAttribute, PairNumber
 from sgstore.model.criticality import RECORDED
 from sgstore.model.pair_numbers import COURSES, WAYS, columns_needed
@@ -89,6 +96,11 @@ class Need:
             return "it has no ego" if every else "its ego is of another kind, or it has none"
         of = "" if self.kinds is None else f" of {self.node}"
         return f"{self.attribute.name}{of} never has a value"
+
+    def reason_in(self, trace: str) -> str:
+        """Message that explains which required data the trace with this name lacks."""
+        value = self.attribute and self.attribute.topic
+        return f"trace {trace} has no topic {value.topic}" if value else self.reason
 
 
 def of_check(check: BoundCheck) -> tuple[Need, ...]:
@@ -219,6 +231,9 @@ def _needed(  # noqa: C901, PLR0911, PLR0912 - a case each
             DisplayUnit.clock,
         }:
             return {Need("", None, attribute)}
+        case b.FrameAttribute(attribute=attribute) if (value := attribute.topic) is not None:
+            of_any_field = topic_attribute(TopicValue(value.topic, ""), Type.open)
+            return {Need("", None, of_any_field)}
         case b.Happened(kind=kind, table=()):
             return {Need("", None, None, kind)}
         case b.BlockValue(scope=scope, value=value):

@@ -14,6 +14,7 @@ from sgstore.lang.bind._recorded_events import happens
 from sgstore.lang.bind._stages import name_path
 from sgstore.lang.bind._symbols import RESERVED, THE_EGO, Binders, Session, Symbol, SymbolTable
 from sgstore.lang.bind._temporal import refuse_window, tense, timespan
+from sgstore.lang.bind._topics import topic_field
 from sgstore.lang.bind._world_scope import whole_block
 from sgstore.lang.catalog import Type
 from sgstore.lang.syntax import said_of
@@ -79,6 +80,7 @@ ALL_BINDERS: Final[Binders] = {
     s.HappensExpression: happens,
     s.OverExpression: over_match,
     s.Temporal: tense,
+    s.TopicExpression: topic_field,
     s.FrameWindow: refuse_window,
 }
 """Binder of each kind of expression."""

@@ -21,6 +21,7 @@ from sgstore.lang.bind._sequences import bind_sequence
 from sgstore.lang.bind._stages import StageBinder
 from sgstore.lang.bind._symbols import ScopeBuilder, Session, SymbolTable
 from sgstore.lang.bind._temporal import settled
+from sgstore.lang.bind._topics import tolerance_of
 from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import normalize_name
 
@@ -41,6 +42,7 @@ SETTINGS: Final = (
     "END",
     "SCOPE",
     "RANGE",
+    "TOLERANCE",
 )
 """Settings allowed after ``USING``."""
 
@@ -248,6 +250,8 @@ def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) ->
             found.ego = value
         elif name == "range":
             found.range = _metres(value, setting, session)
+        elif name == "tolerance":
+            session.tolerance_ns = tolerance_of(value, setting.span, session)
         elif name == "dataset":
             asked(value, setting.span, session)
         elif name == "abstraction":

@@ -14,8 +14,17 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang.bind._in_range import scopes_of
-from sgstore.lang.catalog import PAIR_NAMES, RECORDED_OWN, Type
-from sgstore.lang.ir import Bound, Edge, Kinds, Node, Scope, ego_kinds
+from sgstore.lang.catalog import PAIR_NAMES, RECORDED_OWN, TOLERANCE_NS, Type, topic_attribute
+from sgstore.lang.ir import (
+    Bound,
+    Edge,
+    FrameAttribute,
+    Kinds,
+    Node,
+    Scope,
+    ego_kinds,
+    with_operands,
+)
 from sgstore.lang.library import predicates
 from sgstore.lang.syntax import condition_hint, hint_at, variable_hint
 from sgstore.lang.syntax import tree as s
@@ -26,7 +35,7 @@ if TYPE_CHECKING:
 
     from sgstore.errors import TextSpan
     from sgstore.lang import ir as b
-    from sgstore.lang.catalog import Catalog, TableFacts, TraceFacts
+    from sgstore.lang.catalog import Catalog, TableFacts, TopicFacts, TraceFacts
     from sgstore.lang.syntax.tree import Define
 
 
@@ -84,6 +93,10 @@ class Session:
         Traces of the store.
     own : mapping of str to Type
         User-defined attributes, by name.
+    topics : mapping of str to TopicFacts
+        Topics of the recordings, by name.
+    tolerance_ns : int or None
+        Largest time between a message and a frame, if ``topic()`` has none; ``None`` means unlimited.
     part : bool
         True if the store is a part of a collection: see :attr:`sgstore.lang.catalog.Catalog.part`.
     online : bool
@@ -123,6 +136,8 @@ class Session:
     traces: tuple[TraceFacts, ...] = ()
     own: Mapping[str, Type] = field(default_factory=dict[str, Type])
     own_edges: Mapping[str, Type] = field(default_factory=dict[str, Type])
+    topics: Mapping[str, TopicFacts] = field(default_factory=dict[str, "TopicFacts"])
+    tolerance_ns: int | None = TOLERANCE_NS
     part: bool = False
     online: bool = False
     dropped: set[str] = field(default_factory=set[str])
@@ -141,7 +156,7 @@ class Session:
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
         self.own = {**RECORDED_OWN, **catalog.own}
         self.own_edges, self.part = catalog.own_edges, catalog.part
-        self.online = catalog.online
+        self.online, self.topics = catalog.online, catalog.topics
         others = catalog.names and catalog.names.get("relation")
         self.strict = not (catalog.part or others or any(one.reach is None for one in self.traces))
 
@@ -365,7 +380,7 @@ class SymbolTable:
         QueryError
             The expression has another type.
         """
-        found = self.bind(expression)
+        found = of_type(self.bind(expression), Type.boolean)
         if found.type not in {Type.boolean, Type.null}:
             written = self.session.text[expression.span.start : expression.span.end]
             self.session.refuse(
@@ -383,7 +398,7 @@ class SymbolTable:
         QueryError
             The expression has another type.
         """
-        found = self.bind(expression)
+        found = of_type(self.bind(expression), Type.number)
         if found.type is not Type.number:
             named = expression.name if isinstance(expression, s.Variable) else ""
             self.session.refuse(
@@ -397,6 +412,17 @@ class SymbolTable:
         """Return all variable names usable at this place of a query, without ``frame``, ``trace``, ``env``."""
         outside = self.parent.visible() if self.parent else {THE_EGO}
         return outside | set(self.meanings) | set(self.aliases)
+
+
+def of_type(value: Bound, kind: Type) -> Bound:
+    """Return a value of an unknown topic with the type that its place requires; others are unchanged."""
+    if value.type is not Type.open or kind in {Type.open, Type.null}:
+        return value
+    if isinstance(value, FrameAttribute):
+        topic = value.attribute.topic
+        assert topic is not None  # noqa: S101 - other attributes have a type
+        return FrameAttribute(topic_attribute(topic, kind), kind)
+    return replace(with_operands(value, lambda part: of_type(part, kind)), type=kind)
 
 
 def call_hint(name: str) -> str | None:

@@ -120,7 +120,7 @@ def course(e: s.Call, names: SymbolTable) -> b.Bound:
 def _previous(e: s.Call, names: SymbolTable) -> b.SignalCall:
     value = names.bind(e.arguments[0])
     _refuse_nested(e, value, names)
-    if value.type not in {Type.number, Type.text, Type.boolean}:
+    if value.type not in {Type.number, Type.text, Type.boolean, Type.open}:
         names.session.refuse(f"prev() takes a value, not a {value.type.value}", e.arguments[0].span)
     return b.SignalCall("prev", value, type=value.type)
 

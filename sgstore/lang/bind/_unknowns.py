@@ -230,7 +230,7 @@ def _unknown(value: b.Bound) -> Iterable[b.Bound]:  # noqa: C901 - a case each
             if parts:
                 yield b.all_of(b.any_of(parts), _is_null(value))
         case b.FrameAttribute(attribute=attribute):
-            if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
+            if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock} or attribute.topic:
                 yield _is_null(value)
         case b.Happened(table=()):
             yield _is_null(value)

@@ -86,6 +86,9 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             name = attribute.name
             if b.is_passed_on(expression):
                 return lambda at: at.passed[name]
+            if attribute.topic is not None and attribute.type in _OWN:
+                of = _OWN[attribute.type]
+                return lambda at: of(at.view.frame.get(name))
             return lambda at: at.view.frame.get(name)
         case b.TraceAttribute(attribute=attribute):
             if attribute is COMPUTED:

@@ -251,7 +251,8 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
     }:
         return _looked_up(attribute, frame)
     if attribute.table:
-        value = as_type(f'"u".{quoted(column)}', attribute.type)
+        value = f'"u".{quoted(column)}'
+        value = value if attribute.type is Type.open else as_type(value, attribute.type)
         on = [f'"u"."frame_id" = {frame}."frame_id"']
         rows = Select([f"any_value({value})"], [f'{quoted(attribute.table)} AS "u"'], on)
         return f"({rows.text()})"

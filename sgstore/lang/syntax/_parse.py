@@ -203,6 +203,8 @@ _OPERATORS: Final = frozenset(
     | {"STARTS", "ENDS", "CONTAINS", "EQUAL", "UNTIL_OP", "UNTIL_LINK", "NOT", "OVER"}
 )
 _EDGES: Final = frozenset({"BARE_RIGHT", "BARE_LEFT", "BARE_ANY", "_OPEN", "_OPEN_LEFT"})
+_OF_TOPICS: Final = frozenset({"FIELD", "SPAN", "_ITEM"})
+"""Terminals of topics only. Error messages do not list them."""
 _LATER: Final = frozenset(
     {
         "HOLDS",
@@ -289,6 +291,7 @@ def _listed(machine: Tables, names: list[str]) -> str:
     Operators form a group, as do starts of values.
     """
     left = set(names) - _LATER or set(names)
+    left -= _OF_TOPICS
     said: list[str] = []
     if "RETURN" in left:  # a second MATCH is allowed wherever RETURN is
         left -= {"MATCH"}

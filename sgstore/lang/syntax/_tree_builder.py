@@ -7,6 +7,7 @@ returns a part of the syntax tree. Signs and keywords are not passed as children
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from functools import partial
@@ -98,8 +99,14 @@ def rule_variable(span: TextSpan, children: Children) -> s.Variable:
     return s.Variable(children[0].text, span)
 
 
-def rule_attribute(span: TextSpan, children: Children) -> s.AttributeOf:
+def rule_attribute(span: TextSpan, children: Children) -> s.AttributeOf | s.TopicExpression:
     owner, name = children
+    field = name.text.strip("`")
+    if isinstance(owner, s.TopicExpression) or _is_topic(owner):
+        return _topic_field(owner, field, TextSpan(name.span.start, span.end), span)
+    if name.name == "FIELD":
+        reason = f"only fields of a topic are written as `{field}`"
+        raise BuildError(reason, name.span, f"topic('/name').`{field}`")
     if not isinstance(owner, s.Variable):
         inner = owner.name if isinstance(owner, s.AttributeOf) else ""
         hint = said_of("attributes", inner) or "call a function for a value: abs(x), lower(x)"
@@ -109,6 +116,51 @@ def rule_attribute(span: TextSpan, children: Children) -> s.AttributeOf:
             f"only variables have attributes; '.{name.text}' is not allowed here", hint=hint
         )
     return s.AttributeOf(owner, name.text, span)
+
+
+def rule_list_item(span: TextSpan, children: Children) -> s.TopicExpression:
+    owner, index = children
+    if not isinstance(owner, s.TopicExpression):
+        hint = "write topic('/name').values[0]"
+        raise BuildError("only lists in the messages of a topic have elements", hint=hint)
+    return _topic_field(owner, _whole(index), TextSpan(owner.path_span.start, span.end), span)
+
+
+def _is_topic(owner: s.Expression) -> bool:
+    return isinstance(owner, s.Call) and normalize_name(owner.name) == "topic"
+
+
+def _topic_field(
+    owner: s.TopicExpression | s.Call, part: str | int, place: TextSpan, span: TextSpan
+) -> s.TopicExpression:
+    """Return the syntax tree of a field of a topic, or of a part of a field."""
+    if isinstance(owner, s.TopicExpression):
+        place = TextSpan(owner.path_span.start, place.end)
+        return replace(owner, path=(*owner.path, part), path_span=place, span=span)
+    if not owner.arguments or not isinstance(owner.arguments[0], s.Constant | s.Parameter):
+        raise BuildError("topic() takes the name of a topic", owner.span, _TOPIC_EXAMPLE)
+    topic, *further = owner.arguments
+    rule, tolerance = "last", None
+    if further and isinstance(word := further[0], s.Variable) and word.name.upper() != "INF":
+        rule, further = word.name.lower(), further[1:]
+    if rule not in TOPIC_RULES:
+        known = ", ".join(TOPIC_RULES)
+        raise BuildError(f"unknown rule '{rule}' of topic(); expected {known}", owner.span)
+    if further:
+        tolerance = further.pop(0)
+        if isinstance(tolerance, s.Variable) and tolerance.name.upper() == "INF":
+            tolerance = s.Duration(math.inf, "s", tolerance.span)
+    right = tolerance is None or isinstance(tolerance, s.Parameter)
+    timed = isinstance(tolerance, s.Duration) and tolerance.unit != "frames"
+    if further or not (right or timed):
+        reason = "topic() takes a name, a rule and a time"
+        raise BuildError(reason, owner.span, _TOPIC_EXAMPLE)
+    return s.TopicExpression(topic, (part,), rule, tolerance, place, span)  # type: ignore[arg-type]
+
+
+TOPIC_RULES: Final = ("last", "nearest", "linear")
+"""Rules that choose the message of a topic for a frame."""
+_TOPIC_EXAMPLE: Final = "topic('/imu', nearest, 0.1s).linear_acceleration.z"
 
 
 def rule_attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:

@@ -87,6 +87,32 @@ class Call:
 
 
 @dataclass(frozen=True, slots=True)
+class TopicExpression:
+    """Field of a recorded message in a query: ``topic('/imu', nearest, 0.1s).linear_acceleration.z``.
+
+    Attributes
+    ----------
+    topic : Constant or Parameter
+    path : tuple of str or int
+        Names of fields, and indices of list elements.
+    rule : str
+        ``last``, ``nearest`` or ``linear``.
+    tolerance : Duration, Parameter or None
+        Largest time between message and frame. ``None`` means the setting of the statement.
+    path_span : TextSpan
+        Place of the path.
+    span : TextSpan
+    """
+
+    topic: Constant | Parameter
+    path: tuple[str | int, ...]
+    rule: str
+    tolerance: Duration | Parameter | None
+    path_span: TextSpan
+    span: TextSpan
+
+
+@dataclass(frozen=True, slots=True)
 class CountAll:
     """Query expression ``COUNT(*)``."""
 
@@ -229,6 +255,7 @@ Expression = (
     | Variable
     | AttributeOf
     | Call
+    | TopicExpression
     | CountAll
     | ListOf
     | Logic

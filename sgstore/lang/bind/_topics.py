@@ -1,0 +1,103 @@
+"""Binder of ``topic('/imu').linear_acceleration.z``: the value of a recorded topic at a frame."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TYPE_CHECKING, Final
+
+from sgstore.errors import QueryNameError, TextSpan
+from sgstore.lang import ir as b
+from sgstore.lang.bind._expressions import parameter
+from sgstore.lang.bind._temporal import length
+from sgstore.lang.catalog import TopicValue, Type, topic_attribute
+from sgstore.lang.syntax import tree as s
+
+if TYPE_CHECKING:
+    from typing import NoReturn
+
+    from sgstore.lang.bind._symbols import Session, SymbolTable
+    from sgstore.lang.topics import TopicError
+
+_TIME: Final = re.compile(r"(\d+(?:\.\d+)?)(ms|s|min)?", re.IGNORECASE)
+
+
+def topic_field(e: s.TopicExpression, names: SymbolTable) -> b.FrameAttribute:
+    """Return the bound value of a field of a topic at the frame.
+
+    Raises
+    ------
+    QueryNameError
+        No such topic, or no such field.
+    QueryError
+        The topic cannot be decoded, or the field has several values.
+    """
+    session = names.session
+    topic = e.topic.value if isinstance(e.topic, s.Constant) else parameter(e.topic, names)
+    if not isinstance(topic, str):
+        session.refuse("topic() takes the name of a topic, a text", e.topic.span)
+    topic, path, kind = _of_recordings(topic, _dotted(e.path), e, session)
+    if kind is Type.list:
+        session.refuse(
+            f"field {path} of {topic} has several values", e.path_span, f"one of them: {path}[0]"
+        )
+    if e.rule == "linear" and kind not in {Type.number, Type.open}:
+        session.refuse(
+            f"only numbers can be interpolated, and {path} is a {kind.value}",
+            e.span,
+            f"write topic('{topic}', nearest)",
+        )
+    tolerance = session.tolerance_ns
+    if isinstance(e.tolerance, s.Duration) and math.isinf(e.tolerance.amount):
+        tolerance = None
+    elif e.tolerance is not None:
+        given = length(e.tolerance, names)
+        if given.frames:
+            session.refuse("the tolerance of topic() is a time such as 0.1s", e.tolerance.span)
+        tolerance = given.amount
+    value = TopicValue(topic, path, e.rule, tolerance)
+    return b.FrameAttribute(topic_attribute(value, kind), kind)
+
+
+def _of_recordings(
+    topic: str, path: str, e: s.TopicExpression, session: Session
+) -> tuple[str, str, Type]:
+    """Return the names of the topic and of the field as the recordings spell them, and the type."""
+    from sgstore.lang.topics import TopicError, field_of, topic_of  # imports numpy
+
+    try:
+        if topic not in session.topics and (session.online or session.part):
+            known = f"/{topic}" in session.topics
+            if not known and (session.part or not session.topics):
+                return topic, path, Type.open  # other parts or later frames may have it
+        facts = topic_of(session.topics, topic)
+    except TopicError as error:
+        _refuse(error, e.topic.span, session)
+    try:
+        field = field_of(facts, path)
+    except TopicError as error:
+        if facts.refused:
+            session.refuse(f"{error.reason}: {error.hint}", e.topic.span)
+        _refuse(error, e.path_span, session)
+    return facts.name, field.name, field.type
+
+
+def _refuse(error: TopicError, span: TextSpan, session: Session) -> NoReturn:
+    raise QueryNameError(error.reason, text=session.text, span=span, hint=error.hint) from None
+
+
+def tolerance_of(value: str, span: TextSpan, session: Session) -> int | None:
+    """Return the time of ``USING TOLERANCE``; ns. ``None`` means unlimited."""
+    if value.upper() == "INF":
+        return None
+    found = _TIME.fullmatch(value)
+    if found is None:
+        session.refuse(
+            f"USING TOLERANCE {value} is not a time", span, "USING TOLERANCE 0.5s, or INF"
+        )
+    return min(s.Duration(float(found[1]), (found[2] or "s").lower(), span).ns, 2**62)
+
+
+def _dotted(path: tuple[str | int, ...]) -> str:
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    return "".join(parts).removeprefix(".")

@@ -1,0 +1,92 @@
+"""Values of topics in an online monitor, from the messages of frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING, Any
+
+from sgstore.lang.ir import FrameAttribute
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from sgstore.lang.catalog import TopicValue
+
+
+def topics_of(part: object) -> Iterator[TopicValue]:
+    """Yield the values of topics in a part of a bound query or check."""
+    if isinstance(part, FrameAttribute):
+        if (value := part.attribute.topic) is not None:
+            yield value
+    elif isinstance(part, Mapping):
+        yield from topics_of([*part.values()])  # pyright: ignore[reportUnknownArgumentType]
+    elif isinstance(part, tuple | list | frozenset):
+        for item in part:  # pyright: ignore[reportUnknownVariableType]
+            yield from topics_of(item)  # pyright: ignore[reportUnknownArgumentType]
+    elif is_dataclass(part):
+        for one in fields(part):
+            yield from topics_of(getattr(part, one.name))
+
+
+class TopicMemory:
+    """Last messages of the topics that a monitor needs.
+
+    Parameters
+    ----------
+    asked : iterable of TopicValue
+
+    Attributes
+    ----------
+    asked : tuple of TopicValue
+    """
+
+    def __init__(self, asked: Iterable[TopicValue]) -> None:
+        self.asked = tuple(dict.fromkeys(asked))
+        self._last: dict[str, tuple[int, Any]] = {}
+
+    def values(self, time_ns: int, messages: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the value of each field at a frame, by its text in a query. Unknown values are ``None``.
+
+        Parameters
+        ----------
+        time_ns : int
+            Time of the frame.
+        messages : mapping of str to message
+            Messages of the frame by topic. A replayed recording adds the values themselves, by text.
+        """
+        found: dict[str, Any] = {}
+        for topic in {one.topic for one in self.asked}:
+            if (message := message_of(messages, topic)) is not None:
+                self._last[topic] = time_ns, message
+        for one in self.asked:
+            if one.written in messages:
+                found[one.written] = messages[one.written]
+            elif one.topic in self._last:
+                since, message = self._last[one.topic]
+                limit = 0 if one.rule == "linear" else one.tolerance_ns
+                if limit is None or 0 <= time_ns - since <= limit:
+                    found[one.written] = _field(message, one.field)
+        return found
+
+
+def message_of(messages: Mapping[str, Any], topic: str) -> Any:
+    """Return the message of a topic. The slash before its name may be missing in the query."""
+    return messages.get(topic, messages.get(f"/{topic}"))
+
+
+def _field(message: Any, path: str) -> Any:
+    """Return a field of a message, which is a mapping or an object. ``None`` means no such field."""
+    for part in path.replace("[", ".[").split("."):
+        if part.startswith("["):
+            index = int(part[1:-1])
+            message = message[index] if index < len(message) else None
+        elif isinstance(message, Mapping):
+            message = message.get(part)  # pyright: ignore[reportUnknownMemberType]
+        else:
+            message = getattr(message, part, None)
+        if message is None:
+            return None
+    unknown = isinstance(message, float) and math.isnan(message)
+    return None if unknown else message
