@@ -127,6 +127,14 @@ def test_a_word_that_is_not_known_is_refused_with_those_that_are(
         Frame(0).add("a", x=0.0, y=0.0, **{"kind": "car", **wrong})
 
 
+def test_other_values_than_texts_become_texts() -> None:
+    frame = Frame(0)
+    frame.add(7, "car", 0.0, 0.0, type_name=[], subkind=3, map_ref=12)  # type: ignore[arg-type]
+    (entity,) = frame.entities
+    texts = entity.ident, entity.type_name, entity.subkind, entity.map_ref
+    assert texts == ("7", "[]", "3", "12")
+
+
 @pytest.mark.parametrize(
     ("frames", "message"),
     [

@@ -296,7 +296,7 @@ def test_infinite_numbers_of_a_damaged_message_are_missing_without_a_warning_of_
 ) -> None:
     with Stack(tmp_path / "a.mcap") as stack:
         for t in (0.0, 0.1):
-            stack.pose(t, 0.0, 0.0)
+            stack.pose(t, 0.0, 0.0, v=(np.inf, 0.0, 0.0), a=(np.inf, 0.0, 0.0))
             stack.objects(t, [thing("car", 20.0, 1.0, a=(np.inf, 0.0), v=(np.inf, 0.0))])
     with open_trace(tmp_path / "a.mcap") as trace:
         (block,) = trace.blocks()

@@ -147,7 +147,7 @@ def product(a: Floats, b: Floats) -> Floats:
 
 
 def rotated(turn: Floats, vectors: Floats) -> Floats:
-    """Rotate vectors (3,) or (n, 3) by a quaternion."""
+    """Rotate vectors (3,) or (n, 3) by a quaternion. An infinite vector becomes NaN."""
     x, y, z, w = turn.tolist()
     matrix = np.array(
         [
@@ -156,7 +156,8 @@ def rotated(turn: Floats, vectors: Floats) -> Floats:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return vectors @ matrix.T
+    with np.errstate(invalid="ignore", over="ignore"):
+        return vectors @ matrix.T
 
 
 def angles(turn: Floats) -> tuple[float, float, float]:
