@@ -359,16 +359,50 @@ class Matches(Tabular):
             return ()
         from sgstore.lang.help import absent_part
 
-        def exists(scope: Scope) -> bool:
-            query = replace(
-                compiled.bound, scope=scope, result=Result(limit=1), steps=(), stages=()
-            )
-            ready = replace(compiled, bound=query, query=rewritten(query, compiled.catalog))
-            apart = copy.copy(self)
-            rows = apart._rows_of(self._statements(ready, Compiled.rows))  # noqa: SLF001
-            return next(rows, None) is not None
+        return absent_part(compiled.bound, partial(self._exists, compiled))
 
-        return absent_part(compiled.bound, exists)
+    def _exists(self, compiled: Compiled, scope: Scope) -> bool:
+        """Return True if some frame of the searched traces matches a pattern."""
+        query = replace(compiled.bound, scope=scope, result=Result(limit=1), steps=(), stages=())
+        ready = replace(compiled, bound=query, query=rewritten(query, compiled.catalog))
+        apart = copy.copy(self)
+        rows = apart._rows_of(self._statements(ready, Compiled.rows))  # noqa: SLF001
+        return next(rows, None) is not None
+
+    def nearest(self) -> dict[str, Any]:
+        """Return the frame that comes nearest to a pattern without matches.
+
+        Returns
+        -------
+        dict
+            ``failed``: the first part of the pattern that no frame has. ``trace``, ``seq`` and ``found``: a
+            frame that has all parts before it, and its value nearest to the limit, as text. They are missing
+            if the part compares no numbers. The result is empty if each part occurs.
+
+        Examples
+        --------
+        >>> near = store.find("MATCH (e:Ego) WHERE e.speed > 60").nearest()
+        >>> near["failed"], near["trace"], near["found"]
+        ('e.speed > 60', 'town', 'e.speed = 9.15')
+        """
+        from sgstore.lang.help import nearest_query
+
+        with self._compiled() as compiled:
+            told = nearest_query(compiled.bound, partial(self._exists, compiled))
+            if told is None:
+                return {}
+            failed, value, text = told
+            using = " ".join(_SETTING.findall(self._text))
+            try:
+                asked = Matches(self._file, self._catalog, f"{using} {text}", {}) if text else None
+                rows = asked.rows() if asked is not None else []
+            except QueryError:  # texts have no difference
+                rows = []
+        for trace, seq, found in rows:
+            if found is not None:
+                shown = f"{value} = {found:.4g}"
+                return {"failed": failed, "trace": trace, "seq": seq, "found": shown}
+        return {"failed": failed}
 
     @property
     def scope(self) -> dict[str, Any]:
@@ -855,6 +889,9 @@ class Matches(Tabular):
                     yield [column[low : low + BLOCK] for column in block]
 
 
+_SETTING: Final = re.compile(r"\bUSING\s+\w+\s+(?:'[^']*'|\w+)", re.IGNORECASE)
+"""Setting of a query."""
+
 _INTERVALS: Final = {"intervals": Compiled.intervals, "bound": Compiled.bound_intervals}
 
 
@@ -933,6 +970,10 @@ class UnionMatches(Matches):
     def mistakes(self) -> tuple[str, ...]:
         """Notes of all parts that need no second search."""
         return tuple(dict.fromkeys(note for part in self._parts for note in part.mistakes))
+
+    def nearest(self) -> dict[str, Any]:
+        """Return the frame that comes nearest to the first part of the union without matches."""
+        return next(filter(None, (part.nearest() for part in self._parts)), {})
 
     def _rows(self, *, whole: bool) -> Iterator[Row]:
         row = row_type(self.columns)

@@ -120,6 +120,44 @@ def test_a_scene_that_the_store_never_contains_gets_a_note(
     assert open_town.find("MATCH (e:Ego) WHERE e.speed > 1").notes == ()
 
 
+NEAREST = {
+    "MATCH (e:Ego)-[:near]->(v:Vehicle) WHERE e.speed > 60": (
+        "SELECT MAX(n.speed) FROM nodes n WHERE n.is_ego AND n.frame_id IN"
+        " (SELECT frame_id FROM edges WHERE relation = 'near' AND src_is_ego AND dst_kind IN"
+        " ('car', 'van', 'truck', 'bus', 'bicycle', 'motorcycle', 'trailer', 'vehicle'))",
+        "e.speed",
+    ),
+    "USING NODES any MATCH (p:Person) WHERE -0.5 > p.speed - 2 AND 90 < p.speed": (
+        "SELECT MAX(speed) FROM nodes WHERE kind = 'person' AND speed < 1.5",
+        "p.speed",
+    ),
+    "MATCH (e:Ego) THEN MATCH (e:Ego) WHERE e.speed < 3 AND e.speed > 4": (
+        "SELECT MAX(speed) FROM nodes WHERE is_ego AND speed < 3",
+        "e.speed",
+    ),
+}
+
+
+@pytest.mark.parametrize("text", NEAREST)
+def test_nearest_frame_of_a_pattern_without_matches(open_town: Store, text: str) -> None:
+    """The values of all frames in SQL have the same extreme, in the frame of the answer."""
+    sql, value = NEAREST[text]
+    near = open_town.find(text).nearest()
+    (extreme,) = open_town.sql(sql).values[0]
+
+    assert near["found"] == f"{value} = {extreme:.4g}"
+    shown = open_town.why_not(f"{near['trace']}#{near['seq']}", text)
+    assert near["failed"] in str(shown)
+
+
+def test_parts_without_a_value_have_no_nearest_frame(open_town: Store) -> None:
+    train = open_town.find("MATCH (e:Ego)-[:near]->(v:Train)").nearest()
+    assert train == {"failed": "(v:Train)"}
+    assert open_town.find("MATCH (e:Ego) WHERE e.speed > 1").nearest() == {}
+    union = "MATCH (v:Train) UNION MATCH (v:Vehicle) WHERE v.speed > 99"
+    assert open_town.find(union).nearest() == {"failed": "(v:Train)"}
+
+
 def test_every_stored_edge_has_known_ends(open_town: Store) -> None:
     for relation, src, dst in {**open_town.catalog().edges, **open_town.catalog().map_edges}:
         kinds = f"a.kind = '{src}' AND b.kind = '{dst}'"

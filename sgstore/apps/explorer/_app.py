@@ -335,7 +335,7 @@ async def page_of(request: Request, script: str = "main.js") -> Response:
 
 _QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(("parts", "why"), ("text", "parameters", "trace", "seq", "binding")),
-    "check": ("text", "parameters"),
+    **dict.fromkeys(("check", "nearest"), ("text", "parameters")),
     "coverage": ("what", "abstraction"),
     "select": ("clips", "abstraction"),
 }

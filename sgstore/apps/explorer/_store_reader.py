@@ -16,7 +16,7 @@ from sgstore.apps.explorer._wire import packed
 from sgstore.base.json_text import finite
 from sgstore.errors import ExportError, SgstoreError, StoreError
 from sgstore.lang.help import words
-from sgstore.lang.library import patterns
+from sgstore.lang.library import patterns, search
 from sgstore.maps.opendrive import read_map
 from sgstore.maps.roads import DrawnOutlines
 from sgstore.store import StateColumns
@@ -39,6 +39,7 @@ MOST_THUMBS: Final = 400
 READS: Final[Mapping[str, tuple[str, ...]]] = {
     "words": (),
     "library": (),
+    "search": ("text",),
     "states": ("trace", "first", "last"),
     "static": ("trace",),
     "map": ("trace",),
@@ -181,6 +182,10 @@ class Reads:
             {name: getattr(one, name) for name in names} | {"drawing": one.example}
             for one in patterns().values()
         ]
+
+    def search(self, text: str) -> list[str]:
+        """Return the names of the library patterns that match some words, best match first."""
+        return [one.name for one in search(text)]
 
 
 def _among(traces: Mapping[str, T], name: str) -> T:

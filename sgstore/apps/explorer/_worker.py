@@ -86,6 +86,10 @@ def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]
     yield {**answer.as_dict(), "relax": changes}
 
 
+def _told_nearest(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    yield store.find(question["text"], **question["parameters"]).nearest()
+
+
 def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
     """Yield the verdicts of checks for each trace, with their violations."""
     run = store.check(question["text"], **question["parameters"])
@@ -117,6 +121,7 @@ QUESTIONS: Final[Mapping[str, Asked]] = {
     "sql": _told_rows,
     "parts": _told_parts,
     "why": _told_why,
+    "nearest": _told_nearest,
     "check": _told_check,
     **dict.fromkeys(("coverage", "select", "lock", "export", "diff"), _measured),
 }

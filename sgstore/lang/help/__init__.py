@@ -6,6 +6,7 @@ from sgstore.lang.help._notes import (
     absent_part,
     compared_in_check,
     compared_in_query,
+    nearest_query,
     notes_on,
     unknown_in_or,
 )
@@ -25,6 +26,7 @@ __all__ = [
     "has_nodes",
     "in_words",
     "looked_up",
+    "nearest_query",
     "notes_on",
     "parts_of",
     "separable",

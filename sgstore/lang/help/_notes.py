@@ -166,28 +166,72 @@ def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str,
     exists : function
         Function that returns True if some frame of the store matches a pattern.
     """
-    steps = [query.steps[number].scope for number in sorted(query.certain)] if query.steps else []
-    for whole in steps or [query.first]:
-        where = [part for part in whole.where if not any(map(b.is_passed_on, b.walk(part)))]
-        scope = replace(whole, where=tuple(where))
-        if scope.nodes and not exists(scope):
-            return _first_absent(scope, exists)
-    return ()
-
-
-def _first_absent(whole: b.Scope, exists: Callable[[b.Scope], bool]) -> tuple[str, ...]:
-    writer, held = Writer(whole), list[str]()
-    for part, scope in growing(whole):
+    for part, scope, writer, held in _first_absent(query, exists):
         text = part_text(part, scope, writer)
         if isinstance(part, b.Edge):
             text = writer.labelled_edge(part, scope)
-        if not exists(scope):
-            alone = _alone(part, scope)
-            others = f" with {', '.join(held)}" if held and exists(alone) else ""
-            told = isinstance(part, b.Node | b.Edge) or _is_scene(part)
-            return (f"no frame of the store has {text}{others}",) if told else ()
-        held.append(text)
+        others = f" with {', '.join(held)}" if held and exists(_alone(part, scope)) else ""
+        told = isinstance(part, b.Node | b.Edge) or _is_scene(part)
+        return (f"no frame of the store has {text}{others}",) if told else ()
     return ()
+
+
+def _first_absent(
+    query: b.Query, exists: Callable[[b.Scope], bool]
+) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope, Writer, list[str]]]:
+    """Yield the first part that no frame has: the part, the pattern up to it, its writer, and the text before."""
+    steps = [query.steps[number].scope for number in sorted(query.certain)] if query.steps else []
+    for step in steps or [query.first]:
+        where = [part for part in step.where if not any(map(b.is_passed_on, b.walk(part)))]
+        whole = replace(step, where=tuple(where))
+        if not whole.nodes or exists(whole):
+            continue
+        writer, held = Writer(whole), list[str]()
+        for part, scope in growing(whole):
+            if not exists(scope):
+                yield part, scope, writer, held
+                return
+            edge = isinstance(part, b.Edge)
+            held.append(writer.labelled_edge(part, scope) if edge else part_text(part, scope, writer))
+        return
+
+
+def nearest_query(
+    query: b.Query, exists: Callable[[b.Scope], bool]
+) -> tuple[str, str, str] | None:
+    """Return the query for the frame that comes nearest to the first part that no frame has.
+
+    Parameters
+    ----------
+    query : Query
+    exists : function
+        Function that returns True if some frame of the store matches a pattern.
+
+    Returns
+    -------
+    failed : str
+        The part that no frame has.
+    value : str
+        The value of the part that is compared; empty if the part compares no values.
+    text : str
+        The query; empty without such a value. Its columns are trace, frame and value.
+    """
+    for part, scope, writer, _ in _first_absent(query, exists):
+        failed, others = part_text(part, scope, writer), scope
+        match part:
+            case b.Operation(word="<" | "<=" | ">" | ">=" | "=", operands=(left, right)):
+                if isinstance(left, b.Value):
+                    left, right = right, left
+                value, limit = (writer.expression(one, inner=True) for one in (left, right))
+                others = replace(scope, where=scope.where[:-1])
+            case b.Edge(src=src, dst=dst, high=1) if src != dst:
+                value = f"dist({writer.name(src)}, {writer.name(dst)})"
+                limit, others = "0", replace(scope, edges=scope.edges[:-1])
+            case _:
+                return failed, "", ""
+        shown = f"RETURN trace.name, frame.seq, {value} AS found ORDER BY ABS({value} - {limit})"
+        return failed, value, f"MATCH {writer.block(others)} {shown} LIMIT 1"
+    return None
 
 
 def _is_scene(condition: b.Bound) -> bool:

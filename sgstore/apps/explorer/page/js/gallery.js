@@ -34,8 +34,19 @@ function layout(found, width) {
   return { rows, height: top, across, wide, high };
 }
 
-/** @param {{match: import("./state.js").Match, x: number, y: number, wide: number, high: number, flies: boolean}} props */
-function Tile({ match, x, y, wide, high, flies }) {
+/** Index of the match that an arrow key leads to.
+ * @param {ReturnType<typeof layout>["rows"]} rows @param {number} at @param {string} key @param {number} page rows in sight */
+function moved(rows, at, key, page) {
+  const lines = rows.filter((row) => !row.group), line = lines.findIndex((row) => at < row.last), last = (lines.at(-1)?.last || 1) - 1;
+  const here = lines[line], down = { ArrowUp: -1, ArrowDown: 1, PageUp: -page, PageDown: page }[key];
+  if (key === "Home" || key === "End") return key === "Home" ? 0 : last;
+  if (key === "ArrowLeft" || key === "ArrowRight") return Math.max(0, Math.min(last, at + (key === "ArrowLeft" ? -1 : 1)));
+  const to = down && here ? lines[Math.max(0, Math.min(lines.length - 1, line + down))] : undefined;
+  return to && here ? Math.min(to.first + at - here.first, to.last - 1) : null;
+}
+
+/** @param {{match: import("./state.js").Match, at: number, x: number, y: number, wide: number, high: number, flies: boolean, turn: boolean}} props */
+function Tile({ match, at, x, y, wide, high, flies, turn }) {
   const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
   const painted = useRef("");
   const waits = arrived.value, look = paints.value;
@@ -59,12 +70,12 @@ function Tile({ match, x, y, wide, high, flies }) {
   const tags = notes.value.filter((n) => n[0] === match.trace && n[1] >= match.first && n[1] <= match.last);
   const who = Object.entries(match.names).filter(([name]) => name !== "e" && name !== "ego").map(([, v]) => v).join(", ");
   return html`<div class=${`tile ${isOpen ? "chosen" : ""}`} style=${{ left: `${x}px`, top: `${y}px`, width: `${wide}px`, height: `${high}px` }}
-      data-index=${match.index} onClick=${match.go || (() => openMatch(match))}>
+      data-index=${match.index} data-at=${at} onClick=${match.go || (() => openMatch(match))}>
     <canvas ref=${canvas} aria-hidden="true"></canvas>
     <div class="about">
-      ${offline.value || match.go ? null : html`<input type="checkbox" checked=${on} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
+      ${offline.value || match.go ? null : html`<input type="checkbox" checked=${on} tabindex=${turn ? 0 : -1} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
         onClick=${(/** @type {any} */ event) => { event.stopPropagation(); tick(match); }} />`}
-      <button class="quiet small" aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start.toFixed(1) === match.end.toFixed(1) ? "" : `${match.start.toFixed(1)}–`}${match.end.toFixed(1)} s</button>
+      <button class="quiet small" tabindex=${turn ? 0 : -1} aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start.toFixed(1) === match.end.toFixed(1) ? "" : `${match.start.toFixed(1)}–`}${match.end.toFixed(1)} s</button>
       ${tags.map((n) => html`<span class="tag">${n[2]}</span>`)}<span class="who" title=${who}>${who}</span>
     </div></div>`;
 }
@@ -107,11 +118,51 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
     const row = rows.find((one) => !one.group && found.slice(one.first, one.last).some((m) => keyOf(m) === keyOf(now)));
     if (row && (row.top < box.top || row.top + row.height > box.top + box.height)) place.current.scrollTop = row.top - box.height / 3;
   }, [now]);
-  return html`<section class="gallery" ref=${place} onScroll=${measure} aria-label="Matches"><div class="inner" style=${{ height: `${height}px` }}>
+  // One tile is in the order of the Tab key. It keeps the focus, though its elements show other matches after scrolling.
+  const [active, setActive] = useState(0), held = useRef("");
+  const turn = Math.min(active, found.length - 1), visible = drawn.some(({ row }) => !row.group && row.first <= turn && turn < row.last);
+  const patching = useRef(true); // an element that is moved or removed loses the focus
+  patching.current = true;
+  useLayoutEffect(() => {
+    patching.current = false;
+    if (!held.current) return;
+    const want = place.current?.querySelector(`[data-at="${turn}"] ${held.current}`) || place.current;
+    if (want !== document.activeElement) /** @type {HTMLElement} */ (want).focus({ preventScroll: true });
+  });
+  useEffect(() => { if (now) setActive(Math.max(0, found.findIndex((m) => keyOf(m) === keyOf(now)))); }, [now]);
+  const wasOpen = useRef(false), isOpen = open.value !== null;
+  useEffect(() => {
+    if (wasOpen.current && !isOpen && document.activeElement === document.body) { held.current = "button"; measure(); }
+    wasOpen.current = isOpen;
+  }, [isOpen]);
+  const onFocus = (/** @type {FocusEvent} */ event) => {
+    const at = /** @type {HTMLElement} */ (event.target), tile = /** @type {HTMLElement | null} */ (at.closest("[data-at]"));
+    if (tile) { held.current = at.localName; setActive(Number(tile.dataset.at)); }
+  };
+  const onBlur = (/** @type {FocusEvent} */ event) => {
+    if (!patching.current && !place.current?.contains(/** @type {Node | null} */ (event.relatedTarget))) held.current = "";
+  };
+  const onKey = (/** @type {KeyboardEvent} */ event) => {
+    const to = moved(rows, turn, event.key, Math.max(1, Math.floor(box.height / (high + GAP)))), match = found[turn];
+    const opens = event.key === "Enter" && held.current !== "button", ticks = event.key === "x" && !match?.go && !offline.value;
+    if (to === null && !opens && !ticks) return;
+    event.preventDefault();
+    event.stopPropagation();
+    if (to === null) { if (match) (ticks ? tick : match.go || openMatch)(match); return; }
+    held.current ||= "button";
+    setActive(to);
+    const row = rows.find((one) => !one.group && to < one.last), seen = place.current;
+    if (!row || !seen) return;
+    if (row.top - HEAD < seen.scrollTop) seen.scrollTop = row.top - HEAD;
+    if (row.top + row.height > seen.scrollTop + seen.clientHeight) seen.scrollTop = row.top + row.height - seen.clientHeight;
+  };
+  return html`<section class="gallery" ref=${place} onScroll=${measure} aria-label="Matches" tabindex=${visible ? -1 : 0} onKeyDown=${onKey}
+      onFocusIn=${onFocus} onFocusOut=${onBlur}>
+    <div class="inner" style=${{ height: `${height}px` }}>
     ${found.length || !none ? null : html`<p class="faint none">${none}</p>`}
     ${drawn.map(({ row, slot }) => (row.group
       ? html`<div class="group" key=${`g ${slot}`} style=${{ top: `${row.top}px` }}>${row.group} <span>${row.many} ${row.many === 1 ? word[0] : word[1]}</span></div>`
-      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${slot} ${i}`} match=${match} wide=${wide} high=${high} flies=${flies}
+      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${slot} ${i}`} match=${match} at=${row.first + i} turn=${row.first + i === turn} wide=${wide} high=${high} flies=${flies}
           x=${GAP + i * (wide + GAP)} y=${row.top} />`)))}
   </div></section>`;
 }

@@ -1,6 +1,6 @@
 // @ts-check
 // Keys of the scene: what they do, and the list of them.
-import { h, htm, useEffect } from "../vendor/core.js";
+import { h, htm, useEffect, useRef } from "../vendor/core.js";
 import { about, askWhy, camera, frame, goTo, matchEnd, nextMatch, panel } from "./clock.js";
 import { dialog, open, playing, tick, toast, writeAddress } from "./state.js";
 
@@ -35,11 +35,15 @@ export const keys = [
 /** What lies above the page: the keys, or a form; and what was just said. @param {{children?: any}} props */
 export function Above({ children }) {
   const what = dialog.value, close = () => { dialog.value = ""; };
-  useEffect(() => { /** @type {HTMLElement | null} */ (document.querySelector(".dialog input, .dialog button"))?.focus(); }, [what]);
-  return html`${what ? html`<div class="dialog" onClick=${(/** @type {any} */ e) => { if (e.target === e.currentTarget) close(); }}>
-    <div role="dialog" aria-modal="true" aria-label=${what}>${what !== "keys" ? children
+  const place = useRef(/** @type {HTMLDialogElement | null} */ (null));
+  useEffect(() => { // closed, it gives the focus back to where it was
+    if (what) place.current?.showModal(); else place.current?.close();
+  }, [!what]);
+  return html`<dialog class="dialog" ref=${place} aria-label=${what} onClose=${close}
+      onClick=${(/** @type {MouseEvent} */ e) => { if (e.target === e.currentTarget) close(); }}>
+    ${what ? html`<div>${what !== "keys" ? children
       : html`<h2>Keys</h2><dl>${keys.map(([sign, does]) => html`<dt><kbd>${sign}</kbd></dt><dd>${does}</dd>`)}</dl>`}
-      <p><button onClick=${close}>Close</button></p></div></div>` : null}
+      <p><button onClick=${close}>Close</button></p></div>` : null}</dialog>
     ${toast.value ? html`<div class="toast" role="status">${toast.value}</div>` : null}`;
 }
 

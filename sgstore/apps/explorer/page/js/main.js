@@ -1,16 +1,17 @@
 // @ts-check
 // The page: its head, the search, what was found, and the view that is open; keys.
-import { effect, h, htm, render, untracked } from "../vendor/core.js";
+import { effect, h, htm, render, untracked, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { copyLink, frame } from "./clock.js";
+import { askWhy, copyLink, frame } from "./clock.js";
 import { Editor, focusEditor, NumberSlider } from "./editor.js";
 import { Gallery } from "./gallery.js";
 import { Above, keys } from "./keys.js";
 import { Scene } from "./scene.js";
 import { Compare } from "./compare.js";
-import { Coverage, countLibrary, Selection, Start } from "./sheets.js";
+import { countLibrary, Near, sought, Start, WordSearch } from "./library.js";
+import { Coverage, Selection } from "./sheets.js";
 import {
-  answer, ask, cancel, dialog, find, history, keep, library, matches, namesIn, notes, open, openFrame, paints, playing, readAddress, reasonOf, say, seq, store, tag,
+  answer, ask, cancel, dialog, find, history, keep, library, matches, namesIn, notes, open, openFrame, paints, parametersOf, playing, readAddress, reasonOf, say, seq, store, tag,
   text, theme, ticked, values, view, words, writeAddress, writeAddressSoon,
 } from "./state.js";
 import { Status } from "./status.js";
@@ -41,6 +42,7 @@ function Search() {
   const groups = [...new Set(patterns.map((p) => p.library))];
   return html`<section class="search" aria-label="Search"><${Editor} />
     <div class="tools">
+      <${WordSearch} />
       <select aria-label="Library of patterns" onChange=${choose}><option value="">library</option>
         ${groups.map((name) => html`<optgroup label=${name}>${patterns.filter((p) => p.library === name).map((p) => html`<option value=${p.name} title=${p.sentence}>${p.name}</option>`)}</optgroup>`)}</select>
       <select aria-label="History" onChange=${(/** @type {any} */ e) => { if (e.target.value) { text.value = e.target.value; find(); } e.target.value = ""; }}><option value="">history</option>
@@ -89,25 +91,44 @@ function TagForm() {
 
 function Found() {
   const told = answer.value;
-  if (told.state === "idle" && !open.value) return html`<${Start} />`;
+  if (sought.value.trim() || (told.state === "idle" && !open.value)) return html`<${Start} />`;
   if (told.rows) return html`<${Rows} />`;
-  if (open.value) return html`<main class="open"><${Gallery} found=${matches.value} /><${Scene} /></main>`;
-  if (told.error || (told.state !== "busy" && !told.matches.length && !told.verdicts)) return html`<${Nothing} />`;
-  return html`${told.verdicts ? html`<${Verdicts} />` : null}<main><${Gallery} found=${matches.value} word=${told.verdicts ? ["violation", "violations"] : undefined} /></main>`;
+  if (!open.value && (told.error || (told.state !== "busy" && !told.matches.length && !told.verdicts))) return html`<${Nothing} />`;
+  return html`${told.verdicts && !open.value ? html`<${Verdicts} />` : null}<main class=${open.value ? "open" : ""}>
+    <${Gallery} found=${matches.value} word=${told.verdicts ? ["violation", "violations"] : undefined} />${open.value ? html`<${Scene} />` : null}</main>`;
 }
 
-/** What to do where nothing was found: mend the text, or look at a frame and ask why it does not match. */
+/** What to do where nothing was found: mend the text, take a pattern that is near, or see how near the store comes. */
 function Nothing() {
-  const { error, query } = answer.value, chars = [...query];
-  if (error) {
-    if (!Number.isInteger(error.start)) return html`<div class="sheet"><p class="error">${error.reason}</p></div>`;
-    const before = chars.slice(0, error.start).join(""), line = before.split("\n").length;
-    return html`<div class="sheet"><pre class="wrong">${before}<mark>${chars.slice(error.start, Math.max(error.end, error.start + 1)).join("") || " "}</mark>${chars.slice(Math.max(error.end, error.start + 1)).join("")}</pre>
-      <p class="error">line ${line}, column ${error.start - before.lastIndexOf("\n")}: ${error.reason}</p>${error.hint ? html`<p>${error.hint}</p>` : null}</div>`;
+  const { error, query } = answer.value, chars = [...query], could = store.value.traces.filter((/** @type {any} */ t) => !(t.name in answer.value.reasons));
+  if (!error) {
+    return html`<div class="sheet"><h2>Nothing matches</h2><${Nearest} query=${query} />
+      <p class="faint">Open a trace: the lanes below it show where each part of the pattern holds, and <kbd>w</kbd> the part that a frame lacks.</p>
+      <p class="row wrap">${could.slice(0, 60).map((/** @type {any} */ t) => html`<button onClick=${() => openFrame(t.name, 0)}>${t.name}</button>`)}</p></div>`;
   }
-  const could = store.value.traces.filter((/** @type {any} */ t) => !(t.name in answer.value.reasons));
-  return html`<div class="sheet"><h2>Nothing matches</h2><p class="faint">Open a trace: the lanes below it say where each part of the pattern holds, and <kbd>w</kbd> what is missing in a frame.</p>
-    <p class="row wrap">${could.slice(0, 60).map((/** @type {any} */ t) => html`<button onClick=${() => openFrame(t.name, 0)}>${t.name}</button>`)}</p></div>`;
+  const placed = Number.isInteger(error.start), { start, end } = placed ? error : { start: 0, end: chars.length }, stop = Math.max(end, start + 1);
+  const before = chars.slice(0, start).join(""), word = chars.slice(start, stop).join(""), line = before.split("\n").length;
+  const better = /did you mean '([^']+)'\?/.exec(error.hint || "")?.[1], pattern = /\b(?:MATCH|CHECK|DEFINE|USING|SELECT|WITH|FROM)\b/.test(query);
+  const mend = () => { text.value = placed ? `${before}${better}${chars.slice(end).join("")}` : `${better}`; find(); };
+  return html`<div class="sheet">${placed ? html`<pre class="wrong">${before}<mark>${word || " "}</mark>${chars.slice(stop).join("")}</pre>` : null}
+    <p class="error">${placed ? `line ${line}, column ${start - before.lastIndexOf("\n")}: ` : ""}${error.reason}</p>
+    ${better ? html`<p>Did you mean <button class="main" onClick=${mend}>${better}</button></p>` : error.hint ? html`<p>${error.hint}</p>` : null}
+    <h2>Near this</h2><${Near} text=${pattern ? word.replace(/([a-z])([A-Z])/g, "$1 $2") : query} most=${6} /></div>`;
+}
+
+/** The part of a pattern that no frame has, and the frame that comes nearest. @param {{query: string}} props */
+function Nearest({ query }) {
+  const [told, tell] = useState(/** @type {any} */ (null));
+  useEffect(() => {
+    const mine = new AbortController();
+    tell(null);
+    if (/\bMATCH\b/i.test(query)) api.json("api/nearest", { text: query, parameters: parametersOf(query) }, { signal: mine.signal }).then(tell, () => {});
+    return () => mine.abort();
+  }, [query]);
+  if (!told?.failed) return null;
+  const go = () => { openFrame(told.trace, told.seq); askWhy(); };
+  return html`<p class="nearest" role="status">No frame of the store has <code>${told.failed}</code>${told.found
+    ? html`. The nearest is <code>${told.found}</code>: <button onClick=${go}>${told.trace}#${told.seq}</button>` : "."}</p>`;
 }
 
 function App() {

@@ -87,7 +87,7 @@ export function Neighbours({ graph, states, north }) {
   const drawn = edges.filter(({ src, dst }) => at.has(src) && at.has(dst));
   const told = drawn.map(({ src, dst, both, labels }) => ({ src, dst, both, label: [...labels].join(", "), holds: null }));
   queueMicrotask(() => { if (JSON.stringify(hop.peek()) !== JSON.stringify(told)) hop.value = told; });
-  return html`<div class="scroll near"><svg viewBox=${`0 0 ${size[0]} ${size[1]}`} role="img" aria-label="Neighbours">
+  return html`<div class="scroll near"><svg viewBox=${`0 0 ${size[0]} ${size[1]}`} role="group" aria-label="Neighbours">
       ${drawn.map(({ src, dst, labels, both }) => {
         const [ax, ay] = at.get(src) || [0, 0], [bx, by] = at.get(dst) || [0, 0], inside = bound.has(src) && bound.has(dst), on = lit.value.has(src) && lit.value.has(dst);
         const words = [...labels], text = words.length > 2 && !on ? `${words[0]} +${words.length - 1}` : words.join(", ");
@@ -97,7 +97,8 @@ export function Neighbours({ graph, states, north }) {
       })}
       ${shown.map((node) => {
         const [x, y] = at.get(node) || [0, 0], one = name(node), wide = widthOf(one);
-        return html`<g key=${node} style=${{ cursor: node >= 0 ? "pointer" : "default" }} onMouseEnter=${() => { lit.value = new Set([node]); }} onMouseLeave=${() => { lit.value = new Set(); }}
+        return html`<g key=${node} style=${{ cursor: node >= 0 ? "pointer" : "default" }} role=${node >= 0 ? "button" : undefined} tabindex=${node >= 0 ? 0 : undefined} aria-label=${about.get(node)?.name || one}
+          onKeyDown=${(/** @type {KeyboardEvent} */ e) => { if (node >= 0 && e.key === "Enter") chosen.value = node; }} onMouseEnter=${() => { lit.value = new Set([node]); }} onMouseLeave=${() => { lit.value = new Set(); }}
           onClick=${() => { if (node >= 0) { chosen.value = node; panel.value = "near"; } }}><title>${about.get(node)?.name || node}</title>
           <rect x=${(x || 0) - wide / 2} y=${(y || 0) - 11} width=${wide} height="22" rx=${node < 0 ? 4 : 11} fill=${bound.has(node) ? "var(--soft)" : "var(--raised)"} stroke=${bound.has(node) ? "var(--mark)" : lit.value.has(node) ? "var(--accent)" : "var(--line)"} stroke-width=${bound.has(node) ? 2 : 1.2} />
           <text x=${x} y=${(y || 0) + 3.5} font-size="10" font-weight=${bound.has(node) ? 600 : 400} text-anchor="middle" fill="var(--ink)">${one}</text></g>`;

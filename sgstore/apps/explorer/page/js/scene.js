@@ -95,6 +95,7 @@ function Above({ trace }) {
     });
   });
   const wheel = (/** @type {WheelEvent} */ e) => {
+    if (document.documentElement.scrollHeight > innerHeight && !e.ctrlKey) return; // of a page in one column the wheel scrolls it
     e.preventDefault();
     zoom.value = { ...zoom.value, factor: Math.max(0.15, Math.min(12, factor * Math.exp(-e.deltaY / 500))) };
   };
@@ -115,7 +116,7 @@ function Above({ trace }) {
     const box = canvas.current.getBoundingClientRect();
     const node = nodeAt(seen.current, look.current, e.clientX - box.left, e.clientY - box.top);
     chosen.value = node < 0 ? null : node;
-    if (node >= 0) { panel.value = "node"; showSeries("speed", "m/s", node); }
+    if (node >= 0) choose(node);
   };
   return html`<div class="panel above">
     <div class="caption">
@@ -172,6 +173,22 @@ function NodePanel() {
   </div>`;
 }
 
+/** Show a node: its values and its speed. @param {number} node */
+function choose(node) {
+  chosen.value = node;
+  panel.value = "node";
+  showSeries("speed", "m/s", node);
+}
+
+/** What lets nodes light up in the view while a row has the pointer or the focus. @param {number[]} nodes */
+function lights(nodes) {
+  const on = () => { lit.value = new Set(nodes); }, off = () => { lit.value = new Set(); };
+  return { onMouseEnter: on, onMouseLeave: off, onFocusIn: on, onFocusOut: off };
+}
+
+/** A node in a table; parts of the map have no values. @param {{node: number, name: any}} props */
+const NodeButton = ({ node, name }) => (node < 0 ? name : html`<button class="quiet small" onClick=${() => choose(node)}>${name}</button>`);
+
 /** @param {{what: string}} props */
 function GraphTable({ what }) {
   const [graph, setGraph] = useState(/** @type {any} */ (null));
@@ -194,16 +211,15 @@ function GraphTable({ what }) {
   if (what === "edges") {
     const names = new Map(graph.nodes.map((/** @type {any} */ n) => [n.id, n.name || n.id]));
     const some = graph.edges.filter((/** @type {any} */ e) => !bound.size || bound.has(e.src) || bound.has(e.dst));
-    return html`<div class="scroll"><table><thead><tr><th>from</th><th>relation</th><th>to</th></tr></thead><tbody>
-      ${some.slice(0, 600).map((/** @type {any} */ e) => html`<tr onMouseEnter=${() => { lit.value = new Set([e.src, e.dst]); }} onMouseLeave=${() => { lit.value = new Set(); }}>
-        <td>${names.get(e.src)}</td><td>${e.relation}</td><td>${names.get(e.dst)}</td></tr>`)}</tbody></table>
+    return html`<div class="scroll" tabindex="0"><table><thead><tr><th>from</th><th>relation</th><th>to</th></tr></thead><tbody>
+      ${some.slice(0, 600).map((/** @type {any} */ e) => html`<tr ...${lights([e.src, e.dst])}>
+        <td><${NodeButton} node=${e.src} name=${names.get(e.src)} /></td><td>${e.relation}</td><td><${NodeButton} node=${e.dst} name=${names.get(e.dst)} /></td></tr>`)}</tbody></table>
       ${some.length > 600 ? html`<p class="faint">600 of ${some.length} edges</p>` : null}</div>`;
   }
   const listed = graph.nodes.filter((/** @type {any} */ n) => n.id >= 0).sort((/** @type {any} */ a, /** @type {any} */ b) => Number(bound.has(b.id)) - Number(bound.has(a.id)));
-  return html`<div class="scroll"><table><thead><tr><th>node</th><th>kind</th><th class="number">speed (m/s)</th></tr></thead><tbody>
-    ${listed.map((/** @type {any} */ n) => html`<tr class=${chosen.value === n.id ? "chosen" : ""} onMouseEnter=${() => { lit.value = new Set([n.id]); }}
-      onMouseLeave=${() => { lit.value = new Set(); }} onClick=${() => { chosen.value = n.id; panel.value = "node"; showSeries("speed", "m/s", n.id); }}>
-      <td>${n.name || n.id}</td><td>${n.kind}</td><td class="number">${n.speed === undefined || n.speed === null ? "" : `${n.speed.toFixed(1)}`}</td></tr>`)}</tbody></table></div>`;
+  return html`<div class="scroll" tabindex="0"><table><thead><tr><th>node</th><th>kind</th><th class="number">speed (m/s)</th></tr></thead><tbody>
+    ${listed.map((/** @type {any} */ n) => html`<tr class=${chosen.value === n.id ? "chosen" : ""} ...${lights([n.id])} onClick=${() => choose(n.id)}>
+      <td><${NodeButton} node=${n.id} name=${n.name || n.id} /></td><td>${n.kind}</td><td class="number">${n.speed === undefined || n.speed === null ? "" : `${n.speed.toFixed(1)}`}</td></tr>`)}</tbody></table></div>`;
 }
 
 // All of it -----------------------------------------------------------------------------------------------------------
@@ -235,6 +251,10 @@ function Transport() {
 
 export function Scene() {
   const trace = open.value?.trace || "", seen = traces.value.get(trace)?.cameras.length, other = inOther(trace);
-  const both = beside.value && traces.value.has(other);
-  return html`<section class=${seen ? "scene" : "scene blind"} aria-label="Scene">${seen ? html`<${Camera} />` : null}<div class=${both ? "views both" : "views"}><${Above} key=${trace} trace=${trace} />${both ? html`<${Above} key=${other} trace=${other} />` : null}</div><${Details} /><${Timeline} /><${Transport} /></section>`;
+  const both = beside.value && traces.value.has(other), place = useRef(/** @type {HTMLElement | null} */ (null)), now = open.value;
+  useEffect(() => { // in one column it comes into sight
+    if (document.documentElement.scrollHeight > innerHeight) place.current?.scrollIntoView({ block: "start" });
+    if (document.activeElement?.closest(".gallery")) place.current?.focus({ preventScroll: true }); // opened by a key
+  }, [now?.match, trace]);
+  return html`<section class=${seen ? "scene" : "scene blind"} aria-label="Scene" tabindex="-1" ref=${place}>${seen ? html`<${Camera} />` : null}<div class=${both ? "views both" : "views"}><${Above} key=${trace} trace=${trace} />${both ? html`<${Above} key=${other} trace=${other} />` : null}</div><${Details} /><${Timeline} /><${Transport} /></section>`;
 }

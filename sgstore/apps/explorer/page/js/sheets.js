@@ -1,63 +1,11 @@
 // @ts-check
-// Views beside the search: the library before anything is asked, coverage, the selection.
-import { h, htm, signal, useEffect, useRef, useState } from "../vendor/core.js";
+// Views beside the search: coverage, the selection; tables and charts.
+import { h, htm, signal, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { beside } from "./clock.js";
-import { answer, ask, idle, keyOf, library, matchesIn, open, openFrame, openMatch, reasonOf, store, tally, tick, ticked, view } from "./state.js";
+import { ask, keyOf, openFrame, openMatch, reasonOf, store, tick, ticked, view } from "./state.js";
 
 const html = htm.bind(h);
-
-// Before anything is asked -----------------------------------------------------------------------------------------
-
-let counting = false;
-
-/** Count the matches of the library, one pattern after another, while it is looked at. */
-export async function countLibrary() {
-  if (counting) return;
-  counting = true;
-  const left = library.value.filter((one) => one.kind !== "predicate" && one.kind !== "property" && !tally.value[one.name]);
-  for (let one = left.shift(); one; one = left.shift()) {
-    while (answer.value.state !== "idle" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
-    const spots = new Set(), place = placed(), mine = new AbortController();
-    let count = 0, more = "";
-    idle.stop = () => mine.abort();
-    try {
-      for await (const { trace, first, last } of matchesIn(api.lines("api/find", { text: one.text }, { signal: mine.signal }), () => { more = "+"; })) {
-        count++;
-        for (let at = Math.floor(place(trace, first)); at < place(trace, last + 1); at++) spots.add(at);
-      }
-    } catch { count = -1; }
-    if (mine.signal.aborted) left.unshift(one); // somebody asks: again later
-    else tally.value = { ...tally.value, [one.name]: { count, more, spots: [...spots] } };
-  }
-  counting = false;
-}
-
-/** What tells where a frame is in all traces, one behind the other: 0 to 250. */
-function placed() {
-  const before = new Map();
-  let whole = 0;
-  for (const { name, frames } of store.value.traces) { before.set(name, whole); whole += frames; }
-  return (/** @type {string} */ trace, /** @type {number} */ at) => ((before.get(trace) + at) / whole) * 250;
-}
-
-export function Start() {
-  const some = library.value.filter((one) => one.kind !== "predicate"), kinds = [...new Set(some.map((one) => one.library))];
-  const over = useRef(false), known = useRef(tally.value); // no card moves away from under the pointer
-  if (!over.current) known.current = tally.value;
-  const found = (/** @type {any} */ one) => known.current[one.name]?.count || 0;
-  return html`<div class="sheet" tabindex="0" onPointerEnter=${() => { over.current = true; }} onPointerLeave=${() => { over.current = false; }}>
-    <p class="faint">Type a pattern above, or begin with one of these ${some.length}. Each says how often it is found in this store, and where in time.</p>
-    ${kinds.map((kind) => html`<h2>${kind}</h2><div class="cards">
-      ${some.filter((one) => one.library === kind).sort((a, b) => Number(found(b) > 0) - Number(found(a) > 0)).map((one) => {
-        const told = tally.value[one.name];
-        return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
-          <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${one.kind === "property" ? html`<span class="faint">check</span>` : told ? html`<span class=${told.count > 0 ? "badge" : "faint"}>${told.count < 0 ? "–" : told.count}${told.more}</span>` : html`<span class="faint">…</span>`}</h3>
-          <p>${one.sentence}</p>
-          ${told?.spots.length ? html`<svg viewBox="0 0 250 18" preserveAspectRatio="none" shape-rendering="crispEdges" aria-hidden="true"><rect class="bar-back" width="250" height="18" />${told.spots.map((at) => html`<rect class="bar-match" x=${at} width="1" height="18" />`)}</svg>` : null}
-          ${one.drawing ? html`<pre aria-hidden="true">${one.drawing}</pre>` : null}</button>`;
-      })}</div>`)}</div>`;
-}
 
 // Tables and charts --------------------------------------------------------------------------------------------------
 

@@ -50,7 +50,7 @@ export function Timeline() {
   const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
   const end = about.seconds, every = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find((s) => (frames * about.period) / s < 9) || 5000;
   const ticks = [...Array(Math.floor(end / every) + 1).keys()].map((i) => i * every).filter((t) => t >= from * about.period);
-  return html`<div class="timeline" role="group" aria-label="Timeline">
+  return html`<div class="timeline" role="group" aria-label="Timeline" tabindex="0">
     <div class="lane"><div class="label">${mine.length} ${word}${mine.length === 1 ? "" : word === "match" ? "es" : "s"} <span class="faint">in this trace</span></div>
       <${Bars} spans=${first.map((m) => [m.first, m.last])}
         kind=${(/** @type {number} */ i) => (first[i] && now.match && keyOf(first[i]) === keyOf(now.match) ? "bar-match" : "bar-match other")} /></div>

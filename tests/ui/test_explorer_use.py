@@ -1,0 +1,145 @@
+"""The explorer in a browser: one column, keys alone, words as entry, the scene, coverage and the timeline."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+from explorer_page import AXE, NEAR, expect, faults, open_first, search
+
+from sgstore.apps.report import report
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+pytestmark = pytest.mark.seconds(30)
+
+NARROW: Final = ((390, 844), (768, 1024), (720, 450))
+"""Sizes of windows with one column; the last is 1440 × 900 at 200 %."""
+
+SCENE: Final = (".above canvas", ".panel.pattern", ".timeline", ".transport", ".gallery")
+
+
+BOX: Final = """names => names.map(name => {
+  const one = document.querySelector(name);
+  one.scrollIntoView({block: "center"});
+  const {x, y, width} = one.getBoundingClientRect();
+  return [name, x, width, y < innerHeight, document.documentElement.scrollWidth];
+})"""
+
+
+def assert_one_column(page: Any) -> None:
+    """Each part of an open match is as wide as the window, or narrower, and can be scrolled to."""
+    for width, height in NARROW:
+        page.set_viewport_size({"width": width, "height": height})
+        for name, x, wide, in_sight, whole in page.evaluate(BOX, [*SCENE]):
+            assert x >= 0, name
+            assert in_sight, name
+            assert width * 0.9 <= wide <= width, name
+            assert whole <= width
+
+
+def test_narrow_window_has_one_column(
+    page: Any, visit: Callable[..., Any], town_store: Path, tmp_path: Path
+) -> None:
+    page.set_viewport_size({"width": 390, "height": 844})
+    for view in ("Coverage", "Selection", "Compare", "Find"):
+        page.get_by_role("button", name=view, exact=True).click()
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    search(page, f"{NEAR} WHERE e.speed > 3")
+    open_first(page)
+    assert_one_column(page)
+    report(Store(town_store), f"{NEAR} WHERE e.speed > 3", tmp_path / "r.html", most=3)
+    page = visit((tmp_path / "r.html").as_uri(), offline=True)
+    open_first(page)
+    assert_one_column(page)
+
+
+def test_matches_can_be_opened_and_read_by_keys_alone(page: Any) -> None:
+    search(page, "MATCH (e:Ego)-[:near]->(v:Vehicle)")
+    page.locator(".tile").nth(1).wait_for()
+    page.locator(".gallery [tabindex='0']").first.focus()
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("[data-at='1'] :focus")).to_have_count(1)
+    page.keyboard.press("End")
+    last = page.evaluate("document.activeElement.closest('[data-at]').dataset.at")
+    focus = page.locator(f"[data-at='{last}'] :focus")
+    for to in ("0", "one.scrollHeight"):  # its elements show other matches meanwhile
+        page.locator(".gallery").evaluate(f"one => {{ one.scrollTop = {to}; }}")
+        expect(focus).to_have_count(0 if to == "0" else 1)
+    page.keyboard.press("x")
+    expect(page.locator(f"[data-at='{last}'] input")).to_be_checked()
+    page.keyboard.press("Enter")
+    expect(page.locator(".scene")).to_be_focused()
+    page.get_by_role("tab", name="nodes").press("Enter")
+    row = page.locator(".pattern tbody button").first
+    row.focus()
+    row.press("Enter")
+    expect(page.get_by_role("button", name="accel")).to_be_visible()
+    page.keyboard.press("?")
+    expect(page.locator("dialog[open]")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.locator("dialog[open]")).to_have_count(0)
+    page.locator(".scene").focus()
+    page.keyboard.press("Escape")
+    expect(focus).to_have_count(1)
+
+
+def test_no_view_has_a_serious_fault_of_accessibility(page: Any) -> None:
+    if not AXE.exists():
+        pytest.skip("axe is not installed: python tools/vendor.py --check")
+    page.set_viewport_size({"width": 390, "height": 844})
+    search(page, "MATCH (e:Ego)-[:near_kol]->(v)")
+    assert faults(page) == []
+    search(page, "SELECT trace, frames FROM traces")
+    assert faults(page) == []
+    search(page, f"{NEAR} WHERE e.speed > 3")
+    page.locator(".tile input").first.check()
+    page.locator(".tile").nth(1).wait_for()
+    open_first(page)
+    for tab in ("neighbours", "nodes", "edges"):
+        page.get_by_role("tab", name=tab).click()
+        page.locator(".pattern .scroll").wait_for()
+        assert faults(page) == []
+    page.get_by_role("button", name="Selection").click()
+    page.locator("tbody button").first.wait_for()
+    assert faults(page) == []
+    page.get_by_role("button", name="Coverage").click()
+    for tab in ("Growth", "Combinations"):
+        page.get_by_role("button", name=tab).click()
+        page.locator("table").first.wait_for()
+        assert faults(page) == []
+
+
+def test_page_without_scripts_has_a_message(
+    visit: Callable[..., Any], served: Callable[[Path], str], town_store: Path
+) -> None:
+    page = visit(served(town_store), java_script_enabled=False)
+    expect(page.locator("noscript p")).to_be_visible()
+    expect(page.locator("#app p")).to_be_hidden()
+
+
+def test_words_lead_to_a_query(page: Any, town_store: Path) -> None:
+    field = page.get_by_label("Search the library")
+    field.fill("pedestrian crosses")
+    expect(page.locator(".near-cards .card h3").first).to_contain_text("crossing")
+    field.fill("yaw rate")
+    page.get_by_role("button", name="yaw_rate", exact=True).click()
+    expect(page.locator(".cm-content")).to_contain_text("x.yaw_rate")
+    expect(field).to_have_value("")
+    search(page, "vehicle brakes hard")  # words in the place of a query
+    expect(page.locator(".near-cards .card h3").first).to_contain_text("brak")
+    search(page, "MATCH (e:Ego)-[:near_kol]->(v)")
+    page.get_by_role("button", name="near_coll", exact=True).first.click()
+    expect(page.locator(".cm-content")).to_have_text("MATCH (e:Ego)-[:near_coll]->(v)")
+    page.locator(".tile").first.wait_for()
+    query = "MATCH (e:Ego)-[:near]->(v:Vehicle) WHERE e.speed > 60"
+    search(page, query)
+    near = Store(town_store).find(query).nearest()
+    expect(page.locator(".nearest")).to_contain_text(f"No frame of the store has {near['failed']}")
+    page.locator(".nearest button", has_text=f"town#{near['seq']}").click()
+    expect(page.locator(".gap")).to_contain_text(near["found"].split(" = ")[0])
+    page.locator(".gap button").click()
+    expect(page.locator(".status")).not_to_contain_text("0 matches")
