@@ -383,7 +383,7 @@ class Matches(Tabular):
         --------
         >>> near = store.find("MATCH (e:Ego) WHERE e.speed > 60").nearest()
         >>> near["failed"], near["trace"], near["found"]
-        ('e.speed > 60', 'town', 'e.speed = 9.15')
+        ('e.speed > 60', 'town', 'e.speed = 12.2')
         """
         from sgstore.lang.help import nearest_query
 

@@ -69,7 +69,7 @@ TESTS = {
     "sumo_net": "sumo",
     "sgg": "sgg sgg_* crowds world_rows",
     "user_notes": "serve",
-    "explorer": "serve live report explorer sandbox_pool",
+    "explorer": "serve live report explorer explorer_* sandbox_pool",
     "online": "online identity",
     "store": "everyday store store_* doors events world_rows fault_messages",
     "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink"

@@ -424,7 +424,10 @@ def test_words_and_library(page: Page) -> None:
     assert "m/s" in next(a for a in words["attributes"]["node"] if a["name"] == "speed")["meaning"]
     assert any(one["drawing"] for one in library)
     assert all(page.find(one["text"])[0].keys() for one in library[:2])
-    assert page.get("/api/search", text="someone brakes hard").json()[0] in {"hard_brake", "brakes_hard"}
+    assert page.get("/api/search", text="someone brakes hard").json()[0] in {
+        "hard_brake",
+        "brakes_hard",
+    }
     near = page.post("/api/nearest", text="MATCH (e:Ego) WHERE e.speed > 60").json()
     assert near["failed"] == "e.speed > 60"
 

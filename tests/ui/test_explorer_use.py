@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.seconds(30)
 
 NARROW: Final = ((390, 844), (768, 1024), (720, 450))
-"""Sizes of windows with one column; the last is 1440 × 900 at 200 %."""
+"""Sizes of windows with one column; the last is 1440 by 900 at 200 %."""
 
 SCENE: Final = (".above canvas", ".panel.pattern", ".timeline", ".transport", ".gallery")
 

@@ -179,7 +179,7 @@ def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str,
 def _first_absent(
     query: b.Query, exists: Callable[[b.Scope], bool]
 ) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope, Writer, list[str]]]:
-    """Yield the first part that no frame has: the part, the pattern up to it, its writer, and the text before."""
+    """Yield the first part that no frame has: the part, the pattern up to it, its writer, and the parts before."""
     steps = [query.steps[number].scope for number in sorted(query.certain)] if query.steps else []
     for step in steps or [query.first]:
         where = [part for part in step.where if not any(map(b.is_passed_on, b.walk(part)))]
@@ -192,13 +192,13 @@ def _first_absent(
                 yield part, scope, writer, held
                 return
             edge = isinstance(part, b.Edge)
-            held.append(writer.labelled_edge(part, scope) if edge else part_text(part, scope, writer))
+            held.append(
+                writer.labelled_edge(part, scope) if edge else part_text(part, scope, writer)
+            )
         return
 
 
-def nearest_query(
-    query: b.Query, exists: Callable[[b.Scope], bool]
-) -> tuple[str, str, str] | None:
+def nearest_query(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str, str, str] | None:
     """Return the query for the frame that comes nearest to the first part that no frame has.
 
     Parameters
