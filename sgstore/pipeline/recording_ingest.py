@@ -26,13 +26,13 @@ from sgstore.base.processes import requests, send_reply
 from sgstore.errors import SgstoreError, TraceError, failure, place_named
 from sgstore.graphs.relations import Crowds, renamed
 from sgstore.maps.map_files import Maps, lost_lanes
-from sgstore.mcap import Loss, check_name, near
+from sgstore.mcap import Findings, Loss, check_name, near
 from sgstore.model.config import ALL_EGOS, Config, from_dict
 from sgstore.model.trace_sampling import TracePart
 from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled
 from sgstore.model.world import covered_s, longest_step_ns
 from sgstore.pipeline.plausibility import Plausibility
-from sgstore.readers import on_map, open_trace
+from sgstore.readers import TopicReading, on_map, open_trace
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 from sgstore.store import Identity, OnMap, Segment, StoreFile
 
@@ -374,6 +374,8 @@ class SegmentReader:
         with open_trace(path, ego=config.ego, digest=digest, mapping=config.mapping) as trace:
             trace.noise = config.noise
             _log.debug("%s: a recording of flavour %s", path, trace.info.flavour)
+            if config.topics:
+                TopicReading(trace.recording, config.topics)  # rejects unknown topics
             road_map, odd = self._maps.of(trace.info)
             lost = lost_lanes(trace.info, road_map)
             on_map(trace, road_map)
@@ -538,6 +540,8 @@ class SegmentReader:
         parked: Sequence[Codes],
     ) -> None:
         report, told, egos = trace.report, tally.as_dict(), self._job.config.egos
+        if self._job.config.topics:
+            report.losses += self._keep_topics(trace, segments)
         moot = [*report.about_ego] if egos else []
         found = tally.checked.findings(report.losses)
         moot += [one.value for one in found]
@@ -559,6 +563,20 @@ class SegmentReader:
             outcome.scope = segment.scope.get("scope", {})
             segment.seal(kept, told, parked)
             outcome.status = "sealed"
+
+    def _keep_topics(self, trace: MessageTrace, segments: Sequence[Segment]) -> list[Loss]:
+        """Write the messages of the configured topics to the segments, and return their losses."""
+        reading = TopicReading(trace.recording, self._job.config.topics)
+        with ExitStack() as stack:
+            writers = [stack.enter_context(segment.topics(reading)) for segment in segments]
+            for batch in reading.batches(Findings()):
+                for writer in writers:
+                    writer.add(batch)
+        return [
+            Loss(f"topic {name!r}: {text}", bytes=0)
+            for name, lost in reading.losses.items()
+            for text in lost.texts()
+        ]
 
     def _meant(self, block: FrameBlock) -> FrameBlock:
         """Return a block of frames after applying the configured mapping from type names to kinds."""

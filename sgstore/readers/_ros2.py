@@ -368,7 +368,7 @@ def decode(kind: Struct, data: Data) -> dict[str, Any]:
         The message is truncated, has a wrong length, exceeds a limit of its definition or :data:`MAX_VALUES`,
         or does not use plain CDR.
     """
-    return _MessageReader.of(data).struct(kind)
+    return MessageReader.of(data).struct(kind)
 
 
 def number(record: dict[str, Any], path: str) -> float:
@@ -409,7 +409,7 @@ def _unpacker(code: str) -> Callable[..., tuple[Any, ...]]:
 
 
 @dataclass(slots=True)
-class _MessageReader:
+class MessageReader:
     """Read position in the bytes of a ROS message.
 
     ``values``: bytes after the head; ``order``: byte order of numbers; ``place``: position of the next byte;
@@ -422,7 +422,7 @@ class _MessageReader:
     left: int = MAX_VALUES
 
     @classmethod
-    def of(cls, data: Data) -> _MessageReader:
+    def of(cls, data: Data) -> MessageReader:
         head = bytes(data[:HEAD])
         kind = int.from_bytes(head[:2], "big")
         if len(head) < HEAD:
@@ -585,7 +585,7 @@ class ColumnReader:
         TraceError
             As :func:`decode`.
         """
-        reader = _MessageReader.of(data)
+        reader = MessageReader.of(data)
         return {name: reader.value(kind) for name, kind in self._head}
 
     def read(self, data: Data) -> tuple[dict[str, Any], Floats]:
@@ -603,7 +603,7 @@ class ColumnReader:
         TraceError
             As :func:`decode`; or there are more than :data:`MAX_ROWS` rows.
         """
-        reader = _MessageReader.of(data)
+        reader = MessageReader.of(data)
         head = {name: reader.value(kind) for name, kind in self._head}
         count = 1 if self._sequence is None else reader.count(self._sequence)
         if count > MAX_ROWS:
@@ -614,7 +614,7 @@ class ColumnReader:
             row += self._some(reader, numbers[row:])
         return head, numbers
 
-    def _some(self, reader: _MessageReader, to: Floats) -> int:
+    def _some(self, reader: MessageReader, to: Floats) -> int:
         """Read the next element and all following ones with equal byte positions. Return their number."""
         values, order, place = reader.values, reader.order, reader.place
         layouts = self._layouts.setdefault((order, place % self._align), [])
@@ -636,7 +636,7 @@ class ColumnReader:
         return alike
 
 
-def _learned(reader: _MessageReader, kind: Struct, columns: dict[str, int]) -> _StructLayout:
+def _learned(reader: MessageReader, kind: Struct, columns: dict[str, int]) -> _StructLayout:
     """Decode the next sequence element, and return the byte positions of its numbers."""
     walk = _ElementWalk(reader, columns, reader.place)
     walk.step(kind, "")
@@ -646,7 +646,7 @@ def _learned(reader: _MessageReader, kind: Struct, columns: dict[str, int]) -> _
 class _ElementWalk:
     """Decoder of one sequence element that records the byte positions of its numbers."""
 
-    def __init__(self, reader: _MessageReader, columns: dict[str, int], start: int) -> None:
+    def __init__(self, reader: MessageReader, columns: dict[str, int], start: int) -> None:
         self.start = start
         self.prefixes: list[tuple[int, int]] = []
         self.found: dict[int, tuple[int, np.dtype[Any]]] = {}

@@ -7,6 +7,7 @@ copied unchanged.
 from __future__ import annotations
 
 import os
+import shutil
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
@@ -24,6 +25,7 @@ from sgstore.store._publish import SCATTERED, SHARED
 from sgstore.store._rows import run
 from sgstore.store._staging import Sealed, scratch
 from sgstore.store._table_stream import FILE, TableFile
+from sgstore.store._topics import FRAME, LISTING, TOPIC_FILES, copy_topic_tables, topic_tables
 from sgstore.store._traces import stored_traces
 
 if TYPE_CHECKING:
@@ -38,6 +40,7 @@ TOGETHER: Final = 64
 """Largest number of stores to join at once. More stores are joined in several steps."""
 
 _TRACE_OF: Final = {
+    FRAME: f"{quoted(FRAME)} >> {SEQ_BITS}",
     "trace_id": "trace_id",
     "bucket": f"bucket >> {BUCKET_BITS}",
     "frame_id": f"frame_id >> {SEQ_BITS}",
@@ -173,14 +176,20 @@ def _copied(
         words = {enum: shape.labels_of(connection, database, enum) for enum in NAMES}
         shape.widen(connection, "fresh", words)
     _choose(connection, traces, maps)
-    for table in shape.expected().tables:
+    topics = {name: topic_tables(connection, name) for name in sources}
+    for table in (*shape.expected().tables, *copy_topic_tables(connection, sources, "fresh")):
         if table not in {"store_info", "bits"}:  # every new store has their rows
-            rows = " UNION ALL BY NAME ".join(_chosen(table, name) for name in sources)
+            having = [
+                name for name in sources if table in {**shape.expected().tables, **topics[name]}
+            ]
+            rows = " UNION ALL BY NAME ".join(_chosen(table, name) for name in having)
             if table in _ONCE or table == "manifest":
                 rows = f"SELECT DISTINCT * FROM ({rows})"
             order = (
                 f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in SCATTERED else " ORDER BY ALL"
             )
+            if table in topics[having[0]]:
+                order = ""  # in order of time in each trace
             if table in {"map", "map_node"}:  # map texts are long, and a map has few rows
                 order = f" ORDER BY map_id{', node_id DESC' * (table == 'map_node')}"
             connection.execute(f"INSERT INTO fresh.inside.{table} BY NAME {rows}{order}")
@@ -232,7 +241,9 @@ def _chosen(table: str, database: str) -> str:
             )
         place = " REPLACE (NULL AS place)" if table == "recording" else ""
         return f"SELECT *{place} FROM {inside}.{table} WHERE {chosen}"
-    column = next(name for name in _TRACE_OF if name in types_of(table))
+    own = shape.expected().tables
+    columns = types_of(table) if table in own else {"trace_id" if table == LISTING else FRAME}
+    column = next(name for name in _TRACE_OF if name in columns)
     return f"SELECT * FROM {inside}.{table} WHERE {_TRACE_OF[column]} IN (SELECT key FROM chosen)"
 
 
@@ -378,6 +389,7 @@ def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
     told = Sealed.read(sealed)
     _copy_pieces([sealed], lambda table: of_map if table in SHARED["map"] else to, [to, of_map])
     replace(told, folder=to).write()
+    _copy_topics(sealed, to)
     return told.identity.map_digest
 
 
@@ -399,7 +411,13 @@ def whole_segment(folders: Sequence[Path], to: Path) -> Sealed:
     _copy_pieces(folders, lambda _: to, [to])
     whole = replace(Sealed.read(folders[0]), folder=to)
     whole.write()
+    _copy_topics(folders[0], to)
     return whole
+
+
+def _copy_topics(source: Path, to: Path) -> None:
+    for file in source.glob(TOPIC_FILES):
+        shutil.copyfile(file, to / file.name)
 
 
 def _copy_pieces(

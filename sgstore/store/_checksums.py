@@ -175,11 +175,11 @@ def expressions(
     """
     listed: list[str] = []
     for name, kind in columns_of(connection, table, catalog):
-        value = f'"{name}"'
+        value = quoted(name)
         if kind.startswith("ENUM"):
             value = code_sql(value, kind)
-        elif kind in TEXTS:
+        elif kind in TEXTS or kind.endswith("]") or kind == "BLOB":
             value = f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
         if (table, name) not in _ASSIGNED and (not only or name in only):
-            listed.append(f'{value} AS "{name}"')
+            listed.append(f"{value} AS {quoted(name)}")
     return ", ".join(listed)

@@ -33,6 +33,7 @@ from sgstore.store._traces import (
     stored_name,
     stored_traces,
     trace_named,
+    unchanged,
     uri_of,
 )
 
@@ -127,7 +128,6 @@ class StoreFile:
         )
         self.access.root = root
         self._graphs: Graphs | None = None
-        self._seen: set[tuple[str, int, int]] = set()
         self._abstracted: Abstracted | None = None
         self._known: tuple[Stamp, Catalog] | None = None
         self._answers: dict[str, dict[str, NDArray[np.generic]]] | None = None
@@ -297,11 +297,13 @@ class StoreFile:
         if self._known is not None and self._known[0] == stamp_of(self.path):
             return self._known[1]  # opening the store takes longer than compiling a query
         from sgstore.store._catalog import catalog_of
+        from sgstore.store._topic_views import topic_facts
 
         with self.access.reading() as connection:
             stamp, catalog = stamp_of(self.path), catalog_of(connection)
             if self.tables is not None:
                 catalog = self.tables.known(connection, catalog)
+            catalog = replace(catalog, topics=topic_facts(connection, self.access))
             self._known = stamp, catalog
             return catalog
 
@@ -502,27 +504,11 @@ class StoreFile:
                 "SELECT r.uri, r.place, r.size, r.mtime_ns, r.digest FROM trace t"
                 " JOIN recording r ON r.recording_id = t.recording_id WHERE t.trace_id = ?"
             )
-            (recording,) = connection.execute(sql, [frame.trace_id]).fetchall()
+            ((uri, inside, size, *mark),) = connection.execute(sql, [frame.trace_id]).fetchall()
         channel_id, chunk_offset, offset, length = found
         place = {"chunk_offset": chunk_offset, "offset": offset, "length": length}
-        return self._unchanged(*recording), channel_id, place
-
-    def _unchanged(
-        self, uri: str, place: str | None, size: int, mtime_ns: int, digest: str
-    ) -> Path:
-        """Return the path of an ingested recording. If its timestamp has changed, its hash is checked once."""
-        from sgstore.mcap import digest_of, mark_of
-
-        path = located(uri, place, size, self.path, self.access.root)
-        try:
-            mark = (str(path), *mark_of(path))
-        except OSError as error:
-            raise TraceError(f"cannot be read: {error.strerror}", path=path) from error
-        if mark[1:] != (size, mtime_ns) and mark not in self._seen:
-            if mark[1] != size or digest_of(path) != digest:
-                raise TraceError("not the file that was ingested; ingest it anew", path=path)
-            self._seen.add(mark)
-        return path
+        path = located(uri, inside, size, self.path, self.access.root)
+        return unchanged(path, size, *mark), channel_id, place
 
     def stored(
         self,
@@ -725,6 +711,13 @@ class StoreFile:
 
         refuse_others(self.path, self.access)
 
+    def _show_topics(self, connection: DuckDBPyConnection, sql: str) -> None:
+        """Create the views of the topics that a statement names."""
+        if '":' in sql:
+            from sgstore.store._topic_views import show_topics
+
+            show_topics(connection, self.access, sql)
+
     @contextmanager
     def answered(
         self,
@@ -744,6 +737,7 @@ class StoreFile:
                     connection = stack.enter_context(self.access.reading(public=public))
                     with translated(self.path):
                         stack.enter_context(recorded_measures(connection, self.path, sql))
+                        self._show_topics(connection, sql)
                         give(connection, given)
                         found = ask(connection, stack)
                     break

@@ -35,6 +35,13 @@ from sgstore.store._locking import spill_folder, transaction
 from sgstore.store._packing import MISSING, plain
 from sgstore.store._staging import PIECE_ROWS, Staging, scratch
 from sgstore.store._table_stream import FILE, TableFile
+from sgstore.store._topics import (
+    FRAME,
+    copy_topic_tables,
+    drop_topic_tables,
+    publish_topics,
+    topic_tables,
+)
 from sgstore.store._traces import (
     Identity,
     already_stored,
@@ -87,7 +94,8 @@ def publish_each(
     found: list[str | SgstoreError] = []
     while len(found) < len(sealed):
         try:
-            with scratch(spill_folder()) as connection, access.attached(connection):
+            folders = [one.folder for one in sealed if one.topics]
+            with scratch(spill_folder()) as connection, access.attached(connection, *folders):
                 for one in sealed[len(found) :]:
                     try:
                         with translated(access.path), transaction(connection):
@@ -139,6 +147,7 @@ def _put(
     own_row = checksums(connection, "store", "trace", "trace", only=identity.trace_id)
     noted["trace"] = own_row[identity.trace_id]
     _note(connection, "trace", identity.trace_id, noted)
+    note(connection, identity.trace_id, publish_topics(connection, sealed))
     if known:
         connection.execute(ORPHANS)
     return name
@@ -285,6 +294,7 @@ def _note(
 
 
 _OWNED: Final = {
+    FRAME: f"{quoted(FRAME)} >= $trace_id << 24 AND {quoted(FRAME)} < ($trace_id + 1) << 24",
     "trace_id": "trace_id = $trace_id",
     "bucket": "bucket >= $trace_id << 18 AND bucket < ($trace_id + 1) << 18",
     "frame_id": "frame_id >= $trace_id << 24 AND frame_id < ($trace_id + 1) << 24",
@@ -312,7 +322,7 @@ def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, 
         WHERE database_name = $1 AND schema_name = 'inside' AND list_contains($2, table_name)
         GROUP BY table_name ORDER BY table_name
         """,
-        [database, [*shape.expected().tables]],  # user tables may exist there
+        [database, [*shape.expected().tables, *topic_tables(connection, database)]],
     ).fetchall()
     for table, columns in rows:
         found = next((column for column in _OWNED if column in columns), None)
@@ -324,6 +334,7 @@ def remove(connection: DuckDBPyConnection, trace_id: int) -> None:
     """Delete a trace from the attached store, with the settings and map that no other trace uses."""
     _delete(connection, trace_id)
     connection.execute(ORPHANS)
+    drop_topic_tables(connection)
 
 
 def _delete(connection: DuckDBPyConnection, trace_id: int) -> None:
@@ -342,6 +353,7 @@ SCATTERED: Final = (*STATES, *REPEATED, *REPEATED.values(), "frame", *MASKS, "de
 
 def copy_sorted(connection: DuckDBPyConnection) -> None:
     """Copy the attached database ``store`` into the empty database ``fresh``, with sorted rows."""
+    copy_topic_tables(connection, ["store"], "fresh")
     tables = connection.execute(
         "SELECT table_name FROM duckdb_tables() WHERE database_name = 'fresh'"
     ).fetchall()
@@ -420,13 +432,15 @@ def checksums(
         Called with the number of rows of each range.
     """
     names = {name for name, _ in columns_of(connection, table, database)}
-    keys = {"bucket": (0, BUCKET_BITS), "frame_id": (FRAME_BITS, SEQ_BITS)}
+    of_frames = (FRAME_BITS, SEQ_BITS)
+    keys = {FRAME: of_frames, "bucket": (0, BUCKET_BITS), "frame_id": of_frames}
     key = next((name for name in keys if name in names), f"{owner}_id")
     low, high = keys.get(key, (-BUCKET_BITS, 0))
     ends = {-_ALL, _ALL} if only is None else {only << high, (only + 1) << high}
     bounds = sorted({cut << low if low >= 0 else cut >> -low for cut in cuts} | ends)
     select = expressions(connection, table, database)
-    sql = f"SELECT {select} FROM {quoted(database)}.inside.{table} WHERE {key} >= ? AND {key} < ?"
+    place, at = f"{quoted(database)}.inside.{table}", quoted(key)
+    sql = f"SELECT {select} FROM {place} WHERE {at} >= ? AND {at} < ?"
     found: dict[int, Checksum] = defaultdict(Checksum)
     for bound in pairwise(bounds):
         rows = connection.execute(sql, bound).fetchnumpy()

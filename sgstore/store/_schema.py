@@ -180,6 +180,65 @@ def database_of(connection: DuckDBPyConnection) -> str:
     return name
 
 
+_TOPIC: Final = re.compile(r"topic(_[0-9a-f]{16})?")
+_TOPIC_TYPES: Final = frozenset(
+    {
+        *(
+            "BOOLEAN",
+            "TINYINT",
+            "UTINYINT",
+            "SMALLINT",
+            "USMALLINT",
+            "INTEGER",
+            "UINTEGER",
+            "BIGINT",
+        ),
+        *("UBIGINT", "FLOAT", "DOUBLE", "VARCHAR", "BLOB", "JSON"),
+    }
+)
+
+
+def topic_statements(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
+    """Return the tables of topics: name → statement that creates it, without ``CREATE TABLE``.
+
+    ``tables``: names and statements of tables. Only tables of plain columns count: a store is not trusted.
+    """
+    found: dict[str, str] = {}
+    for name, told in tables:
+        if _TOPIC.fullmatch(name) and _is_plain(words := statement(told)):
+            found[name] = f"{name}{' '.join(words[3:]).removesuffix(';')}"
+    return found
+
+
+def _is_plain(words: Tokens) -> bool:
+    """True if a CREATE TABLE statement has only columns with plain types."""
+    *columns, end = words[4:] if words[-1] != ";" else words[4:-1]
+    if words[3] != "(" or end != ")":
+        return False
+    column: list[str] = []
+    for word in (*columns, ","):
+        if word != ",":
+            column.append(word)
+            continue
+        kind = column[2:]
+        kind = kind[:-2] if kind[-2:] == ["NOT", "NULL"] else kind
+        if len(column) < 2 or column[1] not in _TOPIC_TYPES or kind not in ([], ["[", "]"]):
+            return False
+        column = []
+    return True
+
+
+def _without_topics(objects: Objects) -> Objects:
+    """Return the objects of a store without its tables of topics, which a store may lack."""
+    told = {
+        (name, str(sql))
+        for what, schema, name, sql in objects
+        if what == "table" and schema == INSIDE and _TOPIC.fullmatch(name)
+    }
+    ours = topic_statements(told) if told else {}
+    return tuple(one for one in objects if one[:2] != ("table", INSIDE) or one[2] not in ours)
+
+
 def _about(
     connection: DuckDBPyConnection, database: str, path: Path, objects: Objects
 ) -> dict[str, str]:
@@ -439,7 +498,10 @@ def _names_in(connection: DuckDBPyConnection, database: str, what: str, one: str
 
 
 def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:
-    """Return tables, views and types of a database: (kind, schema, name, statement or values)."""
+    """Return tables, views and types of a database: (kind, schema, name, statement or values).
+
+    Tables of topics are not among them.
+    """
     found: list[tuple[str, str, str, str | Tokens]] = []
     for what, told in (("table", "sql"), ("view", "sql"), ("type", "labels")):
         rows = connection.execute(
@@ -450,7 +512,7 @@ def objects_of(connection: DuckDBPyConnection, database: str) -> Objects:
         for schema, name, made in rows:
             text = tuple(made or ()) if what == "type" else (made or "").rstrip().removesuffix(";")
             found.append((what, schema, name, text))
-    return tuple(found)
+    return _without_topics(tuple(found))
 
 
 def _made(objects: Objects) -> Mapping[tuple[str, str], dict[str, Tokens]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
@@ -335,6 +335,8 @@ class Sealed:
         Table → checksum of its rows.
     words : dict
         Enumeration → values that the store may have to add.
+    topics : list of dict
+        Topics with messages in files of the folder: attributes of :class:`sgstore.store._topics.TopicFile`.
     """
 
     folder: Path
@@ -343,6 +345,7 @@ class Sealed:
     trace: dict[str, Any]
     checksums: dict[str, Checksum]
     words: dict[str, list[str]]
+    topics: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
     def write(self) -> None:
         """Write the description of a complete trace into its folder, for :meth:`read`.
@@ -378,4 +381,5 @@ class Sealed:
             trace=values["trace"],
             checksums={name: Checksum(**one) for name, one in values["checksums"].items()},
             words=values["words"],
+            topics=values.get("topics", []),
         )

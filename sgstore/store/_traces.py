@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.display import excerpt
-from sgstore.errors import SgstoreError, StoreError, place_named, url_named
+from sgstore.errors import SgstoreError, StoreError, TraceError, place_named, url_named
 from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS
 from sgstore.model.pair_numbers import UNEVEN
 from sgstore.model.vocabulary import natural, suggestion
@@ -314,6 +314,31 @@ def located(
             found = one.resolve()
             if found == path or mark_of(found)[0] == size:
                 return found
+    return path
+
+
+_seen: Final[set[tuple[str, int, int]]] = set()
+"""Path, size and modification time of recordings that have been checked."""
+
+
+def unchanged(path: Path, size: int, mtime_ns: int, digest: str) -> Path:
+    """Return the path of an ingested recording. If its modification time has changed, it is hashed once.
+
+    Raises
+    ------
+    TraceError
+        The file is missing, or is another one.
+    """
+    from sgstore.mcap import digest_of, mark_of
+
+    try:
+        mark = (str(path), *mark_of(path))
+    except OSError as error:
+        raise TraceError(f"cannot be read: {error.strerror}", path=path) from error
+    if mark[1:] != (size, mtime_ns) and mark not in _seen:
+        if mark[1] != size or digest_of(path) != digest:
+            raise TraceError("not the file that was ingested; ingest it anew", path=path)
+        _seen.add(mark)
     return path
 
 

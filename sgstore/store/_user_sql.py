@@ -74,6 +74,10 @@ class UserSql:
     ) -> None:
         self._answer, self._given = answered, given
         self.sql, self.timeout_s = sql, timeout_s
+        if "topic" in sql.lower():
+            from sgstore.lang.syntax import topic_tables  # slow import
+
+            self.sql = topic_tables(sql)
 
     def batches(self, size: int = BATCH) -> AbstractContextManager[Batches]:
         """Stream the rows of the statement in batches."""
@@ -130,7 +134,7 @@ class UserSql:
             given = [(counted[0], {})] if counted else self._given and self._given()
             sql = counted[1] if counted else self.sql
             if given:
-                with self._interrupted(connection), self._refused():
+                with self._interrupted(connection), self._refused(connection):
                     connection.execute(f"USE {INSIDE}")
                     give(connection, given)
                     connection.execute("USE main")
@@ -143,13 +147,13 @@ class UserSql:
     def _running(
         self, connection: DuckDBPyConnection, step: Callable[[DuckDBPyConnection], T]
     ) -> Generator[T]:
-        with self._refused():
+        with self._refused(connection):
             _check(connection, self.sql)
-        with self._interrupted(connection), self._refused():
+        with self._interrupted(connection), self._refused(connection):
             yield step(connection)
 
     @contextmanager
-    def _refused(self) -> Generator[None]:
+    def _refused(self, connection: DuckDBPyConnection) -> Generator[None]:
         """Context manager that converts DuckDB errors to errors of the user's SQL statement."""
         try:
             yield
@@ -160,6 +164,10 @@ class UserSql:
             if (fault := engine_fault(error)) is not None:
                 raise EngineError(fault) from error
             message = spill_fault(str(error)) or str(error).strip()
+            if '":topic ' in self.sql:
+                from sgstore.store._topic_views import field_fault
+
+                message = field_fault(connection, self.sql, message) or message
             if "pytz" in message:  # before DuckDB 2.0.1
                 message = "times with a time zone cannot be shown; cast them: now()::TIMESTAMP"
             raise SqlError(_TO_A_TABLE.sub(_views, message)) from error

@@ -6,6 +6,7 @@ Only the publication changes the store: it adds a complete trace, or nothing.
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -22,18 +23,21 @@ from sgstore.model.graph import LeftOut
 from sgstore.model.vocabulary import KINDS
 from sgstore.model.world import BUCKET_FRAMES, Origin, longest_step_ns, origin_of, quantize
 from sgstore.store._classes import IngestedClasses
+from sgstore.store._locking import spill_folder
 from sgstore.store._packing import NodeKinds, texts
 from sgstore.store._payloads import FrameTimes, Happenings
 from sgstore.store._staging import Sealed, Staging
+from sgstore.store._topics import FrameClock, TopicFile, TopicWriter, topic_scratch
 from sgstore.store._traces import uri_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Generator, Mapping, Sequence
     from pathlib import Path
 
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import GraphBlock
     from sgstore.model.world import Codes, FrameBlock, Ints, TraceInfo, TraceReport
+    from sgstore.readers import TopicReading
     from sgstore.store._packing import Columns
     from sgstore.store._staging import StagedRows
     from sgstore.store._traces import Identity
@@ -120,6 +124,7 @@ class Segment:
         self._times: list[Ints] = []
         self._left_out = LeftOut()
         self._constants = {name: [np.zeros(0, object)] for name in ("special", "subkind")}
+        self._topics: list[TopicFile] = []
         self._staging = Staging(store, place)
         try:
             self._insert_about()
@@ -220,6 +225,18 @@ class Segment:
             }
             self._staging.insert("attribute", columns)
 
+    @contextmanager
+    def topics(self, reading: TopicReading) -> Generator[TopicWriter]:
+        """Context manager with a writer of the messages of topics. All frames must have been added."""
+        time_ns, log_time_ns = np.concatenate(self._times, axis=1)
+        identity = self._identity
+        clock = FrameClock.of_trace(identity.trace_id, time_ns, log_time_ns)
+        bounded = (identity.since, identity.until) != (None, None)
+        with topic_scratch(spill_folder()) as connection:
+            writer = TopicWriter(connection, self._staging.folder, clock, bounded=bounded)
+            yield writer
+            self._topics = writer.files(reading)
+
     def seal(
         self,
         report: TraceReport,
@@ -281,7 +298,8 @@ class Segment:
             "version": version("sgstore"),
         }  # fmt: skip
         words, path = staging.words(self._answers), self._info.path
-        sealed = Sealed(staging.folder, path, identity, trace, staging.checksums, words)
+        topics = [asdict(one) for one in self._topics]
+        sealed = Sealed(staging.folder, path, identity, trace, staging.checksums, words, topics)
         sealed.write()
         return sealed
 

@@ -10,10 +10,11 @@ from sgstore.lang.syntax._hints import (
 )
 from sgstore.lang.syntax._parse import joined, parse
 from sgstore.lang.syntax._pattern_builder import Pattern
-from sgstore.lang.syntax._table_function import pattern_tables
+from sgstore.lang.syntax._table_function import TOPIC, pattern_tables, topic_tables
 from sgstore.lang.syntax._tables import keywords
 
 __all__ = [
+    "TOPIC",
     "Pattern",
     "comparison_hint",
     "condition_hint",
@@ -25,5 +26,6 @@ __all__ = [
     "pattern_of",
     "pattern_tables",
     "said_of",
+    "topic_tables",
     "variable_hint",
 ]

@@ -1,4 +1,4 @@
-"""Calls of ``sgql('MATCH …')`` in SQL, which use the matches of a query as a table.
+"""Calls in SQL that are tables: ``sgql('MATCH …')`` of the matches of a query, ``topic('/imu')`` of messages.
 
 The SQL statement is not parsed. Texts, quoted names and comments are skipped, so only real calls are found.
 """
@@ -40,7 +40,7 @@ _DOLLARS: Final = r"\$(?P<tag>[A-Za-z_]\w*|)\$.*?\$(?P=tag)\$"
 _BLANK: Final = re.compile(r"(?:\s+|--[^\n]*|/\*.*?\*/)*", re.DOTALL)
 _PART: Final = re.compile(
     rf"""\be'(?:[^'\\]|\\.|'')*'|{_TEXT}|"(?:[^"]|"")*"|{_DOLLARS}|--[^\n]*|/\*.*?\*/"""
-    r"|(?P<call>(?<![\w.\"])sgql\s*\()",
+    r"|(?P<call>(?<![\w.\"])(?P<of>sgql|topic)\s*\()",
     re.DOTALL | re.IGNORECASE,
 )
 _VALUE: Final = re.compile(
@@ -48,6 +48,7 @@ _VALUE: Final = re.compile(
     re.DOTALL | re.IGNORECASE,
 )
 _NAME: Final = re.compile(r"([A-Za-z_]\w*)\s*(?::=|=>|=)")
+_OF_TOPIC: Final = "SELECT * FROM topic('/imu')"
 _EXAMPLE: Final = "SELECT * FROM sgql('MATCH (e:Ego) RETURN FRAMES')"
 
 
@@ -69,7 +70,7 @@ def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[Pa
     parts: list[str] = []
     end = 0
     for call in _PART.finditer(sql):
-        if call["call"] is None or call.start() < end:
+        if (call["of"] or "").lower() != "sgql" or call.start() < end:
             continue
         arguments = _Arguments(sql, call.start(), call.end())
         text, values = arguments.read()
@@ -80,6 +81,33 @@ def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[Pa
         parts += [sql[end : call.start()], quoted(table.name)]
         end = arguments.at
     return "".join([*parts, sql[end:]]), tuple(found.values())
+
+
+TOPIC: Final = ":topic"
+"""Start of the name of a view with the messages of a topic."""
+
+
+def topic_tables(sql: str) -> str:
+    """Return an SQL statement in which names of views replace the ``topic('/imu')`` calls.
+
+    Raises
+    ------
+    QueryError
+        A call is not ``topic('…')``. The error has the place.
+
+    Examples
+    --------
+    >>> topic_tables("SELECT x FROM topic('/imu')")
+    'SELECT x FROM ":topic /imu"'
+    """
+    parts: list[str] = []
+    end = 0
+    for call in _PART.finditer(sql):
+        if (call["of"] or "").lower() == "topic" and call.start() >= end:
+            arguments = _Arguments(sql, call.start(), call.end())
+            parts += [sql[end : call.start()], quoted(f"{TOPIC} {arguments.topic()}")]
+            end = arguments.at
+    return "".join([*parts, sql[end:]])
 
 
 def _free(taken: Collection[str], number: int) -> str:
@@ -118,6 +146,15 @@ class _Arguments:
             self._refuse("expected ',' or ')' after the query", self.at, hint)
         self.at += 1
         return text, tuple(values)
+
+    def topic(self) -> str:
+        """Return the name in a ``topic(…)`` call."""
+        first = self._next()
+        name = self._value()
+        if not isinstance(name, str) or not name or self._sign() != ")":
+            self._refuse("topic() takes the name of a topic in quotes", first, _OF_TOPIC)
+        self.at += 1
+        return name
 
     def _next(self) -> int:
         found = _BLANK.match(self.sql, self.at)

@@ -360,6 +360,9 @@ class Config:
         names of vehicles as for ego; an ego never is
     without : tuple of str
         relations that are not computed and stay unknown: ['overlaps', 'follows']
+    topics : tuple of str
+        channels of the recording whose messages are stored as columns, beside the graphs:
+        ['/planner', '/imu']
     orientation : str
         whom a signal of an OpenDRIVE map applies to that has no <validity>: 'asam': traffic in the
         direction of its orientation along the road, as the standard says; 'carla': the lanes to the
@@ -403,6 +406,7 @@ class Config:
     kinds: tuple[str, ...] = ()
     exclude_ids: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
+    topics: tuple[str, ...] = ()
     orientation: str = "asam"
     new_kinds: tuple[str, ...] = ()
     types: Mapping[str, TypeMeaning] = field(default_factory=dict)
@@ -421,6 +425,8 @@ class Config:
         right = "a length from 0 to 10 m, or -1 for an estimate"
         check(0 <= self.noise <= 10 or self.noise == -1, "noise", self.noise, right)
         check_labels("kinds", self.kinds, ego=False)
+        once = all(self.topics) and len(set(self.topics)) == len(self.topics)
+        check(once, "topics", self.topics, "names of channels, each once")
         both = set(self.proximity.names) & set(self.direction.names)
         check(not both, "direction.names", self.direction.names, "other names than proximity.names")
         for name in self.without:
@@ -477,7 +483,7 @@ class Config:
         return {name: n for name, n in types.items() if name.lower() not in self.types}
 
     def as_stored(self) -> dict[str, Any]:
-        """Return the settings as a store keeps them. Those of stores before ``noise`` stay the same.
+        """Return the settings as a store keeps them. Settings that older stores lack are left out by default.
 
         Examples
         --------
@@ -487,6 +493,8 @@ class Config:
         found = self.as_dict()
         if self.noise < 0:
             del found["noise"]
+        if not self.topics:
+            del found["topics"]
         return found
 
     def __repr__(self) -> str:

@@ -337,7 +337,9 @@ _NEEDS: Final = {
 }
 
 
-def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[Any]:
+def message_class(
+    schema: Schema, fields: dict[str, Any] | None = None, *, whole: bool = False
+) -> type[Any]:
     """Return the protobuf message class for the schema of an MCAP channel.
 
     Parameters
@@ -346,6 +348,8 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
     fields : dict, optional
         Fields to read instead of those of frames, as in :func:`~sgstore.readers.osi._schema.prune`; each of
         them may be missing.
+    whole : bool
+        True for a class with all fields of any schema.
 
     Raises
     ------
@@ -359,13 +363,13 @@ def message_class(schema: Schema, fields: dict[str, Any] | None = None) -> type[
     try:
         files = list(descriptor_pb2.FileDescriptorSet.FromString(schema.data).file)
         wanted = fields_read().get(schema.name) if fields is None else fields
-        if wanted is not None:
+        if wanted is not None and not whole:
             parts = {name: fields_read()[name] for name in (MOVING_OBJECT, TRAFFIC_LIGHT)}
             prune(files, parts | {schema.name: wanted})
         pool = descriptor_pool.DescriptorPool()
         _add(pool, {file.name: file for file in files})
         found = pool.FindMessageTypeByName(schema.name)
-        _require(found, _NEEDS.get(schema.name, ()) if fields is None else ())
+        _require(found, _NEEDS.get(schema.name, ()) if fields is None and not whole else ())
         return message_factory.GetMessageClass(found)
     except DECODE_ERRORS as error:
         reason = f"schema {schema.name}: its protobuf descriptors are malformed: {error}"

@@ -1,0 +1,267 @@
+"""Values of topics as columns: arrays of numbers, or texts that the database converts to the type of a field.
+
+Message data are untrusted. A value that is too large is missing, and counted.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from sgstore.lang.catalog import TopicField
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    Column = NDArray[Any]
+    """Values of a field: numbers (masked where they are missing), lists of numbers (n, length), or texts."""
+
+
+MAX_FIELDS: Final = 2048
+"""Maximum number of fields of a topic."""
+MAX_DEPTH: Final = 12
+"""Maximum nesting depth of a field. Deeper values are JSON."""
+MAX_VALUE: Final = 1 << 16
+"""Maximum size of a text, of bytes, or of a list; characters, bytes, or elements."""
+MAX_JSON: Final = 1 << 20
+"""Maximum size of a nested list as JSON; characters."""
+OWN: Final = ("trace", "t", "log_time_ns", "publish_time_ns")
+"""Columns of each topic beside its fields."""
+
+NUMPY: Final[Mapping[str, type[np.generic]]] = {
+    "BOOLEAN": np.bool_,
+    "TINYINT": np.int8,
+    "UTINYINT": np.uint8,
+    "SMALLINT": np.int16,
+    "USMALLINT": np.uint16,
+    "INTEGER": np.int32,
+    "UINTEGER": np.uint32,
+    "BIGINT": np.int64,
+    "UBIGINT": np.uint64,
+    "FLOAT": np.float32,
+    "DOUBLE": np.float64,
+}
+"""Database type → type of the array."""
+
+_CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
+
+
+@dataclass(slots=True)
+class TopicNames:
+    """Names of the columns of a topic. Two names never differ only by case.
+
+    Attributes
+    ----------
+    taken : dict
+        Path in a message → column.
+    """
+
+    taken: dict[str, str] = field(default_factory=dict[str, str])
+    _folded: set[str] = field(default_factory=lambda: {*OWN})
+
+    def of(self, path: str) -> str:
+        """Return the column of a field. ``_`` is appended to a name that another column has."""
+        if (known := self.taken.get(path)) is not None:
+            return known
+        name = _CONTROL.sub("?", path)[:200] or "_"
+        while name.lower() in self._folded:
+            name += "_"
+        self._folded.add(name.lower())
+        self.taken[path] = name
+        return name
+
+
+@dataclass(slots=True)
+class Losses:
+    """Counts of messages and values of a topic that are not decoded.
+
+    Attributes
+    ----------
+    messages : int
+    reason : str
+        Reason of the first lost message.
+    values : int
+        Values that are too large, or of another type than their field.
+    """
+
+    messages: int = 0
+    reason: str = ""
+    values: int = 0
+
+    def lose(self, reason: object, messages: int = 1) -> None:
+        """Count messages that cannot be decoded."""
+        self.messages += messages
+        self.reason = self.reason or " ".join(str(reason).split())[:200]
+
+    def texts(self) -> list[str]:
+        """Return the lost messages and values, each as a clause."""
+        found: list[str] = []
+        if self.messages:
+            found.append(f"{self.messages} messages cannot be decoded, the first: {self.reason}")
+        if self.values:
+            found.append(f"{self.values} values are left out: too large, or of another type")
+        return found
+
+
+def column_of(declared: str, values: Sequence[Any], losses: Losses) -> Column:
+    """Return Python values of a field as a column of its database type. ``None`` means missing."""
+    if (kind := NUMPY.get(declared)) is not None:
+        return _numbers(kind, values, losses)
+    column = np.empty(len(values), object)
+    column[:] = [None if value is None else _text(declared, value, losses) for value in values]
+    return column
+
+
+def _numbers(kind: type[np.generic], values: Sequence[Any], losses: Losses) -> Column:
+    missing = [value is None for value in values]
+    known = [kind(0) if value is None else value for value in values]
+    try:
+        with np.errstate(over="raise"):
+            return np.ma.masked_array(np.array(known, kind), missing)
+    except (OverflowError, ValueError, TypeError, FloatingPointError):
+        fits = [_fits(kind, value) for value in known]
+        losses.values += fits.count(False)
+        known = [value if fit else kind(0) for value, fit in zip(known, fits, strict=True)]
+        hidden = [gone or not fit for gone, fit in zip(missing, fits, strict=True)]
+        return np.ma.masked_array(np.array(known, kind), hidden)
+
+
+def _fits(kind: type[np.generic], value: Any) -> bool:
+    try:
+        np.array([value], kind)
+    except (OverflowError, ValueError, TypeError):
+        return False
+    return True
+
+
+def _text(declared: str, value: Any, losses: Losses) -> str | None:
+    """Return a value as the text that the database converts to the type of the field."""
+    if declared == "VARCHAR":
+        found = value if isinstance(value, str) else as_json(value)
+    elif declared == "BLOB":
+        found = bytes(value[: MAX_VALUE + 1]).hex()
+    elif declared.endswith("[]") and len(value) > MAX_VALUE:
+        found = None
+    else:
+        found = as_json(value)
+    size = {"JSON": MAX_JSON, "BLOB": 2 * MAX_VALUE}.get(declared, MAX_JSON)
+    if found is None or len(found) > (MAX_VALUE if declared == "VARCHAR" else size):
+        losses.values += 1
+        return None
+    return plain_text(found)
+
+
+def plain_text(text: str) -> str:
+    """Return a text without surrogates, which UTF-8 cannot encode."""
+    if text.isascii():
+        return text
+    return text.encode("utf-8", "replace").decode()
+
+
+def as_json(value: Any) -> str:
+    """Return a value of a message as JSON. Arrays are lists, bytes are hexadecimal."""
+    return json.dumps(value, default=_json_value, ensure_ascii=False)
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, bytes | memoryview):
+        return value.hex()
+    return str(value)
+
+
+def list_column(declared: str, rows: Column, losses: Losses) -> Column:
+    """Return lists of numbers (n, length) as texts, if a list is long or the field is of bytes."""
+    if rows.shape[1] > MAX_VALUE:
+        losses.values += len(rows)
+        return np.full(len(rows), None, object)
+    column = np.empty(len(rows), object)
+    if declared == "BLOB":
+        column[:] = [row.tobytes().hex() for row in rows]
+    else:
+        column[:] = [as_json(row) for row in rows.tolist()]
+    return column
+
+
+def joined_columns(
+    declared: str, count: int, parts: Iterable[tuple[NDArray[np.intp], Column]], losses: Losses
+) -> Column:
+    """Return one column from parts with their row numbers.
+
+    Lists of different lengths become texts. Rows without a part are missing.
+    """
+    parts = list(parts)
+    if len(parts) == 1 and len(parts[0][0]) == count and _is_short(declared, parts[0][1]):
+        return parts[0][1]
+    if (kind := NUMPY.get(declared)) is not None:
+        whole: Any = np.ma.masked_all(count, kind)
+        for rows, values in parts:
+            whole[rows] = values
+        return whole
+    column = np.full(count, None, object)
+    for rows, values in parts:
+        texts = values if values.ndim == 1 else list_column(declared, values, losses)
+        column[rows] = texts
+    return column
+
+
+MAX_LISTED: Final = 64
+"""Maximum length of lists that go to the database as arrays."""
+
+
+def _is_short(declared: str, values: Column) -> bool:
+    """True if a column needs no conversion to texts."""
+    return values.ndim == 1 or (declared != "BLOB" and 0 < values.shape[1] <= MAX_LISTED)
+
+
+def guessed(value: Any) -> str:
+    """Return the database type of a JSON value."""
+    if isinstance(value, bool):
+        return "BOOLEAN"
+    if isinstance(value, int):
+        return "BIGINT" if -(1 << 63) <= value < 1 << 63 else "DOUBLE"
+    if isinstance(value, float):
+        return "DOUBLE"
+    if isinstance(value, list):
+        kinds = {guessed(item) for item in value if item is not None} or {""}
+        return f"{wider(kinds)}[]" if kinds <= _OF_LISTS else "JSON"
+    return "VARCHAR" if isinstance(value, str) else "JSON"
+
+
+_OF_LISTS: Final = {"", "BOOLEAN", "BIGINT", "DOUBLE", "VARCHAR"}
+
+
+def wider(kinds: Iterable[str]) -> str:
+    """Return the database type for JSON values of several types. An empty list has the type ``[]``."""
+    found = {*kinds}
+    if len(found) == 1:
+        return found.pop()
+    if all(kind.endswith("[]") for kind in found):
+        return f"{wider(kind.removesuffix('[]') for kind in found)}[]"
+    found.discard("")
+    if found <= {"BIGINT", "DOUBLE"}:
+        return wider(found) if len(found) == 1 else "DOUBLE"
+    if len(found) == 1:
+        return found.pop()
+    return "VARCHAR" if not any(kind.endswith("]") for kind in found) else "JSON"
+
+
+def as_number(value: Any) -> Any:
+    """Return a JSON number that fits a double; too large integers are infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
+def field_list(names: Iterable[tuple[str, str]]) -> dict[str, TopicField]:
+    """Return fields by name, from names and database types."""
+    return {name: TopicField(name, declared) for name, declared in names}

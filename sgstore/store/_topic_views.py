@@ -1,0 +1,376 @@
+"""Topics in SQL: views of their messages, and their values at frames.
+
+Messages come from the tables of the store, and for traces without them from the recording: it is converted once
+per process to Parquet files in the folder of user tables, which store connections can read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any, Final
+
+from sgstore.base.quoting import quoted
+from sgstore.errors import TraceError
+from sgstore.lang.catalog import TopicFacts, TopicField, Type
+from sgstore.lang.syntax import TOPIC
+from sgstore.lang.topics import RULES, TopicError, field_of, fields_of, topic_of
+from sgstore.mcap import Findings
+from sgstore.model.frame_ids import SEQ_BITS
+from sgstore.readers import TopicReading, open_recording, refusal
+from sgstore.store._joins import tables_folder
+from sgstore.store._schema import INSIDE
+from sgstore.store._topics import (
+    FRAME,
+    KEYS,
+    LISTING,
+    FrameClock,
+    TopicFile,
+    TopicWriter,
+    topic_scratch,
+    topic_tables,
+)
+from sgstore.store._traces import stored_traces, unchanged
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+    from pathlib import Path
+
+    from duckdb import DuckDBPyConnection
+
+    from sgstore.store._locking import Access
+    from sgstore.store._traces import StoredTrace
+
+_NAMED: Final = re.compile(rf'"({TOPIC}|:messages) ((?:[^"]|"")+)"')
+
+
+def show_topics(connection: DuckDBPyConnection, access: Access, sql: str) -> None:
+    """Create the views of topics that an SQL statement names, on its connection.
+
+    Raises
+    ------
+    TopicError
+        A topic does not exist, or its recording cannot be read.
+    """
+    for topic in {name.replace('""', '"') for _, name in _NAMED.findall(sql)}:
+        _show(connection, access, topic)
+
+
+def _show(connection: DuckDBPyConnection, access: Access, topic: str) -> dict[str, str]:
+    """Create the views of a topic, and return its fields with their database types."""
+    with access.reading() as reading:
+        facts = topic_of(topic_facts(reading, access), topic)
+        if facts.refused:
+            fields_of(facts)
+        sources = [*_sources(reading, access, facts)]
+    fields = common_fields(one.fields for one in sources)
+    rows = " UNION ALL ".join(one.rows(fields) for one in sources)
+    view = quoted(f":messages {topic}")
+    connection.execute(f"CREATE OR REPLACE TEMP VIEW {view} AS {rows}")
+    listed = "".join(f", m.{quoted(name)}" for name in fields)
+    connection.execute(
+        f"CREATE OR REPLACE TEMP VIEW {quoted(f'{TOPIC} {topic}')} AS"
+        f' SELECT t.name AS trace, round((m.":time_ns" - t.start_ns) / 1e3) / 1e6 AS t, m.log_time_ns,'
+        f" m.publish_time_ns{listed} FROM {view} m"
+        f" JOIN {INSIDE}.trace t ON t.trace_id = m.{quoted(FRAME)} >> {SEQ_BITS}"
+    )
+    return fields
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """Messages of a topic in one table of the store, or in files of one recording."""
+
+    table: str
+    fields: Mapping[str, str]
+
+    def rows(self, fields: Mapping[str, str]) -> str:
+        """Return SQL of the messages, with the same columns for all sources of a topic."""
+        listed = [*map(quoted, KEYS)]
+        for name, kind in fields.items():
+            value = quoted(name) if name in self.fields else "NULL"
+            same = self.fields.get(name) == kind
+            listed.append(f"{value if same else f'CAST({value} AS {kind})'} AS {quoted(name)}")
+        return f"SELECT {', '.join(listed)} FROM {self.table}"
+
+
+def _sources(
+    connection: DuckDBPyConnection, access: Access, facts: TopicFacts
+) -> Iterator[_Source]:
+    stored = _stored(connection).get(facts.name, {})
+    for table, fields in dict(stored.values()).items():
+        yield _Source(f"{INSIDE}.{table}", fields)
+    missing = facts.traces - stored.keys()
+    if missing:
+        for trace in stored_traces(connection, access.path, access.root):
+            if trace.trace_id in missing:
+                yield _of_recording(connection, access, trace, facts.name)
+
+
+def _stored(connection: DuckDBPyConnection) -> dict[str, dict[int, tuple[str, dict[str, str]]]]:
+    """Return the stored topics: topic → trace id → table and fields."""
+    ((database,),) = connection.execute("SELECT current_database()").fetchall()
+    tables = topic_tables(connection, database)
+    found: dict[str, dict[int, tuple[str, dict[str, str]]]] = {}
+    if LISTING not in tables:
+        return found
+    sql = f'SELECT topic, trace_id, "table", fields FROM {INSIDE}.{LISTING} ORDER BY ALL'
+    for topic, trace_id, table, fields in connection.execute(sql).fetchall():
+        if table in tables:
+            known = TopicFile(topic, fields=json.loads(fields))
+            if known.table == table:  # so the table has these columns
+                found.setdefault(topic, {})[trace_id] = table, known.fields
+    return found
+
+
+_converted: Final[dict[tuple[Any, ...], TopicFile]] = {}
+"""Topics of recordings that this process has converted to files."""
+
+
+def _of_recording(
+    connection: DuckDBPyConnection, access: Access, trace: StoredTrace, topic: str
+) -> _Source:
+    """Convert a topic of a recording to files, once per process."""
+    key = (trace.trace_id, trace.frames, trace.start_ns, trace.end_ns, topic)
+    name = hashlib.sha256(repr(key).encode("utf-8", "replace")).hexdigest()[:16]
+    folder = tables_folder() / "topics" / name
+    file = _converted.get((folder, *key))
+    if file is None:
+        clock = FrameClock.of_stored(connection, trace.trace_id)
+        bounded = (trace.since, trace.until) != (None, None)
+        path = _recording(trace, topic)
+        file = _converted[folder, *key] = converted(path, topic, folder, clock, bounded=bounded)
+    return _Source(f"({file.rows(folder)})", file.fields)
+
+
+def _recording(trace: StoredTrace, topic: str) -> Path:
+    """Return the path of the recording of a trace. It must exist and be unchanged."""
+    try:
+        return unchanged(trace.path, trace.size, trace.mtime_ns, trace.digest)
+    except TraceError as error:
+        hint = f"ingest it with --topics {topic} to store the topic, or give the folder of the recordings"
+        raise TopicError(
+            f"topic {topic!r} is read from the recording; {error}", f"{hint} (--root)"
+        ) from error
+
+
+def converted(
+    path: Path, topic: str, folder: Path, clock: FrameClock, *, bounded: bool = False
+) -> TopicFile:
+    """Write the messages of a topic of a recording to Parquet files in a folder."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with open_recording(path) as recording, topic_scratch(folder) as connection:
+        if not recording.channels:
+            # Without a summary, channels are known only after a walk.
+            for _ in recording.walk(Findings()):
+                pass
+        reading = TopicReading(recording, [topic])
+        writer = TopicWriter(connection, folder, clock, bounded=bounded)
+        for batch in reading.batches(Findings()):
+            writer.add(batch)
+        (file,) = writer.files(reading)
+    return file
+
+
+def topic_facts(connection: DuckDBPyConnection, access: Access) -> dict[str, TopicFacts]:
+    """Return the topics of a store, by name. Their fields are read on demand."""
+    stored = _stored(connection)
+    sql = (
+        "SELECT topic, coalesce(message_encoding, ''), coalesce(schema_encoding, ''), list(trace_id)"
+        f" FROM {INSIDE}.channel WHERE topic IS NOT NULL GROUP BY ALL ORDER BY ALL"
+    )
+    found: dict[str, TopicFacts] = {}
+    for topic, encoding, schema, traces in connection.execute(sql).fetchall():
+        known = found.get(topic)
+        ids = frozenset(traces) | (known.traces if known else frozenset())
+        reason = (known.refused if known else "") or refusal(encoding, schema)
+        whole = stored.get(topic, {}).keys() >= ids
+        source = cache(partial(_fields, access, topic))
+        found[topic] = TopicFacts(topic, ids, whole, "" if whole else reason, source)
+    return found
+
+
+def _fields(access: Access, topic: str) -> Mapping[str, TopicField]:
+    """Return the fields of a topic: of its tables, and of the first recording without."""
+    with access.reading() as connection:
+        stored = _stored(connection).get(topic, {})
+        told = [fields for _, fields in stored.values()]
+        others = [
+            trace
+            for trace in stored_traces(connection, access.path, access.root)
+            if trace.trace_id not in stored
+            and connection.execute(
+                f"SELECT 1 FROM {INSIDE}.channel WHERE trace_id = ? AND topic = ?",
+                [trace.trace_id, topic],
+            ).fetchone()
+        ]
+        for trace in others[:1]:
+            fields = fields_in(_recording(trace, topic), topic)
+            told.append(fields or dict(_of_recording(connection, access, trace, topic).fields))
+    return {name: TopicField(name, kind) for name, kind in common_fields(told).items()}
+
+
+def fields_in(path: Path, topic: str) -> dict[str, str] | None:
+    """Return the fields of a topic of a recording, with database types. ``None`` means JSON: read it first."""
+    with open_recording(path) as recording:
+        if not recording.channels:
+            for _ in recording.walk(Findings()):
+                pass
+        found = TopicReading(recording, [topic]).fields(topic)
+    return None if found is None else {name: one.declared for name, one in found.items()}
+
+
+_UNKNOWN: Final = re.compile(r'Referenced (?P<what>column|table) "(?P<name>[^"]+)" not found')
+
+
+def field_fault(connection: DuckDBPyConnection, sql: str, message: str) -> str:
+    """Return the error for an unknown field of a topic in a user's SQL statement; empty for other errors.
+
+    ``message``: error of the database.
+    """
+    found = _UNKNOWN.search(message)
+    topics = dict.fromkeys(topic for view, topic in _NAMED.findall(sql) if view == TOPIC)
+    if found is None or not topics:
+        return ""
+    name = found["name"]
+    for topic in topics:
+        rows = connection.execute(f"DESCRIBE {quoted(f'{TOPIC} {topic}')}").fetchall()
+        fields = {str(row[0]): TopicField(str(row[0]), str(row[1])) for row in rows}
+        within = [one for one in fields if one.lower().startswith(f"{name.lower()}.")]
+        if found["what"] == "table" and within:
+            reason = f"topic {topic!r} has no table {name!r}"
+            return f'{reason}; write a dotted field in double quotes: "{within[0]}"'
+        if found["what"] == "column":
+            try:
+                field_of(
+                    TopicFacts(
+                        topic, frozenset(), stored=True, refused="", source=lambda f=fields: f
+                    ),
+                    name,
+                )
+            except TopicError as error:
+                return str(error)
+    return ""
+
+
+_WHOLE: Final = frozenset(
+    {"TINYINT", "UTINYINT", "SMALLINT", "USMALLINT", "INTEGER", "UINTEGER", "BIGINT"}
+)
+
+
+def common_fields(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """Return the fields of several recordings of a topic, with database types for all of their values."""
+    found: dict[str, str] = {}
+    for fields in several:
+        for name, kind in fields.items():
+            found[name] = _common(found.get(name, kind), kind)
+    return found
+
+
+def _common(one: str, other: str) -> str:
+    if one == other:
+        return one
+    if one.endswith("[]") and other.endswith("[]"):
+        return f"{_common(one.removesuffix('[]'), other.removesuffix('[]'))}[]"
+    both = {one, other}
+    if both <= _WHOLE:
+        return "BIGINT"
+    return "DOUBLE" if both <= {*_WHOLE, "UBIGINT", "FLOAT", "DOUBLE"} else "VARCHAR"
+
+
+# Values at frames.
+
+
+def topic_values(
+    connection: DuckDBPyConnection,
+    access: Access,
+    topic: str,
+    field: str,
+    rule: str = "last",
+    tolerance_ns: int | None = None,
+) -> str:
+    """Return SQL of the value of a field at each frame: frame_id, value. Frames without a value are left out.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+        Connection of the statement. It gets the views of the topic.
+    access : Access
+    topic, field : str
+        ``/imu``; ``linear_acceleration.z``, ``covariance[0]``.
+    rule : str
+        ``last``: of the last message at or before the frame; ``nearest``: of the nearest one, the earlier one
+        of two; ``linear``: interpolated between the messages before and after.
+    tolerance_ns : int, optional
+        Greatest difference of log times between the frame and the message; ns. ``None`` means unlimited.
+
+    Raises
+    ------
+    TopicError
+        The topic, the field or the rule does not exist.
+
+    Notes
+    -----
+    Values never cross a backward step of the clock of the frames. Among messages of equal log time, the last
+    one counts.
+    """
+    with access.reading() as reading:
+        facts = topic_of(topic_facts(reading, access), topic)
+    known = field_of(facts, field)
+    if rule not in RULES:
+        raise TopicError(f"no rule {rule!r}", f"the rules are {', '.join(RULES)}")
+    if rule == "linear" and known.type is not Type.number:
+        reason = f"field {known.name!r} of topic {facts.name!r} is not a number"
+        raise TopicError(reason, "rules for it are last and nearest")
+    _show(connection, access, facts.name)
+    within = "" if tolerance_ns is None else f" <= {int(tolerance_ns)}"
+    values = _VALUES.format(
+        shift=SEQ_BITS,
+        value=_value(known.name),
+        messages=quoted(f":messages {facts.name}"),
+        inside=INSIDE,
+    )
+    chosen = {"last": _LAST, "nearest": _NEAREST, "linear": _LINEAR}[rule]
+    limits = {"before": f"f.at - b.at{within}", "after": f"a.at - f.at{within}"}
+    if not within:
+        limits = {"before": "b.at IS NOT NULL", "after": "a.at IS NOT NULL"}
+    return values + chosen.format(**limits)
+
+
+def _value(name: str) -> str:
+    element = re.fullmatch(r"(.+)\[(\d+)\]", name)
+    if element is None:
+        return quoted(name)
+    return f"{quoted(element[1])}[{int(element[2]) + 1}]"
+
+
+_VALUES: Final = """WITH m AS (
+  SELECT ":frame" >> {shift} AS trace_id, ":run" AS run, log_time_ns AS at,
+         arg_max_null({value}, ":number") AS value
+  FROM {messages} GROUP BY ALL
+), f AS (
+  SELECT frame_id, trace_id, log_time_ns AS at,
+         CAST(coalesce(sum(back) OVER (PARTITION BY trace_id ORDER BY seq), 0) AS INTEGER) AS run
+  FROM (
+    SELECT *, CAST(time_ns < lag(time_ns) OVER (PARTITION BY trace_id ORDER BY seq) AS INTEGER) AS back
+    FROM {inside}.frame
+  )
+)
+"""
+_BEFORE: Final = "m b ON b.trace_id = f.trace_id AND b.run = f.run AND f.at >= b.at"
+_AFTER: Final = "m a ON a.trace_id = f.trace_id AND a.run = f.run AND f.at <= a.at"
+_LAST: Final = f"SELECT f.frame_id, b.value FROM f ASOF JOIN {_BEFORE} WHERE {{before}} AND b.value IS NOT NULL"
+_BOTH: Final = f"FROM f ASOF LEFT JOIN {_BEFORE} ASOF LEFT JOIN {_AFTER}"
+_NEAREST: Final = f"""SELECT frame_id, value FROM (
+  SELECT f.frame_id, CASE
+    WHEN coalesce({{before}}, false) AND coalesce(f.at - b.at <= a.at - f.at OR NOT {{after}}, true)
+    THEN b.value
+    WHEN {{after}} THEN a.value END AS value
+  {_BOTH}
+) WHERE value IS NOT NULL"""
+_LINEAR: Final = f"""SELECT f.frame_id,
+  b.value + (CAST(a.value AS DOUBLE) - b.value) * (f.at - b.at) / greatest(a.at - b.at, 1) AS value
+{_BOTH} WHERE {{before}} AND {{after}} AND a.value IS NOT NULL AND b.value IS NOT NULL"""
