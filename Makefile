@@ -12,7 +12,7 @@ TOOL   := PYTHONPATH=$(FOLDERS) $(BIN)/python
 # compile all packages again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers py123d maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers py123d maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster clients
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -41,6 +41,7 @@ help:
 	@echo "make maps    the package lanelet2 and SUMO beside what we make of their maps and recordings (downloads both)"
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make cluster  1,000 random questions of collections, by each engine; S3, and faults of all (hours; installs ray, pyspark, obstore, moto)"
+	@echo "make clients  DuckDB 1.0 to 2, ibis, dbt, SQLAlchemy, pandas, polars, datasets, Spark and Lance read an export (downloads them)"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
 	@echo "make patterns  draw the examples of the library, and write its page, again"
 	@echo "make api     write docs/api.md and docs/relations.md from the code again"
@@ -199,6 +200,10 @@ cluster: $(VENV)/.base
 	@$(call install,--group dev --group cluster -e '.[$(ENGINES)]',build/cluster/bin)
 	PYTHONPATH=$(FOLDERS) build/cluster/bin/python tests/reference/oracle_collection.py 1000 'local+ray+spark:local[2,4]' 1 3 20
 	SGSTORE_LONG=1 build/cluster/bin/python -m pytest $(wildcard tests/edges/test_collection*.py)
+
+# Each in an environment of its own: old versions, and large packages.
+clients: $(VENV)/.dev
+	$(TOOL) tools/client_matrix.py
 
 duckdb-versions: $(VENV)/.dev
 	$(TOOL) tools/duckdb_versions.py

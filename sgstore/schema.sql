@@ -328,31 +328,31 @@ SELECT s.frame_id, s.node_id, s.kind, s.is_ego, s.kind || ' ' || s.node_id AS na
        (s.lights & 512) <> 0 AS light_special1, (s.lights & 1024) <> 0 AS light_special2, s.steer, s.throttle, s.brake, s.gear, s.hand_brake,
        (s.derived & 1) <> 0 AS derived_velocity, (s.derived & 2) <> 0 AS derived_acceleration, (s.derived & 4) <> 0 AS derived_yaw_rate,
        NULL::VARCHAR AS lane_type, NULL::VARCHAR AS road, NULL::INTEGER AS section, NULL::INTEGER AS lane, NULL::VARCHAR AS junction,
-       NULL::VARCHAR AS turn, NULL::FLOAT AS speed_limit, NULL::DOUBLE AS curvature, e.ident, e.type_name, s.carrier, e.lifetime
+       NULL::VARCHAR AS turn, NULL::FLOAT AS speed_limit, NULL::DOUBLE AS curvature, e.ident, e.type_name, s.carrier, e.lifetime, t.name AS trace
 FROM inside.state s JOIN inside.entity e ON e.trace_id = s.frame_id >> 24 AND e.node_id = s.node_id JOIN inside.trace t ON t.trace_id = e.trace_id
 UNION ALL
 SELECT f.frame_id, n.node_id, n.kind, false, n.name, n.special, n.subkind, true, n.x, n.y, n.z, degrees(n.heading),
        NULL, NULL, n.still, n.still, n.still, n.still, NULL, NULL, NULL, NULL, NULL, n.length, n.width, n.height,
        NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
-       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature, n.ident, n.type_name, NULL, n.lifetime
+       n.lane_type, n.road, n.section, n.lane, n.junction, n.turn, n.speed_limit, n.curvature, n.ident, n.type_name, NULL, n.lifetime, n.trace
 FROM inside.frame f JOIN (
   SELECT k.bucket, k.mask, k.node_id, k.kind, m.name, NULL::VARCHAR AS special, NULL::VARCHAR AS subkind, m.x, m.y, m.z, m.heading,
          m.length::FLOAT AS length, m.width::FLOAT AS width, NULL::FLOAT AS height,
          CASE WHEN k.kind IN ('lane', 'road', 'junction', 'crosswalk', 'off_road', 'waypoint', 'roundabout') THEN NULL ELSE 0::FLOAT END AS still, m.lane_type, m.road, m.section, m.lane, m.junction, m.turn, m.speed_limit::FLOAT AS speed_limit, m.curvature,
-         NULL::VARCHAR AS ident, NULL::VARCHAR AS type_name, NULL::INTEGER AS lifetime
-  FROM inside.bucket b JOIN inside.node k ON k.bucket = b.bucket JOIN inside.map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
+         NULL::VARCHAR AS ident, NULL::VARCHAR AS type_name, NULL::INTEGER AS lifetime, t.name AS trace
+  FROM inside.bucket b JOIN inside.trace t ON t.trace_id = b.trace_id JOIN inside.node k ON k.bucket = b.bucket JOIN inside.map_node m ON m.map_id = b.map_id AND m.node_id = k.node_id
   UNION ALL
   SELECT k.bucket, k.mask, k.node_id, k.kind, k.kind || ' ' || k.node_id, e.special, e.subkind,
          t.origin_x + e.x, t.origin_y + e.y, t.origin_z + e.z, e.heading, e.length, e.width, e.height, 0::FLOAT, NULL, NULL, NULL, NULL, NULL, NULL, NULL, NULL,
-         e.ident, e.type_name, e.lifetime
+         e.ident, e.type_name, e.lifetime, t.name
   FROM inside.node k JOIN inside.trace t ON t.trace_id = k.bucket >> 18 JOIN inside.entity e ON e.trace_id = t.trace_id AND e.node_id = k.node_id
 ) n ON n.bucket = f.bucket AND (n.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). ident, type_name: of an entity, as the simulator has them; x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; gear: 1, 2, …, 0 neutral, below 0 backwards; hand_brake: whether it is on; curvature of a waypoint in 1/m, positive to the left. carrier: node_id of what pulls a trailer or carries a rider; lifetime: 1, 2, …: which of the entities with this ident, where an id returns as another entity. What is not known is NULL. derived_…: computed by differences, not read from the recording.';
+COMMENT ON VIEW main.nodes IS 'One row a node and frame: entities (node_id 0 and above) and parts of the road map in range (below zero). ident, type_name: of an entity, as the simulator has them; x, y, z, length, width, height in m (a lane: a point of its centre line, its length and mean width); heading, pitch, roll in degrees; speed, vx, vy, vz, speed_limit in m/s (what stands for ever has speed 0); accel (signed, along the heading), ax, ay, az in m/s²; yaw_rate in degrees/s; steer -1 … 1, throttle and brake 0 … 1; gear: 1, 2, …, 0 neutral, below 0 backwards; hand_brake: whether it is on; curvature of a waypoint in 1/m, positive to the left. carrier: node_id of what pulls a trailer or carries a rider; lifetime: 1, 2, …: which of the entities with this ident, where an id returns as another entity. What is not known is NULL. derived_…: computed by differences, not read from the recording; trace: name of the recording.';
 
 CREATE VIEW main.edges AS
-SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego
-FROM inside.frame f JOIN (
+SELECT f.frame_id, e.src, e.relation, e.dst, e.src_kind, e.dst_kind, e.src_is_ego, e.dst_is_ego, t.name AS trace
+FROM inside.frame f JOIN inside.trace t ON t.trace_id = f.trace_id JOIN (
   SELECT bucket, mask, src, relation, dst, src_kind, dst_kind, src_is_ego, dst_is_ego FROM inside.edge
   UNION ALL
   SELECT b.bucket, s.mask & d.mask, m.src, m.relation, m.dst, m.src_kind, m.dst_kind, false, false
@@ -361,7 +361,7 @@ FROM inside.frame f JOIN (
   WHERE (s.mask & d.mask) <> 0
 ) e ON e.bucket = f.bucket AND (e.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW main.edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst), for the gap between who follows and who leads lane_gaps.';
+COMMENT ON VIEW main.edges IS 'One row an edge and frame: src relation dst. Edges among parts of the road map are among them. For how an entity lies in a lane (relation isIn) join lane_states USING (frame_id, src, dst), for the gap between who follows and who leads lane_gaps. trace: name of the recording.';
 
 CREATE VIEW main.lane_states AS
 SELECT f.frame_id, l.node_id AS src, l.lane AS dst, l.kind AS src_kind, l.overlap, l.lane_offset, degrees(l.heading_error) AS heading_error,

@@ -37,7 +37,7 @@ TESTS = {
     "doctor": "damaged plausibility",
     "draw": "draw draw_* timeline",
     "errors": "cli_errors",
-    "exporters": "exports exports_docs export_*",
+    "exporters": "exports exports_docs export_* clients",
     "output_files": "outputs",
     "temporary_folders": "folders moved",
     "geometry": "geometry",

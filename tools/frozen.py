@@ -47,8 +47,11 @@ ENDINGS = (".mcap", ".osi")
 FRAMES = 60
 """Frames whose rows are in memory at once."""
 
-LEFT_OUT = {"payloads": ("file",)}
-"""Columns that differ from place to place."""
+LEFT_OUT = {
+    "payloads": ("file",),
+    **dict.fromkeys(("nodes", "edges", "world_nodes"), ("trace",)),
+}
+"""Columns that differ from place to place, or that frames have, too."""
 VERBS = """
 info STORE
 info STORE --trace town

@@ -14,7 +14,7 @@ from sgstore.exporters._recorder import Recorder, Written
 from sgstore.exporters._registry import EXPORTERS, GROUP, Exporter, Write, exporter_named, exporters
 from sgstore.exporters._sensor_data import cloud_of
 from sgstore.exporters._transforms import Mount, parse_mounts
-from sgstore.exporters._write import around_frames, labelled, write_export
+from sgstore.exporters._write import around_frames, labelled, whole_clips, write_export
 
 __all__ = [
     "EXPORTERS",
@@ -39,5 +39,6 @@ __all__ = [
     "labelled",
     "parse_labels",
     "parse_mounts",
+    "whole_clips",
     "write_export",
 ]

@@ -12,7 +12,7 @@ from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.model.world import tolerance_ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from sgstore.exporters._labels import Labels
     from sgstore.exporters._transforms import Mount
@@ -66,6 +66,10 @@ class Export:
         Topics of the wanted sensors; empty means all.
     clouds : str
         File format of point clouds: ``pcd``, ``npy`` or ``bin``.
+    storage : str
+        Oldest version of DuckDB that can read a DuckDB file.
+    crs : str
+        Coordinate system of the road maps for GeoJSON, such as ``EPSG:32632``; empty means their own.
     provenance : mapping
         Values about the origin: ``query``, and others of the caller.
     progress : callable, optional
@@ -82,6 +86,8 @@ class Export:
     graphml: bool = False
     channels: tuple[str, ...] = ()
     clouds: str = "pcd"
+    storage: str = "v1.0.0"
+    crs: str = ""
     provenance: Mapping[str, str] = field(default_factory=dict[str, str])
     progress: Callable[[int, int], None] | None = None
 
@@ -140,6 +146,12 @@ class Export:
     def label_columns(self, frame_id: Ints) -> dict[str, list[Any]]:
         """Return the labels of some frames as columns, by label name."""
         return {} if self.labels is None else self.labels.of(frame_id)
+
+    def label_types(self) -> dict[str, str]:
+        """Return the database type of each label: the narrowest type for all its values."""
+        if self.labels is None:
+            return {}
+        return {name: _type_of(values.tolist()) for name, values in self.labels.values.items()}
 
     def label_cells(self, frame_id: Ints) -> Iterator[list[Any]]:
         """Yield the labels of each frame as a list of CSV cells."""
@@ -222,3 +234,12 @@ class ClipFrames:
     def bounds(self) -> dict[str, int]:
         """Return the ids of the first and last frame as values of the SQL parameters ``$first``, ``$last``."""
         return {"first": int(self.frame_id[0]), "last": int(self.frame_id[-1])}
+
+
+def _type_of(values: Sequence[Any]) -> str:
+    known = {type(value) for value in values} - {type(None)}
+    if known <= {bool}:
+        return "BOOLEAN"
+    if known <= {int}:
+        return "BIGINT"
+    return "DOUBLE" if known <= {int, float} else "VARCHAR"

@@ -118,6 +118,8 @@ class WrittenFile:
         Number of these.
     losses : tuple of Loss
         Parts of the graphs or recordings that are missing in it.
+    notes : tuple of str
+        Properties of the format that users must know. They are no loss.
     """
 
     file: Path
@@ -125,16 +127,27 @@ class WrittenFile:
     holds: str
     count: int
     losses: tuple[Loss, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, file: Path, holds: str, count: int, losses: Sequence[Loss] = ()) -> WrittenFile:
+    def of(
+        cls,
+        file: Path,
+        holds: str,
+        count: int,
+        losses: Sequence[Loss] = (),
+        notes: Sequence[str] = (),
+    ) -> WrittenFile:
         """Return the description of an existing file or folder, with its hash."""
         digest = digest_of(file) if file.is_file() else ""
-        return cls(file, digest, holds, count, tuple(losses))
+        return cls(file, digest, holds, count, tuple(losses), tuple(notes))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the description of a written file as plain values for the manifest file."""
-        return asdict(self) | {"file": self.file.name}
+        values = asdict(self) | {"file": self.file.name}
+        if not self.notes:
+            del values["notes"]
+        return values
 
     def as_row(self) -> dict[str, Any]:
         """Return the description of a written file as a table row for the command line."""

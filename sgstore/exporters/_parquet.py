@@ -21,7 +21,7 @@ from sgstore.exporters._clips import WrittenFile
 from sgstore.store import ParquetTable, count_parquet
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
     from pathlib import Path
 
     from sgstore.exporters._clip_frames import ClipFrames, Export
@@ -132,7 +132,7 @@ def _write_table(
     export: Export, folder: Path, name: str, present: _Present
 ) -> tuple[int, dict[str, str]]:
     file = export.store.file
-    kinds = _label_types(export) if name == "frames" else {}
+    kinds = export.label_types() if name == "frames" else {}
     columns = {"clip": "INTEGER", **_types(file, TABLES[name]), **kinds}
     with ParquetTable(folder / f"{name}.parquet", columns.items()) as table:
         for frames in export.windows():
@@ -162,22 +162,6 @@ def _of_clip(
 def _types(file: StoreFile, sql: str, bounds: Mapping[str, int] = _NOWHERE) -> dict[str, str]:
     found = file.rows(sql, dict(bounds))
     return dict(zip(found.columns, found.types, strict=True))
-
-
-def _label_types(export: Export) -> dict[str, str]:
-    """Return the database type of each label: the narrowest type for all its values."""
-    if export.labels is None:
-        return {}
-    return {name: _type_of(values.tolist()) for name, values in export.labels.values.items()}
-
-
-def _type_of(values: Sequence[Any]) -> str:
-    known = {type(value) for value in values} - {type(None)}
-    if known <= {bool}:
-        return "BOOLEAN"
-    if known <= {int}:
-        return "BIGINT"
-    return "DOUBLE" if known <= {int, float} else "VARCHAR"
 
 
 def _tested(file: Path, name: str, count: int) -> WrittenFile:

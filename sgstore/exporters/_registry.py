@@ -46,7 +46,7 @@ class Exporter:
         See :class:`Write`.
     options : frozenset of str
         Supported options of an :class:`Export`: ``abstraction``, ``with_graph``, ``mounts``,
-        ``rebase_context``, ``graphml``, ``channels``, ``clouds``.
+        ``rebase_context``, ``graphml``, ``channels``, ``clouds``, ``storage``, ``crs``.
     """
 
     name: str
@@ -74,6 +74,9 @@ EXPORTERS: Final = (
     _of("xosc"),
     _of("openlabel"),
     _of("rrd", "mounts"),
+    _of("duckdb", "storage"),
+    _of("lance"),
+    _of("geojson", "crs"),
 )
 """Built-in formats."""
 

@@ -3,7 +3,7 @@
 The header is ``ds, sg, n_img, t_id, node1, edge, node2``. ``ds`` is the trace, ``sg`` the frame as
 ``trace#seq``, ``n_img`` is 1 (every frame counts once), ``t_id`` counts the rows of a graph. Graphs
 follow the abstraction ``RSV``, which is S3C's ELR, or another one. A node without edges has no row:
-such nodes are counted as a loss. Labels have their own file, because the header has no room for
+a note counts such nodes. Labels have their own file, because the header has no room for
 them.
 
 Source: S3C (Woodlief et al., ICSE 2024), its data sets of triples; "ELR" of its section 3.
@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile
 from sgstore.graphs.abstractions import abstraction_named
-from sgstore.mcap import Loss
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,10 +46,10 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
                 for number, edge in enumerate(edges):
                     writer.writerow((trace, f"{trace}#{seq}", 1, number, *edge))
                 rows += len(edges)
-    reason = f"{alone} nodes without an edge are in no row"
-    losses = [Loss(reason, 0, 0)] if alone else []
+    reason = f"{alone} nodes without an edge are in no row: rows of S3C are edges"
     _test(folder / GRAPHS, rows)
-    written = [WrittenFile.of(folder / GRAPHS, "rows", rows, losses)]
+    notes = [reason] if alone else []
+    written = [WrittenFile.of(folder / GRAPHS, "rows", rows, notes=notes)]
     if export.labels is not None:
         written.append(_write_labels(export, folder / LABELS))
     return written

@@ -62,6 +62,35 @@ def around_frames(
     )
 
 
+_RECORDED: Final = ("mcap", "frames")
+"""Formats that copy messages of recordings."""
+
+
+def whole_clips(store: Store, form: str) -> list[Clip]:
+    """Return a clip for each whole trace of a store.
+
+    Parameters
+    ----------
+    store : Store
+    form : str
+        Name of an exporter.
+
+    Raises
+    ------
+    ExportError
+        The format copies recordings.
+    """
+    if form in _RECORDED:
+        raise ExportError(
+            f"the format '{form}' copies recordings; add a query: 'MATCH (e:Ego)' is every frame"
+            " with an ego"
+        )
+    found = store.file.rows(
+        "SELECT trace, min(log_time_ns), max(log_time_ns) FROM frames GROUP BY trace"
+    )
+    return sorted((Clip(*row) for row in found), key=lambda clip: natural(clip.trace))
+
+
 def labelled(export: Export, texts: Mapping[str, str], **parameters: object) -> Export:
     """Return an export with labels for the frames of its clips.
 

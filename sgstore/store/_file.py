@@ -38,7 +38,7 @@ from sgstore.store._traces import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
     from contextlib import AbstractContextManager
 
     from duckdb import DuckDBPyConnection
@@ -704,6 +704,18 @@ class StoreFile:
         from sgstore.store._rebuild import compact
 
         compact(self.path, self.access, self.memory)
+
+    def write_portable(
+        self,
+        to: Path,
+        frame_id: NDArray[np.int64],
+        storage: str,
+        labels: Mapping[str, tuple[str, Sequence[Any]]],
+    ) -> None:
+        """Copy frames into a plain DuckDB file; see :func:`sgstore.store._portable.write_portable`."""
+        from sgstore.store._portable import write_portable
+
+        write_portable(self.path, to, frame_id, storage, labels)
 
     def refuse_others(self) -> None:
         """Raise an error if the store has user tables or views, which compaction would delete."""

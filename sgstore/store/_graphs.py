@@ -333,7 +333,9 @@ def _records(
     names = found.columns[ids:]
     for row in found:
         known = zip(names, row[ids:], strict=True)
-        yield row[:ids], {name: value for name, value in known if value is not None}
+        about = {name: value for name, value in known if value is not None}
+        about.pop("trace", None)  # of the frame, not of the node
+        yield row[:ids], about
 
 
 def _own_attributes(

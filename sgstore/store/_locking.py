@@ -433,6 +433,8 @@ class Access:
                 if self._checked:
                     self._check(connection, "store", stamp_of(self.path))
                     checked = True
+                    with translated(self.path):
+                        shape.add_trace(connection, "store")
                 with translated(self.path):
                     yield
             finally:

@@ -51,8 +51,8 @@ def schema_version() -> str:
 
 
 TEXT: Final = (
-    "3c19727148bb1ce972456aa9410c38357aa451940ba8a040b45fb212fc8fbd02",
-    "7535a0e47dd54aff42b430f36fcecb652340d281021f582733125e752a644a4c",
+    "e9ebc59d420611f3c67a44adb57d4dc0075386363355a2e2d66a66a4417e8e16",
+    "b97bda47e1fdf0a4a970985fd707ae4ee0fa509ef4d7056cbef17b61ee7f0bb5",
 )
 """Digests of the text and of the statements of ``schema.sql``. Parsing the statements takes 10 ms."""
 
@@ -114,17 +114,63 @@ def expected(*wider: tuple[str, Tokens]) -> Shape:
 _written: dict[str, Tokens] = {}
 
 
+BEFORE_TRACE: Final = "7535a0e47dd54aff42b430f36fcecb652340d281021f582733125e752a644a4c"
+"""Digest of the statements before ``nodes`` and ``edges`` had the column ``trace``.
+
+Such stores are read. The next write adds the column: see :func:`add_trace`.
+"""
+
+_WITH_TRACE: Final = ("nodes", "edges", "world_nodes")
+_TRACE: Final = re.compile(
+    r" , (t \. name AS trace|n \. trace|t \. name(?= FROM))"
+    r"| JOIN inside \. trace t ON t \. trace_id = [bf] \. trace_id(?= JOIN)"
+)
+"""Parts of the views for the column ``trace``."""
+
+
+def add_trace(connection: DuckDBPyConnection, database: str = "") -> None:
+    """Add the column ``trace`` to the views of an older store.
+
+    Parameters
+    ----------
+    connection : DuckDBPyConnection
+    database : str
+        Attached store to change. Empty: create temporary views, and do not change the store.
+    """
+    if not database:
+        for name in _WITH_TRACE[:2]:
+            connection.execute(f"CREATE OR REPLACE TEMP VIEW {name} AS {expected().views[name]}")
+        return
+    where = "WHERE key = 'schema_digest'"
+    info = f"{quoted(database)}.{INSIDE}.store_info"
+    if connection.execute(f"SELECT value FROM {info} {where}").fetchall() != [(BEFORE_TRACE,)]:
+        return
+    ((before,),) = connection.execute("SELECT current_database()").fetchall()
+    connection.execute(f"USE {quoted(database)}; BEGIN TRANSACTION")
+    for name in _WITH_TRACE:
+        connection.execute(f"CREATE OR REPLACE VIEW main.{name} AS {expected().views[name]}")
+    for words in statements():
+        if words[:3] == ("COMMENT", "ON", "VIEW") and words[5] in _WITH_TRACE:
+            connection.execute(" ".join(words))
+    connection.execute(f"UPDATE {info} SET value = '{schema_digest()}' {where}")
+    connection.execute(f"COMMIT; USE {quoted(before)}")
+
+
 def _expected_views(connection: DuckDBPyConnection) -> dict[str, Tokens]:
-    """Return the views of ``schema.sql`` in the text form of this DuckDB version."""
+    """Return the views of ``schema.sql`` in the text form of this DuckDB version.
+
+    Names that end in ``:`` have the text before the column ``trace`` was added.
+    """
     if not _written:
         views = expected().views | expected().inner
+        views |= {f"{name}:": _TRACE.sub("", views[name]) for name in _WITH_TRACE}
         rows = connection.execute(
             "SELECT system.main.json_deserialize_sql(system.main.json_serialize_sql(text))"
             " FROM (SELECT unnest($1::VARCHAR[]) AS text)",
             [list(views.values())],
         ).fetchall()
         for name, (sql,) in zip(views, rows, strict=True):
-            _written[name] = tuple(tokens_of(f"CREATE VIEW {name} AS {sql}"))
+            _written[name] = tuple(tokens_of(f"CREATE VIEW {name.rstrip(':')} AS {sql}"))
     return _written
 
 
@@ -299,7 +345,7 @@ def other_version(about: dict[str, str]) -> str:
     )
     if held != SCHEMA_VERSION:
         reason = f"a store of version {held}, expected {SCHEMA_VERSION}"
-    elif about.get("schema_digest") != schema_digest():
+    elif about.get("schema_digest") not in {schema_digest(), BEFORE_TRACE}:
         reason = (
             f"a store of version {held}, but with other tables or views than those of this sgstore"
         )
@@ -320,11 +366,17 @@ def _altered(connection: DuckDBPyConnection, database: str, objects: Objects) ->
     if objects not in _compared:
         if len(_compared) >= _MOST_COMPARED:
             _compared.clear()
-        changed = () if _is_known(objects) else _changed(objects, _expected_views(connection))
-        _compared[objects] = tuple(changed)
+        _compared[objects] = () if _is_known(objects) else _any_changed(connection, objects)
     found = [*_compared[objects], *_shadowing(connection, database)]
     found += _attached(connection, database)
     return found or [*_strange(objects)]
+
+
+def _any_changed(connection: DuckDBPyConnection, objects: Objects) -> tuple[str, ...]:
+    """Return the faults of a store, compared with the current or the older views."""
+    views = _expected_views(connection)
+    older = views | {name: views[f"{name}:"] for name in _WITH_TRACE}
+    return min((tuple(_changed(objects, one)) for one in (views, older)), key=len)
 
 
 _compared: dict[Objects, tuple[str, ...]] = {}
@@ -332,11 +384,15 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 
 _MOST_COMPARED: Final = 64
 
-KNOWN: Final = "88cc89a9c30bd1ca48d3ed75dc8c5ba4ec58402b7109afb8f95dedb3a6378486"
+KNOWN: Final = "301269ba8fdf3e61843f4f12dba454cd03f1b3245979edf008de02d16f63eaaf"
 """Digest of a store's objects in DuckDB 2. A comparison of tokens takes 30 ms.
 
 Objects of other versions are compared token by token.
 """
+
+
+KNOWN_BEFORE_TRACE: Final = "08b87305aed75d1f55843ceca6095e634f77b883d65c0bc40a289432f91d08ff"
+"""The same of a store without the column ``trace`` in ``nodes`` and ``edges``."""
 
 
 def digest_of(objects: Objects) -> str:
@@ -346,7 +402,7 @@ def digest_of(objects: Objects) -> str:
 
 @lru_cache(maxsize=_MOST_COMPARED)
 def _is_known(objects: Objects) -> bool:
-    return digest_of(objects) == KNOWN
+    return digest_of(objects) in {KNOWN, KNOWN_BEFORE_TRACE}
 
 
 def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:

@@ -18,7 +18,7 @@ from sgstore.store._edge_counts import counted_edges
 from sgstore.store._engine_errors import EngineError, engine_fault, spill_fault
 from sgstore.store._interrupts import interrupt
 from sgstore.store._rows import BATCH, Batches, Rows
-from sgstore.store._schema import INSIDE, expected
+from sgstore.store._schema import BEFORE_TRACE, INSIDE, add_trace, expected
 from sgstore.store._table_files import ParquetTable
 from sgstore.store._temporary_tables import Given, give
 
@@ -130,6 +130,9 @@ class UserSql:
         """Yield the result of a step, a function of a connection and a statement with the rows of this one."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
+            if re.search(r"(?i)\btrace\b", self.sql) and _lacks_trace(connection):
+                with self._refused():
+                    add_trace(connection)
             counted = None if self._given else counted_edges(self.sql)
             given = [(counted[0], {})] if counted else self._given and self._given()
             sql = counted[1] if counted else self.sql
@@ -249,6 +252,12 @@ def _check(connection: DuckDBPyConnection, sql: str) -> None:
             f"the store is read only here: {kind} is not allowed; expected SELECT, WITH, FROM, VALUES,"
             f" DESCRIBE, SHOW, SUMMARIZE or EXPLAIN{more}"
         )
+
+
+def _lacks_trace(connection: DuckDBPyConnection) -> bool:
+    """True if a store is older than the column ``trace`` of the views ``nodes`` and ``edges``."""
+    sql = f"SELECT 1 FROM {INSIDE}.store_info WHERE key = 'schema_digest' AND value = $1"
+    return bool(connection.execute(sql, [BEFORE_TRACE]).fetchall())
 
 
 def _views(_: re.Match[str]) -> str:

@@ -76,6 +76,8 @@ OWNERS = {
     "av": {"draw"},
     "pytest": {"apps/pytest_plugin"},
     "rerun": {"exporters"},
+    "lance": {"exporters"},
+    "pyproj": {"exporters"},
     "torch": {"exporters"},
     "torch_geometric": {"exporters"},
     "carla": {"readers"},

@@ -319,7 +319,7 @@ def test_static_entities_have_their_pose_in_every_frame_that_they_are_in(store: 
         scenery = trace.blocks[0].frames.scenery
         sql = """
           SELECT DISTINCT n.node_id, n.x, n.y FROM nodes n JOIN frames USING (frame_id)
-          WHERE trace = ? AND n.is_static AND n.node_id >= 0 ORDER BY n.node_id
+          WHERE n.trace = ? AND n.is_static AND n.node_id >= 0 ORDER BY n.node_id
         """
         found = store.rows(sql, [name]).values
         assert np.array(found).reshape(-1, 3) == pytest.approx(
@@ -334,7 +334,9 @@ def test_a_graph_is_all_that_the_views_show_of_its_frame(store: Any, name: Any) 
         graph = store.graph(frame)
         nodes = {
             row.pop("node_id"): {k: v for k, v in row.items() if v is not None and k != "frame_id"}
-            for row in store.rows("SELECT * FROM nodes WHERE frame_id = ?", [frame]).dicts()
+            for row in store.rows(
+                "SELECT * EXCLUDE (trace) FROM nodes WHERE frame_id = ?", [frame]
+            ).dicts()
         }
         edges = store.rows(
             "SELECT src, relation, dst FROM edges WHERE frame_id = ?", [frame]

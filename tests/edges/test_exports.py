@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.seconds(25)
 
-FORMATS = [exporter.name for exporter in EXPORTERS if exporter.name != "rrd"]
-"""All but that of Rerun, which is large: tests/edges/test_export_rerun.py."""
+FORMATS = [exporter.name for exporter in EXPORTERS if exporter.name not in {"rrd", "lance"}]
+"""All but those of Rerun and Lance, which are large: test_export_rerun.py, test_clients.py."""
 each_format = pytest.mark.parametrize("form", FORMATS)
 
 S = 1_000_000_000

@@ -67,6 +67,10 @@ class ClipOptions:
         frames: use only this sensor; repeatable.
     clouds
         frames: format of point clouds.
+    storage : VERSION
+        duckdb: oldest version of DuckDB that can read the file, such as v1.0.0.
+    crs : CRS
+        geojson: coordinate system of the road maps, such as EPSG:32632; by default their own.
     """
 
     before: str = "2s"
@@ -79,6 +83,8 @@ class ClipOptions:
     graphml: bool = False
     channels: Annotated[list[str] | None, Option("--channel")] = None
     clouds: Literal["pcd", "npy", "bin"] = "pcd"
+    storage: str = "v1.0.0"
+    crs: str = ""
 
     def order(self, store: Store, clips: Sequence[Clip], **about: Any) -> Export:
         """Return an export of clips from a store, with the settings of the command line."""
@@ -104,10 +110,11 @@ def export(
 ) -> int:
     """Cut matches out of their recordings, as clips with the original messages.
 
-    Other formats: tables (parquet), pictures and clouds (frames), scenarios to drive
-    again (xosc), labels (openlabel), recordings for Rerun (rrd), graphs for networkx (nx), PyTorch
-    Geometric (pyg) and S3C (s3c). RETURN CLIPS(-3s, +5s) in the query wins over
-    --before and --after.
+    Other formats: tables (parquet, lance), a database of them (duckdb), pictures and clouds
+    (frames), scenarios to drive again (xosc), labels (openlabel), recordings for Rerun (rrd), maps
+    (geojson), graphs for networkx (nx), PyTorch Geometric (pyg) and S3C (s3c). Without a query all
+    frames are exported, but no recordings (mcap, frames). RETURN CLIPS(-3s, +5s) in the query
+    wins over --before and --after.
 
     Parameters
     ----------
@@ -118,13 +125,15 @@ def export(
     lock : FILE
         Instead of a query: each case of a lock, a clip each.
     form
-        mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, or that of a package.
+        mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, duckdb, lance, geojson, or
+        that of a package.
     """
     from sgstore.exporters import (
         check_folder,
         exporter_named,
         labelled,
         parse_labels,
+        whole_clips,
         write_export,
     )
 
@@ -137,9 +146,12 @@ def export(
     if sum((frames is not None, lock is not None, bool(question))) > 1:
         raise typer.BadParameter("expected one of: a QUERY, --frames, --lock")
     text, held = "", {}
-    if frames is None and lock is None:
+    if question:
         text, held = question.asked()
-    clips = _clips(opened, (frames, lock), text, held, margins)
+    if question or frames or lock:
+        clips = _clips(opened, (frames, lock), text, held, margins)
+    else:
+        clips = whole_clips(opened, form)
     if not clips:
         say("no matches to export")
         return 0
@@ -162,6 +174,9 @@ def _say_lost(written: Sequence[WrittenClip | WrittenFile]) -> None:
     for one in written:
         for loss in one.losses:
             say(f"{one.file.name}: lost: {loss.reason}")
+    notes = {note: one for one in written for note in getattr(one, "notes", ())}
+    for note, one in notes.items():
+        say(f"{one.file.name}: {note}")
 
 
 def _clips(
