@@ -595,7 +595,8 @@ class SceneGraphGenerator:
         if self._online is None:
             fresh = partial(SceneGraphGenerator, self._road_map, self._config)
             shown = map_of_graphs(self._road_map, self._config)
-            self._online = Stepper(fresh, shown, DrivenLanes(self._road_map), self._config.ego)
+            settings = self._config.ego, self._config.noise
+            self._online = Stepper(fresh, shown, DrivenLanes(self._road_map), *settings)
         graphs = self._online.step(frame.meant(self._config.types), egos)
         for graph in self._online.last[0] if self._online.last else ():
             self._crowds.see(graph)

@@ -18,6 +18,7 @@ import numpy as np
 from sgstore.base.geometry import wrapped
 from sgstore.base.tables import chained
 from sgstore.model.graph import Edges, LaneDistances, StaticPresence
+from sgstore.model.online_noise import ClientNoise
 from sgstore.model.scene_columns import MapRecords, SceneColumns, edge_attributes
 from sgstore.model.vocabulary import (
     CONTROL,
@@ -815,6 +816,8 @@ class Stepper:
         Choice of the lanes that vehicles drive in junctions.
     ego : str
         Default ego for frames without an ego.
+    noise : float
+        Noise of the positions, as in the settings; m.
 
     Attributes
     ----------
@@ -830,8 +833,10 @@ class Stepper:
         road_map: RoadMap | None,
         driven: DrivenLanes,
         ego: str = "",
+        noise: float = 0.0,
     ) -> None:
         self._make, self._driven = make, driven
+        self._noise = ClientNoise(noise)
         self._generator = make()
         self._ego = ego
         self._records = Records(road_map)
@@ -863,8 +868,9 @@ class Stepper:
         if self._introduced > 2 * (len(moving) + len(self._standing)) + SPARE:
             self._generator, self._inner, self._introduced = self._make(), {}, 0
             new = [entity for entity, _ in self._standing.values()]
-        block = self._kept(self._block(frame, moving, new))
-        block = self._driven.now(block, self._outer[block.states.node])
+        block = self._block(frame, moving, new)
+        outer = self._outer[block.states.node]
+        block = self._driven.now(self._kept(self._noise.smoothed(block, outer)), outer)
         for row, entity in enumerate(new):
             self._records.stand(self._standing[entity.ident][1], block.scenery, row)
         here = {entity.ident for entity in moving}

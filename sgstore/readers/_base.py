@@ -18,6 +18,7 @@ from sgstore.base.display import first_of
 from sgstore.errors import TraceError
 from sgstore.graphs.online import Frame, check_entities
 from sgstore.mcap import IDS, Findings, Loss, OutOfOrder, digest_of, read_and_digest
+from sgstore.model.noise import ESTIMATED, Noise
 from sgstore.model.vocabulary import KINDS, TypeMeaning
 from sgstore.model.world import POSE, Channel, Event, MessageRefs, TraceInfo, TraceReport
 from sgstore.readers._blocks import (
@@ -31,7 +32,6 @@ from sgstore.readers._blocks import (
     first_noise,
     lacks_velocity,
 )
-from sgstore.readers._noise import ESTIMATED, Noise
 from sgstore.readers._roles import channel_rank
 from sgstore.readers._stamps import Stamps, late_reason
 
@@ -412,10 +412,13 @@ class MessageTrace:
         Filled during the reading of blocks.
     noise : float
         Standard deviation of the positions; m. 0: exact; below 0: estimated from the first frames.
+    causal : bool
+        True: motion from noisy positions does not depend on later frames.
     """
 
     name: ClassVar[str] = ""
     noise: float = -1.0
+    causal: bool = False
 
     def __init__(
         self,
@@ -488,7 +491,8 @@ class MessageTrace:
         decoder = self.decoder(report)
         refs = frame_refs(self.info.channels, self.recording.window)
         runs = self.recording.walk(report, rank=self._rank)
-        yield from counted(assemble(runs, size, decoder, refs, first_steps, noise), report)
+        blocks = assemble(runs, size, decoder, refs, first_steps, noise, causal=self.causal)
+        yield from counted(blocks, report)
         decoder.settle()
         if not report.frames:
             topic = next(c.topic for c in self.info.channels if c.role == "ground_truth")

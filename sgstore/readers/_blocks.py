@@ -18,6 +18,8 @@ import numpy as np
 
 from sgstore.base.tables import chained, taken
 from sgstore.mcap import IDS, Loss
+from sgstore.model.noise import Noise, Smoother, noise_of
+from sgstore.model.online_noise import OnlineSmoother
 from sgstore.model.vocabulary import KIND_CODE, KINDS
 from sgstore.model.world import (
     FASTEST,
@@ -37,7 +39,6 @@ from sgstore.model.world import (
     valid_attributes,
     without_implausible,
 )
-from sgstore.readers._noise import Noise, Smoother, noise_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -482,6 +483,8 @@ def assemble(
     refs: Callable[[Messages], MessageRefs],
     first_steps: Iterable[int] = (),
     noise: Noise = EXACT,
+    *,
+    causal: bool = False,
 ) -> Iterator[FrameBlock]:
     """Decode the messages of a recording, and yield blocks of consecutive frames.
 
@@ -498,6 +501,8 @@ def assemble(
         Times between the first frames; ns.
     noise : Noise
         Noise of the positions. Missing motion of noisy positions needs more frames before and after a block.
+    causal : bool
+        True: motion from noisy positions does not depend on later frames.
 
     Yields
     ------
@@ -508,7 +513,9 @@ def assemble(
     wanted = np.zeros(IDS, np.bool_)
     wanted[[*decoder.channels]] = True
     steps = [step for step in first_steps if step > 0]
-    maker = _BlockMaker(decoder, size, steps, noise)
+    period = float(np.median(steps)) / 1e9 if steps else 0.1
+    form = OnlineSmoother if causal else Smoother
+    maker = _BlockMaker(decoder, size, steps, form(noise, period) if noise else None)
     between = _Between()
     for run in runs:
         start = 0
@@ -546,17 +553,21 @@ class _BlockMaker(Generic[Raw]):
         Frames per block.
     steps : list of int
         Times between the first frames; ns.
-    noise : Noise
+    smoother : Smoother, OnlineSmoother or None
+        Source of missing motion. ``None``: differences of exact positions.
     """
 
     def __init__(
-        self, decoder: MessageDecoder[Raw], size: int, steps: list[int], noise: Noise
+        self,
+        decoder: MessageDecoder[Raw],
+        size: int,
+        steps: list[int],
+        smoother: Smoother | OnlineSmoother | None,
     ) -> None:
         self._decoder, self._size = decoder, size
         self._lives = LifetimeTracker(decoder.roster, steps, sure_kinds=decoder.sure_kinds)
-        period = float(np.median(steps)) / 1e9 if steps else 0.1
-        self._smoother = Smoother(noise, period) if noise else None
-        self._reach = noise.reach(period)
+        self._smoother = smoother
+        self._reach = smoother.reach if isinstance(smoother, Smoother) else 1
         self._raw: list[Raw] = []
         self._sizes: list[int] = []  # Number of known ids before the frame after each one.
         self._done: list[FrameRows] = []  # Completed frames, also those before the block.
@@ -689,7 +700,7 @@ def _block(
     refs: list[MessageRefs],
     roster: EntityTable,
     known: int,
-    smoother: Smoother | None,
+    smoother: Smoother | OnlineSmoother | None,
 ) -> FrameBlock:
     """Return a block of frames, built from these frames and the frames next to them.
 

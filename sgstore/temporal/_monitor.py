@@ -125,6 +125,7 @@ def opened(
     with open_trace(path, ego=ego or config.ego) as trace:
         found, warnings = Maps(road_map, config.signs).of(trace.info)
         on_map(trace, found)
+        trace.noise, trace.causal = config.noise, True
         cameras = RecordedCameras(trace.info.path, trace.info.channels)
         told = FrameSource(path.stem, found, iter(()), warnings, cameras=cameras)
         told.losses += [loss.reason for loss in lost_lanes(trace.info, found)]

@@ -9,7 +9,11 @@ import pytest
 from recordings import Recorder, car
 
 import sgstore
+from sgstore import Frame
+from sgstore.graphs.online import NUMBERS, Replay
+from sgstore.model.world import STANDS
 from sgstore.readers import open_trace
+from sgstore.temporal import opened
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -188,6 +192,130 @@ def test_noise_can_be_set(tmp_path: Path) -> None:
         (outcome,) = store.ingest(path, config=sgstore.Config(noise=0.0))
         assert not any("noise" in words for words in outcome.warnings)
         assert store.find("MATCH (v) WHERE v.stands").count() == 0
+
+
+def clients(
+    sigma: float, *, velocity: bool = False, frames: int = FRAMES
+) -> tuple[NDArray[Any], NDArray[Any], list[Frame]]:
+    """Frames of a client with a driven ego and two parked cars; speed and noisy place of the ego."""
+    rng = np.random.default_rng(5)
+    t = np.arange(frames) * PERIOD
+    x, y, speed = driven(t)
+    place = np.stack([x, y], axis=1) + rng.normal(0, sigma, (frames, 2))
+    found = []
+    for i in range(frames):
+        frame = Frame(round(i * PERIOD * 1e9), ego="e")
+        told = {"vx": speed[i], "vy": 0.0} if velocity else {}
+        frame.add("e", "car", *place[i], 0.0, heading=0, length=4, width=2, **told)
+        for k in (1, 2):
+            told = {"vx": 0.0, "vy": 0.0} if velocity else {}
+            off = rng.normal(0, sigma, 2)
+            frame.add(f"p{k}", "car", 30 + 8 * k + off[0], 8 + off[1], 0.0, heading=0, **told)
+        found.append(frame)
+    return speed, place, found
+
+
+def online(frames: list[Frame], noise: float = -1.0) -> list[dict[str, dict[str, Any]]]:
+    """Attributes of the bodies of each graph of the online mode, by their ids."""
+    generator = sgstore.SceneGraphGenerator(None, sgstore.Config(noise=noise))
+    graphs = [generator.step(frame) for frame in frames]
+    return [{node["ident"]: node for node in graph.nodes.values()} for graph in graphs]
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.3])
+def test_online_speed_error_is_a_third_of_difference_quotients(sigma: float) -> None:
+    speed, place, frames = clients(sigma)
+    found = online(frames, sigma)
+    got = np.array([one["e"].get("speed", np.nan) for one in found])
+    quotient = np.hypot(*np.diff(place, axis=0).T) / PERIOD
+    known = np.isfinite(got[1:])
+    assert known[20:].all()
+    errors = [np.sqrt(np.mean((v - speed[1:])[known] ** 2)) for v in (got[1:], quotient)]
+    assert errors[0] < errors[1] / 3
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.2])
+def test_online_terms_hold_without_false_alarms(sigma: float) -> None:
+    _, _, frames = clients(sigma)
+    rules = """
+        MATCH (v) WHERE NOT v.is_ego AND moving(v);
+        MATCH (v) WHERE NOT v.is_ego AND hard_brake(v);
+        MATCH (e:Ego) WHERE hard_brake(e);
+        MATCH (e:Ego) WHERE stopped(e);
+        MATCH (v) WHERE NOT v.is_ego AND stopped(v)
+    """
+    monitor = sgstore.Monitor(rules, None, sgstore.Config(noise=sigma))
+    told: dict[str, list[float]] = {}
+    for frame in frames:
+        for event in monitor.step(frame):
+            told.setdefault(event.name, []).append(event.start.t)
+    names = [f"pattern {i}" for i in range(1, 6)]
+    times = [told.get(name, []) for name in names]
+    assert not times[0] + times[1]
+    assert len(times[2]) >= 1
+    assert all(4 < t < 7.5 for t in times[2])
+    assert times[3]
+    assert all(t > 9.5 for t in times[3])
+    assert len(times[4]) == 2
+
+
+def test_online_motion_does_not_depend_on_later_frames() -> None:
+    _, _, frames = clients(0.1)
+    assert online(frames[:70], 0.1) == online(frames, 0.1)[:70]
+
+
+def test_online_noise_is_estimated_from_the_first_frames() -> None:
+    speed, _, frames = clients(0.1)
+    found = online(frames)
+    assert "speed" not in found[20]["e"]
+    assert abs(found[119]["e"]["speed"] - speed[119]) < 1
+    assert found[119]["p1"]["stands"]
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+def test_exact_online_motion_is_that_of_the_client(velocity: bool) -> None:
+    _, _, frames = clients(0.0, velocity=velocity)
+    found = online(frames)
+    assert found == online(frames, 0.0)
+    assert ("speed" in found[140]["e"]) == velocity
+
+
+def test_an_online_jump_gives_no_acceleration() -> None:
+    rng = np.random.default_rng(3)
+    frames = []
+    for i in range(120):
+        frame = Frame(round(i * PERIOD * 1e9), ego="e")
+        place = 0.9 * i - 1.9 * (i >= 40) + 3.0 * (i == 80) + rng.normal(0, 0.05)
+        frame.add("e", "car", place, rng.normal(0, 0.05), 0.0, heading=0)
+        frames.append(frame)
+    found = [one["e"] for one in online(frames, 0.05)]
+    assert max(abs(one.get("accel", 0.0)) for one in found) < 3
+    assert all(abs(one.get("speed", 9.0) - 9) < 1.2 for one in found)
+
+
+def test_a_monitor_smooths_a_recording_as_the_online_mode(tmp_path: Path) -> None:
+    _, path = recorded(tmp_path / "a.mcap", 0.1)
+    config = sgstore.Config(noise=0.1)
+    with opened(str(path), config) as source:
+        told = [frame.entities[0] for frame in source.frames]
+    with open_trace(path) as trace:
+        trace.noise = 0.0
+        replay = Replay()
+        raw = [frame for block in trace.blocks() for frame in replay.frames(block)]
+    assert len(told) == len(raw)
+    frames = []
+    for one in raw:
+        frame = Frame(one.time_ns, one.ego)
+        for entity in one.entities:
+            numbers = dict(zip(NUMBERS, entity.numbers, strict=True))
+            numbers["heading"] = np.degrees(numbers["heading"])
+            frame.add(entity.ident, "car", **{n: numbers[n] for n in ("x", "y", "z", "heading")})
+        frames.append(frame)
+    for entity, node in zip(told, online(frames, 0.1), strict=True):
+        numbers = dict(zip(NUMBERS, entity.numbers, strict=True))
+        one = node[entity.ident]
+        np.testing.assert_allclose(numbers["vx"], one.get("vx", np.nan), rtol=1e-5, atol=1e-6)
+        assert bool(entity.whole[2] & STANDS) == one["stands"]
 
 
 def test_windows_around_a_frame_equal_their_definition(open_town: Store) -> None:

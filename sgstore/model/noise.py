@@ -49,6 +49,9 @@ BODIES: Final = 5
 KINKED: Final = 0.9
 """Share of the bend that positions between two kinks lack."""
 
+USUAL: Final = 1.5
+"""Usual acceleration of a body: that of a short noisy window counts less; m/s²."""
+
 JUMP: Final = 0.5
 """A step that differs by more from its neighbours divides a track, beside noise and acceleration; m."""
 
@@ -93,10 +96,6 @@ class Noise(NamedTuple):
     def leave(self) -> float:
         """Speed from which a standing body moves again; m/s."""
         return 1.3 * self.enter
-
-    def reach(self, period: float) -> int:
-        """Return the number of frames on each side that the values of a frame depend on."""
-        return min(MOST_ROWS, int(np.ceil(WIDE / period))) + 3 if self else 1
 
     def half(self, period: float) -> float:
         """Return half the window of velocities: the shortest in which they are calm; s."""
@@ -239,12 +238,15 @@ class Fit:
         Mean time of the window, from the time of the row; s.
     span : (n,) float64
         Length of the window; s.
+    loose : (n,) float64
+        Variance of the bend, if that of the values is 1; NaN without a bend.
     """
 
     slope: Floats
     bend: Floats
     middle: Floats
     span: Floats
+    loose: Floats
 
     @classmethod
     def of(cls, sums: Floats, moments: Floats, span: Floats) -> Fit:
@@ -257,7 +259,7 @@ class Fit:
             m0 = moments[0] / sums[0][:, None]
             m1 = moments[1] / sums[0][:, None] - middle[:, None] * m0
             slope = m1 / s2[:, None]
-            bend = np.full_like(slope, np.nan)
+            bend, loose = np.full_like(slope, np.nan), np.full_like(middle, np.nan)
             if degree == 2:
                 s3 = sums[3] / sums[0] - 3 * middle * sums[2] / sums[0] + 2 * middle**3
                 s4 = sums[4] / sums[0] - 4 * middle * sums[3] / sums[0]
@@ -271,7 +273,8 @@ class Fit:
                 bend = 2 * (m2 - (s3 / s2)[:, None] * m1) / rest[:, None]
                 slope = slope - (s3 / s2)[:, None] * bend / 2
                 bend[sums[0] < 4] = np.nan
-        return cls(slope, bend, middle, span)
+                loose = 4 / (rest * sums[0])
+        return cls(slope, bend, middle, span, loose)
 
     def instead(self, other: Fit, rows: Bools) -> Fit:
         """Return the fit with some rows of another one."""
@@ -280,6 +283,7 @@ class Fit:
             np.where(rows[:, None], other.bend, self.bend),
             np.where(rows, other.middle, self.middle),
             np.where(rows, other.span, self.span),
+            np.where(rows, other.loose, self.loose),
         )
 
 
@@ -329,8 +333,8 @@ def _close(time: Ints, place: Floats, rows: Ints, jitter: float) -> Bools:
 
 
 @dataclass(slots=True)
-class Smoother:
-    """Velocities, accelerations and yaw rates from noisy positions, block after block.
+class GapFiller:
+    """Missing motion of noisy bodies, from motion that a subclass estimates from positions.
 
     Parameters
     ----------
@@ -350,38 +354,8 @@ class Smoother:
     period: float
     unreal: Ints = field(default_factory=lambda: np.zeros(2, np.int64))
     apart: Ints = field(default_factory=lambda: np.zeros(5001, np.int64))
-    _stands: dict[int, bool] = field(default_factory=dict[int, bool])
 
-    def fill(
-        self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
-    ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
-        """Return the values of rows without gaps of motion, their bits ``derived``, and further attributes.
-
-        Parameters and result are those of :func:`sgstore.readers._blocks.derive`. The attributes are motion
-        from positions, of rows whose motion is recorded.
-        """
-        tracks = Tracks.of(node, frame, seconds, values, self.noise.jitter, self.period)
-        half = self.noise.half(self.period)
-        near = tracks.fits(tracks.place, half, 1)
-        calm = tracks.fits(tracks.place, max(HALF, half), 1)
-        if self.noise.jitter:  # At the end of a track, the window on one side must be longer.
-            near = near.instead(calm, near.span < 1.9 * half)
-        wide = tracks.fits(tracks.place, WIDE, 2)
-        turns = tracks.fits(tracks.turn[:, None], HALF, 1, 2 * np.pi)
-        bend = np.where((wide.span >= HALF)[:, None], wide.bend, np.nan)
-        moved = near.slope - np.nan_to_num(bend) * near.middle[:, None]
-        moved[:, 2] = calm.slope[:, 2]
-        back = np.empty(len(node), np.int64)
-        back[tracks.order] = np.arange(len(node))
-        at = back[rows]
-        found = np.column_stack([moved, bend, turns.slope])[at]
-        speed = np.hypot(calm.slope[:, 0], calm.slope[:, 1])
-        stands = self._standing(node[rows], frame[rows], speed[at])
-        found[stands & np.isfinite(found[:, 2]), 2] = 0.0  # The height of boxes trembles, too.
-        filled, derived = self._filled(values[rows], found, fixed[rows], stands)
-        return filled, derived, self._second(values[rows], found)
-
-    def _second(self, values: Floats, found: Floats) -> list[Mapping[str, float] | None]:
+    def second(self, values: Floats, found: Floats) -> list[Mapping[str, float] | None]:
         """Return speed and acceleration from positions as attributes of rows with recorded velocities."""
         heading = values[:, _HEADING]
         table = np.column_stack(
@@ -407,7 +381,7 @@ class Smoother:
             for row, told in zip(table.tolist(), recorded.tolist(), strict=True)
         ]
 
-    def _filled(
+    def filled(
         self, values: Floats, found: Floats, fixed: Bools, stands: Bools
     ) -> tuple[Floats, Ints]:
         """Return values with derived motion in place of missing motion, and their bits."""
@@ -449,6 +423,51 @@ class Smoother:
         if spun:
             found.append(f"{spun} yaw rates are impossible")
         return found
+
+
+@dataclass(slots=True)
+class Smoother(GapFiller):
+    """Velocities, accelerations and yaw rates from noisy positions, block after block.
+
+    The windows are centred: a block needs frames after it. See :class:`OnlineSmoother` for the causal form.
+    """
+
+    _stands: dict[int, bool] = field(default_factory=dict[int, bool])
+
+    @property
+    def reach(self) -> int:
+        """Number of frames on each side that the values of a frame depend on."""
+        return min(MOST_ROWS, int(np.ceil(WIDE / self.period))) + 3
+
+    def fill(
+        self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
+    ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
+        """Return the values of rows without gaps of motion, their bits ``derived``, and further attributes.
+
+        Parameters and result are those of :func:`sgstore.readers._blocks.derive`. The attributes are motion
+        from positions, of rows whose motion is recorded.
+        """
+        tracks = Tracks.of(node, frame, seconds, values, self.noise.jitter, self.period)
+        half = self.noise.half(self.period)
+        near = tracks.fits(tracks.place, half, 1)
+        calm = tracks.fits(tracks.place, max(HALF, half), 1)
+        if self.noise.jitter:  # At the end of a track, the window on one side must be longer.
+            near = near.instead(calm, near.span < 1.9 * half)
+        wide = tracks.fits(tracks.place, WIDE, 2)
+        turns = tracks.fits(tracks.turn[:, None], HALF, 1, 2 * np.pi)
+        sure = USUAL**2 / (USUAL**2 + self.noise.jitter**2 * wide.loose)
+        bend = np.where((wide.span >= HALF)[:, None], wide.bend * sure[:, None], np.nan)
+        moved = near.slope - np.nan_to_num(bend) * near.middle[:, None]
+        moved[:, 2] = calm.slope[:, 2]
+        back = np.empty(len(node), np.int64)
+        back[tracks.order] = np.arange(len(node))
+        at = back[rows]
+        found = np.column_stack([moved, bend, turns.slope])[at]
+        speed = np.hypot(calm.slope[:, 0], calm.slope[:, 1])
+        stands = self._standing(node[rows], frame[rows], speed[at])
+        found[stands & np.isfinite(found[:, 2]), 2] = 0.0  # The height of boxes trembles, too.
+        filled, derived = self.filled(values[rows], found, fixed[rows], stands)
+        return filled, derived, self.second(values[rows], found)
 
     def _standing(self, node: Ints, frame: Ints, speed: Floats) -> Bools:
         """Return a mask of the rows with a standing body: slow enough, or not faster since then."""
