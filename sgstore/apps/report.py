@@ -29,6 +29,8 @@ from sgstore.store import StateColumns
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from numpy.typing import NDArray
+
     from sgstore.query import Store
 
 CHUNK: Final = 300
@@ -176,7 +178,8 @@ def _kept(
     traces = {one["name"]: one for one in about["traces"] if one["name"] in {m[0] for m in found}}
     for one in traces.values():
         one |= {"cameras": []}
-    spans = _spans(found, traces, around_s)
+    times = {name: _times(store, name, about["frames"]) for name, about in traces.items()}
+    spans = _spans(found, times, around_s)
     kept: dict[str, Any] = {
         "about": {**about, "traces": [*traces.values()], "around": around_s},
         "query": text,
@@ -218,13 +221,18 @@ def _key(*values: Any) -> str:
     return json.dumps(values, separators=(",", ":"), ensure_ascii=False)
 
 
-def _spans(found: list[Found], traces: Mapping[str, Any], around_s: float) -> Spans:
+def _times(store: Store, trace: str, frames: int) -> NDArray[np.float64]:
+    """Return the times of all frames of a trace since its start; s."""
+    return StateColumns(store.file).frames(trace, 0, frames - 1)["t"]
+
+
+def _spans(found: list[Found], times: Mapping[str, NDArray[np.float64]], around_s: float) -> Spans:
     """Return the frame ranges that contain the matches and the time around them, by trace."""
     spans: Spans = {}
     for trace, first, last, _ in sorted(found, key=lambda match: match[:3]):
-        about = traces[trace]
-        around = int(around_s / (about["period"] or 0.1))
-        low, high = max(first - around, 0), min(last + around, about["frames"] - 1)
+        t, around = times[trace], around_s + 1e-6  # times have six decimals
+        low = int(np.searchsorted(t, t[first] - around))
+        high = int(np.searchsorted(t, t[last] + around)) - 1
         mine = spans.setdefault(trace, [])
         if mine and low <= mine[-1][1] + 1:
             mine[-1] = mine[-1][0], max(mine[-1][1], high)
@@ -276,17 +284,9 @@ def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[i
     for low, high in spans:
         inside |= (low <= seq) & (seq <= high)
     start = np.searchsorted(seq[inside], np.append(frames["seq"], last + 1)).astype(np.uint32)
-    columns = {f"frame.{name}": column for name, column in frames.items()} | {"frame.start": start}
-    # Positions to a centimetre, other numbers to three decimals: the file is a third smaller.
-    kept = {name: _rounded(column[inside]) for name, column in states.items()}
+    columns = {f"frame.{name}": frames[name] for name in ("seq", "ego")} | {"frame.start": start}
+    kept = {name: column[inside] for name, column in states.items()}
     return packed({"trace": trace, "first": first, "last": last}, columns | kept)
-
-
-def _rounded(column: Any) -> Any:
-    """Return numbers rounded to multiples of 1/128, because trailing zero bits compress well."""
-    if column.dtype.kind != "f":
-        return column
-    return (np.round(column * 128) / 128).astype(column.dtype)
 
 
 def _small(data: bytes) -> str:
@@ -302,9 +302,11 @@ def _pictures(
     for about in traces:
         trace, topics = about["name"], cameras[about["name"]][:1]
         about["cameras"] = topics
-        every = max(round(1 / (about["period"] or 0.1)), 1)
-        mine = [match for match in matches if match[0] == trace]
-        wanted = {seq for _, first, last, _ in mine for seq in range(first, last + 1, every)}
+        times = _times(store, trace, about["frames"])
+        wanted = set[int]()
+        for _, first, last, _ in (match for match in matches if match[0] == trace):
+            second = np.floor(times[first : last + 1] - times[first] + 1e-6)
+            wanted.update((first + np.unique(second, return_index=True)[1]).tolist())
         for topic in topics:
             kept = found[_key(trace, topic)] = {}
             for seq in sorted(wanted):

@@ -424,7 +424,7 @@ class SandboxPool:
     size : int
         Number of parallel queries; further ones wait.
     small : collection of str
-        Kinds of short queries (``ask`` of a query) that never wait: the spare sandbox runs them.
+        Kinds of short queries (``ask`` of a query) that never wait: each has a spare process.
     first : mapping, optional
         Warm-up query of each new process.
     **limits
@@ -454,8 +454,8 @@ class SandboxPool:
         self._closed = False
         self._make = lambda: Sandbox(store, **limits)
         self._starting = [
-            threading.Thread(target=self._more, daemon=True, name="sgstore sandbox")
-            for _ in range(size)
+            threading.Thread(target=self._more, args=(many,), daemon=True, name="sgstore sandbox")
+            for many in (*[1] * (size - 1), max(len(small), 1))
         ]
         for thread in self._starting:
             thread.start()
@@ -528,9 +528,10 @@ class SandboxPool:
         self._starting = [one for one in self._starting if one.is_alive()] + [again]
         again.start()
 
-    def _more(self) -> None:
+    def _more(self, many: int) -> None:
         with suppress(SgstoreError):  # the first one started, so this fault is temporary
-            self._ready(self._make())
+            for _ in range(many):
+                self._ready(self._make())
 
     def _again(self, box: Sandbox) -> None:
         with suppress(SgstoreError):

@@ -81,7 +81,10 @@ _ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
 
 
 class Entity(NamedTuple):
-    """Object in a frame with id, kind, pose, size and motion; angles in radians."""
+    """Object in a frame with id, kind, pose, size and motion; angles in radians.
+
+    ``node`` is its node id in a store, if a reader has assigned one; -1: none.
+    """
 
     ident: str
     kind: int
@@ -94,6 +97,7 @@ class Entity(NamedTuple):
     whole: tuple[int, ...]
     trailer: str = ""
     own: Mapping[str, Any] | None = None
+    node: int = -1
 
     @property
     def constants(self) -> tuple[int, str, str]:
@@ -528,6 +532,7 @@ class Replay:
                 whole=tuple(codes),
                 trailer=self._trailers[node],
                 own=own,
+                node=node,
             )
             for node, values, codes, own in zip(
                 states.node[start:stop].tolist(),
@@ -941,9 +946,10 @@ class Stepper:
 
     def _enter(self, entity: Entity, lifetime: int = 1) -> EntityConstants:
         texts = entity.special, entity.subkind, entity.type_name
-        known = EntityConstants(self._next, entity.ident, KINDS[entity.kind], *texts, lifetime)
-        self._next += 1
-        return known
+        is_free = entity.node >= 0 and entity.node not in self._inner
+        node = entity.node if is_free else self._next
+        self._next = max(self._next, node + 1)
+        return EntityConstants(node, entity.ident, KINDS[entity.kind], *texts, lifetime)
 
     def _follow(self, entity: Entity, time_ns: int) -> None:
         """Record the position of an object. An object that reuses the id of another one is a new object."""

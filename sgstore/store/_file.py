@@ -5,6 +5,7 @@ Imports for writing and drawing are local: they would take longer than a query.
 
 from __future__ import annotations
 
+import hashlib
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -291,6 +292,11 @@ class StoreFile:
         """Return the row counts of user tables that are joined with frames, by table name."""
         with self.access.reading() as connection:
             return {} if self.tables is None else self.tables.joined(connection)
+
+    @property
+    def stamp(self) -> str:
+        """Return a short text that every write to the store changes."""
+        return hashlib.sha256(repr(stamp_of(self.path)).encode()).hexdigest()[:16]
 
     def catalog(self) -> Catalog:
         """Return names, types and counts of the store for the query compiler. Cached until the file changes."""

@@ -71,6 +71,7 @@ def serve(
     host: str = "127.0.0.1",
     port: Annotated[int, Option(min=0, max=65535)] = 0,
     browse: Annotated[bool, Option("--open/--no-open")] = False,
+    link: str = "",
 ) -> int:
     """Explore a store in a browser: search, view matches, and see why a frame matches or not.
 
@@ -88,6 +89,8 @@ def serve(
         Port; 0: any free.
     browse
         Open the page in a browser.
+    link : LINK
+        A link copied from the page of another server: the first view.
     """
     from sgstore.apps.explorer import serve as run
 
@@ -107,6 +110,7 @@ def serve(
         other=compare,
         write_to=write_to.resolve() if write_to else None,
         browse=browse,
+        link=link,
         on_start=tell,
     )
     return 0

@@ -42,7 +42,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MOST_QUESTIONS: Final = 8
-"""Greatest number of running queries; further ones are rejected with 503."""
+"""Greatest number of long running queries; further ones are rejected with 503."""
+
+SMALL: Final = "parts", "why"
+"""Short queries about one match; they have one more slot and sandbox process each."""
 
 TIMEOUT_S: Final = 60.0
 """Time limit of a query of a user; s."""
@@ -97,6 +100,7 @@ class _Answer(StreamingResponse):
     ) -> None:
         super().__init__(told(self._replies()), media_type=media_type)
         self._pool, self._question, self._key = pool, question, key
+        self.is_small = question["ask"] in SMALL
         self._asked: SandboxPool | Errand | None = None
         self._gone = threading.Event()
         self._loop = asyncio.get_running_loop()
@@ -119,8 +123,8 @@ class _Answer(StreamingResponse):
                 tell(reply)
         except SgstoreError as error:
             tell({"error": error.as_dict()})
-        except BaseException:
-            tell({"error": {"error": "SgstoreError", "reason": "the question failed"}})
+        except BaseException as error:
+            tell({"error": {"error": "SgstoreError", "reason": f"the question failed: {error!r}"}})
             raise
         finally:
             tell(None)
@@ -171,7 +175,7 @@ class Explorer:
         self._stamp = self.notes.stamp()
         self._folder = TemporaryDirectory(prefix="sgstore-notes-")
         self._pools = {side: self._pool(side) for side in self.stores}
-        self._threads = ThreadPoolExecutor(MOST_QUESTIONS + 4, "sgstore question")
+        self._threads = ThreadPoolExecutor(MOST_QUESTIONS + len(SMALL) + 4, "sgstore question")
         self._ended = threading.Event()
         self.busy = set[_Answer]()
 
@@ -200,7 +204,7 @@ class Explorer:
             max_rows=MOST_MATCHES,
             tables=self._tables() if side == "a" else {},
             worker=WORKER,
-            small=("parts", "why"),
+            small=SMALL,
             first=FIRST,
         )
 
@@ -224,7 +228,9 @@ class Explorer:
     def _side(self, fields: Mapping[str, Any]) -> str:
         return one_of(*self.stores)(fields.get("side"), "side")
 
-    def _answer(self, pool: Callable[[], SandboxPool | Errand], *asked: Any) -> _Answer:
+    def _answer(
+        self, pool: Callable[[], SandboxPool | Errand], question: Mapping[str, Any], *how: Any
+    ) -> _Answer:
         """Start a query in a thread, and return the HTTP response that streams its results.
 
         Raises
@@ -232,9 +238,12 @@ class Explorer:
         RequestError
             Too many queries are running.
         """
-        if len(self.busy) >= MOST_QUESTIONS:
-            raise RequestError(f"{MOST_QUESTIONS} questions are under way; try again later", 503)
-        answer = _Answer(pool, *asked)
+        is_small = question["ask"] in SMALL
+        count = len(self.busy) if is_small else sum(not one.is_small for one in self.busy)
+        most = MOST_QUESTIONS + is_small * len(SMALL)
+        if count >= most:
+            raise RequestError(f"{most} questions are under way; try again later", 503)
+        answer = _Answer(pool, question, *how)
         self.busy.add(answer)
         asking = self._threads.submit(answer.ask)
         asking.add_done_callback(lambda _: self.busy.discard(answer))
@@ -282,6 +291,10 @@ class Explorer:
         sides = {side: await self.threaded(reads.about) for side, reads in self.reads.items()}
         writing = self.write_to is not None
         return JSONResponse({**sides["a"], "other": sides.get("b"), "writing": writing})
+
+    async def stamps(self, _: Request) -> Response:
+        """Endpoint with a text for each store that changes with the store."""
+        return JSONResponse({side: one.file.stamp for side, one in self.stores.items()})
 
     async def tags(self, request: Request) -> Response:
         """Endpoint with all tags of users; POST adds or removes a tag."""
@@ -334,7 +347,7 @@ async def page_of(request: Request, script: str = "main.js") -> Response:
 
 
 _QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
-    **dict.fromkeys(("parts", "why"), ("text", "parameters", "trace", "seq", "binding")),
+    **dict.fromkeys(SMALL, ("text", "parameters", "trace", "seq", "binding")),
     **dict.fromkeys(("check", "nearest"), ("text", "parameters")),
     "coverage": ("what", "abstraction"),
     "select": ("clips", "abstraction"),
@@ -374,6 +387,7 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
     table: list[tuple[str, Endpoint]] = [
         ("GET /", page_of),
         ("GET /api/store", explorer.about),
+        ("GET /api/stamp", explorer.stamps),
         ("POST /api/find", explorer.find),
         ("DELETE /api/find/{key}", explorer.cancel),
         ("GET /api/notes", explorer.tags),

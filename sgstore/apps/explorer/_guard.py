@@ -9,12 +9,14 @@ match.
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import secrets
 from typing import TYPE_CHECKING, Final
 
 from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -26,6 +28,19 @@ POLICY: Final = (
 )
 """Content policy of the page; the editor's styles have the nonce, and the browser itself writes
 some attributes."""
+
+_AGAIN: Final = 'if (location.search !== "?again") location.replace("/?again" + location.hash);'
+"""A browser sends the cookie for a link on a page of another site only if the page loads itself again."""
+
+_FIRST_PAGE: Final = f"""<!doctype html><html lang="en"><meta charset="utf-8"><title>sgstore</title>
+<p>This page needs the address that 'sgstore serve' printed, with its token.
+Open that address once in this browser; then links to the page work.</p><script>{_AGAIN}</script></html>
+"""
+
+_FIRST_POLICY: Final = (
+    "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; script-src 'sha256-"
+    f"{base64.b64encode(hashlib.sha256(_AGAIN.encode()).digest()).decode()}'"
+)
 
 _HEADERS: Final = {
     "x-content-type-options": "nosniff",
@@ -64,7 +79,7 @@ class Guard:
         async def send_with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                headers["content-security-policy"] = POLICY.format(nonce=nonce)
+                headers.setdefault("content-security-policy", POLICY.format(nonce=nonce))
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
             await send(message)
@@ -89,10 +104,12 @@ class Guard:
         site = headers.get("sec-fetch-site")
         if site not in {None, "same-origin"} and not is_first_page:
             return PlainTextResponse("wrong site", 403)
-        if is_first_page and scope["query_string"]:
-            token = connection.query_params.get("token", "")
+        token = connection.query_params.get("token")
+        if is_first_page and token is not None:
             return self._log_in() if self._is_token(token) else _no_token()
-        return None if self._is_token(connection.cookies.get(self._cookie, "")) else _no_token()
+        if not self._is_token(connection.cookies.get(self._cookie, "")):
+            return _first_page() if is_first_page else _no_token()
+        return RedirectResponse("/", 303) if is_first_page and scope["query_string"] else None
 
     def _is_token(self, text: str) -> bool:
         return secrets.compare_digest(text.encode(), self._token.encode())
@@ -114,3 +131,7 @@ def _no_token() -> Response:
     return PlainTextResponse(
         "This page needs the address that 'sgstore serve' printed, with its token.", 403
     )
+
+
+def _first_page() -> Response:
+    return HTMLResponse(_FIRST_PAGE, 403, {"content-security-policy": _FIRST_POLICY})

@@ -23,6 +23,9 @@ MOST_TEXT: Final = 100_000
 MOST_ITEMS: Final = 10_000
 """Greatest length of a list in it."""
 
+MOST_CLIPS: Final = 50_000
+"""Greatest number of clips; the page can select all matches of a query."""
+
 MOST_NUMBER: Final = 1 << 53
 """Greatest integer that is exact in browsers."""
 
@@ -131,9 +134,17 @@ def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
 
 
 def _clips(value: object, name: str) -> list[tuple[Any, ...]]:
-    """Return validated clips: trace name, number of the first frame, number of the last frame."""
-    found = _spans(value, name, 3)
-    if any(first > last for _, first, last in found):
+    """Return validated rows of clips: the name of a trace, then first and last frame of each clip in it."""
+    rows = value if isinstance(value, list) else [None]
+    if any(
+        not isinstance(row, list) or len(row) % 2 == 0 or not isinstance(row[0], str)
+        for row in rows
+    ):
+        raise RequestError(f"{name}: expected lists of a trace and pairs of numbers")
+    if sum(len(row) // 2 for row in rows) > MOST_CLIPS:
+        raise RequestError(f"{name}: expected at most {MOST_CLIPS} clips")
+    found = [(row[0], *(_whole(number, name) for number in row[1:])) for row in rows]
+    if any(first > last for row in found for first, last in zip(row[1::2], row[2::2], strict=True)):
         raise RequestError("clips: one ends before it begins")
     return found
 

@@ -33,7 +33,7 @@ EVERYWHERE: Final = {"0.0.0.0", "::", ""}  # noqa: S104 - only where somebody as
 """Addresses for all interfaces of this machine; then its names are permitted hosts, too."""
 
 
-def serve(
+def serve(  # noqa: PLR0913  one argument per option
     store: Path,
     *,
     host: str = HOST,
@@ -41,6 +41,7 @@ def serve(
     other: Path | None = None,
     write_to: Path | None = None,
     browse: bool = False,
+    link: str = "",
     on_start: Callable[[str], None] = print,
 ) -> None:
     """Serve the explorer page of a store until the user interrupts the process.
@@ -59,6 +60,8 @@ def serve(
         Folder for locks and clips; without it the page writes only tags.
     browse : bool
         True to open the address in a browser.
+    link : str
+        A link copied from the page of another server, or its part after ``#``: the first view.
     on_start : function
         Called with the address and its token.
 
@@ -73,7 +76,7 @@ def serve(
         explorer.warm()
         make = partial(application, explorer)
         with (
-            _begun(make, host, port, (on_start, webbrowser.open)[: 1 + browse]) as (
+            _begun(make, host, port, (on_start, webbrowser.open)[: 1 + browse], link) as (
                 server,
                 listening,
             ),
@@ -116,6 +119,7 @@ def _begun(
     host: str,
     port: int,
     told: Iterable[Callable[[str], object]],
+    link: str = "",
 ) -> Generator[tuple[uvicorn.Server, socket.socket]]:
     """Yield a web server that is not started yet, with its socket, and report its address to the user."""
     with _listening(host, port) as listening:
@@ -131,7 +135,8 @@ def _begun(
             lifespan="on",  # the explorer is closed at the end
             timeout_graceful_shutdown=1,  # a running query does not block the shutdown
         )
-        address = f"http://{hosts[0]}/?token={token}"
+        view = link.partition("#")[2] if "#" in link else link
+        address = f"http://{hosts[0]}/?token={token}" + f"#{view}" * bool(view)
         for tell in told:
             tell(address)
         yield uvicorn.Server(config), listening

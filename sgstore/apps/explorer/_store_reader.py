@@ -71,11 +71,12 @@ class Reads:
     def _traces(self) -> tuple[dict[str, StoredTrace], dict[str, Any]]:
         """Return the traces of the store by name, and its description for the page. Both are cached."""
         with self._looking:  # after a change one thread reads, and the others wait
+            stamp = self._store.file.stamp
             catalog = self._store.catalog()
             if self._known is None or self._known[0] is not catalog:
                 with self._store.file.snapshot():
                     traces = {one.name: one for one in self._store.traces()}
-                    self._known = catalog, traces, self._told(traces)
+                    self._known = catalog, traces, self._told(traces) | {"stamp": stamp}
             return self._known[1], self._known[2]
 
     def _told(self, traces: dict[str, StoredTrace]) -> dict[str, Any]:
@@ -86,7 +87,8 @@ class Reads:
             about = {"name": name, "frames": one.frames, "period": one.period_ns / 1e9}
             about |= {"seconds": one.seconds, "map": one.map}
             listed.append(about | {"map_key": digest[:16], "origin": (x, y), "cameras": cameras})
-        return {"store": file.path.name, "traces": listed, "codes": StateColumns(file).codes()}
+        about = {"store": file.path.name, "path": str(file.path.absolute())}
+        return {**about, "traces": listed, "codes": StateColumns(file).codes()}
 
     def about(self) -> dict[str, Any]:
         """Return the traces of the store, and the kind and light names of the codes in binary columns."""
@@ -121,17 +123,17 @@ class Reads:
             frames, states = columns.frames(of, first, last), columns.states(of, first, last)
         # Start of the states of each frame, so that the page need not search.
         start = np.searchsorted(states.pop("seq"), [*frames["seq"].tolist(), 1 << 31])
-        found = {f"frame.{name}": column for name, column in frames.items()}
+        found = {f"frame.{name}": column for name, column in frames.items() if name != "t"}
         found["frame.start"] = start.astype(np.uint32)
         return packed({"trace": trace, "first": first, "last": last}, found | states)
 
     def static(self, trace: str) -> bytes:
-        """Return the static entities of a trace, and the names of all entities, as bytes."""
-        of = self._trace(trace).trace_id
+        """Return the static entities of a trace, all names of entities, and all times of frames, as bytes."""
+        of, columns = self._trace(trace), StateColumns(self._store.file)
         with self._store.file.snapshot():
-            names = StateColumns(self._store.file).names(of)
-            columns = StateColumns(self._store.file).scenery(of)
-        return packed({"trace": trace, "names": names}, columns)
+            names, found = columns.names(of.trace_id), columns.scenery(of.trace_id)
+            found["t"] = columns.frames(of.trace_id, 0, of.frames - 1)["t"]
+        return packed({"trace": trace, "names": names}, found)
 
     def map(self, trace: str) -> bytes:
         """Return the outlines of the road map of a trace as bytes; empty without a map."""

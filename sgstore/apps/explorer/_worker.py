@@ -33,7 +33,8 @@ def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator
         matches = store.find(question["text"], **question["parameters"])
         names, found = tuple[str, ...](), list[list[Any]]()
         many, sent = 0, time.monotonic()
-        yield {"more": True, "reasons": matches.reasons, "columns": matches.columns}
+        head = {"reasons": matches.reasons, "columns": matches.columns}
+        yield {"more": True, "stamp": store.file.stamp, **head}
         for interval in islice(matches.intervals(bound=True), most + 1):
             many += 1
             if many > most:
@@ -54,8 +55,10 @@ def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator
 
 def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
     """Yield rows of a pattern or of an SQL statement, as JSON values."""
-    key = "sql" if question["ask"] == "sql" else "find"
-    told = rows_found(store, {key: question["text"], "parameters": question["parameters"]}, most)
+    key, stamp = "sql" if question["ask"] == "sql" else "find", store.file.stamp
+    told = {"stamp": stamp} | rows_found(
+        store, {key: question["text"], "parameters": question["parameters"]}, most
+    )
     for row in told["rows"]:  # frame ids exceed the exact integers of a browser
         row[:] = [str(v) if isinstance(v, int) and abs(v) > 2**53 else v for v in row]
     yield told
@@ -92,7 +95,7 @@ def _told_nearest(store: Store, question: dict[str, Any], _: int) -> Iterator[Re
 
 def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
     """Yield the verdicts of checks for each trace, with their violations."""
-    run = store.check(question["text"], **question["parameters"])
+    stamp, run = store.file.stamp, store.check(question["text"], **question["parameters"])
     many, verdicts = 0, list[Reply]()
     for verdict in run:
         spans = [
@@ -105,14 +108,19 @@ def _told_check(store: Store, question: dict[str, Any], most: int) -> Iterator[R
         about["absent_frames"] = verdict.absent_frames
         about["robustness"] = " · ".join(filter(None, margin_cells(verdict)))
         verdicts.append(about)
-    yield {"verdicts": verdicts, "count": many, "truncated": many >= most, "notes": run.notes}
+    told = {"stamp": stamp, "verdicts": verdicts, "count": many}
+    yield {**told, "truncated": many >= most, "notes": run.notes}
 
 
 def _measured(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
     """Yield the progress of a long task (coverage, selection, export), then its result."""
     from sgstore.apps.explorer import _measures  # not needed by the others
 
-    yield getattr(_measures, question.pop("ask"))(store, **question)
+    rows, ask = question.pop("clips", None), question.pop("ask")
+    if rows is not None:
+        pairs = ((trace, zip(ns[::2], ns[1::2], strict=True)) for trace, *ns in rows)
+        question["clips"] = [(trace, first, last) for trace, of in pairs for first, last in of]
+    yield getattr(_measures, ask)(store, **question)
 
 
 QUESTIONS: Final[Mapping[str, Asked]] = {

@@ -2,8 +2,11 @@
 // One clock over all that is open: the frame, whether it plays, and what the server says of it.
 import { computed, effect, signal } from "../vendor/core.js";
 import * as api from "./api.js";
-import { nameOf, stillOf } from "./data.js";
-import { answer, inOther, live, matches, offline, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, span, store, text, traces, writeAddress } from "./state.js";
+import { nameOf, seqAt, stillOf, timeAt } from "./data.js";
+import {
+  again, answer, inOther, isLost, live, matches, offline, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, span,
+  retries, store, text, traces,
+} from "./state.js";
 
 /** Lanes of truth of what is open: answers of the server. */
 export const lanes = signal(/** @type {any} */ (null));
@@ -21,26 +24,34 @@ export const asked = computed(() => answer.value.query || text.value.trim());
 /** The trace that is open. */
 export const about = computed(() => traces.value.get(open.value?.trace || ""));
 /** First and last frame of the timeline: of the trace; of a monitor of what is kept. */
-export const range = computed(/** @returns {[number, number]} */ () => (live.value ? span.value : [0, (about.value?.frames || 1) - 1]));
+export const range = computed(/** @returns {[number, number]} */ () => (
+  live.value ? span.value : [0, (about.value?.frames || 1) - 1]));
 
 /** First and last frame that can be shown: of the timeline; in a report of what it holds around the match. */
 const bounds = computed(/** @returns {[number, number]} */ () => {
   const [first, last] = range.value, match = open.value?.match;
   if (live.value || !offline.value || !match) return [first, last];
-  const around = Math.floor(store.value.around / (about.value?.period || 0.1));
-  return [Math.max(match.first - around, first), Math.min(match.last + around, last)];
+  const { trace } = match, around = store.value.around + 1e-6; // times have six decimals
+  const low = Math.ceil(seqAt(trace, timeAt(trace, match.first) - around));
+  const high = Math.floor(seqAt(trace, timeAt(trace, match.last) + around));
+  return Number.isFinite(low) ? [low, high] : [match.first, match.last];
 });
 
-/** Which parts hold now, by lane; of a monitor whose last frames were not looked at yet, in the last that was. @param {number} now @param {any} [of] */
-export const holdsAt = (now, of = lanes.value) => (of?.lanes || []).map((/** @type {any} */ lane) => (lane.unknown.length || (of.known && now < of.known[0]) ? null
-  : lane.spans.some((/** @type {number[]} */ [a, z]) => (a ?? 0) <= Math.min(now, of.known?.[1] ?? now) && Math.min(now, of.known?.[1] ?? now) <= (z ?? 0))));
+/** Which parts hold now, by lane; of a monitor whose last frames were not looked at yet, in the last that was.
+ * @param {number} now @param {any} [of] */
+export function holdsAt(now, of = lanes.value) {
+  const at = Math.min(now, of?.known?.[1] ?? now), gone = of?.known && now < of.known[0];
+  return (of?.lanes || []).map((/** @type {any} */ lane) => (lane.unknown.length || gone ? null
+    : lane.spans.some((/** @type {number[]} */ [a, z]) => (a ?? 0) <= at && at <= (z ?? 0))));
+}
 
 /** What the server is asked for the lanes of what is open; null: there are none.
  * @param {NonNullable<typeof open.value>} now @param {string} query @returns {any} */
 function lanesWanted(now, query) {
   if (live.value) return now.match?.pattern ? { text: now.match.pattern, binding: now.binding } : null;
   if (!/\bMATCH\b/i.test(query)) return null;
-  return { text: query, parameters: parametersOf(query), trace: now.trace, seq: Math.round(seq.peek()), binding: now.binding };
+  const parameters = parametersOf(query), at = Math.round(seq.peek());
+  return { text: query, parameters, trace: now.trace, seq: at, binding: now.binding };
 }
 
 /** Ask for the lanes and for the curve again, of a monitor that goes on. */
@@ -52,30 +63,43 @@ export async function refresh() {
   if (more && series.value === curve) series.value = { ...curve, columns: more.columns };
 }
 
-let answered = /** @type {any} */ (null);
+let answered = /** @type {any} */ (null), missed = false, tried = 0;
 // Lanes are asked for when another match is opened, not when their answer said which nodes are bound.
 effect(() => {
-  const now = open.value, query = asked.value;
-  if (now && now === answered) return;
+  const now = open.value, query = asked.value, retried = retries.value !== tried;
+  again.value;
+  tried = retries.value;
+  if ((retried && !missed) || (now && now === answered)) return;
+  missed = false;
   lanes.value = why.value = series.value = null;
   const body = now && lanesWanted(now, query), current = () => open.value === now && asked.value === query;
   if (!body) return;
   api.json("api/parts", body).then((found) => {
-    if (found.error || !current()) return;
+    if (!current()) return;
+    if (found.error?.reason) say(`no lanes: ${found.error.reason}`);
+    if (found.error) return;
     lanes.value = found;
     if (!now.binding && Object.keys(found.binding).length) open.value = answered = { ...now, binding: found.binding };
-  }).catch((error) => { if (current()) say(reasonOf(error)); });
+  }).catch((error) => {
+    if (!current()) return;
+    missed = isLost(error);
+    say(reasonOf(error));
+  });
 });
 
 /** Lanes of the same match in the second store, while that is shown beside. */
 export const others = signal(/** @type {any} */ (null));
 effect(() => {
-  const now = open.value, query = asked.value;
+  const now = open.value, query = asked.value, other = inOther(now?.trace || "");
+  again.value;
   others.value = null;
-  const other = inOther(now?.trace || "");
   if (!now || !beside.value || !traces.value.has(other) || !/\bMATCH\b/i.test(query)) return;
-  const body = { text: query, parameters: parametersOf(query), trace: now.trace, seq: Math.round(seq.peek()), binding: sameIn(other, now) };
-  api.json("api/parts", { ...body, side: "b" }).then((found) => { if (open.value === now && !found.error) others.value = found; }).catch((error) => say(reasonOf(error)));
+  const parameters = parametersOf(query), at = Math.round(seq.peek());
+  const body = { text: query, parameters, trace: now.trace, seq: at, binding: sameIn(other, now), side: "b" };
+  api.json("api/parts", body).then((found) => {
+    if (open.value !== now) return;
+    if (found.error) say(`no lanes of the second store: ${found.error.reason}`); else others.value = found;
+  }).catch((error) => say(reasonOf(error)));
 });
 
 /** The nodes of a match in the second store, by the ids that the simulator gave them; null: not all are known there.
@@ -85,7 +109,9 @@ function sameIn(other, now) {
   const sameMap = traces.value.get(other)?.map_key === traces.value.get(now.trace)?.map_key;
   if (!here || !there || !now.binding) return null;
   const ids = new Map(Object.entries(there).map(([node, about]) => [about[1], Number(node)]));
-  const found = Object.entries(now.binding).map(([key, node]) => [key, node < 0 ? (sameMap ? node : undefined) : here[node]?.[1] ? ids.get(here[node][1]) : undefined]);
+  const same = (/** @type {number} */ node) => (here[node]?.[1] ? ids.get(here[node][1]) : undefined);
+  const found = Object.entries(now.binding).map(([key, node]) => [key,
+    node >= 0 ? same(node) : sameMap ? node : undefined]);
   return found.every(([, node]) => node !== undefined) ? Object.fromEntries(found) : null;
 }
 
@@ -110,16 +136,21 @@ export function goTo(to) {
   seq.value = Math.max(first, Math.min(last, to));
 }
 
-export function copyLink() {
-  writeAddress();
-  navigator.clipboard.writeText(location.href).then(() => say("link copied"), () => say(location.href));
+/** Move by a time. @param {number} time s */
+export function goBy(time) {
+  const trace = open.value?.trace || "", to = seqAt(trace, timeAt(trace, frame.value) + time);
+  if (!Number.isFinite(to)) return;
+  const next = Math.round(to); // in a gap to its other side
+  goTo(next === frame.value ? next + Math.sign(time) : next);
 }
 
 let last = 0;
 /** @param {number} now */
 function step(now) {
-  const next = seq.value + ((now - last) / 1000) * rate.value / (about.value?.period || 0.1);
-  if (playing.value) goTo(next);
+  const trace = open.value?.trace || "", at = seq.value, low = Math.floor(at), begun = timeAt(trace, low);
+  const here = begun + (at - low) * ((timeAt(trace, low + 1) - begun) || 0);
+  const next = seqAt(trace, here + ((now - last) / 1000) * rate.value);
+  if (playing.value && Number.isFinite(next)) goTo(next);
   if (next >= bounds.value[1]) playing.value = false;
   last = now;
   if (playing.value) requestAnimationFrame(step);
@@ -147,7 +178,8 @@ export async function showSeries(attribute, unit, node, other) {
   try {
     const body = { trace, attribute, node, ...(other === undefined ? {} : { other }) };
     const path = api.address("api/series", body), { columns } = await api.columns(path);
-    series.value = { path, attribute, unit, node, other, columns, label: `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}` };
+    const label = `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}`;
+    series.value = { path, attribute, unit, node, other, columns, label };
   } catch (error) { say(reasonOf(error)); }
 }
 

@@ -5,14 +5,13 @@ import * as api from "./api.js";
 import { beside } from "./clock.js";
 import { Gallery } from "./gallery.js";
 import { abstraction, Table, useWork } from "./sheets.js";
-import { find, inOther, matchesIn, openFrame, parametersOf, reasonOf, say, store, text, traces } from "./state.js";
+import {
+  again, find, inOther, matchesIn, openFrame, parametersOf, reasonOf, say, second, side, store, text, traces,
+} from "./state.js";
 
 const html = htm.bind(h);
 const MOST = 2000; // tiles of what differs
 
-/** The second query, and the store that it is asked of; empty: the first one's. */
-const second = signal("");
-const side = signal("");
 const shown = signal("tiles");
 const other = computed(() => second.value.trim() || text.value.trim());
 const inB = computed(() => side.value || (store.value?.other ? "b" : "a"));
@@ -47,7 +46,7 @@ function onlyIn(a, b, of, word, query) {
   /** @type {Match[]} */
   const tiles = [];
   for (const [name, { frames, matches }] of a) {
-    const not = b.get(name)?.frames, period = traces.value.get(name)?.period || 0.1;
+    const not = b.get(name)?.frames;
     /** @type {[number, number][]} */
     const runs = [];
     for (const at of [...frames].filter((one) => !not?.has(one)).sort((x, y) => x - y)) {
@@ -57,8 +56,9 @@ function onlyIn(a, b, of, word, query) {
     for (const [first, last] of runs) {
       const found = matches.find((m) => m.first <= first && first <= m.last);
       tiles.push({
-        trace: of === "b" ? inOther(name) : name, first, last, start: first * period, end: (last + 1) * period, binding: found?.binding || {},
-        names: found?.names || {}, values: {}, index: `${word} ${name} ${first}`, group: `${name} · only in ${word}`, go: () => go(name, first, query),
+        trace: of === "b" ? inOther(name) : name, first, last, start: NaN, end: NaN, binding: found?.binding || {},
+        names: found?.names || {}, values: {}, index: `${word} ${name} ${first}`, group: `${name} · only in ${word}`,
+        go: () => go(name, first, query),
       });
     }
   }
@@ -70,10 +70,11 @@ function scenesOf(table) {
   return table.rows.flatMap((/** @type {any[]} */ [change, name, inA, ofB, frame], /** @type {number} */ i) => {
     const found = /^(.*)#(\d+)$/.exec(String(frame)), b = change !== "vanished";
     if (!found || change === "changed") return [];
-    const trace = found[1] || "", first = Number(found[2]), period = traces.value.get(trace)?.period || 0.1;
+    const trace = found[1] || "", first = Number(found[2]), frames = `${inA || ofB} frames of ${name.slice(0, 8)}`;
     return [{
-      trace: b ? inOther(trace) : trace, first, last: first, start: first * period, end: (first + 1) * period, binding: {}, names: { frames: `${inA || ofB} frames of ${name.slice(0, 8)}` },
-      values: {}, index: `scene ${i}`, group: `Scenes that only ${b ? "B" : "A"} has`, go: () => go(trace, first, text.value.trim()),
+      trace: b ? inOther(trace) : trace, first, last: first, start: NaN, end: NaN, binding: {}, names: { frames },
+      values: {}, index: `scene ${i}`, group: `Scenes that only ${b ? "B" : "A"} has`,
+      go: () => go(trace, first, text.value.trim()),
     }];
   });
 }
@@ -89,8 +90,11 @@ export function Compare() {
     Promise.all([framesOf(a, "a", mine.signal), framesOf(b, of, mine.signal)])
       .then(([one, two]) => { if (!mine.signal.aborted) tell({ a: one, b: two }); }).catch((error) => { if (!mine.signal.aborted) fail(reasonOf(error)); });
     return () => mine.abort();
-  }, [a, b, of]);
-  const submit = (/** @type {any} */ event) => { event.preventDefault(); second.value = new FormData(event.target).get("second")?.toString() || ""; };
+  }, [a, b, of, again.value]);
+  const submit = (/** @type {any} */ event) => {
+    event.preventDefault();
+    second.value = new FormData(event.target).get("second")?.toString().trim() || "";
+  };
   return html`<section class="compare" aria-label="Compare"><form class="sheet row wrap" onSubmit=${submit}>
       <span><b>A</b> ${store.value.store}</span> <code class="cut" title=${a}>${a || "no query yet: type one under Find"}</code>
       <b>B</b>

@@ -2,7 +2,7 @@
 // Columns of states, maps and pictures as the page needs them: asked for once, kept while they are near.
 import { signal } from "../vendor/core.js";
 import * as api from "./api.js";
-import { live, offline, store, traces } from "./state.js";
+import { isLost, live, offline, span, store, traces } from "./state.js";
 
 /** @typedef {import("./state.js").Match} Match */
 
@@ -14,6 +14,9 @@ const PICTURES = 120;
 /** Counts what has come, so that what waits for it is drawn again. */
 export const arrived = signal(0);
 
+/** The place of an answer that has not come yet. */
+class Under {}
+
 /** What the server was asked for, by key; of more than `most` those go that were not used for the longest time.
  * @extends {Map<string, any>} */
 class Kept extends Map {
@@ -24,19 +27,27 @@ class Kept extends Map {
     this.end = end;
   }
 
+  /** Forget what failed for a time only. */
+  retry() {
+    for (const [key, value] of this) if (value?.failed?.lost) this.delete(key);
+  }
+
   /** What is known of a key; asks for it if nothing is. @param {string} key @param {() => Promise<any>} ask */
   known(key, ask) {
     const found = this.get(key);
     if (found === undefined) {
-      const tell = (/** @type {any} */ told) => { this.set(key, told); arrived.value++; };
-      this.set(key, null);
+      const under = new Under(); // what was asked before it was forgotten is not kept
+      const tell = (/** @type {any} */ told) => {
+        if (this.get(key) === under) { this.set(key, told); arrived.value++; }
+      };
+      this.set(key, under);
       ask().then(tell, (failed) => tell({ failed }));
     } else { // the one that was used last is the last to go
       this.delete(key);
       this.set(key, found);
     }
     this.trim();
-    return found && !found.failed ? found : null;
+    return found instanceof Under || found?.failed ? null : found || null;
   }
 
   trim() {
@@ -52,6 +63,29 @@ const maps = new Kept(), still = new Kept(), chunks = new Kept(KEPT), thumbs = n
 /** A report keeps all that it holds. */
 export const keepAll = () => { chunks.most = Infinity; };
 const pictures = new Kept(PICTURES, (found) => found?.image?.close());
+
+/** Ask again for what the server could not answer for a time. */
+export function retry() {
+  for (const all of [maps, still, chunks, pictures]) all.retry();
+  arrived.value++;
+  ask();
+}
+
+/** Ask anew for all that is of the traces of the store, because it has changed. */
+export function forget() {
+  for (const all of [still, chunks, thumbs]) all.clear();
+  for (const one of pictures.values()) pictures.end(one);
+  pictures.clear();
+  arrived.value++;
+  wantThumbs(inSight);
+}
+
+/** Why something near a trace cannot be shown; empty: nothing failed. @param {string} trace */
+export function failureOf(trace) {
+  const keys = [...chunks.keys()].filter((key) => key.startsWith(`${trace}\n`)).map((key) => chunks.get(key));
+  const failed = [still.get(trace), ...keys].find((one) => one?.failed)?.failed;
+  return failed ? String(failed.message || failed) : "";
+}
 
 /** What a request calls a trace. @param {import("./state.js").Trace} about */
 const of = (about) => (about.side ? { trace: about.name, side: about.side } : { trace: about.name });
@@ -79,10 +113,55 @@ export function mapOf(trace) {
   });
 }
 
-/** What never moves in a trace, and the names of its entities. @param {string} trace */
+/** What never moves in a trace, the names of its entities, and the times of its frames. @param {string} trace */
 export function stillOf(trace) {
   const about = traces.value.get(trace);
   return about ? still.known(trace, () => api.columns(api.address("api/static", of(about)))) : null;
+}
+
+// Time: that of each frame, as the store has it; no frame is where the period says --------------------------------
+
+/** The time of a frame since its trace began; NaN: not known yet. @param {string} trace @param {number} frame */
+export function timeAt(trace, frame) {
+  if (live.value) return /** @type {number} */ (fed.get(frame)?.t ?? NaN);
+  return /** @type {number} */ (stillOf(trace)?.columns.t[frame] ?? NaN);
+}
+
+/** Where a time is among the frames of a trace, with its fraction; NaN: not known yet.
+ * @param {string} trace @param {number} time */
+export function seqAt(trace, time) {
+  const [first, count] = live.value ? [span.value[0], span.value[1] + 1]
+    : [0, /** @type {number} */ (stillOf(trace)?.columns.t.length ?? 0)];
+  return placeIn(first, count, time, (at) => timeAt(trace, at));
+}
+
+/** The place of a time among frames, by their times in order.
+ * @param {number} first @param {number} end @param {number} time @param {(frame: number) => number} timeOf */
+export function placeIn(first, end, time, timeOf) {
+  if (first >= end) return NaN;
+  let low = first, high = end - 1;
+  if (time <= timeOf(low)) return low;
+  if (time >= timeOf(high)) return high;
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (timeOf(middle) <= time) low = middle; else high = middle;
+  }
+  const from = timeOf(low), to = timeOf(high);
+  return to > from ? low + (time - from) / (to - from) : low;
+}
+
+/** Begin and end of a match: as the answer has them, or of its frames.
+ * @param {Match} match @returns {[number, number]} */
+export const timesOf = (match) => (Number.isFinite(match.start) ? [match.start, match.end]
+  : [timeAt(match.trace, match.first), timeAt(match.trace, match.last)]);
+
+/** A time in words. @param {number} time @param {number} [digits] */
+export const seconds = (time, digits = 2) => (Number.isFinite(time) ? time.toFixed(digits) : "…");
+
+/** The place of an entity as in the store; m. @param {string} trace @param {any} columns @param {number} row */
+export function placeOf(trace, columns, row) {
+  const [x, y] = traces.value.get(trace)?.origin || [0, 0];
+  return [x + columns.x[row], y + columns.y[row]];
 }
 
 /** A person's name of a node. @param {string} trace @param {number} node */
@@ -141,8 +220,7 @@ export function statesAt(trace, frame) {
   const row = frame - number * CHUNK;
   if (row >= found["frame.seq"].length) return null;
   return {
-    columns: found, from: found["frame.start"][row], to: found["frame.start"][row + 1],
-    t: found["frame.t"][row], ego: found["frame.ego"][row],
+    columns: found, from: found["frame.start"][row], to: found["frame.start"][row + 1], ego: found["frame.ego"][row],
   };
 }
 
@@ -150,6 +228,8 @@ export function statesAt(trace, frame) {
 
 /** @type {[string, number][]} */
 let wanted = [];
+/** @type {[string, number][]} */
+let inSight = [];
 let asking = false;
 const MANY = 60;
 
@@ -160,6 +240,7 @@ export function thumbOf(trace, frame) {
 
 /** @param {[string, number][]} frames what is in sight, the first first */
 export function wantThumbs(frames) {
+  inSight = frames;
   wanted = offline.value ? [] : frames.filter(([trace, frame]) => !thumbs.has(`${trace}#${frame}`));
   ask();
 }
@@ -181,6 +262,11 @@ async function ask() {
     });
     thumbs.trim();
   } catch (error) {
+    if (isLost(error)) { // asked again when the server answers
+      wanted = [...now, ...wanted];
+      asking = false;
+      return;
+    }
     for (const [trace, frame] of now) thumbs.set(`${trace}#${frame}`, { columns: null, from: 0, to: 0 });
   }
   asking = false;

@@ -1,7 +1,7 @@
 // @ts-check
 // The matches as small pictures, grouped by trace; only what is in sight is there.
 import { h, htm, useEffect, useLayoutEffect, useMemo, useRef, useState } from "../vendor/core.js";
-import { arrived, mapOf, stillOf, thumbOf, wantThumbs } from "./data.js";
+import { arrived, mapOf, seconds, stillOf, thumbOf, timesOf, wantThumbs } from "./data.js";
 import { fitted, lookAt, paintScene } from "./draw.js";
 import { keyOf, notes, offline, open, openMatch, paints, tick, ticked, traces } from "./state.js";
 
@@ -66,6 +66,7 @@ function Tile({ match, at, x, y, wide, high, flies, turn }) {
       { marked: new Set(nodes), lit: new Set(), small: true });
     canvas.current.dataset.painted = "1";
   }, [match, wide, waits, look, flies]);
+  const [start, end] = timesOf(match).map((t) => seconds(t, 1)), when = start === end ? end : `${start}–${end}`;
   const isOpen = open.value?.match && keyOf(open.value.match) === keyOf(match), on = ticked.value.has(keyOf(match));
   const tags = notes.value.filter((n) => n[0] === match.trace && n[1] >= match.first && n[1] <= match.last);
   const who = Object.entries(match.names).filter(([name]) => name !== "e" && name !== "ego").map(([, v]) => v).join(", ");
@@ -73,9 +74,9 @@ function Tile({ match, at, x, y, wide, high, flies, turn }) {
       data-index=${match.index} data-at=${at} onClick=${match.go || (() => openMatch(match))}>
     <canvas ref=${canvas} aria-hidden="true"></canvas>
     <div class="about">
-      ${offline.value || match.go ? null : html`<input type="checkbox" checked=${on} tabindex=${turn ? 0 : -1} aria-label=${`Select ${match.trace} ${match.start.toFixed(1)} s`}
+      ${offline.value || match.go ? null : html`<input type="checkbox" checked=${on} tabindex=${turn ? 0 : -1} aria-label=${`Select ${match.trace} ${start} s`}
         onClick=${(/** @type {any} */ event) => { event.stopPropagation(); tick(match); }} />`}
-      <button class="quiet small" tabindex=${turn ? 0 : -1} aria-label=${`Open ${match.trace}, ${match.start.toFixed(1)}–${match.end.toFixed(1)} s`}>${match.start.toFixed(1) === match.end.toFixed(1) ? "" : `${match.start.toFixed(1)}–`}${match.end.toFixed(1)} s</button>
+      <button class="quiet small" tabindex=${turn ? 0 : -1} aria-label=${`Open ${match.trace}, ${start}–${end} s`}>${when} s</button>
       ${tags.map((n) => html`<span class="tag">${n[2]}</span>`)}<span class="who" title=${who}>${who}</span>
     </div></div>`;
 }

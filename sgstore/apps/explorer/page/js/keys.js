@@ -1,11 +1,10 @@
 // @ts-check
 // Keys of the scene: what they do, and the list of them.
 import { h, htm, useEffect, useRef } from "../vendor/core.js";
-import { about, askWhy, camera, frame, goTo, matchEnd, nextMatch, panel } from "./clock.js";
-import { dialog, open, playing, tick, toast, writeAddress } from "./state.js";
+import { about, askWhy, camera, frame, goBy, goTo, matchEnd, nextMatch, panel } from "./clock.js";
+import { dialog, open, playing, tick, toast } from "./state.js";
 
 const html = htm.bind(h);
-const second = () => Math.max(1, Math.round(1 / (about.value?.period || 0.1)));
 
 /** Keys as they are listed: their signs, what they do, and the act of each.
  * @type {[string, string, Record<string, () => void>][]} */
@@ -13,7 +12,7 @@ export const keys = [
   ["n  p", "next match, match before", { n: () => nextMatch(1), p: () => nextMatch(-1) }],
   ["space", "play, pause", { " ": () => { if (open.value) playing.value = !playing.value; } }],
   ["← →", "a frame", { ArrowLeft: () => goTo(frame.value - 1), ArrowRight: () => goTo(frame.value + 1) }],
-  [", .", "a second", { ",": () => goTo(frame.value - second()), ".": () => goTo(frame.value + second()) }],
+  [", .", "a second", { ",": () => goBy(-1), ".": () => goBy(1) }],
   ["[ ]", "ends of the match", { "[": () => matchEnd(-1), "]": () => matchEnd(1) }],
   ["x", "select the match", { x: () => { if (open.value?.match) tick(open.value.match); } }],
   ["c", "next camera", { c: () => {
@@ -27,7 +26,7 @@ export const keys = [
   ["w", "why does this frame match, or not", { w: () => { askWhy(); } }],
   ["Esc", "close", { Escape: () => {
     if (dialog.value) dialog.value = "";
-    else if (open.value) { playing.value = false; open.value = null; writeAddress(); }
+    else if (open.value) { playing.value = false; open.value = null; }
   } }],
   ["?", "these keys", { "?": () => { dialog.value = "keys"; } }],
 ];

@@ -3,7 +3,7 @@
 import { batch, effect, h, htm, render, signal } from "../vendor/core.js";
 import * as api from "./api.js";
 import { frame, range, refresh } from "./clock.js";
-import { feed, feedStill, keepThumb } from "./data.js";
+import { feed, feedStill, keepThumb, retry, timeAt } from "./data.js";
 import { Gallery } from "./gallery.js";
 import { Above, keys } from "./keys.js";
 import { Scene } from "./scene.js";
@@ -20,7 +20,7 @@ const following = signal(true);
 const told = signal(/** @type {Record<string, {state: string, many: number, spans: number[][], open: Map<string, number[]>}>} */ ({}));
 const ended = signal(/** @type {any} */ (null));
 const lost = signal(false);
-let count = 0, first = -1, begun = 0;
+let count = 0;
 
 const of = (/** @type {string} */ name) => told.value[name] || { state: "", many: 0, spans: [], open: new Map() };
 
@@ -30,7 +30,7 @@ function begin(hello) {
   batch(() => {
     feedStill(hello.about.store, hello.still, hello.names);
     lost.value = false;
-    if (again) return;
+    if (again) { retry(); return; }
     live.value = offline.value = true;
     store.value = hello.about;
     told.value = Object.fromEntries([...hello.about.checks, ...hello.about.patterns].map((name) => [name, of(name)]));
@@ -42,14 +42,13 @@ function begin(hello) {
 /** @param {import("./wire.js").Columns} found */
 function step({ header, columns }) {
   const trace = store.value.store, at = header.seq;
-  if (first < 0) { first = at; begun = header.t; }
   if (at <= span.value[1] && count) return; // the line was cut, and this was told before
   count++;
   const kept = feed(trace, at, header, columns);
   feedStill(trace, header.still, header.names);
   batch(() => {
-    const period = at > first ? (header.t - begun) / (at - first) : 0.1;
-    store.value = { ...store.value, traces: [{ ...store.value.traces[0], frames: at + 1, seconds: header.t, period, origin: header.origin }] };
+    const trace = { ...store.value.traces[0], frames: at + 1, seconds: header.t, origin: header.origin };
+    store.value = { ...store.value, traces: [trace] };
     span.value = [kept, at];
     for (const [name, state] of Object.entries(header.status)) if (of(name).state !== state) told.value = { ...told.value, [name]: { ...of(name), state } };
     take(header.events);
@@ -84,9 +83,9 @@ function take(events) {
 }
 
 function Head() {
-  const [from, to] = span.value, period = store.value.traces[0].period;
+  const [from, to] = span.value, kept = timeAt(store.value.store, to) - timeAt(store.value.store, from);
   return html`<header><span class="brand"><img src="static/icon.svg" alt="" />sgstore</span>
-    <h1>${store.value.store} · ${ended.value ? "it has ended" : lost.value ? "the monitor does not answer" : "live"} · ${(to + 1).toLocaleString("en")} frames${from > 0 ? `, the last ${((to - from + 1) * period).toFixed(0)} s are kept` : ""}</h1>
+    <h1>${store.value.store} · ${ended.value ? "it has ended" : lost.value ? "the monitor does not answer" : "live"} · ${(to + 1).toLocaleString("en")} frames${from > 0 ? `, the last ${kept.toFixed(0)} s are kept` : ""}</h1>
     <span class="grow"></span>
     <button class=${following.value ? "main" : ""} aria-pressed=${following.value} onClick=${follow}>${following.value ? "● Live" : "Back to live"}</button>
     <button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>`;

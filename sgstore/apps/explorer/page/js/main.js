@@ -2,17 +2,20 @@
 // The page: its head, the search, what was found, and the view that is open; keys.
 import { effect, h, htm, render, untracked, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { askWhy, copyLink, frame } from "./clock.js";
+import { copyCommand, copyLink, followPlace, readAddress } from "./address.js";
+import { askWhy, frame } from "./clock.js";
+import { forget, retry } from "./data.js";
 import { Editor, focusEditor, NumberSlider } from "./editor.js";
 import { Gallery } from "./gallery.js";
 import { Above, keys } from "./keys.js";
 import { Scene } from "./scene.js";
 import { Compare } from "./compare.js";
 import { countLibrary, Near, sought, Start, WordSearch } from "./library.js";
-import { Coverage, Selection } from "./sheets.js";
+import { Selection } from "./select.js";
+import { Coverage } from "./sheets.js";
 import {
-  answer, ask, cancel, dialog, find, history, keep, library, matches, namesIn, notes, open, openFrame, paints, parametersOf, playing, readAddress, reasonOf, say, seq, store, tag,
-  text, theme, ticked, values, view, words, writeAddress, writeAddressSoon,
+  answer, ask, askAgain, cancel, changed, dialog, find, history, keep, library, matches, namesIn, notes, notice, open,
+  openFrame, paints, parametersOf, reasonOf, refresh, retries, say, store, tag, text, theme, ticked, values, view, words,
 } from "./state.js";
 import { Status } from "./status.js";
 import { Verdicts } from "./verdicts.js";
@@ -27,7 +30,7 @@ function Head() {
   return html`<header><button class="brand" title="the library" onClick=${home}><img src="static/icon.svg" alt="" />sgstore</button>
     <h1>${about.store} · ${about.traces.length} ${about.traces.length === 1 ? "trace" : "traces"} · ${frames.toLocaleString("en")} frames</h1>
     <nav aria-label="Views">${VIEWS.map(([key, name]) => html`<button aria-current=${view.value === key ? "page" : undefined}
-      onClick=${() => { view.value = key || "find"; writeAddress(); }}>${name}${key === "selection" && ticked.value.size ? html` <span class="badge">${ticked.value.size}</span>` : null}</button>`)}</nav>
+      onClick=${() => { view.value = key || "find"; }}>${name}${key === "selection" && ticked.value.size ? html` <span class="badge">${ticked.value.size}</span>` : null}</button>`)}</nav>
     <button class="quiet" title="light, dark, or as the system has it" aria-label=${`Colours: ${theme.value || "of the system"}`} onClick=${() => { theme.value = next; }}>${theme.value === "dark" ? "☾" : theme.value === "light" ? "☀" : "◐"}</button>
     <button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>`;
 }
@@ -134,12 +137,13 @@ function Nearest({ query }) {
 function App() {
   if (!store.value) return html`<p class="loading">Reading the store …</p>`;
   const shownView = view.value;
-  return html`<${Head} />${shownView === "find" ? html`<${Search} /><${Status} /><${Found} />`
+  return html`<${Head} /><${Notices} />${shownView === "find" ? html`<${Search} /><${Status} /><${Found} />`
     : shownView === "coverage" ? html`<${Coverage} />` : shownView === "selection" ? html`<${Selection} />` : html`<${Compare} />`}<${Above}><${TagForm} /></${Above}>`;
 }
 
 keys.unshift(["/", "editor", { "/": focusEditor }], ["Ctrl ⏎", "find", {}]);
-keys.push(["t", "tag this frame", { t: () => { if (open.value) dialog.value = "tag"; } }], ["y", "copy a link", { y: copyLink }]);
+keys.push(["t", "tag this frame", { t: () => { if (open.value) dialog.value = "tag"; } }], ["y", "copy a link", { y: copyLink }],
+  ["Y", "copy the command that opens this view", { Y: copyCommand }]);
 
 effect(() => {
   if (theme.value) document.documentElement.dataset.theme = theme.value; else delete document.documentElement.dataset.theme;
@@ -147,23 +151,70 @@ effect(() => {
   untracked(() => { paints.value++; });
 });
 
+/** What the page has to say of the store and the server. */
+function Notices() {
+  const close = () => { notice.value = ""; };
+  return html`${api.trouble.value ? html`<p class="notice error" role="alert">${api.trouble.value}</p>` : null}
+    ${notice.value ? html`<p class="notice" role="alert">${notice.value} <button class="small" onClick=${close}>Close</button></p>` : null}
+    ${changed.value ? html`<p class="notice" role="status">The store has changed since this was asked.
+      <button class="small" onClick=${askAgain}>Ask again</button></p>` : null}`;
+}
+
+const LOOK = 2000; // ms between looks at the store
+
+/** Follow the store and its server, while the page is in sight. */
+async function follow() {
+  const found = document.hidden ? null : await api.look();
+  if (found && (found.a !== store.value.stamp || (found.b && found.b !== store.value.other?.stamp))) {
+    await refresh().catch((error) => say(reasonOf(error)));
+  }
+  setTimeout(follow, LOOK);
+}
+
+/** Read what belongs to the store beside its traces. */
+async function readRest() {
+  try {
+    notes.value = (await api.json("api/notes")).notes;
+    words.value = await api.json("api/words");
+    library.value = await api.json("api/library");
+    countLibrary();
+  } catch (error) { say(reasonOf(error)); }
+}
+
+/** The store, as soon as the server answers. @param {HTMLElement} place */
+async function firstRead(place) {
+  for (;;) {
+    try { return await api.json("api/store"); } catch (error) { place.textContent = reasonOf(error); }
+    await new Promise((done) => setTimeout(done, LOOK));
+  }
+}
+
 async function begin() {
   const place = /** @type {HTMLElement} */ (document.getElementById("app"));
-  try {
-    store.value = await api.json("api/store");
-  } catch (error) {
-    place.textContent = reasonOf(error);
-    return;
-  }
+  store.value = await firstRead(place);
   place.textContent = "";
   render(html`<${App} />`, place);
   await readAddress();
-  addEventListener("hashchange", readAddress);
-  effect(() => { open.value; seq.value; view.value; values.value; if (!playing.value) writeAddressSoon(); });
-  api.json("api/notes").then((told) => { notes.value = told.notes; }).catch((error) => say(reasonOf(error)));
-  api.json("api/words").then((told) => { words.value = told; }).catch((error) => say(reasonOf(error)));
-  library.value = await api.json("api/library");
-  countLibrary();
+  followPlace();
+  let stamp = "";
+  effect(() => { // another state of the store
+    const { stamp: now, store: name, other } = store.value;
+    if (stamp && stamp !== `${now} ${other?.stamp}`) untracked(forget);
+    stamp = `${now} ${other?.stamp}`;
+    document.title = `${name} · sgstore`;
+    untracked(readRest);
+  });
+  effect(() => { // the server answers again
+    if (!api.returns.value) return;
+    untracked(() => {
+      retries.value++;
+      retry();
+      if (!library.value.length) readRest();
+      if (answer.value.lost) find({ keep: true });
+    });
+  });
+  addEventListener("online", () => { api.look(); });
+  follow();
 }
 
 begin();

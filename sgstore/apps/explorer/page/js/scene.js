@@ -2,12 +2,13 @@
 // A match, or a frame: camera, view from above, the pattern, lanes of truth, all by one clock.
 import { effect, h, htm, signal, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { asked, askWhy, beside, camera, copyLink, frame, holdsAt, lanes, nextMatch, others, panel, series, showSeries, why } from "./clock.js";
-import { arrived, nameOf, pictureAt, statesAt } from "./data.js";
+import { copyLink } from "./address.js";
+import { asked, askWhy, beside, camera, frame, holdsAt, lanes, nextMatch, others, panel, series, showSeries, why } from "./clock.js";
+import { arrived, nameOf, pictureAt, placeOf, seconds, statesAt, timeAt } from "./data.js";
 import { egoRow, fitted, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
 import { hop, Neighbours } from "./neighbours.js";
 import { PatternDrawing } from "./pattern.js";
-import { ask, chosen, find, inOther, lit, live, offline, open, openFrame, paints, playing, rate, reasonOf, say, store, text, traces, writeAddress } from "./state.js";
+import { ask, chosen, find, inOther, lit, live, offline, open, openFrame, paints, playing, rate, reasonOf, say, store, text, traces } from "./state.js";
 import { Timeline } from "./timeline.js";
 
 const html = htm.bind(h);
@@ -161,7 +162,7 @@ function NodePanel() {
   if (!now || node === null) return null;
   const row = states ? rowOf(states, node) : -1, c = states?.columns, ego = states ? egoRow(states) : -1;
   const about = row < 0 || !c ? [] : [["speed", `${c.speed[row].toFixed(2)} m/s`], ["heading", `${((c.heading[row] * 180) / Math.PI).toFixed(1)}°`],
-    ["size", `${c.length[row].toFixed(1)} × ${c.width[row].toFixed(1)} m`], ["place", `${c.x[row].toFixed(1)}, ${c.y[row].toFixed(1)} m`]];
+    ["size", `${c.length[row].toFixed(1)} × ${c.width[row].toFixed(1)} m`], ["place", `${placeOf(now.trace, c, row).map((v) => v.toFixed(2)).join(", ")} m`]];
   const other = ego >= 0 && c && c.node[ego] !== node ? c.node[ego] : undefined;
   return html`<div class="scroll" style=${{ padding: "8px 12px" }}>
     <table><tbody>${about.map(([name, value]) => html`<tr><td class="faint">${name}</td><td>${value}</td></tr>`)}</tbody></table>
@@ -228,8 +229,7 @@ function GraphTable({ what }) {
 const Icon = ({ path }) => html`<svg class="icon" viewBox="0 0 14 14" aria-hidden="true"><path d=${path} fill="currentColor" /></svg>`;
 
 function Transport() {
-  const now = open.value, about = traces.value.get(now?.trace || ""), states = now ? statesAt(now.trace, frame.value) : null;
-  const t = states ? states.t : frame.value * (about?.period || 0.1);
+  const now = open.value, t = arrived.value >= 0 && now ? timeAt(now.trace, frame.value) : NaN;
   const told = why.value?.at === frame.value ? why.value : null, gap = told?.steps ? told.steps.find((/** @type {any} */ s) => s.failed) : told;
   return html`<div class="transport">
     <button aria-label="Match before" title="match before (p)" onClick=${() => nextMatch(-1)}><${Icon} path="M3 2h2v10H3zM13 2v10L5.5 7z" /></button>
@@ -237,12 +237,12 @@ function Transport() {
     <button aria-label="Next match" title="next match (n)" onClick=${() => nextMatch(1)}><${Icon} path="M9 2h2v10H9zM1 2v10l7.5-5z" /></button>
     <select aria-label="Speed" value=${rate.value} onChange=${(/** @type {any} */ e) => { rate.value = Number(e.target.value); }}>
       ${[0.25, 0.5, 1, 2, 4].map((r) => html`<option value=${r}>${r}×</option>`)}</select>
-    <span class="time"><b>${now?.trace}</b>#${frame.value} · ${t.toFixed(2)} s</span>
+    <span class="time"><b>${now?.trace}</b>#${frame.value} · ${seconds(t)} s</span>
     <span class="grow"></span>
     ${traces.value.has(inOther(now?.trace || "")) ? html`<button aria-pressed=${beside.value} title="the second store by the same clock" onClick=${() => { beside.value = !beside.value; }}>Beside</button>` : null}
     ${offline.value && !now?.match?.pattern ? null : html`<button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>`}
     ${offline.value ? null : html`<button title="copy a link (y)" onClick=${copyLink}>Link</button>`}
-    ${live.value ? null : html`<button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; writeAddress(); }}>✕</button>`}
+    ${live.value ? null : html`<button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; }}>✕</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}
       ${(told.relax || []).map((/** @type {any} */ change) => html`<button class="small" onClick=${() => relax(change)}>${[...asked.value].slice(change.start, change.end).join("")} → ${change.text}</button>`)}</span>` : null}

@@ -1,9 +1,9 @@
 // @ts-check
-// Views beside the search: coverage, the selection; tables and charts.
-import { h, htm, signal, useEffect, useState } from "../vendor/core.js";
+// Views beside the search: coverage; tables and charts.
+import { h, htm, signal, useEffect, useMemo, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { beside } from "./clock.js";
-import { ask, keyOf, openFrame, openMatch, reasonOf, store, tick, ticked, view } from "./state.js";
+import { again, ask, isLost, openFrame, reasonOf, retries, view } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -53,11 +53,12 @@ function Chart({ table, x, lines }) {
 
 /** Something that takes a while: asks once, and says what came of it; what is not looked at any more ends. @param {string} path @param {any} body */
 export function useWork(path, body) {
-  const [told, tell] = useState(/** @type {any} */ ({})), asked = path + JSON.stringify(body);
+  const [told, tell] = useState(/** @type {any} */ ({})), text = useMemo(() => JSON.stringify(body), [body.clips || JSON.stringify(body)]);
+  const asked = `${path}${text} ${again.value} ${retries.value > told.lost ? retries.value : ""}`;
   useEffect(() => {
     const mine = new AbortController(), how = { signal: mine.signal };
     (path === "api/diff" ? api.work(path, body, undefined, how) : api.json(path, body, how).then((found) => { if (found.error) throw new Error(found.error.reason); return found; }))
-      .then((found) => tell({ asked, found })).catch((error) => { if (!mine.signal.aborted) tell({ asked, error: reasonOf(error) }); });
+      .then((found) => tell({ asked, found })).catch((error) => { if (!mine.signal.aborted) tell({ asked, error: reasonOf(error), lost: isLost(error) ? retries.peek() : undefined }); });
     return () => mine.abort();
   }, [asked]);
   return told.asked === asked ? told : {}; // not the answer to what was asked before
@@ -80,36 +81,4 @@ export function Coverage() {
       ? html`<h2>Does more data bring more kinds of scenes?</h2><${Chart} table=${found} x="frames" lines=${["classes", "at_random"]} /><${Table} table=${found} />`
       : found.missing ? html`<h2>Combinations of two features</h2><${Table} table=${found.shares} /><h2>Missing</h2><p class="faint">Each is a query: what it finds would close the gap.</p><${Table} table=${found.missing} /><h2>Covered</h2><${Table} table=${found.covered} />`
       : found.columns ? html`<h2>Classes of scenes, the most frequent first</h2><${Chart} table=${found} x="rank" lines=${["frames"]} /><${Table} table=${found} />` : null)}</${Waiting}></div>`;
-}
-
-// Selection --------------------------------------------------------------------------------------------------------------
-
-/** @param {number} bytes */
-const size = (bytes) => (bytes > 1e9 ? `${(bytes / 1e9).toFixed(2)} GB` : bytes > 1e6 ? `${(bytes / 1e6).toFixed(1)} MB` : `${Math.round(bytes / 1e3)} kB`);
-
-export function Selection() {
-  const all = [...ticked.value.values()], clips = all.map((m) => [m.trace, m.first, m.last]);
-  const [made, tell] = useState("");
-  const told = useWork("api/select", { clips });
-  const write = async (/** @type {any} */ event) => {
-    event.preventDefault();
-    const form = new FormData(event.target), how = event.submitter?.value || "lock";
-    tell("working …");
-    try {
-      const found = await api.work(`api/${how}`, { clips, name: form.get("name"), format: form.get("format") }, (done, of) => tell(`${done} of ${of}`));
-      tell(how === "lock" ? `${found.cases} cases in ${found.file}` : `${found.files.length} files in ${found.folder}${found.losses.length ? `; lost: ${found.losses.join("; ")}` : ""}`);
-    } catch (error) { tell(reasonOf(error)); }
-  };
-  if (!all.length) return html`<div class="sheet"><h2>Nothing is selected</h2><p class="faint">Tick matches in the gallery, or press <kbd>x</kbd> in a scene. They become a test set here: a lock, or clips of the recordings.</p></div>`;
-  return html`<div class="sheet" tabindex="0"><h2>${all.length} ${all.length === 1 ? "clip" : "clips"}</h2>
-    <${Waiting} told=${told}>${(/** @type {any} */ found) => html`<p><b>${found.seconds.toFixed(1)} s</b>, ${found.frames.toLocaleString("en")} frames, ${size(found.bytes)} of sensor messages</p><${Table} table=${found.kept} />`}</${Waiting}>
-    <h2>Keep them</h2>
-    ${store.value.writing ? html`<form class="row wrap" onSubmit=${write}><label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" defaultValue="tests" /></label>
-      <button class="main" value="lock">Write a lock</button>
-      <label>as <select name="format">${["mcap", "frames", "parquet", "nx", "pyg", "s3c"].map((f) => html`<option>${f}</option>`)}</select></label><button value="export">Export clips</button></form>`
-      : html`<p class="note">Start <code>sgstore serve</code> with <code>--write-to DIR</code> to write locks and clips.</p>`}
-    <p role="status">${made}</p>
-    <h2>Clips</h2><table><thead><tr><th>trace</th><th class="number">from</th><th class="number">to</th><td></td></tr></thead><tbody>
-    ${all.map((m) => html`<tr key=${keyOf(m)}><td>${m.trace}</td><td class="number">${m.start.toFixed(2)} s</td><td class="number">${m.end.toFixed(2)} s</td>
-      <td><button class="small" onClick=${() => { view.value = "find"; openMatch(m); }}>open</button> <button class="small" onClick=${() => tick(m)}>remove</button></td></tr>`)}</tbody></table></div>`;
 }

@@ -1,5 +1,5 @@
 // @ts-check
-// What the page knows and shows, as signals; and its address, from which all of it can be had again.
+// What the page knows and shows, as signals.
 import { batch, computed, signal } from "../vendor/core.js";
 import * as api from "./api.js";
 
@@ -31,6 +31,16 @@ export const notes = signal(/** @type {any[][]} */ ([]));
 export const lit = signal(/** @type {Set<number>} */ (new Set()));
 export const chosen = signal(/** @type {number | null} */ (null));
 export const toast = signal("");
+/** What stays in sight until it is read, such as a fault of a link. */
+export const notice = signal("");
+/** The second query of Compare, and the store that it is asked of; empty: as the first. */
+export const second = signal("");
+export const side = signal("");
+/** Whether the store has changed since what is shown was asked; and how often it was asked again. */
+export const changed = signal(false);
+export const again = signal(0);
+/** How often the server answered again after a time without an answer: what failed is asked once more. */
+export const retries = signal(0);
 export const dialog = signal("");
 /** True in a report, which has no server, and of a monitor, whose server knows the last frames only. */
 export const offline = signal(false);
@@ -69,7 +79,7 @@ export const framesFound = computed(() => {
 /** @param {Match} m */
 export const keyOf = (m) => `${m.trace}#${m.first}-${m.last}:${Object.values(m.binding).join(",")}`;
 
-/** @param {string} message */
+/** The last word of the page on a fault or an act. @param {string} message */
 export function say(message) {
   toast.value = message;
   setTimeout(() => { if (toast.value === message) toast.value = ""; }, 3500);
@@ -123,35 +133,49 @@ export function cancel() {
 
 /** Ask for a pattern of the library, or of a table. @param {string} query */
 export function ask(query) {
-  values.value = {};
-  text.value = query;
-  find();
+  batch(() => {
+    values.value = {};
+    text.value = query;
+  });
+  return find();
 }
 
-/** Ask for the matches of the text in the editor. @param {{keep?: boolean}} [how] */
+/** Ask for the matches of the text in the editor; true: no other query came meanwhile.
+ * @param {{keep?: boolean}} [how] */
 export async function find(how = {}) {
   const query = text.value.trim();
   cancel();
-  if (!query) { answer.value = { state: "idle", matches: [], names: [], reasons: {}, notes: [] }; return; }
+  if (!query) {
+    answer.value = { state: "idle", matches: [], names: [], reasons: {}, notes: [] };
+    changed.value = false;
+    return true;
+  }
   idle.stop();
-  const id = `q${Date.now().toString(36)}${number++}`;
+  const id = `q${Date.now().toString(36)}${number++}`, parameters = parametersOf(query);
   const mine = (under = new AbortController());
   const began = performance.now();
   /** @type {any} */
-  const told = { state: "busy", id, query, matches: [], names: [], reasons: {}, notes: [], columns: [], rows: null };
-  answer.value = { ...told };
-  if (!how.keep) open.value = null;
-  view.value = "find";
+  const told = { state: "busy", id, query, parameters, matches: [], names: [], reasons: {}, notes: [], columns: [], rows: null };
+  batch(() => {
+    answer.value = { ...told };
+    if (!how.keep) open.value = null;
+    view.value = "find";
+    changed.value = false;
+  });
   remember(query);
   const checks = /^\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b/i.test(query);
   try {
     if (checks) {
-      const found = await api.json("api/check", { text: query, parameters: parametersOf(query) }, { signal: mine.signal });
-      answer.value = fromVerdicts({ ...told, state: found.error ? "error" : "done", ms: performance.now() - began }, found);
-      return;
+      const found = await api.json("api/check", { text: query, parameters }, { signal: mine.signal });
+      if (mine.signal.aborted) return false;
+      await follow(found.stamp);
+      told.ms = performance.now() - began;
+      answer.value = fromVerdicts({ ...told, state: found.error ? "error" : "done" }, found);
+      return true;
     }
     let last = 0;
-    for await (const line of api.lines("api/find", { text: query, parameters: parametersOf(query), id }, { signal: mine.signal })) {
+    for await (const line of api.lines("api/find", { text: query, parameters, id }, { signal: mine.signal })) {
+      await follow(line.stamp);
       if (line.names) told.names = line.names;
       if (line.matches) for (const row of line.matches) told.matches.push(matchOf(row, told));
       for (const name of ["reasons", "columns", "rows", "notes", "count", "truncated", "error"]) {
@@ -162,11 +186,48 @@ export async function find(how = {}) {
     told.ms = performance.now() - began;
     told.state = told.error ? "error" : "done";
   } catch (error) {
-    if (mine.signal.aborted) return;
+    if (mine.signal.aborted) return false;
     told.state = "error";
     told.error = { reason: reasonOf(error) };
+    told.lost = isLost(error);
   }
-  if (under === mine) { under = null; answer.value = { ...told }; writeAddress(); }
+  if (under !== mine) return false;
+  under = null;
+  answer.value = { ...told };
+  return true;
+}
+
+/** Whether a request failed for a time only, so that it is asked again. @param {any} error @returns {boolean} */
+export const isLost = (error) => error?.lost === true;
+
+/** Know the store as it is now: its traces, and what it counts. */
+export async function refresh() {
+  const now = await api.json("api/store"), same = (/** @type {any} */ one) => `${one?.stamp} ${one?.other?.stamp}`;
+  if (same(now) === same(store.value)) return;
+  batch(() => {
+    store.value = now;
+    tally.value = {};
+    changed.value = answer.value.state !== "idle" || view.value !== "find";
+    const trace = open.value?.trace;
+    if (trace && !traces.value.has(trace)) {
+      open.value = null;
+      notice.value = `The store no longer has the trace ${trace}.`;
+    }
+  });
+}
+
+/** Know the store that an answer is of. @param {string | undefined} stamp */
+async function follow(stamp) {
+  if (!stamp || offline.value || stamp === store.value.stamp) return;
+  await refresh();
+  changed.value = stamp !== store.value.stamp;
+}
+
+/** Ask again what is shown, because the store has changed. */
+export function askAgain() {
+  changed.value = false;
+  again.value++;
+  if (answer.value.query) find({ keep: true });
 }
 
 /** An error with what helps on this page: its fields are the place for values. @param {any} error */
@@ -228,13 +289,11 @@ export function openMatch(match, at) {
     lit.value = new Set();
     chosen.value = null;
   });
-  writeAddress();
 }
 
 /** @param {string} trace @param {number} at @param {Record<string, number> | null} [binding] */
 export function openFrame(trace, at, binding = null) {
   batch(() => { open.value = { trace, match: null, binding }; seq.value = at; view.value = "find"; });
-  writeAddress();
 }
 
 /** @param {Match} match */
@@ -244,56 +303,15 @@ export function tick(match) {
   ticked.value = next;
 }
 
+/** Tick many matches in one step. @param {Match[]} all */
+export function tickAll(all) {
+  const next = new Map(ticked.value);
+  for (const match of all) next.set(keyOf(match), match);
+  ticked.value = next;
+}
+
 /** @param {Record<string, any>} body */
 export async function tag(body) {
   const told = await api.json("api/notes", body);
   notes.value = told.notes;
-}
-
-// The address: everything behind '#', so that it never reaches the server ----------------------------------
-
-export function writeAddress() {
-  if (offline.value) return;
-  const parts = new URLSearchParams();
-  if (view.value !== "find") parts.set("show", view.value);
-  if (text.value.trim()) parts.set("q", text.value.trim());
-  for (const [name, value] of Object.entries(values.value)) if (value) parts.set(`$${name}`, value);
-  if (open.value) {
-    const period = traces.value.get(open.value.trace)?.period || 0.1;
-    parts.set("at", `${open.value.trace}@${(Math.round(seq.value) * period).toFixed(3)}s`);
-    const bind = Object.entries(open.value.binding || {}).map(([k, v]) => `${k}:${v}`);
-    if (bind.length) parts.set("bind", bind.join(","));
-  }
-  window.history.replaceState(null, "", `#${parts}`);
-}
-
-/** @type {any} */
-let soon = 0;
-
-/** Write it when nothing has changed for a while: a browser allows a few hundred in ten seconds. */
-export function writeAddressSoon() {
-  clearTimeout(soon);
-  soon = setTimeout(writeAddress, 400);
-}
-
-export async function readAddress() {
-  const parts = new URLSearchParams(location.hash.slice(1));
-  batch(() => {
-    text.value = parts.get("q") || "";
-    values.value = Object.fromEntries([...parts].filter(([name]) => name.startsWith("$")).map(([name, value]) => [name.slice(1), value]));
-    view.value = parts.get("show") || "find";
-  });
-  const at = /^(.*)@([\d.]+)s$/.exec(parts.get("at") || "");
-  const bind = Object.fromEntries((parts.get("bind") || "").split(",").filter(Boolean).map((one) => {
-    const [key, value] = one.split(":");
-    return [key, Number(value)];
-  }));
-  if (text.value && view.value === "find") await find();
-  const trace = at && traces.value.get(at[1] || "");
-  if (!at || !trace) return;
-  const frame = Math.min(Math.round(Number(at[2]) / (trace.period || 0.1)), trace.frames - 1);
-  const same = matches.value.find((m) => m.trace === trace.name && m.first <= frame && frame <= m.last
-    && Object.entries(bind).every(([k, v]) => m.binding[k] === v));
-  if (same) openMatch(same, frame);
-  else openFrame(trace.name, frame, Object.keys(bind).length ? /** @type {Record<string, number>} */ (bind) : null);
 }

@@ -1,7 +1,7 @@
 // @ts-check
 // What was found, in a line: how much, how long it took, who cannot answer.
 import { h, htm } from "../vendor/core.js";
-import { answer, filter, framesFound, keyOf, matches, offline, store, tick, ticked } from "./state.js";
+import { answer, filter, framesFound, matches, offline, store, tickAll } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -25,6 +25,6 @@ export function Status() {
     <span class="grow"></span>
     ${/** @type {const} */ (["trace", "map"]).map((of) => (known[of].length < 2 ? null : html`<select aria-label=${of} value=${where[of]} onChange=${(/** @type {any} */ e) => { filter.value = { ...where, [of]: e.target.value }; }}>
       <option value="">${`all ${of}s`}</option>${known[of].map((one) => html`<option>${one}</option>`)}</select>`))}
-    ${found && !told.rows && !offline.value ? html`<button class="small" onClick=${() => { for (const m of matches.value) if (!ticked.value.has(keyOf(m))) tick(m); }}>select all</button>` : null}
+    ${found && !told.rows && !offline.value ? html`<button class="small" onClick=${() => tickAll(matches.value)}>select all</button>` : null}
   </div>`;
 }

@@ -2,6 +2,7 @@
 // The whole trace in time: matches, a lane for each part of the pattern, tags, values; drag to go there.
 import { h, htm, useRef } from "../vendor/core.js";
 import { frame, goTo, holdsAt, lanes, range, series } from "./clock.js";
+import { arrived, seqAt, timeAt } from "./data.js";
 import { answer, keyOf, lit, live, matches, notes, open, playing, traces } from "./state.js";
 
 const html = htm.bind(h);
@@ -48,8 +49,10 @@ export function Timeline() {
   const tags = notes.value.filter((n) => n[0] === now.trace), holds = holdsAt(frame.value), word = live.value ? "event" : answer.value.verdicts ? "violation" : "match";
   const all = lanes.value?.lanes || [], steps = new Set(all.map((/** @type {any} */ l) => l.step)).size > 1;
   const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
-  const end = about.seconds, every = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find((s) => (frames * about.period) / s < 9) || 5000;
-  const ticks = [...Array(Math.floor(end / every) + 1).keys()].map((i) => i * every).filter((t) => t >= from * about.period);
+  const [begun, end] = arrived.value >= 0 ? [timeAt(now.trace, from), timeAt(now.trace, to)] : [0, 0];
+  const every = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find((s) => (end - begun) / s < 9) || 5000;
+  const low = Math.ceil(begun / every - 1e-6), many = Math.max(Math.floor(end / every + 1e-6) - low + 1, 0) || 0;
+  const ticks = [...Array(many).keys()].map((i) => (low + i) * every);
   return html`<div class="timeline" role="group" aria-label="Timeline" tabindex="0">
     <div class="lane"><div class="label">${mine.length} ${word}${mine.length === 1 ? "" : word === "match" ? "es" : "s"} <span class="faint">in this trace</span></div>
       <${Bars} spans=${first.map((m) => [m.first, m.last])}
@@ -63,6 +66,6 @@ export function Timeline() {
     ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n[1], n[1] + frames / 200])} kind=${() => "bar-tag"} /></div>` : null}
     ${series.value ? html`<${Series} />` : null}
     <div class="lane"><div class="label"></div><div class="ticks">
-      ${ticks.map((t) => html`<span style=${{ left: `${(100 * (t / about.period - from + 0.5)) / frames}%` }}>${Number(t.toFixed(1))} s</span>`)}</div></div>
+      ${ticks.map((t) => html`<span style=${{ left: `${(100 * (seqAt(now.trace, t) - from + 0.5)) / frames}%` }}>${Number(t.toFixed(1))} s</span>`)}</div></div>
   </div>`;
 }

@@ -1,0 +1,90 @@
+// @ts-check
+// The selection: ticked matches as a test set, with their length, and as a lock or clips.
+import { computed, h, htm, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
+import * as api from "./api.js";
+import { arrived, seconds, timesOf } from "./data.js";
+import { Table, useWork, Waiting } from "./sheets.js";
+import { keyOf, openMatch, reasonOf, store, tick, ticked, view } from "./state.js";
+
+const html = htm.bind(h);
+const ROW = 34, SPARE = 6; // height of a row; rows that are there out of sight
+const FORMATS = ["mcap", "frames", "parquet", "nx", "pyg", "s3c"];
+
+/** @typedef {import("./state.js").Match} Match */
+
+/** Ticked frames by trace: a name, then first and last frame of each match. */
+const clips = computed(() => {
+  const by = new Map();
+  for (const { trace, first, last } of ticked.value.values()) {
+    if (!by.has(trace)) by.set(trace, [trace]);
+    by.get(trace).push(first, last);
+  }
+  return [...by.values()];
+});
+
+/** @param {number} bytes */
+const size = (bytes) => (bytes > 1e9 ? `${(bytes / 1e9).toFixed(2)} GB`
+  : bytes > 1e6 ? `${(bytes / 1e6).toFixed(1)} MB` : `${Math.round(bytes / 1e3)} kB`);
+
+/** Rows of a long list; only those in sight are there. @param {{all: Match[]}} props */
+function Clips({ all }) {
+  const place = useRef(/** @type {HTMLElement | null} */ (null));
+  const [box, setBox] = useState({ top: 0, height: 600 });
+  const measure = () => { if (place.current) setBox({ top: place.current.scrollTop, height: place.current.clientHeight }); };
+  useLayoutEffect(measure, [all.length]);
+  useEffect(() => {
+    addEventListener("resize", measure);
+    return () => removeEventListener("resize", measure);
+  }, []);
+  arrived.value;
+  const first = Math.max(Math.floor(box.top / ROW) - SPARE, 0);
+  const rows = all.slice(first, first + Math.ceil(box.height / ROW) + 2 * SPARE);
+  return html`<div class="clips" ref=${place} onScroll=${measure} tabindex="0" role="list" aria-label="Clips">
+    <div style=${{ height: `${all.length * ROW}px` }}>${rows.map((match, i) => {
+      const [start, end] = timesOf(match);
+      return html`<div class="clip" role="listitem" key=${keyOf(match)} style=${{ top: `${(first + i) * ROW}px` }}
+          aria-posinset=${first + i + 1} aria-setsize=${all.length}><span class="cut">${match.trace}</span>
+        <span class="number">${seconds(start)} s</span><span class="number">${seconds(end)} s</span>
+        <button class="small" onClick=${() => { view.value = "find"; openMatch(match); }}>open</button>
+        <button class="small" onClick=${() => tick(match)}>remove</button></div>`;
+    })}</div></div>`;
+}
+
+/** A lock or clips of what is ticked, below the folder that the page may write to. */
+function Keep() {
+  const [made, tell] = useState("");
+  const write = async (/** @type {any} */ event) => {
+    event.preventDefault();
+    const form = new FormData(event.target), how = event.submitter?.value || "lock";
+    tell("working …");
+    try {
+      const body = { clips: clips.value, name: form.get("name"), format: form.get("format") };
+      const found = await api.work(`api/${how}`, body, (done, of) => tell(`${done} of ${of}`));
+      const lost = found.losses?.length ? `; lost: ${found.losses.join("; ")}` : "";
+      tell(how === "lock" ? `${found.cases} cases in ${found.file}` : `${found.files.length} files in ${found.folder}${lost}`);
+    } catch (error) { tell(reasonOf(error)); }
+  };
+  if (!store.value.writing) {
+    return html`<p class="note">Start <code>sgstore serve</code> with <code>--write-to DIR</code> to write locks and clips.</p>`;
+  }
+  return html`<form class="row wrap" onSubmit=${write}>
+      <label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" defaultValue="tests" /></label>
+      <button class="main" value="lock">Write a lock</button>
+      <label>as <select name="format">${FORMATS.map((f) => html`<option>${f}</option>`)}</select></label>
+      <button value="export">Export clips</button></form><p role="status">${made}</p>`;
+}
+
+export function Selection() {
+  const all = [...ticked.value.values()], told = useWork("api/select", { clips: clips.value });
+  if (!all.length) {
+    return html`<div class="sheet"><h2>Nothing is selected</h2><p class="faint">Tick matches in the gallery, or press
+      <kbd>x</kbd> in a scene. They become a test set here: a lock, or clips of the recordings.</p></div>`;
+  }
+  return html`<div class="sheet" tabindex="0">
+    <h2>${all.length.toLocaleString("en")} ${all.length === 1 ? "clip" : "clips"}</h2>
+    <${Waiting} told=${told}>${(/** @type {any} */ found) => html`<p><b>${found.seconds.toFixed(1)} s</b>,
+      ${" "}${found.frames.toLocaleString("en")} frames, ${size(found.bytes)} of sensor messages</p><${Table} table=${found.kept} />`}</${Waiting}>
+    <h2>Keep them</h2><${Keep} />
+    <h2>Clips</h2><p><button class="small" onClick=${() => { ticked.value = new Map(); }}>remove all</button></p>
+    <${Clips} all=${all} /></div>`;
+}
