@@ -179,7 +179,7 @@ def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str,
 def _first_absent(
     query: b.Query, exists: Callable[[b.Scope], bool]
 ) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope, Writer, list[str]]]:
-    """Yield the first part that no frame has: the part, the pattern up to it, its writer, and the parts before."""
+    """Yield the first part that no frame has, the pattern up to it, its writer, and the parts before."""
     steps = [query.steps[number].scope for number in sorted(query.certain)] if query.steps else []
     for step in steps or [query.first]:
         where = [part for part in step.where if not any(map(b.is_passed_on, b.walk(part)))]
