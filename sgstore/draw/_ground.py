@@ -14,7 +14,7 @@ from matplotlib.path import Path as Outline
 import sgstore.draw._page as layers
 import sgstore.draw._palette as palette
 from sgstore.draw._view import SCENERY
-from sgstore.maps.roads import RoadMap
+from sgstore.maps.roads import DrawnOutlines, RoadMap
 from sgstore.model.vocabulary import KINDS
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 
-ARROW_SPACING: Final = 14.0
-"""Distance between two arrows on a lane; m."""
 STOREY_HEIGHT: Final = 4.0
 """Least difference of height for drawing one lane above another; m. Clearance between crossing
 roads is larger."""
@@ -276,7 +274,7 @@ def _chevrons(line: Floats) -> list[Floats]:
     """Return evenly spaced arrow heads along a line, as lines; empty for a short line."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate(((0.0,), np.cumsum(steps)))
-    count = round(along[-1] / ARROW_SPACING)
+    count = round(along[-1] / DrawnOutlines.ARROW_SPACING)
     # A lane in tiny pieces has no room for arrows; a lane of absurd length needs no more.
     if not 1 <= count <= 2000:
         return []

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from sgstore.maps.roads import DrawnOutlines
 from sgstore.model.vocabulary import PROXIMITY
 
 if TYPE_CHECKING:
@@ -48,12 +49,7 @@ DIAGRAM_TINTS: Final[Mapping[str, str]] = {
 }
 """Diagram nodes of map parts; entities have their own colours."""
 
-TRAVELLED: Final = frozenset(
-    (
-        *("driving", "bidirectional", "entry", "exit", "onRamp", "offRamp", "connectingRamp"),
-        *("slipLane", "bus", "taxi", "HOV"),
-    )
-)
+TRAVELLED: Final = DrawnOutlines.MOTOR_LANES
 """Lane types for motor traffic: they have markings, and arrows along their centre lines."""
 
 LANE_TINTS: Final[Mapping[str, str]] = {

@@ -213,6 +213,7 @@ def drawn_map(road_map: RoadMap | None) -> bytes:
     drawn = DrawnOutlines.of(road_map)
     names = ("x", "y", "start", "node", "word", "closed")
     columns = {name: getattr(drawn, name) for name in names}
+    columns |= {f"arrow.{name}": drawn.arrows[:, i] for i, name in enumerate(("x", "y", "angle"))}
     return packed({"origin": drawn.origin, "words": drawn.words}, columns)
 
 

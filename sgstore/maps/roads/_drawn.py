@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 import shapely
@@ -39,7 +39,21 @@ class DrawnOutlines:
         Index into ``words``.
     closed : (R,) uint8
         1 if the outline encloses an area.
+    arrows : (A, 3) float32
+        Points on lanes for motor traffic outside junctions, one in ``ARROW_SPACING``: x, y, and the
+        direction of travel; m, rad.
     """
+
+    MOTOR_LANES: ClassVar = frozenset(
+        (
+            *("driving", "bidirectional", "entry", "exit", "onRamp", "offRamp", "connectingRamp"),
+            *("slipLane", "bus", "taxi", "HOV"),
+        )
+    )
+    """Types of lanes for motor traffic."""
+
+    ARROW_SPACING: ClassVar = 14.0
+    """Distance between two arrows on a lane; m."""
 
     origin: tuple[float, float]
     words: tuple[str, ...]
@@ -49,6 +63,7 @@ class DrawnOutlines:
     node: NDArray[np.int32]
     word: NDArray[np.uint8]
     closed: NDArray[np.uint8]
+    arrows: NDArray[np.float32]
 
     @staticmethod
     def of(road_map: RoadMap, tolerance: float = TOLERANCE) -> DrawnOutlines:
@@ -90,7 +105,27 @@ class DrawnOutlines:
             (-1 - owner).astype(np.int32),
             codes[owner].astype(np.uint8),
             closed.astype(np.uint8),
+            _arrows(road_map, centre),
         )
+
+
+def _arrows(road_map: RoadMap, centre: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return evenly spaced points on the centre lines of lanes, with the direction of travel."""
+    nodes, ribbons = road_map.nodes, road_map.ribbons
+    found = [np.empty((0, 3))]
+    for row, word in enumerate(nodes.lane_type):
+        if word not in DrawnOutlines.MOTOR_LANES or nodes.junction[row] or not 1 <= row < len(ribbons.offsets):
+            continue
+        part = slice(*ribbons.offsets[row - 1 : row + 1].tolist())
+        x = (ribbons.left_x[part] + ribbons.right_x[part]) / 2
+        y = (ribbons.left_y[part] + ribbons.right_y[part]) / 2
+        along = np.append(0.0, np.hypot(np.diff(x), np.diff(y)).cumsum())
+        count = min(round(along[-1] / DrawnOutlines.ARROW_SPACING), 2000)
+        at = (np.arange(count) + 0.5) * along[-1] / max(count, 1)
+        here, ahead = (np.stack([np.interp(s, along, v) for v in (x, y)]) for s in (at, at + 0.5))
+        angle = np.arctan2(*(ahead - here)[::-1])
+        found.append(np.column_stack([*(here - centre[:, None]), angle]))
+    return np.concatenate(found).astype(np.float32)
 
 
 _ABOVE: Final = {"crosswalk": 4, "parking": 3}

@@ -97,20 +97,53 @@ export function mapOf(trace) {
   if (!about?.map_key) return null;
   return maps.known(about.map_key, async () => {
     const { header, columns } = await api.columns(api.address("api/map", of(about)));
-    if (!columns.x) return { origin: [0, 0], rings: [], nodes: new Map() };
+    if (!columns.x) return { origin: [0, 0], rings: [], nodes: new Map(), arrows: [] };
     const rings = [], nodes = new Map();
     for (let i = 0; i + 1 < columns.start.length; i++) {
       const path = new Path2D(), [xs, ys] = [columns.x, columns.y].map((all) => all.subarray(columns.start[i], columns.start[i + 1]));
       xs.forEach((/** @type {number} */ x, /** @type {number} */ k) => path.lineTo(x, ys[k]));
       const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
       if (columns.closed[i]) path.closePath();
-      const ring = { path, box, word: header.words[columns.word[i]], closed: columns.closed[i], node: columns.node[i] };
+      const stripes = header.words[columns.word[i]] === "crosswalk" ? stripesOf(xs, ys) : null;
+      const ring = { stripes, path, box, word: header.words[columns.word[i]], closed: columns.closed[i], node: columns.node[i] };
       rings.push(ring);
       if (!nodes.has(ring.node)) nodes.set(ring.node, []);
       nodes.get(ring.node).push(ring);
     }
-    return { origin: header.origin, rings, nodes };
+    return { origin: header.origin, rings, nodes, arrows: arrowsOf(columns) };
   });
+}
+
+/** Stripes of a crosswalk, across its longest side. @param {Float32Array} xs @param {Float32Array} ys */
+function stripesOf(xs, ys) {
+  let long = 0, ux = 1, uy = 0;
+  for (let i = 0; i + 1 < xs.length; i++) {
+    const dx = (xs[i + 1] || 0) - (xs[i] || 0), dy = (ys[i + 1] || 0) - (ys[i] || 0), far = Math.hypot(dx, dy);
+    if (far > long) { long = far; ux = dx / far; uy = dy / far; }
+  }
+  const along = [...xs].map((x, i) => x * ux + (ys[i] || 0) * uy), across = [...xs].map((x, i) => (ys[i] || 0) * ux - x * uy);
+  const path = new Path2D(), low = Math.min(...across), high = Math.max(...across), end = Math.max(...along);
+  for (let s = Math.min(...along) + 0.3; s < end - 0.3; s += 1.1) {
+    const corners = [[s, low], [s + 0.55, low], [s + 0.55, high], [s, high]];
+    corners.forEach(([a = 0, b = 0], k) => path[k ? "lineTo" : "moveTo"](a * ux - b * uy, a * uy + b * ux));
+    path.closePath();
+  }
+  return path;
+}
+
+const CELL = 64; // m, of the arrows that are painted together
+
+/** Arrows of the driving direction, by squares of the map. @param {Record<string, any>} columns */
+function arrowsOf(columns) {
+  /** @type {Map<string, {x: number, y: number, path: Path2D}>} */
+  const cells = new Map(), { "arrow.x": xs = [], "arrow.y": ys = [], "arrow.angle": angles = [] } = columns;
+  xs.forEach((/** @type {number} */ x, /** @type {number} */ i) => {
+    const y = ys[i], cos = Math.cos(angles[i]), sin = Math.sin(angles[i]), cx = Math.round(x / CELL), cy = Math.round(y / CELL);
+    const cell = cells.get(`${cx} ${cy}`) || { x: cx * CELL, y: cy * CELL, path: new Path2D() };
+    cells.set(`${cx} ${cy}`, cell);
+    [[-0.5, 0.55], [0.4, 0], [-0.5, -0.55]].forEach(([a = 0, b = 0], k) => cell.path[k ? "lineTo" : "moveTo"](x + a * cos - b * sin, y + a * sin + b * cos));
+  });
+  return [...cells.values()];
 }
 
 /** What never moves in a trace, the names of its entities, and the times of its frames. @param {string} trace */

@@ -32,6 +32,8 @@ const DARK_KINDS = { ...KINDS, building: "#3d434c", vegetation: "#33432f", prop:
 const LIGHTS = { red: "#e5383b", red_yellow: "#ff8c1a", yellow: "#ffb703", green: "#2ec4a0", flashing: "#ffe08a", off: "#5a626f" };
 export const SCENERY = new Set(["building", "vegetation", "prop", "pole", "barrier"]);
 
+const CELL_REACH = 50; // m, from the middle of a square of arrows to its corner
+
 const scheme = matchMedia("(prefers-color-scheme: dark)");
 scheme.addEventListener("change", () => { paints.value++; });
 
@@ -42,7 +44,8 @@ const inks = computed(() => {
   return {
     at: paints.value, ink: of("--ink"), faint: of("--faint"), ego: of("--ego"), hold: of("--hold"), fail: of("--fail"),
     mark: of("--mark"), ground: of("--map-ground"), raised: of("--raised"), lanes: isDark ? DARK_LANES : LANES, kinds: isDark ? DARK_KINDS : KINDS,
-    line: isDark ? "#59636f" : "#ffffff",
+    line: isDark ? "#59636f" : "#ffffff", stripe: isDark ? "#aeb6c1" : "#fdfdfb", arrow: isDark ? "#667180" : "#f7f9fb",
+    grid: isDark ? "#232a31" : "#dfe4dd",
   };
 });
 /** @typedef {typeof inks.value} Inks */
@@ -73,7 +76,12 @@ function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
   for (const ring of map.rings) {
     const [x0, y0, x1, y1] = ring.box;
     if (x1 < x - reach || x0 > x + reach || y1 < y - reach || y0 > y + reach) continue;
-    if (ring.closed) {
+    if (ring.stripes && !small) {
+      ctx.fillStyle = ink.lanes.driving || "#888";
+      ctx.fill(ring.path);
+      ctx.fillStyle = ink.stripe;
+      ctx.fill(ring.stripes);
+    } else if (ring.closed) {
       ctx.fillStyle = ink.lanes[ring.word] || (ink.kinds[ring.word] ? `${ink.kinds[ring.word]}38` : ink.lanes.none || "#888");
       ctx.fill(ring.path);
       if (!small && ring.word === "driving") ctx.stroke(ring.path);
@@ -82,6 +90,11 @@ function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
       ctx.stroke(ring.path);
       ctx.strokeStyle = ink.line;
     }
+  }
+  if (!small && look.scale > 2.5) {
+    ctx.strokeStyle = ink.arrow;
+    ctx.lineWidth = 0.18;
+    for (const cell of map.arrows) if (Math.hypot(cell.x - x, cell.y - y) < reach + CELL_REACH) ctx.stroke(cell.path);
   }
   for (const node of [...marked, ...lit]) {
     if (node >= 0) continue;
@@ -95,9 +108,86 @@ function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
   }
 }
 
+/** Lines each ten metres, where no road map is known. @param {CanvasRenderingContext2D} ctx @param {Look} look @param {number} ratio @param {Inks} ink */
+function paintGrid(ctx, look, ratio, ink) {
+  const reach = Math.hypot(look.width, look.height) / look.scale / 2, step = look.scale < 0.8 ? 100 : 10;
+  ctx.setTransform(axes(look, ratio));
+  ctx.strokeStyle = ink.grid;
+  ctx.lineWidth = 1 / look.scale;
+  ctx.beginPath();
+  for (let k = Math.ceil((look.x - reach) / step) * step; k < look.x + reach; k += step) { ctx.moveTo(k, look.y - reach); ctx.lineTo(k, look.y + reach); }
+  for (let k = Math.ceil((look.y - reach) / step) * step; k < look.y + reach; k += step) { ctx.moveTo(look.x - reach, k); ctx.lineTo(look.x + reach, k); }
+  ctx.stroke();
+}
+
+/** Rings around the ego, with their distances. @param {CanvasRenderingContext2D} ctx @param {any} states @param {Look} look @param {number} ratio @param {Inks} ink */
+function paintRings(ctx, states, look, ratio, ink) {
+  const ego = egoRow(states);
+  if (ego < 0) return;
+  const { x, y } = axes(look).transformPoint({ x: states.columns.x[ego], y: states.columns.y[ego] });
+  ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+  ctx.strokeStyle = ctx.fillStyle = ink.faint;
+  ctx.lineWidth = 0.8;
+  ctx.globalAlpha = 0.55;
+  ctx.setLineDash([2, 4]);
+  ctx.font = "10.5px system-ui, sans-serif";
+  ctx.textBaseline = "alphabetic";
+  for (const far of [10, 20, 50, 100, 200].filter((m) => m * look.scale > 45 && m * look.scale < Math.max(look.width, look.height))) {
+    ctx.beginPath();
+    ctx.arc(x, y, far * look.scale, 0, 7);
+    ctx.stroke();
+    ctx.fillText(`${far} m`, x + 4, y - far * look.scale - 3);
+  }
+  ctx.setLineDash([]);
+  ctx.globalAlpha = 1;
+}
+
+/** A traffic light as its housing with three lamps, upright on the screen. @param {CanvasRenderingContext2D} ctx @param {string} state
+ * @param {number} scale @param {number} turn back to upright */
+function paintLight(ctx, state, scale, turn) {
+  const high = Math.max(2.6, 20 / scale), wide = high * 0.46, lamps = ["green", "yellow", "red"];
+  const on = state === "red_yellow" ? ["red", "yellow"] : state === "flashing" ? ["yellow"] : [state];
+  ctx.rotate(turn);
+  ctx.fillStyle = "#20262e";
+  ctx.beginPath();
+  ctx.roundRect(-wide / 2, -high / 2, wide, high, wide * 0.3);
+  ctx.fill();
+  ctx.lineWidth = 1 / scale;
+  ctx.strokeStyle = "#8a94a3";
+  ctx.stroke();
+  lamps.forEach((lamp, i) => {
+    ctx.fillStyle = on.includes(lamp) ? LIGHTS[lamp] || "#fff" : "#4a535f";
+    ctx.beginPath();
+    ctx.arc(0, (i - 1) * high * 0.3, high * 0.12, 0, 7);
+    ctx.fill();
+  });
+  ctx.beginPath(); // its outline, where it is marked
+  ctx.roundRect(-wide / 2, -high / 2, wide, high, wide * 0.3);
+}
+
+/** What the colours of a scene stand for: a colour, its form, and a word. @param {string} trace @param {any} states @returns {[string, string, string][]} */
+export function legendOf(trace, states) {
+  const ink = inks.value, c = states?.columns, kinds = new Set(), lights = new Set(), still = stillOf(trace)?.columns;
+  for (let i = states?.from || 0; i < (states?.to || 0); i++) {
+    if (c.ego?.[i]) continue;
+    const kind = kindOf(c.kind[i]);
+    if (kind === "traffic_light") lights.add(lightOf(c.light?.[i] ?? 0)); else kinds.add(kind);
+  }
+  for (const code of still?.kind || []) kinds.add(kindOf(code));
+  const words = new Set((mapOf(trace)?.rings || []).map((/** @type {any} */ ring) => ring.word));
+  kinds.delete("traffic_light");
+  return [
+    ["ego", "box", ink.ego], ["bound in the match", "outline", ink.mark],
+    ...[...kinds].sort().map((kind) => [kind, "box", ink.kinds[kind] || ink.kinds.unknown || ""]),
+    ...[...lights].sort().map((state) => [`light: ${state}`, "dot", LIGHTS[state] || ink.faint]),
+    ...[...words].filter((word) => ink.lanes[word]).sort().map((word) => [word === "crosswalk" ? word : `lane: ${word}`, "area", ink.lanes[word] || ""]),
+    ["relation holds", "line", ink.hold], ["relation fails", "dashed", ink.fail],
+  ].map(([word = "", form = "", colour = ""]) => [colour, form, word.replace(/_/g, " ")]);
+}
+
 /** @param {CanvasRenderingContext2D} ctx @param {any} c @param {number} i @param {number} scale
- * @param {Inks} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null}} what */
-function paintEntity(ctx, c, i, scale, ink, what) {
+ * @param {Inks} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null, small?: boolean}} what @param {number} turn */
+function paintEntity(ctx, c, i, scale, ink, what, turn) {
   const kind = kindOf(c.kind[i]), node = c.node[i], ego = c.ego ? c.ego[i] : 0;
   const least = (what.marked.has(node) ? 7 : 3.5) / scale;
   const length = Math.max(c.length[i] || 0.5, least), width = Math.max(c.width[i] || 0.5, least * 0.7);
@@ -108,13 +198,14 @@ function paintEntity(ctx, c, i, scale, ink, what) {
   ctx.fillStyle = ego ? ink.ego : ink.kinds[kind] || ink.kinds.unknown || "#888";
   if (kind === "traffic_light") ctx.fillStyle = LIGHTS[lightOf(c.light?.[i] ?? 0)] || ink.faint;
   if (SCENERY.has(kind)) ctx.globalAlpha = 0.55;
-  ctx.beginPath();
-  if (kind === "person" || kind === "traffic_light" || kind === "pole") {
+  const glyph = kind === "traffic_light" && !what.small;
+  if (glyph) paintLight(ctx, lightOf(c.light?.[i] ?? 0), scale, -heading - turn); else ctx.beginPath();
+  if (glyph) { /* painted */ } else if (kind === "person" || kind === "traffic_light" || kind === "pole") {
     ctx.arc(0, 0, Math.max(length, width) / 2, 0, 7);
   } else {
     ctx.roundRect(-length / 2, -width / 2, length, width, Math.min(width, length) * 0.18);
   }
-  ctx.fill();
+  if (!glyph) ctx.fill();
   if (what.marked.has(node) || what.lit.has(node) || what.chosen === node) {
     ctx.globalAlpha = 1;
     ctx.lineWidth = (what.lit.has(node) || what.chosen === node ? 4 : 2.6) / scale;
@@ -124,7 +215,7 @@ function paintEntity(ctx, c, i, scale, ink, what) {
     ctx.strokeStyle = ink.ink;
     ctx.stroke();
   }
-  if (width * scale > 7 && length > width && !SCENERY.has(kind)) { // which end is ahead
+  if (width * scale > 7 && length > width && !glyph && !SCENERY.has(kind)) { // which end is ahead
     ctx.fillStyle = "rgba(255,255,255,.75)";
     ctx.beginPath();
     ctx.moveTo(length * 0.42, 0);
@@ -179,7 +270,9 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
   ctx.setTransform(1, 0, 0, 1, 0, 0);
   ctx.fillStyle = ink.ground;
   ctx.fillRect(0, 0, ctx.canvas.width, ctx.canvas.height);
+  if (!traces.value.get(trace)?.map_key) paintGrid(ctx, look, ratio, ink);
   paintMap(ctx, trace, look, ratio, ink, what.marked, what.lit, !!what.small);
+  if (states && !what.small) paintRings(ctx, states, look, ratio, ink);
   ctx.setTransform(axes(look, ratio));
   const reach = Math.hypot(look.width, look.height) / look.scale / 2 + 12;
   const still = stillOf(trace)?.columns;
@@ -187,7 +280,7 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
     if (!c) continue;
     for (let i = from; i < to; i++) {
       if (Math.abs(c.x[i] - look.x) > reach || Math.abs(c.y[i] - look.y) > reach) continue;
-      paintEntity(ctx, c, i, look.scale, ink, what);
+      paintEntity(ctx, c, i, look.scale, ink, what, look.turn);
     }
   }
   if (what.track && what.track.length > 1) {

@@ -3,14 +3,15 @@
 import { h, htm, useEffect, useLayoutEffect, useMemo, useRef, useState } from "../vendor/core.js";
 import { arrived, mapOf, seconds, stillOf, thumbOf, timesOf, wantThumbs } from "./data.js";
 import { fitted, lookAt, paintScene } from "./draw.js";
-import { keyOf, notes, offline, open, openMatch, paints, tick, ticked, traces } from "./state.js";
+import { merged, ORDERS } from "./order.js";
+import { dialog, keyOf, notes, offline, open, openMatch, order, paints, tagged, tick, ticked, traces } from "./state.js";
 
 const html = htm.bind(h);
 const GAP = 12, HEAD = 32;
 const REST = 100; // ms without a jump, after which what flew past stands
 
 /** What the matches before and behind are grouped by. @param {import("./state.js").Match | undefined} match */
-const groupOf = (match) => match?.group ?? match?.trace ?? "";
+const groupOf = (match) => match?.group ?? (order.value ? ORDERS[order.value] : match?.trace) ?? "";
 
 /** Where everything stands: groups and rows, by their heights.
  * @param {import("./state.js").Match[]} found @param {number} width */
@@ -45,8 +46,8 @@ function moved(rows, at, key, page) {
   return to && here ? Math.min(to.first + at - here.first, to.last - 1) : null;
 }
 
-/** @param {{match: import("./state.js").Match, at: number, x: number, y: number, wide: number, high: number, flies: boolean, turn: boolean}} props */
-function Tile({ match, at, x, y, wide, high, flies, turn }) {
+/** @param {{match: import("./state.js").Match, at: number, x: number, y: number, wide: number, high: number, flies: boolean, turn: boolean, many: number}} props */
+function Tile({ match, at, x, y, wide, high, flies, turn, many }) {
   const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
   const painted = useRef("");
   const waits = arrived.value, look = paints.value;
@@ -77,12 +78,17 @@ function Tile({ match, at, x, y, wide, high, flies, turn }) {
       ${offline.value || match.go ? null : html`<input type="checkbox" checked=${on} tabindex=${turn ? 0 : -1} aria-label=${`Select ${match.trace} ${start} s`}
         onClick=${(/** @type {any} */ event) => { event.stopPropagation(); tick(match); }} />`}
       <button class="quiet small" tabindex=${turn ? 0 : -1} aria-label=${`Open ${match.trace}, ${start}–${end} s`}>${when} s</button>
-      ${tags.map((n) => html`<span class="tag">${n[2]}</span>`)}<span class="who" title=${who}>${who}</span>
+      ${many > 1 ? html`<span class="faint" title="matches with the same nodes in another order">×${many}</span>` : null}
+      ${[...new Set(tags.map((n) => n[2]))].map((one) => html`<span class="tag">${one}</span>`)}
+      ${offline.value || match.go ? null : html`<button class="quiet small tagger" tabindex=${turn ? 0 : -1} title="tag this match" aria-label=${`Tag ${match.trace} ${start} s`}
+        onClick=${(/** @type {Event} */ event) => { event.stopPropagation(); tagged.value = { trace: match.trace, first: match.first, last: match.last }; dialog.value = "tag"; }}>＋tag</button>`}
+      ${order.value ? html`<span class="faint">${match.trace}</span>` : null}<span class="who" title=${who}>${who}</span>
     </div></div>`;
 }
 
 /** @param {{found: import("./state.js").Match[], none?: string, word?: [string, string]}} props */
-export function Gallery({ found, none, word = ["match", "matches"] }) {
+export function Gallery({ found: all, none, word = ["match", "matches"] }) {
+  const { shown: found, many } = useMemo(() => merged(all), [all]);
   const place = useRef(/** @type {HTMLElement | null} */ (null));
   const [box, setBox] = useState({ width: 900, height: 600, top: 0 });
   const measure = () => {
@@ -95,7 +101,7 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
     return () => watch.disconnect();
   }, []);
   // Of thousands of matches it is made once, not while it is scrolled.
-  const { rows, height, wide, high } = useMemo(() => layout(found, box.width), [found, box.width]);
+  const { rows, height, wide, high } = useMemo(() => layout(found, box.width), [found, box.width, order.value]);
   const low = Math.max(0, rows.findIndex((row) => row.top + row.height >= box.top - 200)), end = box.top + box.height + 200;
   // As many rows each time: what leaves the sight lends its elements to what comes, for to make new ones takes most of the time.
   const most = useRef(0), was = useRef(0), jumped = useRef(false);
@@ -138,7 +144,7 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
   }, [isOpen]);
   const onFocus = (/** @type {FocusEvent} */ event) => {
     const at = /** @type {HTMLElement} */ (event.target), tile = /** @type {HTMLElement | null} */ (at.closest("[data-at]"));
-    if (tile) { held.current = at.localName; setActive(Number(tile.dataset.at)); }
+    if (tile) { held.current = at.localName + (at.classList.contains("tagger") ? ".tagger" : ""); setActive(Number(tile.dataset.at)); }
   };
   const onBlur = (/** @type {FocusEvent} */ event) => {
     if (!patching.current && !place.current?.contains(/** @type {Node | null} */ (event.relatedTarget))) held.current = "";
@@ -163,7 +169,7 @@ export function Gallery({ found, none, word = ["match", "matches"] }) {
     ${found.length || !none ? null : html`<p class="faint none">${none}</p>`}
     ${drawn.map(({ row, slot }) => (row.group
       ? html`<div class="group" key=${`g ${slot}`} style=${{ top: `${row.top}px` }}>${row.group} <span>${row.many} ${row.many === 1 ? word[0] : word[1]}</span></div>`
-      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${slot} ${i}`} match=${match} at=${row.first + i} turn=${row.first + i === turn} wide=${wide} high=${high} flies=${flies}
+      : found.slice(row.first, row.last).map((match, i) => html`<${Tile} key=${`${slot} ${i}`} match=${match} many=${many.get(match.index) || 1} at=${row.first + i} turn=${row.first + i === turn} wide=${wide} high=${high} flies=${flies}
           x=${GAP + i * (wide + GAP)} y=${row.top} />`)))}
   </div></section>`;
 }

@@ -15,9 +15,10 @@ import { Selection } from "./select.js";
 import { Coverage } from "./sheets.js";
 import {
   answer, ask, askAgain, cancel, changed, dialog, find, history, keep, library, matches, namesIn, notes, notice, open,
-  openFrame, paints, parametersOf, reasonOf, refresh, retries, say, store, tag, text, theme, ticked, values, view, words,
+  openFrame, paints, parametersOf, reasonOf, refresh, retries, say, store, tag, tagged, text, theme, ticked, values, view, words,
 } from "./state.js";
 import { Status } from "./status.js";
+import { runsOfTags } from "./timeline.js";
 import { Verdicts } from "./verdicts.js";
 
 const html = htm.bind(h);
@@ -70,24 +71,32 @@ function Rows() {
 const shown = (v) => (v === null ? "" : typeof v === "object" ? JSON.stringify(v) : typeof v === "number" && !Number.isInteger(v) ? String(Number(v.toPrecision(7))) : String(v));
 
 function TagForm() {
-  const now = open.value;
-  if (!now) return null;
-  const mine = notes.value.filter((n) => n[0] === now.trace && n[1] === frame.value);
-  const write = async (/** @type {any} */ event) => {
+  const now = open.value, match = now?.match, chosen = tagged.value;
+  const spans = [
+    ...(chosen ? [{ ...chosen, word: chosen.first === chosen.last ? "this frame" : "these frames" }] : []),
+    ...(now && !chosen ? [{ trace: now.trace, first: frame.value, last: frame.value, word: "this frame" }] : []),
+    ...(now && match && !chosen ? [{ trace: match.trace, first: match.first, last: match.last, word: "the match" }] : []),
+  ];
+  const first = spans[0];
+  if (!first) return null;
+  const mine = runsOfTags(notes.value, first.trace).filter((one) => one.first <= first.last && first.first <= one.last);
+  const write = async (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
-    const form = new FormData(event.target);
+    const form = new FormData(/** @type {HTMLFormElement} */ (event.target)), { trace, first: seq, last } = spans[Number(form.get("span") || 0)] || first;
     try {
-      await tag({ trace: now.trace, seq: frame.value, tag: form.get("tag"), note: form.get("note") });
+      await tag({ trace, seq, last, tag: form.get("tag"), note: form.get("note") });
       dialog.value = "";
       say("tagged");
     } catch (error) { say(reasonOf(error)); }
   };
+  const remove = (/** @type {typeof mine[0]} */ one) => tag({ trace: first.trace, seq: one.first, last: one.last, tag: one.tag, do: "remove" }).catch((e) => say(reasonOf(e)));
   const known = [...new Set(notes.value.map((n) => n[2]))];
-  return html`<h2>Tag ${now.trace}#${frame.value}</h2><form onSubmit=${write}>
+  return html`<h2>Tag ${first.trace}#${first.first}${first.last > first.first ? `–${first.last}` : ""}</h2><form onSubmit=${write}>
     <p><label>Tag <input name="tag" required maxlength="100" list="tags" autofocus /></label><datalist id="tags">${known.map((one) => html`<option value=${one} />`)}</datalist></p>
     <p><label>Note <input name="note" size="40" maxlength="2000" /></label></p>
-    ${mine.map((n) => html`<p class="row"><span class="chip">${n[2]}</span> ${n[3]} <span class="faint">${n[4]}</span>
-      <button type="button" class="small" onClick=${() => tag({ trace: n[0], seq: n[1], tag: n[2], do: "remove" }).catch((e) => say(reasonOf(e)))}>remove</button></p>`)}
+    ${spans.length < 2 ? null : html`<p><label>For <select name="span">${spans.map((one, i) => html`<option value=${i}>${one.word}, #${one.first}${one.last > one.first ? `–${one.last}` : ""}</option>`)}</select></label></p>`}
+    ${mine.map((one) => html`<p class="row"><span class="chip">${one.tag}</span> ${one.note} <span class="faint">#${one.first}${one.last > one.first ? `–${one.last}` : ""} ${one.who}</span>
+      <button type="button" class="small" onClick=${() => remove(one)}>remove</button></p>`)}
     <button class="main">Tag</button></form>
     <p class="faint">Tags lie in a file beside the store; a query can ask for them: WHERE notes.tag = '…'</p>`;
 }
@@ -142,7 +151,7 @@ function App() {
 }
 
 keys.unshift(["/", "editor", { "/": focusEditor }], ["Ctrl ⏎", "find", {}]);
-keys.push(["t", "tag this frame", { t: () => { if (open.value) dialog.value = "tag"; } }], ["y", "copy a link", { y: copyLink }],
+keys.push(["t", "tag this frame", { t: () => { tagged.value = null; if (open.value) dialog.value = "tag"; } }], ["y", "copy a link", { y: copyLink }],
   ["Y", "copy the command that opens this view", { Y: copyCommand }]);
 
 effect(() => {

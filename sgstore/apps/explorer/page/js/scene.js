@@ -4,8 +4,8 @@ import { effect, h, htm, signal, useEffect, useLayoutEffect, useRef, useState } 
 import * as api from "./api.js";
 import { copyLink } from "./address.js";
 import { asked, askWhy, beside, camera, frame, holdsAt, lanes, nextMatch, others, panel, series, showSeries, why } from "./clock.js";
-import { arrived, nameOf, pictureAt, placeOf, seconds, statesAt, timeAt } from "./data.js";
-import { egoRow, fitted, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
+import { arrived, kindOf, lightOf, nameOf, pictureAt, placeOf, seconds, statesAt, timeAt } from "./data.js";
+import { egoRow, fitted, legendOf, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
 import { hop, Neighbours } from "./neighbours.js";
 import { PatternDrawing } from "./pattern.js";
 import { ask, chosen, find, inOther, lit, live, offline, open, openFrame, paints, playing, rate, reasonOf, say, store, text, traces } from "./state.js";
@@ -53,12 +53,30 @@ function Camera() {
 
 // View from above ---------------------------------------------------------------------------------------------------
 
+const legend = signal(false);
+
+/** The node under the pointer. @param {{x: number, y: number, node: number, trace: string, states: any}} props */
+function Tip({ x, y, node, trace, states }) {
+  const row = states ? rowOf(states, node) : -1, c = states?.columns;
+  if (row < 0) return null;
+  const kind = kindOf(c.kind[row]), speed = Number.isFinite(c.speed[row]) ? ` · ${c.speed[row].toFixed(1)} m/s` : "";
+  const more = kind === "traffic_light" ? ` · ${lightOf(c.light?.[row] ?? 0)}` : speed;
+  return html`<div class="tip" role="tooltip" style=${{ left: `${x + 12}px`, top: `${y + 12}px` }}>${nameOf(trace, node)}${more}</div>`;
+}
+
+/** What the colours and forms stand for. @param {{trace: string, states: any}} props */
+const Legend = ({ trace, states }) => html`<ul class="legend" aria-label="Legend" tabindex="0">${legendOf(trace, states).map(([colour, form, word]) => html`<li>
+  <svg viewBox="0 0 22 12" aria-hidden="true">${form === "line" || form === "dashed"
+    ? html`<path d="M1 6H21" stroke=${colour} stroke-width="2.4" stroke-dasharray=${form === "line" ? "" : "4 3"} />`
+    : form === "dot" ? html`<circle cx="11" cy="6" r="5" fill=${colour} />`
+    : html`<rect x="2" y="1" width="18" height="10" rx=${form === "area" ? 0 : 3} fill=${form === "outline" ? "none" : colour} stroke=${form === "outline" ? colour : "none"} stroke-width="2.4" />`}</svg>${word}</li>`)}</ul>`;
+
 /** @param {{trace: string}} props */
 function Above({ trace }) {
   const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
   const look = useRef(/** @type {any} */ (null)), drag = useRef(/** @type {any} */ (null));
   const now = open.value, at = frame.value;
-  const [, redraw] = useState(0);
+  const [, redraw] = useState(0), [tip, showTip] = useState(/** @type {{x: number, y: number, node: number} | null} */ (null));
   const states = statesAt(trace, at), about = traces.value.get(trace);
   const seen = useRef(/** @type {any} */ (null));
   if (states || seen.current?.trace !== trace) seen.current = states && { ...states, trace };
@@ -105,6 +123,10 @@ function Above({ trace }) {
     canvas.current?.setPointerCapture(e.pointerId);
   };
   const move = (/** @type {PointerEvent} */ e) => {
+    if (!drag.current && look.current && seen.current && canvas.current && e.pointerType === "mouse") { // what is under the pointer
+      const box = canvas.current.getBoundingClientRect(), x = e.clientX - box.left, y = e.clientY - box.top, node = nodeAt(seen.current, look.current, x, y);
+      if (node >= 0 || tip) showTip(node < 0 ? null : { x, y, node });
+    }
     if (!drag.current || !look.current) return;
     const mx = e.clientX - drag.current.x, my = e.clientY - drag.current.y;
     if (Math.abs(mx) + Math.abs(my) > 4) drag.current.moved = true;
@@ -124,10 +146,12 @@ function Above({ trace }) {
       <button class="small" aria-pressed=${north} onClick=${() => { zoom.value = { ...zoom.value, north: !north }; }}>${north ? "north up" : "heading up"}</button>
       <button class="small" aria-label="Nearer" onClick=${() => { zoom.value = { ...zoom.value, factor: factor * 1.4 }; }}>+</button>
       <button class="small" aria-label="Farther" onClick=${() => { zoom.value = { ...zoom.value, factor: factor / 1.4 }; }}>−</button>
+      <button class="small" aria-pressed=${legend.value} onClick=${() => { legend.value = !legend.value; }}>legend</button>
       ${beside.value ? html`<span class="chip">${about?.side ? store.value.other.store : store.value.store}</span>` : null}
       ${factor !== 1 || dx || dy ? html`<button class="small" onClick=${() => { zoom.value = { factor: 1, dx: 0, dy: 0, north }; }}>reset</button>` : null}
     </div>
-    <canvas ref=${canvas} role="img" aria-label=${about?.side ? "View from above, second store" : "View from above"} onWheel=${wheel} onPointerDown=${down} onPointerMove=${move} onPointerUp=${up}></canvas>
+    <canvas ref=${canvas} role="img" aria-label=${about?.side ? "View from above, second store" : "View from above"} onWheel=${wheel} onPointerDown=${down} onPointerMove=${move} onPointerUp=${up} onPointerLeave=${() => showTip(null)}></canvas>
+    ${tip ? html`<${Tip} ...${tip} trace=${trace} states=${seen.current} />` : null}${legend.value ? html`<${Legend} trace=${trace} states=${seen.current} />` : null}
   </div>`;
 }
 

@@ -2,6 +2,7 @@
 // What the page knows and shows, as signals.
 import { batch, computed, signal } from "../vendor/core.js";
 import * as api from "./api.js";
+import { ordered } from "./order.js";
 
 /** A match: a run of frames of a trace, and the nodes that are bound.
  * @typedef {{trace: string, first: number, last: number, start: number, end: number,
@@ -21,6 +22,7 @@ export const text = signal("");
 export const values = signal(/** @type {Record<string, string>} */ ({}));
 export const answer = signal(/** @type {any} */ ({ state: "idle", matches: [], names: [], reasons: {}, notes: [] }));
 export const filter = signal({ trace: "", map: "" });
+export const order = signal("");
 /** What is open: trace, frame (with its fraction), the match, the nodes. */
 export const open = signal(/** @type {{trace: string, match: Match | null, binding: Record<string, number> | null} | null} */ (null));
 export const seq = signal(0);
@@ -42,6 +44,8 @@ export const again = signal(0);
 /** How often the server answered again after a time without an answer: what failed is asked once more. */
 export const retries = signal(0);
 export const dialog = signal("");
+/** Frames that the form for tags is for; null: the frame that is shown. */
+export const tagged = signal(/** @type {{trace: string, first: number, last: number} | null} */ (null));
 /** True in a report, which has no server, and of a monitor, whose server knows the last frames only. */
 export const offline = signal(false);
 /** True of a monitor that runs; and the first and last frame of it that are kept. */
@@ -61,8 +65,9 @@ export const traces = computed(() => new Map(/** @type {[string, Trace][]} */ ([
 ])));
 export const matches = computed(() => {
   const { trace, map } = filter.value;
-  return /** @type {Match[]} */ (answer.value.matches)
+  const some = /** @type {Match[]} */ (answer.value.matches)
     .filter((m) => (!trace || m.trace === trace) && (!map || traces.value.get(m.trace)?.map === map));
+  return ordered(some, order.value);
 });
 /** Frames that match, each once. */
 export const framesFound = computed(() => {

@@ -1,9 +1,20 @@
 // @ts-check
 // What was found, in a line: how much, how long it took, who cannot answer.
-import { h, htm } from "../vendor/core.js";
-import { answer, filter, framesFound, matches, offline, store, tickAll } from "./state.js";
+import { h, htm, useEffect, useState } from "../vendor/core.js";
+import { ORDERS } from "./order.js";
+import { answer, filter, framesFound, matches, offline, order, store, tickAll } from "./state.js";
 
 const html = htm.bind(h);
+
+/** How long a question is under way. */
+function Busy() {
+  const [seconds, tell] = useState(0);
+  useEffect(() => {
+    const began = performance.now(), tick = setInterval(() => tell(Math.floor((performance.now() - began) / 1000)), 250);
+    return () => clearInterval(tick);
+  }, []);
+  return html`<span class="busy" aria-hidden="true"></span><span class="asking">asking … ${seconds} s</span>`;
+}
 
 export function Status() {
   const told = answer.value, { frames, traces: many } = framesFound.value, found = matches.value.length;
@@ -12,7 +23,7 @@ export function Status() {
   const where = filter.value, all = /** @type {import("./state.js").Trace[]} */ (store.value.traces);
   const known = { trace: all.map((t) => t.name), map: [...new Set(all.map((t) => t.map).filter(Boolean))] };
   return html`<div class="status" role="status" aria-live="polite">
-    ${told.state === "busy" ? html`<span class="busy" aria-hidden="true"></span>` : null}
+    ${told.state === "busy" ? html`<${Busy} key=${told.id} />` : null}
     ${told.error ? html`<div class="error"><b>${told.error.reason}</b>${told.error.hint ? html` · ${told.error.hint}` : null}</div>`
       : told.rows ? html`<span><b>${told.rows.length.toLocaleString("en")}</b> rows</span>`
       : html`<span><b>${found.toLocaleString("en")}</b> ${told.verdicts ? (found === 1 ? "violation" : "violations") : found === 1 ? "match" : "matches"} in ${many} ${many === 1 ? "trace" : "traces"}, ${frames.toLocaleString("en")} frames</span>`}
@@ -25,6 +36,8 @@ export function Status() {
     <span class="grow"></span>
     ${/** @type {const} */ (["trace", "map"]).map((of) => (known[of].length < 2 ? null : html`<select aria-label=${of} value=${where[of]} onChange=${(/** @type {any} */ e) => { filter.value = { ...where, [of]: e.target.value }; }}>
       <option value="">${`all ${of}s`}</option>${known[of].map((one) => html`<option>${one}</option>`)}</select>`))}
+    ${found > 1 && !told.rows ? html`<select aria-label="order" value=${order.value} onChange=${(/** @type {any} */ e) => { order.value = e.target.value; }}>
+      ${Object.entries(ORDERS).map(([key, word]) => html`<option value=${key}>${word}</option>`)}</select>` : null}
     ${found && !told.rows && !offline.value ? html`<button class="small" onClick=${() => tickAll(matches.value)}>select all</button>` : null}
   </div>`;
 }

@@ -42,11 +42,25 @@ function Series() {
       <line class="cursor" x1=${frame.value + 0.5} x2=${frame.value + 0.5} y1="0" y2="54" vector-effect="non-scaling-stroke" /></svg></div>`;
 }
 
+/** Tags of a trace as runs of frames. @param {any[][]} all @param {string} trace */
+export function runsOfTags(all, trace) {
+  /** @type {{tag: string, note: string, who: string, first: number, last: number}[]} */
+  const runs = [], ends = new Map();
+  for (const [, seq, tag, note, who] of all.filter((n) => n[0] === trace).sort((a, b) => a[1] - b[1])) {
+    const before = ends.get(`${tag}\n${note}`);
+    if (before && before.last + 1 >= seq) { before.last = seq; continue; }
+    const one = { tag, note, who, first: seq, last: seq };
+    ends.set(`${tag}\n${note}`, one);
+    runs.push(one);
+  }
+  return runs;
+}
+
 export function Timeline() {
   const now = open.value, about = traces.value.get(now?.trace || "");
   if (!now || !about) return null;
   const [from, to] = range.value, frames = to - from + 1, mine = matches.value.filter((m) => m.trace === now.trace);
-  const tags = notes.value.filter((n) => n[0] === now.trace), holds = holdsAt(frame.value), word = live.value ? "event" : answer.value.verdicts ? "violation" : "match";
+  const tags = runsOfTags(notes.value, now.trace), holds = holdsAt(frame.value), word = live.value ? "event" : answer.value.verdicts ? "violation" : "match";
   const all = lanes.value?.lanes || [], steps = new Set(all.map((/** @type {any} */ l) => l.step)).size > 1;
   const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
   const [begun, end] = arrived.value >= 0 ? [timeAt(now.trace, from), timeAt(now.trace, to)] : [0, 0];
@@ -63,7 +77,7 @@ export function Timeline() {
         <div class="label mono" title=${lane.unknown.length ? `nothing is known of ${lane.unknown.join(", ")}` : lane.text}><span class=${`now ${holds[i] ? "holds" : "fails"}`}>${holds[i] === null ? "?" : holds[i] ? "✓" : "✗"}</span>${steps ? `${lane.step}. ` : ""}${lane.text}</div>
         <${Bars} spans=${lane.spans} kind=${() => "bar-hold"} /></div>`;
     })}
-    ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n[1], n[1] + frames / 200])} kind=${() => "bar-tag"} /></div>` : null}
+    ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n.first, Math.max(n.last, n.first + frames / 200)])} kind=${() => "bar-tag"} /></div>` : null}
     ${series.value ? html`<${Series} />` : null}
     <div class="lane"><div class="label"></div><div class="ticks">
       ${ticks.map((t) => html`<span style=${{ left: `${(100 * (seqAt(now.trace, t) - from + 0.5)) / frames}%` }}>${Number(t.toFixed(1))} s</span>`)}</div></div>
