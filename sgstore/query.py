@@ -625,6 +625,8 @@ class StoreVerbs:
         graphml: bool = False,
         channels: Sequence[str] = (),
         clouds: Literal["pcd", "npy", "bin"] = "pcd",
+        storage: str = "v1.0.0",
+        crs: str = "",
         parameters: Mapping[str, object] | None = None,
     ) -> Any:
         """Cut matches out of their recordings, as clips with the original messages.
@@ -640,7 +642,8 @@ class StoreVerbs:
         lock : str or Path
             Instead of a query: each case of a lock, a clip each.
         form : str
-            mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, or that of a package.
+            mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, duckdb, lance, geojson, or that
+            of a package.
         before : str or float
             Time before each match: 2s, 500ms.
         after : str or float
@@ -662,6 +665,10 @@ class StoreVerbs:
             frames: use only this sensor; repeatable.
         clouds : {"pcd", "npy", "bin"}
             frames: format of point clouds.
+        storage : str
+            duckdb: oldest version of DuckDB that can read the file, such as v1.0.0.
+        crs : str
+            geojson: coordinate system of the road maps, such as EPSG:32632; by default their own.
         parameters : mapping of str to value
             Value of $NAME in the query; write a list as [1, 2]; repeatable.
 

@@ -254,20 +254,18 @@ VERBS = {
     "ingest": Verb(f"ingest {{p}}/s.db {_RECORDINGS} --jobs 1", ("first/s.db",)),
     "ingest, 2 jobs": Verb(f"ingest {{p}}/s.db {_RECORDINGS} --jobs 2", ("first/s.db",)),
     "derive": Verb(
-        "derive {p}/s.db --as wide --config {i}/wide.toml --trace a --trace b", ("s.db",)
+        "derive {p}/s.db --name wide --config {i}/wide.toml --trace a --trace b", ("s.db",)
     ),
-    "import s3c": Verb("import {p}/s.db {i}/more.csv --format s3c", ("s.db",)),
-    "import nodelink": Verb("import {p}/s.db {i}/graphs.json --format nodelink", ("s.db",)),
+    "import s3c": Verb("import {p}/s.db {i}/more.csv --as s3c", ("s.db",)),
+    "import nodelink": Verb("import {p}/s.db {i}/graphs.json --as nodelink", ("s.db",)),
     "remove --compact": Verb(
         "remove {p}/s.db a b --compact", ("s.db",), again="remove {p}/s.db --compact"
     ),
     "rebuild": Verb("rebuild {p}/s.db", ("s.db",), keeps=_FRESH),
     "rebuild, 2 jobs": Verb("rebuild {p}/s.db --jobs 2", ("s.db",), keeps=_FRESH),
-    "export clips": Verb(
-        "export {i}/s.db MATCH_ALL --to {p}/clips --format mcap", (), gives="clips"
-    ),
+    "export clips": Verb("export {i}/s.db MATCH_ALL --to {p}/clips --as mcap", (), gives="clips"),
     "export parquet": Verb(
-        "export {i}/s.db MATCH_ALL --to {p}/tables --format parquet", (), gives="tables"
+        "export {i}/s.db MATCH_ALL --to {p}/tables --as parquet", (), gives="tables"
     ),
     "shrink --to": Verb("shrink {i}/s.db MATCH_ALL --to {p}/cut", (), gives="cut"),
     "select -o": Verb("select {i}/s.db -o {p}/t.lock", ("t.lock",), gives="t.lock"),
@@ -307,8 +305,8 @@ def prepare(folder: Path, frames: int) -> None:
         ["ingest", f"{i}/first/s.db", f"{i}/b.mcap"],
         ["ingest", store, f"{i}/a.mcap", f"{i}/b.mcap"],
         ["ingest", store, f"{i}/other/a.mcap", "--map", f"{i}/street.xodr"],
-        ["import", store, f"{i}/few.csv", "--format", "s3c"],
-        ["derive", store, "--as", "near_by", "--config", f"{i}/wide.toml", "--trace", "b"],
+        ["import", store, f"{i}/few.csv", "--as", "s3c"],
+        ["derive", store, "--name", "near_by", "--config", f"{i}/wide.toml", "--trace", "b"],
         ["select", store, "MATCH (e:Ego) WHERE e.x < 5", "-o", f"{i}/a.lock"],
         ["select", store, "MATCH (e:Ego) WHERE e.x >= 5", "-o", f"{i}/b.lock"],
         ["select", store, "--minimal", "-o", f"{i}/t.lock"],

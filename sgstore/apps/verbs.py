@@ -376,6 +376,7 @@ def export(  # noqa: PLR0913 - the options of the command
         labelled,
         parse_labels,
         parse_mounts,
+        whole_clips,
         write_export,
     )
 
@@ -386,7 +387,8 @@ def export(  # noqa: PLR0913 - the options of the command
     if sum((bool(query), frames is not None, lock is not None)) > 1:
         raise ConfigError("expected one of: a QUERY, --frames, --lock")
     opened, values = one_store(store), dict(parameters or {})
-    told = {"query": query} if query else {"lock": Path(lock).name} if lock else {}
+    text, held = statement(query, values) if query else ("", {})
+    told = {"query": text} if query else {"lock": Path(lock).name} if lock else {}
     if lock is not None:
         from sgstore.testsets.locks import cases_of
 
@@ -395,18 +397,17 @@ def export(  # noqa: PLR0913 - the options of the command
         from sgstore.exporters import around_frames
 
         clips = around_frames(opened, frames, *margins)
-    else:
-        matches = opened.find(query or EVERY_FRAME, **values)
+    elif query:
+        matches = opened.find(text, **held)
         if on_matches is not None:
             on_matches(matches)
         clips = list(matches.clips(*margins))
+    else:
+        clips = whole_clips(opened, form)
     if not clips:
         return []
     order = Export(opened, tuple(clips), provenance=told, **same)
-    return write_export(labelled(order, texts, **values), to, form)
-
-
-EVERY_FRAME: Final = "MATCH () RETURN FRAMES"
+    return write_export(labelled(order, texts, **(held if query else values)), to, form)
 
 
 def lock(

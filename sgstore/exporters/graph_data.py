@@ -1,4 +1,4 @@
-"""Reader of exported graphs (``sgstore export --format pyg``) for machine learning.
+"""Reader of exported graphs (``sgstore export --as pyg``) for machine learning.
 
 ::
 

@@ -160,7 +160,7 @@ def test_bugs_10_foxglove_deletion_timestamp(case: Callable[[str], Case], tmp_pa
 
 def test_bugs_11_integers_beyond_2_53(case: Callable[[str], Case], tmp_path: Path) -> None:
     odd = case("bugs-11-integers-beyond-2-53")
-    run(["import", str(odd.store), str(odd.folder / "odd.jsonl"), "--format", "nodelink"])
+    run(["import", str(odd.store), str(odd.folder / "odd.jsonl"), "--as", "nodelink"])
     odd.capsys.readouterr()
 
     found = odd.values("MATCH (b:Car) WHERE b.n = 9007199254740993 RETURN frame.seq, b.n")
@@ -170,7 +170,7 @@ def test_bugs_11_integers_beyond_2_53(case: Callable[[str], Case], tmp_path: Pat
 def test_bugs_12_attribute_changes_type(case: Callable[[str], Case]) -> None:
     types = case("bugs-12-attribute-changes-type")
     for name in ("ty3.jsonl", "ty2.jsonl"):
-        run(["import", str(types.store), str(types.folder / name), "--format", "nodelink"])
+        run(["import", str(types.store), str(types.folder / name), "--as", "nodelink"])
     types.capsys.readouterr()
 
     assert types.values("MATCH (b:Vehicle) RETURN MAX(b.q) AS m") == [(50,)]

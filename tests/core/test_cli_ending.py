@@ -473,7 +473,7 @@ LONG = {
     "sql": ["sql", "{store}", ONE_STEP],
     "sql --safe": ["sql", "{store}", PAIRS, "--safe", "--timeout", "60s"],
     "show": ["show", "{store}", "town#0..249", "-o", "{folder}/clip.gif"],
-    "export": ["export", "{store}", "MATCH (e:Ego)", "--to", "{folder}/e", "--format", "nx"],
+    "export": ["export", "{store}", "MATCH (e:Ego)", "--to", "{folder}/e", "--as", "nx"],
 }
 """Long runs of all kinds: with processes, transactions, spilled tables, and files on their way."""
 BEGUN = {
@@ -585,7 +585,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next_start(
     fast = [str(town_store), "MATCH (e:Ego) WHERE e.speed > 9"]
     lines = {
         "show": ["show", str(town_store), "town#3", "-o", f"{begun.folder}/x.png"],
-        "export": ["export", "--format", "parquet", "--to", f"{begun.folder}/e", *fast],
+        "export": ["export", "--as", "parquet", "--to", f"{begun.folder}/e", *fast],
         "ingest --jobs": ["ingest", f"{begun.folder}/new.sgstore", str(RECORDING), "--until", "1s"],
         "find": ["find", str(town_store), "MATCH (e:Ego)", "-o", f"{begun.folder}/rows.csv"],
     }
@@ -603,7 +603,7 @@ def test_a_refused_export_removes_the_folders_of_a_killed_one(
 ) -> None:
     to, temporary = tmp_path / "to", tmp_path / "tmp"
     temporary.mkdir()
-    more = ["--format", "parquet"] if verb == "export" else []
+    more = ["--as", "parquet"] if verb == "export" else []
     line = [verb, str(town_store), "MATCH (e:Ego) WHERE e.speed > 9", "--to", str(to), *more]
     code = (
         "import os, signal, sys; from sgstore.apps import cli; "

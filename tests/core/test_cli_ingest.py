@@ -300,7 +300,7 @@ def test_graphs_in_a_file_whose_name_is_no_utf_8_are_refused(tmp_path: Path) -> 
     except OSError:
         pytest.skip("a file system of Unicode alone")
 
-    run = started("import", tmp_path / "s.db", file, "--format", "csv")
+    run = started("import", tmp_path / "s.db", file, "--as", "csv")
 
     assert run.returncode == 1
     assert r"'g\xff.csv' is not; rename it" in run.stderr.decode()

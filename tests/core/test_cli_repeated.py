@@ -131,7 +131,7 @@ def test_names_that_are_given_two_values_are_refused(town_store: Path, tmp_path:
     store = str(town_store)
     twice = ["--param", "x=1", "--param", "x=2"]
     (tmp_path / "g.csv").write_text("graph,src,relation,dst\n0,ego,near,car 1\n")
-    graphs = ["import", str(tmp_path / "new.sgstore"), str(tmp_path / "g.csv"), "--format", "csv"]
+    graphs = ["import", str(tmp_path / "new.sgstore"), str(tmp_path / "g.csv"), "--as", "csv"]
 
     assert run(["find", store, "MATCH (e:Ego) WHERE e.speed > $x", *twice]) == 2
     assert run(["patterns", "run", store, "cut_in", "within=1s", "within=2s"]) == 2

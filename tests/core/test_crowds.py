@@ -286,7 +286,7 @@ def test_derive_says_what_it_cannot_relate(
     (outcome,) = ingest(tmp_path / "s.sgstore", [path], config=configured(pairs={"within": 3.0}))
     config = tmp_path / "wide.toml"
     config.write_text("[pairs]\nwithin = 40.0\n")
-    command = ["derive", str(tmp_path / "s.sgstore"), "--as", "wide", "--config", str(config)]
+    command = ["derive", str(tmp_path / "s.sgstore"), "--name", "wide", "--config", str(config)]
 
     code = run(command)
 

@@ -250,7 +250,7 @@ VERBS = (
     ("coverage", "of", "{store}", "--by", "{store}"),
     ("select", "{store}", "--minimal"),
     ("export", "{store}", "MATCH (e:Ego)", "--to", "{out}"),
-    ("derive", "{store}", "--as", "near"),
+    ("derive", "{store}", "--name", "near"),
     ("ingest", "{store}", "{recording}", "--force"),
     ("remove", "{store}", "drive12", "--compact"),
     ("timeline", "{store}", "-p", "cut_in"),
@@ -375,7 +375,7 @@ def test_tables_of_somebody_else_are_left_alone_and_told(
     assert verified.exit_code == 0
     assert "tables of other programs, not checked: broken, labels, mine.trace" in verified.output
     assert run("find", store, "MATCH (e:Ego)", "--count").exit_code == 0
-    assert run("derive", store, "--as", "again").exit_code == 0
+    assert run("derive", store, "--name", "again").exit_code == 0
     assert run("sql", store, "SELECT sum(label) FROM labels").exit_code == 0
     before = store.read_bytes()
     refused = run("remove", store, "drive12", "--compact")
@@ -520,7 +520,7 @@ ASKED = (
     ("like", "{store}", "drive12#3"),
     ("payload", "{store}", "drive12#3", "/ego/camera/front/image", "-o", "{out}"),
     ("sql", "{store}", "SELECT * FROM nodes JOIN pairs USING (frame_id)"),
-    ("derive", "{store}", "--as", "more"),
+    ("derive", "{store}", "--name", "more"),
     ("coverage", "of", "{store}", "--by", "{store}"),
     ("remove", "{store}", "drive12"),
     ("rebuild", "{store}"),

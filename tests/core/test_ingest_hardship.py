@@ -99,7 +99,7 @@ def test_an_export_that_was_killed_while_its_files_were_moved_is_made_again(tmp_
 def test_folders_that_a_killed_export_had_moved_are_taken_back_too(tmp_path: Path) -> None:
     store, to = tmp_path / "s.db", tmp_path / "frames"
     ingest(store, [drive(tmp_path / "d.mcap", frames=12)])
-    line = ("export", store, "MATCH (e:Ego) WHERE e.x < 5", "--format", "frames", "--to", to)
+    line = ("export", store, "MATCH (e:Ego) WHERE e.x < 5", "--as", "frames", "--to", to)
     temporary = dies(tmp_path, "Path.replace", *line)
     assert [path for path in to.iterdir() if path.is_dir() and not path.name.startswith(".")]
 
@@ -156,8 +156,8 @@ def test_a_verb_that_finds_all_there_works_in_what_a_killed_one_left(
     (tmp_path / "g.csv").write_text("graph,src,relation,dst\ng,ego,near,car_1\n")
     (tmp_path / "c.toml").write_text("[range]\nradius = 20.0\n")
     line = {
-        "derive": ["derive", store, "--as", "x", "--config", tmp_path / "c.toml", "--trace", "d"],
-        "import": ["import", store, tmp_path / "g.csv", "--format", "csv"],
+        "derive": ["derive", store, "--name", "x", "--config", tmp_path / "c.toml", "--trace", "d"],
+        "import": ["import", store, tmp_path / "g.csv", "--as", "csv"],
     }[verb]
     assert sgstore(list(map(str, line))) == 0
     subprocess.run([sys.executable, "-c", LOGGED, str(store)], check=False)

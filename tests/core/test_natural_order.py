@@ -194,6 +194,6 @@ def test_verbs_tell_in_order(
     both = json.loads((tmp_path / "b.lock").read_text())
     assert [one["trace"] for one in both["cases"]] == NAMES
     capsys.readouterr()
-    assert run_verb(["export", path, CARS, "--format", "frames", "--to", str(out)]) == 0
+    assert run_verb(["export", path, CARS, "--as", "frames", "--to", str(out)]) == 0
     with (out / "frames.csv").open(newline="") as stream:
         in_order([(row["trace"], int(row["seq"])) for row in csv.DictReader(stream)])

@@ -176,7 +176,7 @@ def test_a_box_that_is_none_and_a_relation_that_nobody_knows_are_told(
     told["frames"]["7"]["objects"]["1"]["object_data"]["cuboid"][0]["val"] = [1, 2]
     file = tmp_path / "labels.json"
     file.write_text(json.dumps({"openlabel": told}), encoding="utf-8")
-    command = ["import", str(tmp_path / "x.sgstore"), str(file), "--format", "openlabel"]
+    command = ["import", str(tmp_path / "x.sgstore"), str(file), "--as", "openlabel"]
 
     assert run([*command, "--unknown-as", "own"]) != 0
     assert "frame 7, objects 1: expected 9 or 10 numbers" in capsys.readouterr().err

@@ -20,7 +20,7 @@ from test_docs_queries import queries_of
 from test_sandbox import RUNAWAY
 from thorough import some
 
-from sgstore.apps.assistant import StoreTools
+from sgstore.apps.assistant import StoreTools, server_of
 from sgstore.errors import ExportError, QueryError, StoreError
 from sgstore.query import Store
 
@@ -454,7 +454,7 @@ def test_verdicts_are_those_of_the_store(tools: StoreTools, town_store: Path) ->
 def test_what_is_missing_is_what_no_frame_has(tools: StoreTools, town_store: Path) -> None:
     found = tools.coverage_missing(k=2, limit=1000)
     cells = tools.coverage_missing(
-        cells="MATCH (e:Ego)-[:isIn {primary: TRUE}]->(l:Lane) RETURN l.turn AS turn, stopped(e) AS stands"
+        spec="MATCH (e:Ego)-[:isIn {primary: TRUE}]->(l:Lane) RETURN l.turn AS turn, stopped(e) AS stands"
     )
     store = Store(town_store)
     asked = [query for _, query in found.data["rows"] if query][:3]
@@ -535,3 +535,64 @@ def test_topics_of_the_vocabulary_say_what_there_is(topic: Any, tools: StoreTool
     }
 
     assert words[topic] in tools.vocabulary(topic).text
+
+
+def called(tools: StoreTools, tool: str, arguments: dict[str, Any]) -> Any:
+    """Result of a tool, called by a client in this process."""
+
+    async def call() -> Any:
+        async with Client(server_of(tools)) as client:
+            return await client.call_tool(tool, arguments)
+
+    return asyncio.run(call())
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "answer"),
+    [
+        ("find", {"pattern": "cut_in", "max_rows": 1, "format": "count"}, r"^frames\n\d+"),
+        ("sql", {"query": "SELECT 1 AS one", "n": 1}, r"^one\n1"),
+        ("check", {"query": "ALWAYS ego.speed < 30", "limt": 3}, "1 true"),
+        ("timeline", {"query": "cut_in", "trace": "town"}, "cut_in"),
+        ("coverage_missing", {"frames": "MATCH (e:Ego)", "k": 1}, "covered; of"),
+    ],
+)
+def test_arguments_may_have_the_usual_names(
+    tool: str, arguments: dict[str, Any], answer: str, tools: StoreTools
+) -> None:
+    result = called(tools, tool, arguments)
+    assert not result.is_error, text_of(result)
+    assert re.search(answer, text_of(result))
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "answer"),
+    [
+        (
+            "find",
+            {},
+            "find: the argument 'query' is missing. Arguments of find: query, form, limit,",
+        ),
+        ("find", {"query": "cut_in", "colour": 1}, "find: unknown argument 'colour'. Arguments"),
+        ("find", {"query": "cut_in", "limit": "many"}, "find: limit is 'many'; Input should be a"),
+        ("find", {"query": "cut_in", "limit": 0}, "find: limit is 0; Input should be greater"),
+        (
+            "find",
+            {"query": "cut_in", "form": "table"},
+            "find: form is 'table'; Input should be 'int",
+        ),
+        ("show", {"query": "cut_in"}, "show: the argument 'frame' is missing"),
+        (
+            "list_traces",
+            {"x": 1},
+            "list_traces: unknown argument 'x'. Arguments of list_traces: limit",
+        ),
+    ],
+)
+def test_wrong_arguments_are_explained_in_a_sentence(
+    tool: str, arguments: dict[str, Any], answer: str, tools: StoreTools
+) -> None:
+    result = called(tools, tool, arguments)
+    assert result.is_error
+    assert text_of(result).startswith(answer)
+    assert "pydantic" not in text_of(result)

@@ -108,7 +108,7 @@ def test_a_shell_is_offered_what_could_stand_there(
     assert offered("sgstore find s -p jay") == ["jaywalking"]
     assert "opposes_ego" not in offered("sgstore find s -p ")  # no predicate: it cannot be asked
     assert offered("sgstore ingest s r --preset carla") == ["carlasgg"]
-    assert offered("sgstore export s --format xo") == ["xosc"]
+    assert offered("sgstore export s --as xo") == ["xosc"]
     assert offered("sgstore find s --format par") == ["parquet"]
     assert offered("sgstore coverage classes s --abstraction roads") == ["roadscene2vec"]
     assert offered(f"sgstore timeline {store} -p cut_in --trace t") == ["town"]
@@ -302,7 +302,7 @@ def test_a_long_table_on_a_terminal_has_its_total_below(
     more = [tmp_path / f"t{number:02}.csv" for number in range(22)]
     for number, one in enumerate(more):
         one.write_text(f"{table.read_text()}\n" + "\n" * number)
-    made = ["import", str(tmp_path / "s.sgstore"), *map(str, more), "--format", "csv"]
+    made = ["import", str(tmp_path / "s.sgstore"), *map(str, more), "--as", "csv"]
     assert run([*made, "--kind", "a=car", "--kind", "b=person"]) == 0
     capsys.readouterr()
 

@@ -105,7 +105,7 @@ def test_the_file_has_the_storage_version(
 ) -> None:
     store = str(folder / "town.sgstore")
     query = "MATCH (e:Ego) WHERE frame.t < 1"
-    command = ["export", store, query, "--format", "duckdb", "--storage", storage]
+    command = ["export", store, query, "--as", "duckdb", "--storage", storage]
     assert run([*command, "--to", str(tmp_path / "out")]) == 0
     with duckdb.connect() as connection:
         connection.execute(f"ATTACH '{tmp_path / 'out' / 'scenes.duckdb'}' AS s (READ_ONLY)")
@@ -123,10 +123,10 @@ def test_the_file_has_the_storage_version(
             ["--format", "duckdb", "--storage", "v9.0.0"],
             "cannot write the storage version 'v9.0.0'",
         ),
-        (["--format", "parquet", "--storage", "v1.2.0"], "--storage cannot be used"),
+        (["--as", "parquet", "--storage", "v1.2.0"], "--storage cannot be used"),
         (["--format", "geojson", "--crs", "EPSG:0"], "coordinate system 'EPSG:0' is unknown"),
         (["--format", "mcap"], "the format 'mcap' copies recordings; add a query"),
-        (["--format", "frames"], "the format 'frames' copies recordings; add a query"),
+        (["--as", "frames"], "the format 'frames' copies recordings; add a query"),
     ],
 )
 def test_a_wrong_option_is_refused_and_nothing_is_written(

@@ -51,7 +51,7 @@ VERBS = [
     "like {} d2#3",
     "like {} d2#3 --all --limit 9 --abstraction ER --ignore person --json",
     "like {} d1 --json",
-    "like {} d3@1.2s --pattern",
+    "like {} d3@1.2s --describe",
     "like {} d9#2",
     "diff {} {other} --json",
     "diff {other} {} --abstraction ER --json",
@@ -62,7 +62,7 @@ VERBS = [
     "diff {}:{kept} {} --json",
     "lock verify {kept} {} --json",
     "lock verify {moved} {} --json",
-    f"coverage novel {{}} --not-in {{}}:{CAR} --list clips --json",
+    f"coverage novel {{}} --by {{}}:{CAR} --items clips --json",
     "coverage sequences {} --k 2 --manoeuvre 'near=MATCH (e:Ego)-[:near]->(v:Car)' --json",
 ]
 
@@ -159,7 +159,7 @@ ASKED_OFTEN = [
 PARTIAL = {
     **dict.fromkeys(ASKED_OFTEN, "less"),
     "coverage classes {} --abstraction E --json": "less",
-    "coverage novel {} --not-in {other} --json": "less",
+    "coverage novel {} --by {other} --json": "less",
     "like {} d2#3 --json": "less",
     "diff {} {other} --json": "less",
     f"diff {{}} {{other}} --query {CAR} --json": "less",

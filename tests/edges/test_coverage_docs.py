@@ -43,7 +43,7 @@ def test_a_command_of_the_page_runs(
 ) -> None:
     monkeypatch.chdir(folder)
     if not Path("graphs.sgstore").exists() and "graphs.sgstore" in command:
-        assert run(["import", "graphs.sgstore", "graphs.csv", "--format", "csv"]) == 0
+        assert run(["import", "graphs.sgstore", "graphs.csv", "--as", "csv"]) == 0
     name, *arguments = shlex.split(command)
     code = run(arguments)
     out, err = capsys.readouterr()

@@ -189,13 +189,13 @@ def test_the_verb_derives_lists_and_removes(stores, tmp_path, capsys) -> None:
     config.write_text("[pairs]\nwithin = 5\n", encoding="utf-8")
     path = str(store.file.path)
 
-    assert run(["derive", path, "--config", str(config), "--as", "near5"]) == 0
+    assert run(["derive", path, "--config", str(config), "--name", "near5"]) == 0
     assert run(["derive", path, "--json"]) == 0
     assert '"near5"' in capsys.readouterr().out
-    assert run(["derive", path, "--config", str(config), "--as", "RSV"]) == 1
+    assert run(["derive", path, "--config", str(config), "--name", "RSV"]) == 1
     assert run(["derive", path, "--config", str(config)]) == 2
     config.write_text("[range]\nradius = 500\n", encoding="utf-8")
-    assert run(["derive", path, "--config", str(config), "--as", "far"]) == 2
+    assert run(["derive", path, "--config", str(config), "--name", "far"]) == 2
     assert "ingest the recording anew" in capsys.readouterr().err
     assert run(["derive", path, "--remove", "near5"]) == 0
     assert run(["derive", path, "--remove", "near5"]) == 1

@@ -335,7 +335,7 @@ def test_a_format_that_breaks_is_told_by_its_name_in_one_line(
             return Exporter("lines", write)
 
     monkeypatch.setattr("sgstore.base.plugins.entry_points", lambda group: [Point()])
-    line = ["export", str(store.file.path), "MATCH (e:Ego)", "--format", "lines", "--to"]
+    line = ["export", str(store.file.path), "MATCH (e:Ego)", "--as", "lines", "--to"]
 
     assert run([*line, str(tmp_path / "out")]) == 1
     (told,) = capsys.readouterr().err.splitlines()

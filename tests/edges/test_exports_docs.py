@@ -75,7 +75,7 @@ def test_a_command_of_the_page_runs(
 
 
 def command_of(form: str) -> str:
-    return next(c for c in COMMANDS if f"--format {form}" in c and c.startswith("sgstore export"))
+    return next(c for c in COMMANDS if f"--as {form}" in c and c.startswith("sgstore export"))
 
 
 def test_every_format_and_every_option_is_on_the_page() -> None:

@@ -578,7 +578,7 @@ def test_what_was_imported_is_looked_at_and_nothing_is_derived_from_it(
     codes = [
         run(["info", store, "--trace", "graphs"]),
         run(["show", store, "graphs#0", "--graph", "-o", str(picture)]),
-        run(["derive", store, "--as", "other"]),
+        run(["derive", store, "--name", "other"]),
     ]
     out, err = capsys.readouterr()
 
@@ -596,10 +596,10 @@ def test_the_verb_imports_and_its_exit_code_says_what_was_lost(
     odd.write_text(HEADER + "d,a,1,0,ego,guards,elf_1\n")
     store = str(tmp_path / "x.sgstore")
     codes = [
-        run(["import", store, str(file), "--format", "s3c", "--json"]),
-        run(["import", store, str(odd), "--format", "s3c"]),
-        run(["import", store, str(odd), "--format", "s3c", "--unknown-as", "other"]),
-        run(["import", store, str(odd), "--format", "s3c", "--kind", "elf"]),
+        run(["import", store, str(file), "--as", "s3c", "--json"]),
+        run(["import", store, str(odd), "--as", "s3c"]),
+        run(["import", store, str(odd), "--as", "s3c", "--unknown-as", "other"]),
+        run(["import", store, str(odd), "--as", "s3c", "--kind", "elf"]),
     ]
     out, err = capsys.readouterr()
 

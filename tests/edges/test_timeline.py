@@ -84,10 +84,7 @@ def test_only_traces_with_a_hit_are_shown_unless_all_are_asked_for(
 ) -> None:
     store = tmp_path / "two.sgstore"
     assert run(["ingest", str(store), str(RECORDING), "--until", "5s", "--json"]) == 0
-    assert (
-        run(["import", str(store), str(_graph(tmp_path)), "--format", "csv", "--kind", "a=car"])
-        == 0
-    )
+    assert run(["import", str(store), str(_graph(tmp_path)), "--as", "csv", "--kind", "a=car"]) == 0
     capsys.readouterr()
     rule = "CHECK slow: ALWAYS ego.speed < 1"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import inspect
 import sys
+from difflib import get_close_matches
 from functools import wraps
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from mcp.server.mcpserver import MCPServer
 from mcp.server.mcpserver.tools import Tool
 from mcp.types import CallToolResult, ImageContent, TextContent, ToolAnnotations
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from sgstore.apps.assistant._vocabulary import TOPICS
 from sgstore.base.docstrings import split_docstring
@@ -63,12 +64,77 @@ def server_of(tools: StoreTools) -> MCPServer[Any]:
     return server
 
 
+_OTHER_NAMES: Final = {
+    **dict.fromkeys(("max_rows", "max", "top", "n", "count", "max_results"), ("limit",)),
+    **dict.fromkeys(("pattern", "text", "q", "match", "name"), ("query", "rule", "words")),
+    **dict.fromkeys(("query", "sql", "check"), ("statement", "rule", "queries", "words")),
+    "frames": ("query",),
+    "reference": ("by",),
+    "cells": ("spec",),
+    "topic": ("about",),
+    "params": ("parameters",),
+    "values": ("parameters",),
+    "trace": ("traces",),
+    "frame_id": ("frame",),
+    "at": ("frame",),
+    "to": ("name",),
+    "folder": ("name",),
+    "as": ("form",),
+    "format": ("form",),
+    "camera": ("channel",),
+    "ego": ("of_ego",),
+}
+"""Argument names of other tools and of older versions → names here; the first free one of a tool is used."""
+
+
+class StoreTool(Tool):
+    """Tool that takes arguments by other usual names, and explains wrong ones in one sentence each."""
+
+    async def run(self, arguments: dict[str, Any], *rest: Any, **named: Any) -> Any:
+        """Run the tool with arguments; see :meth:`Tool.run`."""
+        known: dict[str, Any] = self.parameters.get("properties", {})
+        taken, wrong = _renamed(arguments, known)
+        missing = [name for name in self.parameters.get("required", ()) if name not in taken]
+        wrong += [f"the argument {name!r} is missing" for name in missing]
+        if not wrong:
+            try:
+                self.fn_metadata.validate_arguments(taken)
+            except ValidationError as error:
+                wrong += [
+                    f"{'.'.join(map(str, one['loc']))} is {one['input']!r}; {one['msg']}"
+                    for one in error.errors()
+                ]
+        if wrong:
+            told = "; ".join([f"{self.name}: {wrong[0]}", *wrong[1:]])
+            told += f". Arguments of {self.name}: {', '.join(known) or 'none'}"
+            return CallToolResult(content=[TextContent(text=told)], is_error=True)
+        return await super().run(taken, *rest, **named)
+
+
+def _renamed(arguments: dict[str, Any], known: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Return arguments by the names of a tool, and a sentence for each unknown one."""
+    taken = {name: value for name, value in arguments.items() if name in known}
+    wrong: list[str] = []
+    for name, value in arguments.items():
+        if name in known:
+            continue
+        others = (*_OTHER_NAMES.get(name.lower(), ()), *get_close_matches(name, known, 1, 0.75))
+        new = next((one for one in others if one in known and one not in taken), None)
+        if new is None:
+            wrong.append(f"unknown argument {name!r}")
+        else:
+            taken[new] = (
+                [value] if new in {"traces", "queries"} and isinstance(value, str) else value
+            )
+    return taken, wrong
+
+
 def _tool(name: str, tool: Callable[..., ToolAnswer]) -> Tool:
     writes = name in WRITING
     hints = ToolAnnotations(
         read_only_hint=not writes, destructive_hint=False, open_world_hint=False
     )
-    made = Tool.from_function(
+    made = StoreTool.from_function(
         _told(tool), name, description=split_docstring(tool)[0], annotations=hints
     )
     made.parameters = _untitled(made.parameters)

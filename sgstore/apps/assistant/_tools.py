@@ -406,9 +406,9 @@ class StoreTools:
 
     def coverage_missing(
         self,
-        frames: str = "",
-        reference: str = "",
-        cells: str = "",
+        query: str = "",
+        by: str = "",
+        spec: str = "",
         abstraction: Literal["RSV", "ER", "EL", "E", "junction"] = "RSV",
         k: Annotated[int, Field(ge=1, le=3)] = 2,
         of_ego: bool = True,
@@ -418,14 +418,14 @@ class StoreTools:
 
         Parameters
         ----------
-        frames
+        query
             MATCH … that chooses frames; empty: all
-        reference
+        by
             MATCH … of the frames to compare with; empty: all frames
-        cells
+        spec
             MATCH … RETURN a, b: each combination of values is a cell
         abstraction
-            without cells: of features
+            without spec: of features
         k
             features in a combination
         of_ego
@@ -433,9 +433,9 @@ class StoreTools:
         """
         reply = self._ask(
             "missing",
-            frames=frames,
-            reference=reference,
-            cells=cells,
+            frames=query,
+            reference=by,
+            cells=spec,
             abstraction=abstraction,
             k=k,
             of_ego=of_ego,

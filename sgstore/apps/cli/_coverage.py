@@ -12,6 +12,7 @@ from typer import Argument, Option
 
 from sgstore.apps.cli._collection_options import CollectionOptions, note_collection
 from sgstore.apps.cli._options import (
+    ROWS,
     Abstraction,
     AskOptions,
     Verbs,
@@ -35,14 +36,16 @@ coverage = Verbs(
     no_args_is_help=True,
 )
 
-Limit = Annotated[int | None, Option("--limit", min=0, show_default="40 in a table")]
+Limit = Annotated[
+    int | None, Option("--limit", min=0, show_default="40 in a table", rich_help_panel=ROWS)
+]
 Unit = Annotated[Literal["frame", "run", "trace"], Option("--unit")]
 Window = Annotated[int, Option("--window", "-t", min=1)]
 Incomplete = Annotated[Literal["equal", "distinct", "drop"], Option("--incomplete")]
 Manoeuvres = Annotated[
-    list[str] | None, Option("--manoeuvre", "-m", show_default="the manoeuvres of the library")
+    list[str] | None, Option("--manoeuvre", show_default="the manoeuvres of the library")
 ]
-Within = Annotated[str | None, Option("--within", show_default="10s")]
+Within = Annotated[str, Option("--within")]
 
 
 @dataclass(frozen=True)
@@ -127,13 +130,7 @@ def of_(
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """Measure how much of the frames of A is covered by B, by classes and by frames.
-
-    Parameters
-    ----------
-    by : B
-        Frames that cover A, written like A.
-    """
+    """Measure how much of the frames of A is covered by B, by classes and by frames."""
     from sgstore.testsets.coverage import covered
 
     ask.report(covered(*scenes.of(ask, a, by, slots=scenes.slots)))
@@ -142,26 +139,18 @@ def of_(
 @coverage.command("novel")
 def novel_(
     a: str,
-    than: Annotated[str, Option("--not-in")],
-    listing: Annotated[Literal["classes", "frames", "clips"], Option("--list")] = "classes",
+    by: Annotated[str, Option()],
+    items: Literal["classes", "frames", "clips"] = "classes",
     limit: Limit = None,
     *,
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """List the classes of scenes of A that do not occur in B, the rarest first.
-
-    Parameters
-    ----------
-    than : B
-        Known frames, written like A.
-    listing
-        Classes, frames, or clips of consecutive frames.
-    """
+    """List the classes of scenes of A that do not occur in B, the rarest first."""
     from sgstore.testsets.coverage import novel, novel_clips, novel_frames
 
-    listed = {"classes": novel, "frames": novel_frames, "clips": novel_clips}[listing]
-    ask.report(listed(*scenes.of(ask, a, than, slots=scenes.slots)), limit)
+    listed = {"classes": novel, "frames": novel_frames, "clips": novel_clips}[items]
+    ask.report(listed(*scenes.of(ask, a, by, slots=scenes.slots)), limit)
 
 
 @coverage.command("venn")
@@ -182,13 +171,7 @@ def growth_(
     scenes: SceneOptions,
     ask: FrameAskOptions,
 ) -> None:
-    """Compare the growth of the number of scene classes with frames in random order.
-
-    Parameters
-    ----------
-    points
-        Number of rows of the curve.
-    """
+    """Compare the growth of the number of scene classes with frames in random order."""
     from sgstore.testsets.coverage import growth
 
     (frames,) = scenes.of(ask, a, slots=scenes.slots)
@@ -209,7 +192,7 @@ def combos_(
     k: Annotated[int, Option(min=1)] = 2,
     by: str | None = None,
     abstraction: Abstraction = "RSV",
-    of_ego: Annotated[bool, Option("--ego")] = False,
+    of_ego: bool = False,
     slots: Path | None = None,
     missing: bool = False,
     covered: bool = False,
@@ -223,12 +206,6 @@ def combos_(
 
     Parameters
     ----------
-    k
-        Number of features in a combination.
-    by : B
-        Reference: combinations that occur in B; by default all.
-    of_ego
-        Use only features of the ego and of its lanes.
     top
         Features in the picture, most gaps first.
     """
@@ -236,7 +213,7 @@ def combos_(
 
     if slots is not None:
         if by or of_ego:
-            raise typer.BadParameter("--slots cannot be combined with --by or --ego")
+            raise typer.BadParameter("--slots cannot be combined with --by or --of-ego")
         _report_slots(a, slots, k, ask, (1 if covered else 2 if missing else 0, limit), picture)
         return
     ours, *others = WindowOptions(abstraction).of(ask, a, *([] if by is None else [by]))
@@ -258,41 +235,23 @@ def sequences_(
     k: Annotated[int, Option(min=1)] = 2,
     by: str | None = None,
     manoeuvres: Manoeuvres = None,
-    within: Within = None,
+    within: Within = "10s",
     missing: bool = False,
     covered: bool = False,
     limit: Limit = None,
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """Count the sequences of k manoeuvres, such as (car stops, ego stops).
-
-    Parameters
-    ----------
-    k
-        Number of manoeuvres in a sequence.
-    by : B
-        Reference: sequences that occur in B; by default all.
-    missing
-        List the missing items.
-    covered
-        List the covered items, with their first place.
-    """
+    """Count the sequences of k manoeuvres, such as (car stops, ego stops)."""
     from sgstore.testsets.coverage import manoeuvres_named, sequences
 
     named = manoeuvres_named(manoeuvres or ())
     ours, *others = ask.frames(*(text for text in (a, by) if text is not None))
     say_left_out(ours)
     say_scope(ours.scope(world=False), ask.chosen)
-    found = sequences(ours, k, others[0] if others else None, named, within_seconds(within))
+    found = sequences(ours, k, others[0] if others else None, named, seconds_of(within, "--within"))
     listed = found.missing if missing else found.covered if covered else found.shares
     _report_below(found.shares, listed, ask, limit)
-
-
-def within_seconds(text: str | None) -> float:
-    from sgstore.testsets.coverage import WITHIN_S
-
-    return WITHIN_S if text is None else seconds_of(text, "--within")
 
 
 @coverage.command("spec")
@@ -315,10 +274,6 @@ def spec_(
     ----------
     query : QUERY
         'MATCH … RETURN a, b': each combination is a cell.
-    cells
-        Number of cells, if known.
-    by : B
-        Use the cells that occur in B.
     """
     from sgstore.testsets.coverage import specification
 
@@ -360,32 +315,20 @@ def windows_(
 @coverage.command("explain")
 def explain_(
     b: str,
-    versus: Annotated[str, Option("--vs")],
+    by: Annotated[str, Option()],
     abstraction: Abstraction = "RSV",
     tree: bool = False,
     depth: Annotated[int, Option(min=1, max=10)] = 4,
-    frames: bool = False,
+    by_frame: bool = False,
     limit: Limit = None,
     *,
     ask: FrameAskOptions,
 ) -> None:
-    """Explain how the scenes of B differ from those of A: the features that differ most.
-
-    Parameters
-    ----------
-    versus : A
-        Frames to compare with, like B.
-    tree
-        Print a decision tree of a few questions instead.
-    depth
-        Maximum questions.
-    frames
-        Weight classes by their frames.
-    """
+    """Explain how the scenes of B differ from those of A: the features that differ most."""
     from sgstore.testsets.coverage import explain
 
-    ours, theirs = WindowOptions(abstraction).of(ask, b, versus)
-    tables = explain(ours, theirs, abstraction, by_frame=frames, depth=depth)
+    ours, theirs = WindowOptions(abstraction).of(ask, b, by)
+    tables = explain(ours, theirs, abstraction, by_frame=by_frame, depth=depth)
     _report_below(tables[0], tables[1] if tree else tables[0], ask, limit)
 
 

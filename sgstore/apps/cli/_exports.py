@@ -12,25 +12,22 @@ from typer import Argument, Option
 from sgstore.apps.cli import _completion as completion
 from sgstore.apps.cli._options import (
     LOSS,
-    AsJson,
     PrintedRows,
     QueryLimits,
     Question,
     StorePath,
     Verbs,
-    form_of,
     lines_of,
     parameters_of,
     say_left_out,
     say_unknown,
-    seconds_of,
 )
-from sgstore.apps.cli._output import Format, count_bar, say, write_rows
+from sgstore.apps.cli._output import count_bar, say
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from sgstore.exporters import Export, WrittenClip, WrittenFile
+    from sgstore.exporters import WrittenClip, WrittenFile
     from sgstore.matches import Matches
     from sgstore.model.world import Clip
     from sgstore.query import Store
@@ -42,36 +39,7 @@ verbs = Verbs()
 
 @dataclass(frozen=True)
 class ClipOptions:
-    """Command line options for the content of exported clips.
-
-    Parameters
-    ----------
-    before : TIME
-        Time before each match: 2s, 500ms.
-    after : TIME
-        Time after each match.
-    labels : NAME=TEXT
-        A value for each frame: an expression, or a query that is true where it matches.
-    with_graph
-        mcap: include the scene graphs, as JSON and as drawings.
-    mounts : AXES=X,Y,Z[,YAW]
-        mcap, rrd, with graphs: where a sensor sits on the ego, by the frame_id of its messages;
-        m, degrees; repeatable.
-    rebase_context
-        mcap: move static messages, such as the map, to the start of each clip.
-    abstraction
-        nx, pyg, s3c: abstraction of the graphs.
-    graphml
-        nx: also write each frame as GraphML, for Gephi.
-    channels : TOPIC
-        frames: use only this sensor; repeatable.
-    clouds
-        frames: format of point clouds.
-    storage : VERSION
-        duckdb: oldest version of DuckDB that can read the file, such as v1.0.0.
-    crs : CRS
-        geojson: coordinate system of the road maps, such as EPSG:32632; by default their own.
-    """
+    """Command line options for the content of exported clips."""
 
     before: str = "2s"
     after: str = "2s"
@@ -86,26 +54,18 @@ class ClipOptions:
     storage: str = "v1.0.0"
     crs: str = ""
 
-    def order(self, store: Store, clips: Sequence[Clip], **about: Any) -> Export:
-        """Return an export of clips from a store, with the settings of the command line."""
-        from sgstore.exporters import Export, parse_mounts
-
-        own = {k: v for k, v in vars(self).items() if k not in {"before", "after", "labels"}}
-        own |= {"mounts": parse_mounts(self.mounts or ()), "channels": tuple(self.channels or ())}
-        return Export(store, tuple(clips), **own, **about)
-
 
 @verbs.command(rich_help_panel=PANEL)
 def export(
     store: StorePath,
     question: Question,
-    to: Path = Path("clips"),
+    to: Annotated[Path, Option("--to", "-o")] = Path("clips"),
     frames: Path | None = None,
     lock: Path | None = None,
-    form: Annotated[str, Option("--format", autocompletion=completion.formats)] = "mcap",
-    as_json: AsJson = False,
+    form: Annotated[str, Option("--as", autocompletion=completion.formats)] = "mcap",
     *,
     clip: ClipOptions,
+    out: PrintedRows,
     bounds: QueryLimits,
 ) -> int:
     """Cut matches out of their recordings, as clips with the original messages.
@@ -120,54 +80,35 @@ def export(
     ----------
     to : DIR
         Folder to write; no file is overwritten.
-    frames
-        Instead of a query: a file with a FRAME a line; - is stdin.
-    lock : FILE
-        Instead of a query: each case of a lock, a clip each.
-    form
-        mcap, parquet, frames, nx, pyg, s3c, xosc, openlabel, rrd, duckdb, lance, geojson, or
-        that of a package.
     """
-    from sgstore.exporters import (
-        check_folder,
-        exporter_named,
-        labelled,
-        parse_labels,
-        whole_clips,
-        write_export,
-    )
+    from sgstore.apps.verbs import export as export_clips
 
-    exporter_named(form)  # before the search starts
-    check_folder(to)
-    texts = parse_labels(clip.labels or [])
     opened = bounds.opened(store)
-    values = parameters_of(question.parameters)
-    margins = seconds_of(clip.before, "--before"), seconds_of(clip.after, "--after")
-    if sum((frames is not None, lock is not None, bool(question))) > 1:
-        raise typer.BadParameter("expected one of: a QUERY, --frames, --lock")
-    text, held = "", {}
-    if question:
-        text, held = question.asked()
-    if question or frames or lock:
-        clips = _clips(opened, (frames, lock), text, held, margins)
-    else:
-        clips = whole_clips(opened, form)
-    if not clips:
+    with count_bar(to.name or "export", "clips") as progress:
+        written = export_clips(
+            opened,
+            query=question.typed(),
+            to=to,
+            form=form,
+            frames=None if frames is None else lines_of(frames),
+            lock=lock,
+            parameters=parameters_of(question.parameters),
+            progress=progress,
+            on_matches=say_left_out,
+            **{name: () if value is None else value for name, value in vars(clip).items()},
+        )
+    if not written:
         say("no matches to export")
         return 0
-    with count_bar(to.name or "export", "clips") as progress:
-        told = {"query": text} if text else {"lock": lock.name} if lock else {}
-        order = clip.order(opened, clips, provenance=told, progress=progress)
-        written = write_export(labelled(order, texts, **values), to, form)
-    _write(written, form_of(Format.table, as_json=as_json))
+    _write(written, out)
     return LOSS if any(one.losses for one in written) else 0
 
 
-def _write(written: Sequence[WrittenClip | WrittenFile], form: Format) -> None:
+def _write(written: Sequence[WrittenClip | WrittenFile], out: PrintedRows) -> None:
     """Print one row for each written clip or file, and report lost messages."""
     _say_lost(written)
     rows = [one.as_row() for one in written]
-    write_rows(tuple(rows[0]), [tuple(row.values()) for row in rows], form)
+    out.write(tuple(rows[0]), [tuple(row.values()) for row in rows])
 
 
 def _say_lost(written: Sequence[WrittenClip | WrittenFile]) -> None:
@@ -179,35 +120,12 @@ def _say_lost(written: Sequence[WrittenClip | WrittenFile]) -> None:
         say(f"{one.file.name}: {note}")
 
 
-def _clips(
-    store: Store,
-    named: tuple[Path | None, Path | None],
-    text: str,
-    parameters: Mapping[str, Any],
-    margins: tuple[float, float],
-) -> list[Clip]:
-    """Return the clips to export: around matches, around listed frames, or the cases of a lock file."""
-    frames, lock = named
-    if lock is not None:
-        from sgstore.model.world import Clip
-        from sgstore.testsets.locks import cases_of
-
-        return [Clip(*case[:3]) for case in cases_of(lock, store)]
-    if frames is not None:
-        from sgstore.exporters import around_frames
-
-        return around_frames(store, lines_of(frames), *margins)
-    matches = store.find(text, **parameters)
-    say_left_out(matches)
-    return list(matches.clips(*margins))
-
-
 @verbs.command(rich_help_panel=PANEL)
 def shrink(
     store: StorePath,
     question: Question,
-    clip: str | None = None,
-    to: Path | None = None,
+    clip: Annotated[str | None, Option("--range")] = None,
+    to: Annotated[Path | None, Option("--to", "-o")] = None,
     *,
     out: PrintedRows,
     bounds: QueryLimits,
@@ -313,9 +231,7 @@ def show(
     store: StorePath,
     frame: Annotated[str, Argument(autocompletion=completion.frames)],
     question: Question,
-    output: Annotated[
-        Path | None, Option("--output", "-o", show_default="frame.png, clip.gif")
-    ] = None,
+    to: Annotated[Path | None, Option("--to", "-o", show_default="frame.png, clip.gif")] = None,
     *,
     drawn: DrawOptions,
     bounds: QueryLimits,
@@ -326,7 +242,7 @@ def show(
     ----------
     frame : FRAME
         A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s.
-    output
+    to
         The picture: .png or .svg; of a clip: .gif, .mp4 or .webm.
     """
     from sgstore.draw import draw_clip, draw_stored
@@ -335,14 +251,14 @@ def show(
     opened = bounds.opened(store)
     text, values = question.asked() if question else ("", {})
     clip = range_of(frame)
-    output = output or Path("clip.gif" if clip else "frame.png")
+    to = to or Path("clip.gif" if clip else "frame.png")
     options = drawn.options(opened.find(text, **values) if text else None)
     if clip is None:
-        marked = int(draw_stored(opened, frame, output, **options))
+        marked = int(draw_stored(opened, frame, to, **options))
     else:
-        with count_bar(output.name, "pictures") as bar:
-            marked = draw_clip(opened, clip, output, fps=drawn.fps, on_frame=bar, **options)
+        with count_bar(to.name, "pictures") as bar:
+            marked = draw_clip(opened, clip, to, fps=drawn.fps, on_frame=bar, **options)
     if text and not marked:
         say(f"the query does not match in {frame}; the picture has no marks")
-    typer.echo(output)
+    typer.echo(to)
     return 0

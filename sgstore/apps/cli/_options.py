@@ -17,12 +17,6 @@ query : QUERY
     A pattern: 'MATCH (e:Ego) …', the name of one in the library, or a file.
 file
     Read the query from a file; - reads stdin.
-budget
-    At most 600s, 10min, 5GB, 1000frames or 40units.
-clip : TIME
-    Longest clip of --unit clip.
-abstraction : NAME
-    Abstraction: E, EL, ER, RSV, …
 picture : FILE
     Picture to draw: .png or .svg.
 trace
@@ -35,7 +29,7 @@ jobs
     Recordings to read at a time; 0: one per core.
 as_json
     Short for --format json.
-output
+to : FILE
     Write to this file instead of stdout.
 url : URL
     The collection: a folder, or s3://bucket/prefix.
@@ -45,27 +39,9 @@ a : A
 b : B
     Frames, written like A.
 limit
-    Maximum rows; 0: all.
-unit
-    Count frames, runs of frames of one class, or traces with it.
-window
-    Number of frames that form one class together.
-incomplete
-    Windows with missing frames: equal, distinct, or dropped.
-slots : FILE
-    TOML file with declared slots.
-missing
-    List the missing items, each with a query for it.
-covered
-    List the covered items, with their frames.
-manoeuvres : NAME
-    A manoeuvre of sequences: a pattern of the library, or NAME=QUERY; may be repeated.
-within : TIME
-    Longest time from the first manoeuvre of a sequence to the last.
+    Maximum number of results; 0: all.
 safe
     Run in a separate process with bounded time (5s), memory and rows.
-max_rows
-    Maximum number of rows, with --safe.
 name : NAME
     Name of a pattern, such as cut_in or ParkingExit.
 kinds
@@ -74,8 +50,10 @@ force
     Read again and replace traces of the store.
 path : LOCK
     A lock that select wrote.
-no_payloads
-    Skip sensor messages: recordings are not read.
+payloads
+    Include messages of sensors, which are read from the recordings.
+files
+    Read queries, or checks, from a file; repeatable.
 """
 
 from __future__ import annotations
@@ -90,6 +68,7 @@ from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, partial, wraps
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -139,7 +118,7 @@ class Verb(TyperCommand):
             whole = args[:-1] if args and args[-1].startswith("-") else args
             return super().parse_args(ctx, _with_store(self, ctx, whole))
         try:
-            args = _with_store(self, ctx, args)
+            args = _with_store(self, ctx, renamed(self, ctx, args))
             _, _, order = self.make_parser(ctx).parse_args(args=list(args))
             given: Counter[Any] = Counter(order)
             for parameter, times in given.items():
@@ -155,9 +134,79 @@ class Verb(TyperCommand):
         return rest
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the help of a command, followed by its examples."""
+        """Write the help of a command, followed by its examples.
+
+        Options of a method of the library have the help of its docstring.
+        """
+        about = library_help(_path_of(ctx))
+        for one in self.params:
+            one.help = one.help or about.get(one.name or "")
         super().format_help(ctx, formatter)
         _write_examples(ctx)
+
+
+def _path_of(ctx: Any) -> str:
+    """Return the words of a command after ``sgstore``."""
+    return str(ctx.command_path).partition(" ")[2]
+
+
+def library_help(path: str) -> dict[str, str]:
+    """Return the descriptions of the parameters of the library's method for a command, by name."""
+    from sgstore.query import Store  # only for help
+
+    words = (word for word in path.split() if word not in _GROUPS)
+    methods = (getattr(Store, word.replace("-", "_"), None) for word in words)
+    method = next(filter(callable, methods), None)
+    entries = {} if method is None else split_docstring(method)[1]
+    return {name.strip("*"): text.replace("`", "") for name, (_, text) in entries.items()}
+
+
+_GROUPS: Final = {"patterns", "lock", "collection"}
+"""Groups of commands without a method of their name for the group."""
+
+OLD_WORDS: Final[dict[str, dict[str, str]]] = {
+    "": {"--output": "--to", "--max-rows": "--limit"},
+    "coverage combos": {"--ego": "--of-ego"},
+    "coverage explain": {"--vs": "--by", "--frames": "--by-frame"},
+    "coverage novel": {"--not-in": "--by", "--list": "--items"},
+    "coverage sequences": {"-m": "--manoeuvre"},
+    "derive": {"--as": "--name"},
+    "export": {"--format": "--as"},
+    "import": {"--format": "--as", "--rows": "--format"},
+    "like": {"--pattern": "--describe"},
+    "prioritize": {"--by": "--order"},
+    "select": {"--ego": "--of-ego", "--least": "--objective", "-m": "--manoeuvre"}
+    | {"--temper": "--alpha"},
+    "shrink": {"--clip": "--range"},
+}
+"""Old options of a command → the new ones; the empty name means all commands. They work until 0.3."""
+
+
+def renamed(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
+    """Return the arguments of a command with new words for old options, and note each on stderr."""
+    known = {word for one in verb.params for word in (*one.opts, *one.secondary_opts)}
+    words = {old: new for old, new in OLD_WORDS[""].items() if old not in known}
+    words |= OLD_WORDS.get(_path_of(ctx), {})
+    if words.get("--format") == "--as" and not _means_files(_path_of(ctx), args):
+        del words["--format"]
+    end = args.index("--") if "--" in args else len(args)
+    found: list[str] = []
+    for text in args[:end]:
+        name, equals, value = text.partition("=")
+        if new := words.get(name):
+            say(f"{name} is now {new}; the old word works until 0.3")
+            text = f"{new}{equals}{value}"  # noqa: PLW2901
+        found.append(text)
+    return [*found, *args[end:]]
+
+
+def _means_files(path: str, args: Sequence[str]) -> bool:
+    """True if ``--format`` of an old command line is the format of files, not of rows."""
+    if any(one == "--as" or one.startswith("--as=") for one in args):
+        return False
+    values = [value for name, value in pairwise(args) if name == "--format"]
+    values += [one.partition("=")[2] for one in args if one.startswith("--format=")]
+    return path == "import" or not {*values} <= {*Format} - {Format.parquet}
 
 
 def _plain(parameters: list[Any]) -> list[Any]:
@@ -217,15 +266,8 @@ def _looks_like_store(place: str) -> bool:
     )
 
 
-_LIMITED: Final = {"find": "the query", "sql": "the SQL"}
-"""Verbs whose text limits the rows itself."""
-
-
 def _advise(error: Any, verb: Verb) -> None:
-    """Add a remedy to the message of a usage error: the right place of the store, or of a limit."""
-    if getattr(error, "option_name", "") == "--limit" and verb.name in _LIMITED:
-        error.possibilities = None
-        error.message = f"{error.message}; write LIMIT 10 at the end of {_LIMITED[verb.name]}"
+    """Add a remedy to the message of a usage error: the right place of the store."""
     places = _places(verb)
     if type(error).__name__ == "MissingParameter" and error.param.name in places[1:]:
         error.message = "Write the store first."
@@ -369,6 +411,24 @@ class Verbs(typer.Typer):
         return registered
 
 
+PLACEHOLDERS: Final = {
+    **dict.fromkeys(("clip", "stride", "within", "before", "after", "around"), "TIME"),
+    **dict.fromkeys(("manoeuvres", "measures", "abstraction"), "NAME"),
+    **dict.fromkeys(("stratify", "weakest"), "EXPR"),
+    **dict.fromkeys(("per_class", "combos", "sequences"), "K"),
+    **dict.fromkeys(("outcomes", "learn_outcomes"), "CSV"),
+    **dict.fromkeys(("slots", "lock"), "FILE"),
+    "learn_from": "STORE",
+    "by": "B",
+    "most": "X",
+    "labels": "NAME=TEXT",
+    "mounts": "AXES=X,Y,Z[,YAW]",
+    "channels": "TOPIC",
+    "storage": "VERSION",
+    "crs": "CRS",
+}
+"""Placeholders of options whose help is in the docstring of a method of the library."""
+
 _hints = cache(partial(get_type_hints, include_extras=True))
 """Types of parameters or fields; many verbs share the dataclasses of options."""
 
@@ -419,11 +479,12 @@ def _described(parameter: inspect.Parameter, hint: Any, *documented: Any) -> ins
     kind, *infos = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     shared = [] if infos and infos[0].help else [module]
     known = (split_docstring(one)[1].get(name) for one in (*documented, *shared))
-    if (found := next(filter(None, known), None)) is not None:
+    found = next(filter(None, known), None) or (PLACEHOLDERS.get(name, ""), "")
+    if any(found) or not infos:
         required = parameter.default is parameter.empty
         flag = [f"--{name.replace('_', '-')}"] * (kind is bool)
         info = copy(infos[0]) if infos else Argument() if required else Option(*flag)
-        info.metavar, info.help = found[0] or None, found[1]
+        info.metavar, info.help = found[0] or info.metavar, found[1] or info.help
         hint = Annotated[kind, info]
     return parameter.replace(annotation=hint, kind=parameter.KEYWORD_ONLY)
 
@@ -479,7 +540,8 @@ Verbose = Annotated[
 _VERBOSITY: Final = {"quiet": Quiet, "verbose": Verbose}
 """Options of every verb."""
 AsJson = Annotated[bool, Option("--json", rich_help_panel=ROWS)]
-Output = Annotated[Path | None, Option("--output", "-o", rich_help_panel=ROWS)]
+To = Annotated[Path | None, Option("--to", "-o", rich_help_panel=ROWS)]
+Limit = Annotated[int, Option("--limit", min=0, rich_help_panel=ROWS)]
 
 
 @dataclass(frozen=True)
@@ -488,11 +550,11 @@ class PrintedRows:
 
     Parameters
     ----------
-    form
+    rows_as
         Format of the rows.
     """
 
-    form: Annotated[Format, Option("--format", rich_help_panel=ROWS)] = Format.table
+    rows_as: Annotated[Format, Option("--format", rich_help_panel=ROWS)] = Format.table
     as_json: AsJson = False
 
     def __post_init__(self) -> None:
@@ -501,12 +563,12 @@ class PrintedRows:
     @property
     def file(self) -> Path | None:
         """Return the output file for result rows; ``None`` means stdout."""
-        return getattr(self, "output", None)
+        return getattr(self, "to", None)
 
     @property
     def chosen(self) -> Format:
         """Return the output format that results from ``--format``, ``--json`` and the file name."""
-        return form_of(self.form, self.file, as_json=self.as_json)
+        return form_of(self.rows_as, self.file, as_json=self.as_json)
 
     @property
     def for_people(self) -> bool:
@@ -566,7 +628,7 @@ def on_terminal(out: PrintedRows) -> bool:
 class RowOptions(PrintedRows):
     """Command line options for the format of result rows and for their file."""
 
-    output: Output = None
+    to: To = None
 
 
 @dataclass(frozen=True)
@@ -632,6 +694,12 @@ class Question:
         """True if the command line contains a query."""
         return bool(self.query or self.file or self.name)
 
+    def typed(self) -> str:
+        """Return the query as typed: its text, the text of its file, or its name; empty without a query."""
+        if sum(source is not None for source in (self.query, self.file, self.name)) > 1:
+            raise typer.BadParameter("expected one of: a query, -f FILE, -p NAME")
+        return (self.name or query_of(self.query, self.file)) if self else ""
+
     def asked(self) -> tuple[str, Mapping[str, Any]]:
         """Return the text of the query on the command line, and the values of its parameters."""
         return asked_of(self.query, self.file, self.name, parameters_of(self.parameters))
@@ -651,6 +719,7 @@ class Statements:
 
     names: PatternNames = None
     texts: Annotated[list[str] | None, Option("--expression", "-e")] = None
+    files: Annotated[list[Path] | None, Option("--file", "-f")] = None
     parameters: Parameters = None
     sgsm_compat: bool = False
 
@@ -669,7 +738,8 @@ class Statements:
 
         values = parameters_of(self.parameters)
         named, texts = named_and_texts(given or ())
-        texts += [statement(one, {}, check=True)[0] for one in self.texts or ()]
+        more = [*(self.texts or ()), *map(text_of, self.files or ())]
+        texts += [statement(one, {}, check=True)[0] for one in more]
         if not (named or self.names or texts):
             raise typer.BadParameter("add a CHECK, a FILE or the NAME of a pattern")
         found = {one.name: one for one in map(pattern_named, (*named, *(self.names or ())))}
@@ -740,6 +810,11 @@ _ENDINGS: Final = {
 }
 
 
+def given(options: Any) -> dict[str, Any]:
+    """Return the fields of options that have a value, by name."""
+    return {name: value for name, value in vars(options).items() if value is not None}
+
+
 def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Format:
     """Return the output format that ``--format``, ``--json`` or the suffix of the output file selects."""
     if as_json and form not in {Format.table, Format.json}:
@@ -750,7 +825,7 @@ def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Forma
     if found is None:
         known = ", ".join(filter(None, _ENDINGS))
         raise typer.BadParameter(
-            f"--output {output}: unknown format '{output.suffix}'; expected one of {known}"
+            f"--to {output}: unknown format '{output.suffix}'; expected one of {known}"
         )
     return found
 
@@ -858,10 +933,6 @@ def _parameter(value: str) -> Any:
     return value
 
 
-_TIME: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min)?")
-_UNIT: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, None: 1.0}
-
-
 def jobs_of(number: int) -> int:
     """Return the number of worker processes for the option ``--jobs``; 0 means one per core."""
     return number or os.cpu_count() or 1
@@ -869,10 +940,9 @@ def jobs_of(number: int) -> int:
 
 def seconds_of(text: str, option: str) -> float:
     """Convert an option value such as ``2s`` to seconds."""
-    match = _TIME.fullmatch(text.strip())
-    if match is None:
-        raise typer.BadParameter(f"{option} {text!r}: expected a time such as 2s, 500ms or 1min")
-    return float(match[1]) * _UNIT[match[2]]
+    from sgstore.apps.verbs import seconds
+
+    return seconds(text, option)
 
 
 _SIZE: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([kMGT]?)B", re.IGNORECASE)

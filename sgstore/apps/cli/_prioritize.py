@@ -14,22 +14,21 @@ from typer import Option
 from sgstore.apps.cli._coverage import PANEL
 from sgstore.apps.cli._options import (
     CaseUnit,
-    Parameters,
+    Limit,
     PrintedRows,
     QueryLimits,
-    QueryText,
+    Question,
     RowOptions,
     StorePath,
     Verbs,
+    given,
     parameters_of,
-    say_scope,
-    seconds_of,
 )
-from sgstore.apps.cli._output import count_bar, say
-from sgstore.apps.cli._testsets import chosen_frames, say_made
+from sgstore.apps.cli._output import say
+from sgstore.apps.cli._testsets import Payloads, check_lock_name, say_chosen, write_lock
 
 if TYPE_CHECKING:
-    from sgstore.testsets.selection import Prioritized, PrioritySpec
+    from sgstore.testsets.selection import Prioritized
 
 
 verbs = Verbs()
@@ -48,44 +47,20 @@ def criticality(
 
     A row is the ego of a trace and one of those that it could meet: the view
     encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.
-
-    Parameters
-    ----------
-    measures : NAME
-        A measure: pet; by default all; repeatable.
-    most : X
-        Keep only pairs with a first measure of at most X.
     """
-    from sgstore.model.criticality import RECORDED, recorded
-    from sgstore.testsets.coverage import ChosenFrames, ReportTable
+    from sgstore.testsets.coverage import ChosenFrames
 
     opened = bounds.opened(store)
-    found = recorded(opened, tuple(measures or RECORDED))
-    say_scope(ChosenFrames(str(store), opened).scope(world=True), out.chosen)
-    rows = found.values
-    if most is not None:
-        first = found.columns.index("kind") + 1
-        rows = [row for row in rows if row[first] is not None and row[first] <= most]
-    out.report(ReportTable(found.columns, rows))
+    found = opened.criticality(measures=measures or (), most=most)
+    say_chosen(ChosenFrames(str(store), opened), out, world=True)
+    out.report(found)
 
 
 @dataclass(frozen=True)
 class OrderOptions:
-    """Command line options for the order of test cases: its rule, and the unit (frame, clip or trace).
+    """Command line options for the order of test cases: its rule, and the unit (frame, clip or trace)."""
 
-    Parameters
-    ----------
-    by
-        Order: most critical first, one of each class first, both, or most likely to fail first.
-    measures : NAME
-        Rank by this measure of criticality, or by an expression, least first; may be repeated.
-    abstraction : NAME
-        Classes to distinguish: situations of the ego, or classes of an abstraction.
-    seed
-        Random seed.
-    """
-
-    by: Literal["risk", "diverse", "both", "learned"] = "risk"
+    order: Literal["risk", "diverse", "both", "learned"] = "risk"
     measures: Annotated[
         list[str] | None, Option("--measure", "-m", show_default="closing_time, ttc_mild")
     ] = None
@@ -95,27 +70,6 @@ class OrderOptions:
     abstraction: str = "situation"
     seed: Annotated[int, Option(min=0, max=(1 << 63) - 1)] = 0
 
-    def spec(self) -> PrioritySpec:
-        """Return the specification of a test case order from the command line options."""
-        from sgstore.testsets.selection import (
-            MEASURES,
-            Budget,
-            Priority,
-            PrioritySpec,
-            SelectionUnit,
-        )
-
-        return PrioritySpec(
-            Priority(self.by),
-            tuple(self.measures or MEASURES),
-            SelectionUnit(self.unit),
-            seconds_of(self.clip, "--clip"),
-            None,
-            self.abstraction,
-            Budget.parse(self.budget) if self.budget else None,
-            self.seed,
-        )
-
 
 @dataclass(frozen=True)
 class OutcomeOptions:
@@ -123,12 +77,6 @@ class OutcomeOptions:
 
     Parameters
     ----------
-    outcomes : CSV
-        Known outcomes, to measure how early failures come and to learn from.
-    learn_outcomes : CSV
-        Outcomes to learn from; by default those of --outcomes.
-    learn_from : STORE
-        Store of the runs of --learn-outcomes; by default STORE.
     picture : FILE
         Draw the failures found: .png or .svg.
     """
@@ -138,33 +86,16 @@ class OutcomeOptions:
     learn_from: Path | None = None
     picture: Path | None = None
 
-    def check(self, by: str) -> None:
-        """Raise an error for an option that has no effect without another one.
-
-        Raises
-        ------
-        typer.BadParameter
-        """
-        if by != "learned" and (self.learn_outcomes or self.learn_from):
-            raise typer.BadParameter("--learn-outcomes and --learn-from need --by learned")
-        if self.learn_from is not None and self.learn_outcomes is None:
-            raise typer.BadParameter("--learn-from needs --learn-outcomes")
-        if by == "learned" and self.outcomes is None and self.learn_outcomes is None:
-            raise typer.BadParameter("--by learned needs --outcomes or --learn-outcomes")
-        if self.picture is not None and self.outcomes is None:
-            raise typer.BadParameter("--picture needs --outcomes, to draw the failures found")
-
 
 @verbs.command(rich_help_panel=PANEL)
 def prioritize(
     store: StorePath,
     order: OrderOptions,
     results: OutcomeOptions,
-    query: QueryText = None,
-    parameters: Parameters = None,
-    output: Annotated[Path | None, Option("--output", "-o")] = None,
-    no_payloads: bool = False,
-    limit: Annotated[int, Option(min=0)] = 0,
+    question: Question,
+    to: Annotated[Path | None, Option("--to", "-o")] = None,
+    payloads: Payloads = True,
+    limit: Limit = 0,
     *,
     out: PrintedRows,
     bounds: QueryLimits,
@@ -172,47 +103,35 @@ def prioritize(
     """Order frames, clips or traces so that tests find failures soon, with reasons.
 
     The risk of a case is the sum of its ranks by measures of criticality of the
-    ego and others that move. With --by learned it is the probability that it
+    ego and others that move. With --order learned it is the probability that it
     fails, as the outcomes of other cases teach.
 
     Parameters
     ----------
-    output : FILE
+    to : FILE
         Write a lock.
     """
-    from sgstore.testsets.coverage import ChosenFrames, read_outcomes
-    from sgstore.testsets.locks import ENDING
-    from sgstore.testsets.selection import locked_order
-    from sgstore.testsets.selection import prioritize as put_in_order
+    from sgstore.testsets.coverage import read_outcomes
 
-    spec = order.spec()
-    if output is not None and output.suffix != ENDING:  # before the search starts
-        raise typer.BadParameter(f"--output {output}: the name of a lock must end in {ENDING}")
-    results.check(order.by)
-    known = None if results.outcomes is None else read_outcomes(results.outcomes)
-    training = known if results.learn_outcomes is None else read_outcomes(results.learn_outcomes)
-    training_frames = None
-    if results.learn_from is not None:
-        training_frames = ChosenFrames(str(results.learn_from), bounds.opened(results.learn_from))
-    chosen = chosen_frames(bounds.opened(store), str(store), query, parameters)
-    say_scope(chosen.scope(world=True), out.chosen)
-    ordered = put_in_order(chosen, spec, training, training_frames)
+    check_lock_name(to)  # before the search starts
+    if results.picture is not None and results.outcomes is None:
+        raise typer.BadParameter("--picture needs --outcomes, to draw the failures found")
+    known = {name: value for name, value in vars(results).items() if name != "picture"}
+    opened = bounds.opened(store)
+    ordered = opened.prioritize(
+        question.typed(),
+        **given(order),
+        **known,
+        parameters=parameters_of(question.parameters),
+    )
+    say_chosen(ordered.units.chosen, out, world=True)
     for text in ordered.said:
         say(text)
-    if known is not None:
-        _fault_detection(ordered, known, results.picture)
+    if results.outcomes is not None:
+        _fault_detection(ordered, read_outcomes(results.outcomes), results.picture)
     rows = ordered.rows()  # the store is read before the lock is made
-    if output is not None:
-        values = parameters_of(parameters)
-        with count_bar(output.name, "cases") as progress:
-            made = locked_order(
-                ordered,
-                query or "",
-                parameters=values,
-                payloads=not no_payloads,
-                progress=progress,
-            )
-        say_made(made, output)
+    if to is not None:
+        write_lock(ordered, to, payloads=payloads)
     # Last, so that the lock exists even if the reader stops after the first rows.
     out.write(ordered.columns, islice(rows, min(limit, sys.maxsize) or None), ordered.types)
 

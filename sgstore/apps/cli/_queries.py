@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -19,13 +19,14 @@ from sgstore.apps.cli._options import (
     AskedPath,
     AskOptions,
     FrameName,
-    Output,
+    Limit,
     QueryFile,
     QueryLimits,
     Question,
     RowOptions,
     Statements,
     StorePath,
+    To,
     Verbs,
     With,
     on_terminal,
@@ -61,9 +62,6 @@ PANEL: Final = "Questions"
 verbs = Verbs()
 
 
-MaxRows = Annotated[int, Option("--max-rows", min=0)]
-
-
 @verbs.command(rich_help_panel=PANEL)
 def find(
     store: AskedPath,
@@ -72,7 +70,7 @@ def find(
     explain: bool = False,
     require: bool = False,
     safe: bool = False,
-    max_rows: MaxRows = 10_000,
+    limit: Limit = 0,
     tables: With = None,
     each_frame: Annotated[bool, Option("--rows")] = False,
     *,
@@ -96,14 +94,17 @@ def find(
         Print one row for each match and frame, always.
     """
     text, values = question.asked()
+    if count and limit:
+        raise typer.BadParameter("--limit cannot be combined with --count")
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask, tables, safe=safe) as opened:
             found = opened.find(text, **values)
+            found = found.limit(limit) if limit else found
             return _write_parted(found, ask, count=count, explain=explain, require=require)
     if safe:
         if count or explain:
             raise typer.BadParameter("--safe cannot be combined with --count or --explain")
-        with _sandbox(store, ask, max_rows, tables) as box:
+        with _sandbox(store, ask, limit, tables) as box:
             answer = box.find(text, **values)
         _say_all(answer)
         number = ask.write(*_as_shown(answer, answer.rows, ask.chosen))
@@ -121,12 +122,13 @@ def find(
             _say_absent(matches, number)
             return NO_MATCH if require and not number else 0
         say_scope(getattr(matches, "scope", {}), ask.chosen)
+        some = matches.limit(limit) if limit else matches
         if ask.chosen in BINARY and not matches.graphs:
-            number = write_binary(matches.parquet, ask.chosen, ask.output)
+            number = write_binary(some.parquet, ask.chosen, ask.to)
         elif not each_frame and on_terminal(ask) and _returns_nothing(text):
-            number = _write_stretches(matches.intervals(), ask)
+            number = _write_stretches(islice(matches.intervals(), limit or None), ask)
         else:
-            number = ask.write(*_as_shown(matches, matches, ask.chosen))
+            number = ask.write(*_as_shown(some, some, ask.chosen))
         _say_absent(matches, number)
     return _ended(number, ask, require=require)
 
@@ -240,9 +242,9 @@ def like(
     frame: FrameName,
     ignore: list[str] | None = None,
     abstraction: Abstraction = "RSV",
-    limit: Annotated[int, Option(min=1)] = 10,
+    limit: Limit = 10,
     every: Annotated[bool, Option("--all")] = False,
-    pattern: bool = False,
+    describe: bool = False,
     *,
     whole: CollectionOptions,
     out: RowOptions,
@@ -258,19 +260,21 @@ def like(
     ----------
     ignore : NAME
         Ignore a relation or a kind; repeatable.
-    limit
-        Number of runs of frames.
     every
         Show all runs of a trace, not only the best, and those near the frame.
-    pattern
+    describe
         Print a pattern that describes the frame instead.
     """
     opened = whole.opened_at(store, bounds)
-    if pattern:
-        write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", out.output)
+    if describe:
+        write_text(f"{opened.pattern(frame, ignore=ignore or ())}\n", out.to)
         return 0
     found = opened.like(
-        frame, abstraction=abstraction, ignore=ignore or (), limit=limit, each_trace=not every
+        frame,
+        abstraction=abstraction,
+        ignore=ignore or (),
+        limit=limit or 10**9,
+        each_trace=not every,
     )
     if out.for_people:
         columns = ("frame", "t", "frames", "similarity", "same", "missing", "extra")
@@ -316,7 +320,7 @@ def _differing(features: dict[str, int]) -> str:
 def translate(
     file: Path,
     language: Annotated[Literal["sgl"], Option("--from")] = "sgl",
-    output: Output = None,
+    to: To = None,
 ) -> int:
     """Translate properties of other tools into the query language, without running any code of the file.
 
@@ -329,7 +333,7 @@ def translate(
     """
     from sgstore.lang.contrib.sgsm import translated
 
-    write_text(translated(text_of(file)), output)
+    write_text(translated(text_of(file)), to)
     return 0
 
 
@@ -339,7 +343,7 @@ def sql(
     statement: Annotated[str | None, Argument()] = None,
     file: QueryFile = None,
     safe: bool = False,
-    max_rows: MaxRows = 10_000,
+    limit: Limit = 0,
     tables: With = None,
     each: Annotated[bool, Option("--each", rich_help_panel=COLLECTIONS)] = False,
     *,
@@ -361,11 +365,11 @@ def sql(
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask, tables, safe=safe) as opened:
             rows = opened.sql(query_of(statement, file), each=each)
-            ask.write(rows.columns, rows)
+            ask.write(rows.columns, islice(rows, limit or None))
             say_left_out(rows)
             return 0
     if safe:
-        with _sandbox(store, ask, max_rows, tables) as box:
+        with _sandbox(store, ask, limit, tables) as box:
             answer = box.sql(query_of(statement, file))
         _say_all(answer)
         ask.write(answer.columns, answer.rows)
@@ -377,16 +381,16 @@ def sql(
         asked = UserStatement(opened.find, opened.catalog().tables, query_of(statement, file))
         say_left_out(asked)
         sql = asked.on(opened.file)
-        if (form := ask.chosen) in BINARY:
-            write_binary(sql.parquet, form, ask.output)
+        if (form := ask.chosen) in BINARY and not limit:
+            write_binary(sql.parquet, form, ask.to)
             return 0
         with sql.batches() as batches:
             rows = chain.from_iterable(batch.values for batch in batches)
-            ask.write(batches.columns, rows, batches.types)
+            ask.write(batches.columns, islice(rows, limit or None), batches.types)
     return 0
 
 
-def _sandbox(store: Path, bounds: QueryLimits, max_rows: int, tables: list[str] | None) -> Sandbox:
+def _sandbox(store: Path, bounds: QueryLimits, limit: int, tables: list[str] | None) -> Sandbox:
     from sgstore.apps.sandbox import Sandbox
 
     if bounds.max_spill is not None:
@@ -394,7 +398,7 @@ def _sandbox(store: Path, bounds: QueryLimits, max_rows: int, tables: list[str] 
     return Sandbox(
         store,
         timeout_s=seconds_of(bounds.timeout or "5s", "--timeout"),
-        max_rows=max_rows,
+        max_rows=limit or 10_000,
         tables=tables_of(tables),
     )
 
@@ -402,7 +406,7 @@ def _sandbox(store: Path, bounds: QueryLimits, max_rows: int, tables: list[str] 
 def _say_all(answer: Answer) -> None:
     say_left_out(answer)
     if answer.truncated:
-        say(f"only the first {len(answer.rows)} rows; --max-rows sets how many")
+        say(f"only the first {len(answer.rows)} rows; --limit sets how many")
 
 
 library = Verbs(
@@ -474,7 +478,7 @@ def search_patterns(
 
 
 @library.command("show")
-def show_pattern(name: LibraryName, as_json: AsJson = False, output: Output = None) -> int:
+def show_pattern(name: LibraryName, as_json: AsJson = False, to: To = None) -> int:
     """Print a pattern: its text, parameters, source, and a scene in which it is true.
 
     What is printed is a query, its remarks being comments: it can be changed and asked with find -f.
@@ -485,7 +489,7 @@ def show_pattern(name: LibraryName, as_json: AsJson = False, output: Output = No
     if as_json:
         write_document({**_told(found), "example": found.example}, Format.json)
     else:
-        write_text(_for_people(found), output)
+        write_text(_for_people(found), to)
     return 0
 
 

@@ -17,7 +17,6 @@ from sgstore.apps.cli._collection_options import note_collection, url_of
 from sgstore.apps.cli._options import (
     ERROR,
     LOSS,
-    AsJson,
     AskedPath,
     Jobs,
     PrintedRows,
@@ -430,12 +429,11 @@ class ImportOptions:
 def import_(
     store: StorePath,
     files: list[Path],
-    form_of_graphs: Annotated[Literal["s3c", "nodelink", "csv", "openlabel"], Option("--format")],
+    form_of_graphs: Annotated[Literal["s3c", "nodelink", "csv", "openlabel"], Option("--as")],
     force: bool = False,
-    form: Annotated[Format, Option("--rows")] = Format.table,
-    as_json: AsJson = False,
     *,
     meaning: ImportOptions,
+    out: PrintedRows,
 ) -> int:
     """Import graphs of other tools into a store: each graph becomes a frame.
 
@@ -446,8 +444,6 @@ def import_(
     form_of_graphs
         s3c: its CSV; csv: graph, src, relation, dst; nodelink: JSON of networkx; openlabel:
         ASAM OpenLABEL 1.0.
-    form
-        Format of the rows.
     """
     from sgstore.model.vocabulary import relation_named
     from sgstore.pipeline.importing import Words, import_graphs
@@ -477,7 +473,7 @@ def import_(
             say(f"{one.path.name}: {what}: {often} times, cannot be kept")
     columns = ("file", "status", "trace", "frames", "entities", "edges")
     rows = ((str(o.path), o.status, o.name, o.frames, o.entities, o.edges) for o in done)
-    PrintedRows(form, as_json).write(columns, rows)
+    out.write(columns, rows)
     if any(one.error is not None for one in done):
         return ERROR
     return LOSS if any(one.lost for one in done) else 0

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 from typer import Option
 
 from sgstore.apps.cli._options import (
+    Limit,
     QueryLimits,
     Question,
     StorePath,
@@ -28,7 +29,7 @@ verbs = Verbs()
 @verbs.command("try", rich_help_panel="Recordings")
 def try_recordings(
     recordings: list[str],
-    output: Annotated[Path | None, Option("--output", "-o")] = None,
+    to: Annotated[Path | None, Option("--to", "-o")] = None,
     keep: Path | None = None,
 ) -> int:
     """Take a first look: rare and critical scenes, violated rules and missing data of a bounded sample.
@@ -40,7 +41,7 @@ def try_recordings(
     ----------
     recordings : RECORDING…
         Recordings, folders of recordings or patterns of names.
-    output : PAGE
+    to : PAGE
         Write the page as HTML with pictures: .html.
     keep : STORE
         Keep the store of the sample.
@@ -55,11 +56,11 @@ def try_recordings(
         with ingest_bar() as bar:
             look = sampled(paths, keep or folder / "sample.sgstore", bar)
         evaluate(look, progress)
-        if output is None:
+        if to is None:
             typer.echo(without_controls(look.text()))
         else:
-            write_bytes(output, look.html().encode())
-            typer.echo(output)
+            write_bytes(to, look.html().encode())
+            typer.echo(to)
     return 0
 
 
@@ -120,10 +121,8 @@ def serve(
 def report(
     store: StorePath,
     question: Question,
-    output: Annotated[Path, Option("--output", "-o", show_default="report.html")] = Path(
-        "report.html"
-    ),
-    limit: Annotated[int, Option(min=1)] = 100,
+    to: Annotated[Path, Option("--to", "-o")] = Path("report.html"),
+    limit: Limit = 100,
     around: str = "2s",
     pictures: Annotated[bool, Option("--pictures/--no-pictures")] = False,
     *,
@@ -135,32 +134,17 @@ def report(
 
     Parameters
     ----------
-    output
+    to
         The page: FILE.html.
-    limit
-        Maximum number of matches or violations in the page.
-    around : TIME
-        Time before and after each match.
-    pictures
-        Add a camera picture for each second of a match.
     """
-    from sgstore.apps.report import report as write
-
     if not question:
         raise typer.BadParameter("add a QUERY, -f FILE or -p NAME")
     text, values = question.asked()
-    many, more = write(
-        bounds.opened(store),
-        text,
-        output,
-        parameters=values,
-        most=limit,
-        around_s=seconds_of(around, "--around"),
-        pictures=pictures,
-    )
+    options: dict[str, Any] = {"around": around, "pictures": pictures, "parameters": values}
+    many, more = bounds.opened(store).report(text, to=to, limit=limit, **options)
     if more:
         say(f"the page has only the first {many} matches; raise --limit")
-    typer.echo(output)
+    typer.echo(to)
     return 0
 
 
@@ -169,7 +153,7 @@ def mcp(
     store: StorePath,
     write_to: Path | None = None,
     question_timeout: Annotated[str, Option("--timeout")] = "10s",
-    max_rows: Annotated[int, Option(min=1)] = 1000,
+    limit: Annotated[int, Option("--limit", min=1)] = 1000,
     tables: With = None,
 ) -> None:
     """Serve a store to an AI assistant by the Model Context Protocol, on stdin and stdout.
@@ -183,8 +167,6 @@ def mcp(
         Allow the export of clips to this folder.
     question_timeout : TIME
         Maximum time for a query.
-    max_rows
-        Maximum rows of an answer.
     """
     try:
         from sgstore.apps.assistant import StoreTools, serve
@@ -194,6 +176,6 @@ def mcp(
         raise MissingExtraError("serving an assistant", "mcp") from error
     seconds, joined = seconds_of(question_timeout, "--timeout"), tables_of(tables)
     with StoreTools(
-        store, write_to=write_to, timeout_s=seconds, most_rows=max_rows, tables=joined
+        store, write_to=write_to, timeout_s=seconds, most_rows=limit, tables=joined
     ) as tools:
         serve(tools)

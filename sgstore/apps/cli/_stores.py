@@ -16,9 +16,9 @@ from sgstore.apps.cli._options import (
     FrameName,
     GraphOptions,
     Jobs,
-    Output,
     PrintedRows,
     StorePath,
+    To,
     Traces,
     Verbs,
     jobs_of,
@@ -138,7 +138,7 @@ def rebuild(
 @verbs.command(rich_help_panel=PANEL)
 def derive(
     store: StorePath,
-    name: Annotated[str | None, Option("--as")] = None,
+    name: str | None = None,
     abstraction: str | None = None,
     trace: Traces = None,
     force: bool = False,
@@ -147,7 +147,7 @@ def derive(
     graphs: GraphOptions,
     out: PrintedRows,
 ) -> int:
-    """Derive another set of relations from the stored states; without --as, list the sets.
+    """Derive another set of relations from the stored states; without --name, list the sets.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def derive(
         return _write_derived(kept, out)
     if name is None or remove is not None:
         if name is not None or given or (remove is None and (trace or force)):
-            raise typer.BadParameter("use --as NAME with settings, --remove NAME, or no option")
+            raise typer.BadParameter("use --name NAME with settings, --remove NAME, or no option")
         deriving = StoreFile(store).deriving
         if remove is not None:
             say(f"removed {remove} of {', '.join(deriving.remove(remove))}")
@@ -198,7 +198,7 @@ def _write_derived(done: list[Derivation], out: PrintedRows) -> int:
 @verbs.command("map", rich_help_panel=PANEL)
 def map_(
     file: Path,
-    picture: Annotated[Path | None, Option("--output", "-o")] = None,
+    to: Annotated[Path | None, Option("--to", "-o")] = None,
     *,
     out: PrintedRows,
 ) -> int:
@@ -208,17 +208,17 @@ def map_(
     ----------
     file : FILE
         OpenDRIVE (.xodr), Lanelet2 (.osm), SUMO (.net.xml), or a recording that carries roads.
-    picture
+    to
         Picture to draw, north up: .png or .svg.
     """
     from sgstore.maps.roads import summary
 
     road_map = _road_map(file)
-    if picture is not None:
+    if to is not None:
         from sgstore.draw import draw_map
 
-        draw_map(road_map, picture)
-        say(f"drawn: {picture}")
+        draw_map(road_map, to)
+        say(f"drawn: {to}")
     rows = [
         (one.part, one.kind, one.count, None if one.length is None else round(one.length, 1))
         for one in summary(road_map)
@@ -261,7 +261,7 @@ def payload(
     store: StorePath,
     frame: FrameName,
     channel: Annotated[str | None, Argument(autocompletion=completion.channels)] = None,
-    output: Output = None,
+    to: To = None,
     message: bool = False,
     *,
     out: PrintedRows,
@@ -281,7 +281,7 @@ def payload(
     if channel is None:
         _list_channels(file, frame, out)
         return 0
-    if output is None and sys.stdout.isatty():
+    if to is None and sys.stdout.isatty():
         raise ExportError(
             "a payload cannot be printed on a terminal; add -o FILE, or redirect stdout"
         )
@@ -292,11 +292,11 @@ def payload(
         data, what = carried.data, carried.form
         if carried.messages > 1:
             what += f", {carried.messages} messages from the key frame on"
-    if output is None:
+    if to is None:
         sys.stdout.buffer.write(data)
     else:
-        write_bytes(output, data)
-    say(f"{output or 'stdout'}: {len(data)} bytes ({what})")
+        write_bytes(to, data)
+    say(f"{to or 'stdout'}: {len(data)} bytes ({what})")
     return 0
 
 

@@ -15,7 +15,6 @@ from sgstore.apps.cli._coverage import (
     FrameAskOptions,
     Manoeuvres,
     Within,
-    within_seconds,
 )
 from sgstore.apps.cli._options import (
     ERROR,
@@ -26,16 +25,17 @@ from sgstore.apps.cli._options import (
     CaseUnit,
     Parameters,
     PrintedRows,
+    QueryFile,
     QueryLimits,
-    QueryText,
+    Question,
     RowOptions,
     Verbs,
     asked_of,
+    given,
     parameters_of,
     pattern_option,
     say_left_out,
     say_scope,
-    seconds_of,
 )
 from sgstore.apps.cli._output import count_bar, say
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from sgstore.query import Store
     from sgstore.testsets.coverage import ChosenFrames
     from sgstore.testsets.locks import Lock
-    from sgstore.testsets.selection import Selection, SelectionSpec, Strategy
+    from sgstore.testsets.selection import Prioritized, Selection
 
 verbs = Verbs()
 
@@ -55,41 +55,14 @@ lock = Verbs(
 )
 LockA = Annotated[Path, Argument(metavar="A", help="A lock.")]
 LockB = Annotated[Path, Argument(metavar="B", help="A lock.")]
-LockOut = Annotated[Path, Option("--output", "-o", metavar="FILE", help="The lock to write.")]
+LockOut = Annotated[Path, Option("--to", "-o", metavar="FILE", help="The lock to write.")]
+Payloads = Annotated[bool, Option("--payloads/--no-payloads")]
 Objective = Literal["units", "frames", "seconds", "bytes"]
 
 
 @dataclass(frozen=True)
 class ChoiceOptions:
-    """Command line options for selecting test cases: strategy, units and limits.
-
-    Parameters
-    ----------
-    minimal
-        Select the smallest set that keeps all items.
-    per_class : K
-        Each class (stratum) K times.
-    rarest
-        Select the rarest classes first.
-    stratify : EXPR
-        Strata by a value: 'ego.speed > 8'.
-    weakest : EXPR
-        Least value first: 'robustness(ego.speed < 9)'.
-    stride : TIME
-        Time between the starts of two clips; clips overlap if it is less than --clip.
-    combos : K
-        Keep combinations of K features.
-    ego
-        With --combos: only of the ego.
-    sequences : K
-        Keep sequences of K manoeuvres.
-    objective
-        Quantity that --minimal minimizes.
-    alpha
-        Weight of strata: 1 by frequency, 0 all equal.
-    seed
-        Random seed.
-    """
+    """Command line options for selecting test cases: strategy, units and limits."""
 
     minimal: bool = False
     per_class: Annotated[int | None, Option(min=1)] = None
@@ -102,66 +75,23 @@ class ChoiceOptions:
     stride: Annotated[str, Option(show_default="--clip")] = ""
     abstraction: Abstraction = "RSV"
     combos: Annotated[int, Option(min=0)] = 0
-    ego: bool = False
+    of_ego: bool = False
     sequences: Annotated[int, Option(min=0)] = 0
     manoeuvres: Manoeuvres = None
-    within: Within = None
+    within: Within = "10s"
     objective: Objective = "units"
     alpha: float = 1.0
-    least: Annotated[Objective | None, Option("--least", hidden=True)] = None  # until 0.3
-    temper: Annotated[float | None, Option("--temper", hidden=True)] = None  # until 0.3
     seed: Annotated[int, Option(min=0, max=(1 << 63) - 1)] = 0
-
-    def spec(self) -> SelectionSpec:
-        """Return the specification of a test case selection from the command line options."""
-        from sgstore.testsets.selection import Budget, SelectionSpec, SelectionUnit
-
-        return SelectionSpec(
-            self._strategy(),
-            SelectionUnit(self.unit),
-            seconds_of(self.clip, "--clip"),
-            self.abstraction,
-            self.combos,
-            of_ego=self.ego,
-            each=self.per_class or (0 if self.stratify else 1),
-            by=self.stratify or self.weakest,
-            alpha=self.alpha if self.temper is None else self.temper,
-            budget=Budget.parse(self.budget) if self.budget else None,
-            objective=self.least or self.objective,
-            seed=self.seed,
-            stride_s=seconds_of(self.stride, "--stride") if self.stride else None,
-            sequences=self.sequences,
-            manoeuvres=tuple(self.manoeuvres or ()),
-            within_s=within_seconds(self.within),
-        )
-
-    def _strategy(self) -> Strategy:
-        from sgstore.testsets.selection import Strategy
-
-        per_class = self.per_class is not None and not self.stratify
-        ways = {
-            Strategy.minimal: self.minimal,
-            Strategy.rarest: self.rarest,
-            Strategy.stratify: bool(self.stratify),
-            Strategy.per_class: per_class,
-            Strategy.weakest: bool(self.weakest),
-        }
-        asked = [way for way, wanted in ways.items() if wanted]
-        if len(asked) > 1:
-            known = "--minimal, --per-class, --rarest, --stratify, --weakest"
-            raise typer.BadParameter(f"expected one of {known}")
-        return asked[0] if asked else Strategy.every
 
 
 @verbs.command(rich_help_panel=PANEL)
 def select(
     store: AskedPath,
     choice: ChoiceOptions,
-    query: QueryText = None,
-    parameters: Parameters = None,
+    question: Question,
     split: str = "",
-    output: Annotated[Path | None, Option("--output", "-o")] = None,
-    no_payloads: bool = False,
+    to: Annotated[Path | None, Option("--to", "-o")] = None,
+    payloads: Payloads = True,
     curve: bool = False,
     picture: Path | None = None,
     *,
@@ -178,41 +108,27 @@ def select(
     ----------
     split
         Parts that share no recording: train=0.8,test=0.2.
-    output : FILE
+    to : FILE
         Write a lock.
     curve
         Print the kept share by size, and that of a random order.
     picture : FILE
         Draw the curve: .png or .svg.
     """
-    from sgstore.testsets.locks import ENDING
-    from sgstore.testsets.selection import listed, locked_selection, parse_split, split_table
-    from sgstore.testsets.selection import select as choose
+    from sgstore.testsets.selection import parse_split, split_table
     from sgstore.testsets.selection import split as split_up
 
-    spec = choice.spec()
-    if output is not None and output.suffix != ENDING:  # before the search starts
-        raise typer.BadParameter(f"--output {output}: the name of a lock must end in {ENDING}")
+    check_lock_name(to)  # before the search starts
     shares = parse_split(split) if split else {}
     opened = whole.opened_at(store, bounds)
-    chosen = chosen_frames(opened, str(store), query, parameters)
-    say_scope(chosen.scope(world=False), out.chosen)
-    found = choose(chosen, spec)
-    parts = split_up(found, shares) if shares else {}
+    values = parameters_of(question.parameters)
+    found = opened.select(question.typed(), **given(choice), parameters=values)
+    say_chosen(found.units.chosen, out, world=False)
+    table = split_table(found, split_up(found, shares), shares) if shares else found.table()
     for text in found.said:
         say(text)
-    table = split_table(found, parts, shares) if shares else listed(found)
-    if output is not None:
-        with count_bar(output.name, "cases") as progress:
-            made = locked_selection(
-                found,
-                query or "",
-                parts,
-                parameters=parameters_of(parameters),
-                payloads=not no_payloads,
-                progress=progress,
-            )
-        say_made(made, output)
+    if to is not None:
+        write_lock(found, to, split=split, payloads=payloads)
     # Last, so that the lock exists even if the reader stops after the first rows.
     if curve or picture is not None:
         _curve(found, picture, out, printed=curve)
@@ -220,22 +136,31 @@ def select(
         out.report(table)
 
 
-def chosen_frames(
-    opened: Store | Collection, name: str, query: str | None, parameters: list[str] | None
-) -> ChosenFrames:
-    """Return the frames from which test cases are selected: the matches of a query, or all frames."""
-    from sgstore.testsets.coverage import ChosenFrames, frames_of
+def check_lock_name(to: Path | None) -> None:
+    """Raise an error if the name of a lock to write has another suffix."""
+    from sgstore.testsets.locks import ENDING
 
-    if query is None:
-        if parameters:
-            raise typer.BadParameter("--param needs a QUERY")
-        return ChosenFrames(name, opened)
-    values = parameters_of(parameters)
-    matches = opened.find(query, **values)
-    say_left_out(matches)
-    return ChosenFrames(
-        f"{name}:{query}", opened, frames_of(opened, query, **values), matches.reasons
-    )
+    if to is not None and to.suffix != ENDING:
+        raise typer.BadParameter(f"--to {to}: the name of a lock must end in {ENDING}")
+
+
+def say_chosen(chosen: ChosenFrames, out: PrintedRows, *, world: bool) -> None:
+    """Print the traces that cannot answer the query of some frames, and the data that settings excluded."""
+    say_left_out(chosen)
+    say_scope(chosen.scope(world=world), out.chosen)
+
+
+def write_lock(
+    found: Selection | Prioritized, to: Path, *, split: str = "", payloads: bool
+) -> None:
+    """Write the lock of a selection or an order, and print its content."""
+    from sgstore.apps.verbs import lock as lock_of
+
+    with count_bar(to.name, "cases") as progress:
+        made = lock_of(
+            None, cases=found, to=None, split=split, payloads=payloads, progress=progress
+        )
+    say_made(made, to)
 
 
 def _curve(found: Selection, picture: Path | None, out: PrintedRows, *, printed: bool) -> None:
@@ -265,7 +190,7 @@ def _curve(found: Selection, picture: Path | None, out: PrintedRows, *, printed:
 def verify_(
     path: Path,
     store: AskedPath,
-    no_payloads: bool = False,
+    payloads: Payloads = True,
     strict: bool = False,
     *,
     whole: CollectionOptions,
@@ -278,19 +203,19 @@ def verify_(
 
     Parameters
     ----------
-    strict
-        Count another version of sgstore as a difference.
+    payloads
+        Compare the messages of sensors, too.
     """
     from sgstore.testsets.locks import read_lock, verify
 
     known = read_lock(path)
     opened = whole.opened_at(store, ask)
-    found = list(verify(known, opened, payloads=not no_payloads))
+    found = list(verify(known, opened, payloads=payloads))
     ask.write(("where", "what", "detail"), [(one.where, one.what, one.detail) for one in found])
     wrong = [one for one in found if strict or one.matters]
     unread = sum(case.payload is None for case in known.cases)
-    if unread or no_payloads:
-        say(f"payloads of {len(known.cases) if no_payloads else unread} cases were not checked")
+    if unread or not payloads:
+        say(f"payloads of {unread if payloads else len(known.cases)} cases were not checked")
     said = f"{len(wrong)} differences" if wrong else "as locked"
     say(f"{path}: {len(known.cases)} cases of {len(known.traces)} traces: {said}")
     return ERROR if wrong else 0
@@ -307,27 +232,27 @@ def list_(path: Path, out: RowOptions) -> None:
 
 
 @lock.command("union")
-def union_(a: LockA, b: LockB, output: LockOut) -> None:
+def union_(a: LockA, b: LockB, to: LockOut) -> None:
     """Write a lock of the test cases that are in A or in B."""
     from sgstore.testsets.locks import read_lock, union
 
-    say_made(union(read_lock(a), read_lock(b)), output)
+    say_made(union(read_lock(a), read_lock(b)), to)
 
 
 @lock.command("intersect")
-def intersect_(a: LockA, b: LockB, output: LockOut) -> None:
+def intersect_(a: LockA, b: LockB, to: LockOut) -> None:
     """Write a lock of the test cases that are in A and in B."""
     from sgstore.testsets.locks import intersect, read_lock
 
-    say_made(intersect(read_lock(a), read_lock(b)), output)
+    say_made(intersect(read_lock(a), read_lock(b)), to)
 
 
 @lock.command("minus")
-def minus_(a: LockA, b: LockB, output: LockOut) -> None:
+def minus_(a: LockA, b: LockB, to: LockOut) -> None:
     """Write a lock of the test cases of A that share no frame with B."""
     from sgstore.testsets.locks import minus, read_lock
 
-    say_made(minus(read_lock(a), read_lock(b)), output)
+    say_made(minus(read_lock(a), read_lock(b)), to)
 
 
 def say_made(made: Lock, output: Path) -> None:
@@ -342,6 +267,7 @@ def diff(
     b: str,
     name: Annotated[str | None, pattern_option("Compare the matches of a library pattern.")] = None,
     query: Annotated[str | None, Option("--query", "-q")] = None,
+    file: QueryFile = None,
     by_frame: bool = False,
     abstraction: Abstraction = "RSV",
     parameters: Parameters = None,
@@ -359,19 +285,17 @@ def diff(
         After, as A.
     query : TEXT
         Compare by a query, or by 'CHECK …'.
-    by_frame
-        Compare traces of the same name frame by frame.
     require
         End with exit code 4 if the results differ.
     """
     from sgstore.testsets import diff as differences
     from sgstore.testsets.coverage import classed
 
-    if (name is not None) + (query is not None) + by_frame > 1:
-        raise typer.BadParameter("expected one of -p NAME, -q TEXT, --by-frame")
+    if sum(one is not None for one in (name, query, file)) + by_frame > 1:
+        raise typer.BadParameter("expected one of -p NAME, -q TEXT, -f FILE, --by-frame")
     values = parameters_of(parameters)
-    if name is not None or query is not None:
-        text, values = asked_of(query, None, name, values)
+    if name or query or file:
+        text, values = asked_of(query, file, name, values)
         compare = differences.verdicts if differences.has_checks(text) else differences.matches
         before, after = (ask.opened_at(Path(one), ask) for one in (a, b))
         _say_sources(before, after)

@@ -40,7 +40,7 @@ def timeline(
     names: PatternNames = None,
     parameters: Parameters = None,
     traces: Traces = None,
-    output: Annotated[Path | None, Option("--output", "-o")] = None,
+    to: Annotated[Path | None, Option("--to", "-o")] = None,
     every: Annotated[bool, Option("--all")] = False,
     parts: str | None = None,
     *,
@@ -55,9 +55,7 @@ def timeline(
     ----------
     queries : [QUERY…]
         'MATCH …', or 'CHECK …'.
-    files
-        Read a query, or checks, from a file; repeatable.
-    output
+    to
         Picture to write: FILE.png or FILE.svg.
     every
         Include traces without matches and violations.
@@ -84,7 +82,7 @@ def timeline(
                 f"{len(found) - len(hits)} more traces without matches or violations; --all shows them"
             )
         found = hits
-    if output is None:
+    if to is None:
         letters = max(LETTERS, min(shutil.get_terminal_size().columns - NAME - 26, 3 * LETTERS))
         longest = max((one.seconds for one in found), default=0.0)
         for one in found:
@@ -92,8 +90,8 @@ def timeline(
         return 0
     from sgstore.draw import draw_timelines
 
-    draw_timelines(found, output)
-    typer.echo(output)
+    draw_timelines(found, to)
+    typer.echo(to)
     return 0
 
 

@@ -200,7 +200,7 @@ class _EdgeTable:
                 self._path,
                 "row 1",
                 f"expected the header of S3C, {','.join(header)}; found {','.join(names)[:200]}"
-                " (another table of edges can be read with --format csv)",
+                " (another table of edges can be read with --as csv)",
             )
         folded = list(map(normalize_name, names))
         for what, words in _NAMES.items():
