@@ -189,7 +189,7 @@ def test_an_old_word_works_with_a_note(
     path: str, town_store: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
     for old, new in OLD_WORDS[path].items():
-        command = COMMANDS[path or ("find" if old == "--limit" else "check")]
+        command = COMMANDS[path or ("find" if new == "--limit" else "check")]
         given: dict[str, Any] = {}
         monkeypatch.setattr(command, "callback", lambda given=given, **values: given.update(values))
         option = next(one for one in command.params if new in one.opts)
