@@ -223,6 +223,7 @@ def ingest(  # noqa: PLR0913  one option per way to read
     since: float | None = None,
     until: float | None = None,
     rate: float | None = None,
+    topics: Sequence[str] = (),
     force: bool = False,
     dry_run: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
@@ -249,6 +250,8 @@ def ingest(  # noqa: PLR0913  one option per way to read
         Start and end of the frames; seconds since the first frame of a recording.
     rate : float, optional
         Frames per second to keep. Default: the rate of the config.
+    topics : sequence of str, optional
+        Channels whose messages are stored as columns: ``/imu``. Default: the topics of the config.
     force : bool
         Read recordings again that the store already contains, and replace their traces.
     dry_run : bool
@@ -273,6 +276,8 @@ def ingest(  # noqa: PLR0913  one option per way to read
         config = replace(config, ego="", egos=tuple(egos))
     if rate is not None:
         config = replace(config, rate=float(rate))
+    if topics:
+        config = replace(config, topics=tuple(topics))
     job = Job(
         store=Path(store),
         road_map=None if road_map is None else Path(road_map),

@@ -891,8 +891,8 @@ class Store(StoreVerbs):
         traces : str, Path or sequence of these
             Files, folders, or patterns such as ``drives/*.mcap``.
         **options
-            ``config``, ``road_map``, ``egos``, ``jobs``, ``since``, ``until``, ``rate``, ``force``,
-            ``dry_run``, ``on_progress``: see :func:`sgstore.ingest.ingest`.
+            ``config``, ``road_map``, ``egos``, ``jobs``, ``since``, ``until``, ``rate``, ``topics``,
+            ``force``, ``dry_run``, ``on_progress``: see :func:`sgstore.ingest.ingest`.
 
         Returns
         -------

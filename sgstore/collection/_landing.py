@@ -25,15 +25,15 @@ from sgstore.mcap import digest_of, mark_of
 from sgstore.model.config import Config
 from sgstore.model.trace_sampling import TracePart
 from sgstore.pipeline.recording_ingest import Job, SegmentReader, TraceOutcome
-from sgstore.store import split_segment
+from sgstore.store import Sealed, split_segment
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
     from sgstore.collection._storage import Place
 
-FILES: Final = ("sealed.json", "tables")
-"""Files of a landed segment."""
+DESCRIPTION: Final = "sealed.json"
+"""File of a landed segment that is uploaded last."""
 
 
 def land(  # noqa: PLR0913  as many options as there are ways to read
@@ -48,6 +48,7 @@ def land(  # noqa: PLR0913  as many options as there are ways to read
     since: float | None = None,
     until: float | None = None,
     rate: float | None = None,
+    topics: Sequence[str] = (),
 ) -> list[TraceOutcome]:
     """Ingest recordings as segment files into a collection; a missing collection is created.
 
@@ -61,7 +62,7 @@ def land(  # noqa: PLR0913  as many options as there are ways to read
         Files; :func:`sgstore.ingest.recordings` finds them in folders and by patterns.
     shard : (int, int)
         Share of the recordings to read, and number of shares: 1 … N, N.
-    road_map, config, egos, jobs, since, until, rate
+    road_map, config, egos, jobs, since, until, rate, topics
         As in :func:`sgstore.ingest.ingest`.
 
     Returns
@@ -85,6 +86,8 @@ def land(  # noqa: PLR0913  as many options as there are ways to read
         settings = replace(settings, ego="", egos=tuple(egos))
     if rate is not None:
         settings = replace(settings, rate=float(rate))
+    if topics:
+        settings = replace(settings, topics=tuple(topics))
     place = place_at(url)
     catalogue.create(place, catalogue.About())
     with working_folder("landing") as folder:
@@ -153,7 +156,10 @@ class _Landing:
             road_map = digest_of_file(job.road_map)
         elif job.road_map is not None:
             road_map = str(job.road_map.resolve())
-        about = [digest, job.config.as_dict(), asdict(job.part), road_map]
+        settings = job.config.as_dict()
+        if not job.config.topics:  # as before this setting
+            del settings["topics"]
+        about = [digest, settings, asdict(job.part), road_map]
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
     def _told(self, key: str, path: Path) -> list[TraceOutcome] | None:
@@ -199,9 +205,10 @@ class _Landing:
                 if not any(one == name for one, _, _ in self.place.names(f"maps/{of_map}")):
                     self.place.upload(parts[1] / "tables", name)
                 self.maps.add(of_map)
-            digests = [digest_of_file(parts[0] / name) for name in FILES]
+            files = Sealed.read(parts[0]).files
+            digests = [digest_of_file(parts[0] / name) for name in files]
             segment = hashlib.sha256(" ".join(digests).encode()).hexdigest()
-            for name in reversed(FILES):  # the completeness file is last
+            for name in reversed(files):  # the completeness file is last
                 self.place.upload(parts[0] / name, f"segments/{segment[:2]}/{segment}/{name}")
             return segment
 

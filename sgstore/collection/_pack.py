@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._catalogue import BUNDLE_TRACES
-from sgstore.collection._landing import FILES
+from sgstore.collection._landing import DESCRIPTION
 from sgstore.collection._storage import bundle_path, digest_of_file, place_at
 from sgstore.errors import StoreError
 from sgstore.model.vocabulary import natural
@@ -340,16 +340,18 @@ def _waiting(place: Place, before: Snapshot, folder: Path) -> list[_Landed]:
     for name, size, _ in place.names("segments"):
         segment = name.split("/")[2]
         sizes[segment] = sizes.get(segment, 0) + size
-        if name.endswith(f"/{FILES[0]}"):
+        if name.endswith(f"/{DESCRIPTION}"):
             complete.add(segment)
     found: list[_Landed] = []
     for segment in sorted(complete - known):
-        sealed = Sealed.read(_fetched(place, segment, folder, FILES[:1]))
+        sealed = Sealed.read(_fetched(place, segment, folder))
         found.append(_Landed(segment, sizes[segment], sealed))
     return sorted(found, key=lambda one: (*one.of, one.segment))
 
 
-def _fetched(place: Place, segment: str, folder: Path, files: Iterable[str] = FILES) -> Path:
+def _fetched(
+    place: Place, segment: str, folder: Path, files: Iterable[str] = (DESCRIPTION,)
+) -> Path:
     to = folder / segment
     to.mkdir(exist_ok=True)
     for name in files:
@@ -406,7 +408,7 @@ def _bundled(
     path = folder / "published.sgstore"
     file = StoreFile.create(path)
     for one in waiting.values():
-        folders = [_fetched(place, one.segment, folder)]
+        folders = [_fetched(place, one.segment, folder, one.sealed.files)]
         if digest := one.sealed.identity.map_digest:
             folders.append(folder / f"map-{digest}")
             folders[1].mkdir(exist_ok=True)

@@ -8,15 +8,16 @@ cannot be decoded is a counted loss.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import isnan
 from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.lang.catalog import TopicFacts
-from sgstore.lang.topics import TopicError, fields_of, topic_of
-from sgstore.mcap import MESSAGE_HEAD, Messages
+from sgstore.lang.catalog import TopicFacts, TopicField
+from sgstore.lang.topics import TopicError, field_of, fields_of, topic_of
+from sgstore.mcap import MESSAGE_HEAD, Findings, Messages
 from sgstore.readers._ros2 import parse_definition
 from sgstore.readers._topic_cdr import CdrColumns
 from sgstore.readers._topic_values import (
@@ -24,6 +25,7 @@ from sgstore.readers._topic_values import (
     MAX_FIELDS,
     Losses,
     TopicNames,
+    as_json,
     as_number,
     column_of,
     field_list,
@@ -39,8 +41,7 @@ if TYPE_CHECKING:
     from mcap.records import Schema
     from numpy.typing import NDArray
 
-    from sgstore.lang.catalog import TopicField
-    from sgstore.mcap import Findings, Recording
+    from sgstore.mcap import Recording
     from sgstore.readers._topic_values import Column
 
     Ints = NDArray[np.int64]
@@ -492,6 +493,58 @@ class TopicReading:
         return batch
 
 
+def topic_series(recording: Recording, topic: str, path: str) -> tuple[Ints, NDArray[np.object_]]:
+    """Return log times and values of a field of a topic, in order of time.
+
+    Parameters
+    ----------
+    recording : Recording
+    topic, path : str
+        ``/imu``; ``linear_acceleration.z``, ``covariance[0]``.
+
+    Returns
+    -------
+    stamps : (n,) int64
+        ns. Messages of equal time come in file order.
+    values : (n,) object
+        Numbers, texts and truth values; ``None``: missing.
+
+    Raises
+    ------
+    TopicError
+        The recording has no such topic or field, or the topic cannot be decoded.
+    """
+    reading = TopicReading(recording, [topic])
+    batches = [*reading.batches(Findings())]
+    fields = {
+        name: TopicField(name, kind) for b in batches for name, (kind, _) in b.columns.items()
+    }
+    facts = topics_of(recording)[next(iter(reading.losses))]
+    name = field_of(replace(facts, source=lambda: fields), path).name
+    stamps = np.concatenate([batch.log_time_ns for batch in batches])
+    values = np.concatenate([_values_of(batch, name) for batch in batches])
+    order = np.argsort(stamps, kind="stable")
+    return stamps[order], values[order]
+
+
+def _values_of(batch: TopicBatch, name: str) -> NDArray[np.object_]:
+    """Return the values of a field, or of an element of a list field, as Python values."""
+    found = np.full(len(batch.number), None, object)
+    of, _, index = name.partition("[") if name not in batch.columns else (name, "", "")
+    if of not in batch.columns:
+        return found
+    declared, values = batch.columns[of]
+    rows: list[Any] = values.tolist()
+    if index:
+        at = int(index.removesuffix("]"))
+        lists = (json.loads(row) if isinstance(row, str) else row for row in rows)
+        rows = [row[at] if row is not None and at < len(row) else None for row in lists]
+    elif declared.endswith("[]") or declared in {"JSON", "BLOB"}:
+        rows = [row if row is None or isinstance(row, str) else as_json(row) for row in rows]
+    found[:] = [None if isinstance(one, float) and isnan(one) else one for one in rows]
+    return found
+
+
 def topics_of(recording: Recording) -> dict[str, TopicFacts]:
     """Return the topics of a recording, by name. Their fields are not known."""
     found: dict[str, TopicFacts] = {}
@@ -521,16 +574,11 @@ def _hold(held: _Waiting, run: Messages, rows: NDArray[np.intp]) -> None:
 
 def _joined(run: Messages, rows: NDArray[np.intp]) -> bytes:
     """Return the data of some messages, one after another."""
-    offsets, lengths = run.offset[rows], run.length[rows]
-    count, size = len(rows), int(lengths[0])
-    step = int(offsets[1] - offsets[0]) if count > 2 else 0
-    even = step >= size + MESSAGE_HEAD.itemsize and type(run) is Messages
-    if (
-        even
-        and (lengths == size).all()
-        and (np.diff(offsets) == step).all()
-        and run.chunk_offset >= 0
-    ):
-        whole = run.read(int(offsets[0]) + MESSAGE_HEAD.itemsize, (count - 1) * step + size)
-        return np.ndarray((count, size), np.uint8, whole, 0, (step, 1)).tobytes()
-    return b"".join(map(run.data, rows.tolist()))
+    if type(run) is not Messages or run.chunk_offset < 0:
+        return b"".join(map(run.data, rows.tolist()))
+    starts = run.offset[rows] + MESSAGE_HEAD.itemsize
+    first = int(starts.min())
+    ends = starts + run.length[rows] - first
+    chunk = run.read(first, int(ends.max()))  # one call for all messages
+    spans = zip((starts - first).tolist(), ends.tolist(), strict=True)
+    return b"".join([chunk[start:end] for start, end in spans])

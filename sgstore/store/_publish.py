@@ -37,6 +37,7 @@ from sgstore.store._staging import PIECE_ROWS, Staging, scratch
 from sgstore.store._table_stream import FILE, TableFile
 from sgstore.store._topics import (
     FRAME,
+    LISTING,
     copy_topic_tables,
     drop_topic_tables,
     publish_topics,
@@ -393,8 +394,10 @@ def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -
     sql = "SELECT frames FROM store.inside.trace WHERE trace_id = ?"
     frames = sum(n for (n,) in connection.execute(sql, [trace_id]).fetchall())
     first = trace_id << BUCKET_BITS
-    cuts = range(first, first + -(-frames // BUCKET_FRAMES), STEP)
+    end = first + -(-frames // BUCKET_FRAMES)
     for table in tables:
+        step = STEP // 16 if table.startswith(LISTING) else STEP  # a frame can have many messages
+        cuts = range(first, end, step)
         found = checksums(connection, "store", table, "trace", cuts, only=trace_id)
         connection.execute(
             """DELETE FROM store.inside.manifest WHERE owner = 'trace' AND id = ? AND "table" = ?""",

@@ -227,7 +227,7 @@ def database_of(connection: DuckDBPyConnection) -> str:
 
 
 _TOPIC: Final = re.compile(r"topic(_[0-9a-f]{16})?")
-_TOPIC_TYPES: Final = frozenset(
+TOPIC_TYPES: Final = frozenset(
     {
         *(
             "BOOLEAN",
@@ -268,7 +268,7 @@ def _is_plain(words: Tokens) -> bool:
             continue
         kind = column[2:]
         kind = kind[:-2] if kind[-2:] == ["NOT", "NULL"] else kind
-        if len(column) < 2 or column[1] not in _TOPIC_TYPES or kind not in ([], ["[", "]"]):
+        if len(column) < 2 or column[1] not in TOPIC_TYPES or kind not in ([], ["[", "]"]):
             return False
         column = []
     return True

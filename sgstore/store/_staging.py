@@ -7,6 +7,7 @@ the file, so memory does not grow. In the end, one file has all tables, with a c
 from __future__ import annotations
 
 import json
+import re
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -316,6 +317,7 @@ def scratch(spill: Path, *, memory: int = 0, threads: int = 1) -> DuckDBPyConnec
 
 
 _SAID: Final = "sealed.json"
+_PART: Final = re.compile(r"topic-\d+-\d+\.parquet", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,6 +349,11 @@ class Sealed:
     words: dict[str, list[str]]
     topics: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
 
+    @property
+    def files(self) -> list[str]:
+        """Names of the files in the folder. The description comes first."""
+        return [_SAID, FILE, *(part for topic in self.topics for part in topic["parts"])]
+
     def write(self) -> None:
         """Write the description of a complete trace into its folder, for :meth:`read`.
 
@@ -356,6 +363,8 @@ class Sealed:
             The file is not writable.
         """
         values = asdict(self) | {"folder": "", "path": str(self.path)}
+        if not self.topics:  # so that a segment without topics has the digest of older versions
+            del values["topics"]
         try:
             (self.folder / _SAID).write_text(json.dumps(values), encoding="utf-8")
         except OSError as error:
@@ -374,6 +383,9 @@ class Sealed:
             values = json.loads((folder / _SAID).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise StoreError(f"{folder}: no segment that is complete: {error}") from error
+        topics = values.get("topics", [])
+        if not all(_PART.fullmatch(part) for topic in topics for part in topic["parts"]):
+            raise StoreError(f"{folder}: the segment names files outside its folder")
         return cls(
             folder=folder,
             path=Path(values["path"]),
@@ -381,5 +393,5 @@ class Sealed:
             trace=values["trace"],
             checksums={name: Checksum(**one) for name, one in values["checksums"].items()},
             words=values["words"],
-            topics=values.get("topics", []),
+            topics=topics,
         )

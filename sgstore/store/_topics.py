@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
+from sgstore.base.display import excerpt
 from sgstore.base.quoting import literal, quoted
+from sgstore.errors import StoreError
 from sgstore.model.frame_ids import frame_ids
-from sgstore.store._schema import INSIDE, topic_statements
+from sgstore.store._schema import INSIDE, TOPIC_TYPES, topic_statements
 from sgstore.store._staging import scratch
 
 if TYPE_CHECKING:
@@ -77,6 +79,13 @@ class TopicFile:
     fields: dict[str, str] = field(default_factory=dict[str, str])
     messages: int = 0
     lost: int = 0
+
+    def __post_init__(self) -> None:
+        for kind in self.fields.values():  # a segment or a store is not trusted
+            if kind.removesuffix("[]") not in TOPIC_TYPES:
+                raise StoreError(
+                    f"topic {excerpt(self.topic)!r} has a field of type {excerpt(kind)!r}"
+                )
 
     @property
     def table(self) -> str:

@@ -61,6 +61,7 @@ def ingest(
     since: str | None = None,
     until: str | None = None,
     rate: Annotated[float | None, Option(min=0)] = None,
+    topics: Annotated[list[str] | None, Option(metavar="TOPIC,…")] = None,
     force: bool = False,
     dry_run: bool = False,
     shard: str | None = None,
@@ -79,6 +80,8 @@ def ingest(
         Stop at this time: 1min.
     rate
         Frames per second to keep; 0: all.
+    topics
+        Channels to store as columns, for topic('/imu') in queries: /planner,/imu.
     dry_run
         Report the planned work without doing it.
     shard : I/N
@@ -96,6 +99,7 @@ def ingest(
         "since": None if since is None else seconds_of(since, "--since"),
         "until": None if until is None else seconds_of(until, "--until"),
         "rate": rate,
+        "topics": [name for one in topics or () for name in one.split(",") if name],
     }
     if shard is not None or url_of(store) is not None:
         outcomes = _land(store, recordings(_names(traces)), shard, options, alone=force or dry_run)

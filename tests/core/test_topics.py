@@ -1,0 +1,287 @@
+"""Topics of recordings as columns: values against other decoders, in SQL, stored and read from recordings."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from topic_recordings import control, ros, topic_recording
+
+import sgstore
+from sgstore.errors import SgstoreError
+from sgstore.ingest import ingest
+from sgstore.lang.topics import RULES, TopicError, field_of, values_at
+from sgstore.readers import open_recording, topic_series
+from sgstore.store._topic_views import topic_values
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.seconds(6)
+
+TOPICS = ("/imu", "/status", "/control", "/planner")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return topic_recording(tmp_path_factory.mktemp("topics") / "run.mcap")
+
+
+@pytest.fixture(scope="module")
+def stores(recording: Path) -> dict[str, sgstore.Store]:
+    """The same recording with stored topics, and without."""
+    made: dict[str, sgstore.Store] = {}
+    for name, topics in (("stored", TOPICS), ("read", ())):
+        path = recording.with_name(f"{name}.sgstore")
+        (outcome,) = ingest(path, [recording], topics=topics)
+        assert outcome.error is None, outcome.error
+        made[name] = sgstore.open(path)
+    return made
+
+
+each = pytest.mark.parametrize("how", ["stored", "read"])
+
+
+def flat(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """An independent flattening: dicts and objects of rosbags have dotted names, NaN is None."""
+    if hasattr(value, "__dataclass_fields__"):
+        value = {
+            name: getattr(value, name)
+            for name in value.__dataclass_fields__
+            if name[0] != "_" and not name.isupper()
+        }
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            if name != "__msgtype__":
+                yield from flat(inner, f"{path}.{name}" if path else name)
+    else:
+        yield path, value
+
+
+def of_control(message: Any) -> dict[str, Any]:
+    names = control()[1].DESCRIPTOR.enum_types_by_name, {0: "PARK", 1: "DRIVE"}
+    target = message.target if message.HasField("target") else None
+    child = {"steer": message.child.steer} if message.HasField("child") else None
+    return {
+        "gear": names[1][message.gear],
+        "steer": message.steer,
+        "target.x": target and target.x,
+        "target.y": target and target.y,
+        "limit": message.limit if message.HasField("limit") else None,
+        "path": [{"x": one.x, "y": one.y} for one in message.path],
+        "gears": [names[1].get(one, str(one)) for one in message.gears],
+        "times": [*message.times],
+        "raw": message.raw,
+        "child": child,
+        "id": message.id,
+        "on": message.on,
+    }
+
+
+def expected(recording: Path, topic: str) -> list[dict[str, Any]]:
+    """The messages of a topic, by the packages of the encodings."""
+    found: list[dict[str, Any]] = []
+    with recording.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(topics=[topic]):
+            data = message.data
+            if channel.message_encoding == "cdr":
+                assert schema is not None
+                values = dict(flat(ros().deserialize_cdr(data, schema.name)))
+            elif channel.message_encoding == "json":
+                values = dict(flat(json.loads(data)))
+            else:
+                values = of_control(control()[1].FromString(data))
+            found.append(
+                {"log_time_ns": message.log_time, "publish_time_ns": message.publish_time, **values}
+            )
+    return found
+
+
+NAMES = {"State": "State_", "t": "t_"}
+"""Fields whose names are taken: of a column of each topic, or of another field but for case."""
+
+
+def plain(value: Any) -> Any:
+    """A value as it is compared: arrays are lists, parts of ROS messages are dicts."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, list):
+        return [dict(flat(one)) if hasattr(one, "__dataclass_fields__") else one for one in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+@each
+@pytest.mark.parametrize("topic", TOPICS)
+def test_values_are_those_of_other_decoders(
+    stores: dict[str, sgstore.Store], recording: Path, topic: str, how: str
+) -> None:
+    rows = stores[how].sql(f"SELECT * FROM topic('{topic}') ORDER BY log_time_ns")
+    assert rows.columns[:4] == ("trace", "t", "log_time_ns", "publish_time_ns")
+    wanted = expected(recording, topic)
+    assert len(rows) == len(wanted)
+    kinds = dict(zip(rows.columns, rows.types, strict=True))
+    for row, values in zip(rows.dicts(), wanted, strict=True):
+        assert row["trace"] == "run"
+        assert row["t"] == pytest.approx(values["log_time_ns"] / 1e9, abs=1e-6)
+        for name, value in values.items():
+            column = NAMES.get(name, name) if topic == "/planner" else name
+            if column == "none":
+                assert column not in row
+                continue
+            found = row[column]
+            if kinds[column] == "JSON":
+                found = None if found is None else json.loads(found)
+            told = plain(value)
+            if kinds[column] == "BLOB":
+                told = bytes(told)
+            if kinds[column].startswith("FLOAT"):
+                told = np.float32(told).tolist()
+                found = np.float32(found).tolist()
+            assert found == told, (column, row)
+
+
+def test_fields_have_types_of_their_encoding(stores: dict[str, sgstore.Store]) -> None:
+    topics = stores["read"].catalog().topics
+    kinds = {
+        topic: {name: one.declared for name, one in topics[topic].source().items()}
+        for topic in TOPICS
+    }
+    assert kinds["/imu"]["header.stamp.nanosec"] == "UINTEGER"
+    assert kinds["/imu"]["angular_velocity_covariance"] == "DOUBLE[]"
+    assert kinds["/status"] == {
+        "ready": "BOOLEAN",
+        "count": "BIGINT",
+        "large": "UBIGINT",
+        "load": "FLOAT",
+        "name": "VARCHAR",
+        "raw": "BLOB",
+        "ranges": "FLOAT[]",
+        "fixed": "SMALLINT[]",
+        "words": "VARCHAR[]",
+        "parts": "JSON",
+    }
+    assert kinds["/control"]["gear"] == "VARCHAR"
+    assert kinds["/control"]["gears"] == "VARCHAR[]"
+    assert kinds["/planner"]["plan.speed"] == "DOUBLE"
+    assert kinds["/planner"]["plan.why.ids"] == "VARCHAR[]"
+    assert field_of(topics["/imu"], "angular_velocity_covariance[2]").declared == "DOUBLE"
+
+
+@pytest.mark.parametrize(
+    ("sql", "message"),
+    [
+        ("SELECT * FROM topic('/imuu')", "no topic '/imuu'; did you mean '/imu'?"),
+        (
+            "SELECT statee FROM topic('/planner')",
+            "topic '/planner' has no field 'statee'; did you mean 'state'?",
+        ),
+        (
+            "SELECT angular_velocity.x FROM topic('/imu')",
+            "topic '/imu' has no table 'angular_velocity'; write a dotted field in double quotes:"
+            ' "angular_velocity.x"',
+        ),
+        (
+            "SELECT * FROM topic('/odd')",
+            "topic '/odd' cannot be decoded; its encoding is 'cbor' without a schema; protobuf, JSON, and CDR"
+            " with ros2msg can be decoded",
+        ),
+    ],
+)
+def test_mistakes_are_one_line(stores: dict[str, sgstore.Store], sql: str, message: str) -> None:
+    with pytest.raises(SgstoreError) as error:
+        _ = stores["stored"].sql(sql).values
+    assert str(error.value) == message
+
+
+def test_a_wrong_topic_is_an_error_of_the_ingest(recording: Path, tmp_path: Path) -> None:
+    for topic, message in (
+        ("/planer", "did you mean '/planner'?"),
+        ("/odd", "its encoding is 'cbor'"),
+    ):
+        (outcome,) = ingest(tmp_path / "a.sgstore", [recording], topics=[topic])
+        assert outcome.status == "failed"
+        assert message in str(outcome.error)
+
+
+def test_a_missing_recording_has_a_remedy(tmp_path: Path) -> None:
+    moved = topic_recording(tmp_path / "moved.mcap", frames=5)
+    ingest(tmp_path / "a.sgstore", [moved], topics=["/imu"])
+    moved.unlink()
+    store = sgstore.open(tmp_path / "a.sgstore")
+    assert store.sql("SELECT count(*) FROM topic('/imu')").values == [(25,)]
+    with pytest.raises(TopicError, match=r"cannot be read.*--topics /status.*--root"):
+        _ = store.sql("SELECT * FROM topic('/status')").values
+
+
+FIELDS = (
+    ("/planner", "state"),
+    ("/planner", "plan.speed"),
+    ("/imu", "linear_acceleration.z"),
+    ("/status", "ranges[1]"),
+)
+
+
+@each
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("tolerance", [None, 40_000_000])
+def test_values_at_frames_agree_with_arrays(
+    stores: dict[str, sgstore.Store], recording: Path, how: str, rule: str, tolerance: int | None
+) -> None:
+    file = stores[how].file
+    frames = file.arrays("SELECT frame_id, log_time_ns FROM frame ORDER BY log_time_ns", plain=True)
+    for topic, path in FIELDS:
+        if rule == "linear" and path == "state":
+            continue
+        with file.asked(
+            lambda at, topic=topic, path=path: dict(
+                at.execute(topic_values(at, file.access, topic, path, rule, tolerance)).fetchall()
+            )
+        ) as found:
+            with open_recording(recording) as opened:
+                stamps, values = topic_series(opened, topic, path)
+            told, known = values_at(stamps, values, frames["log_time_ns"], rule, tolerance)
+            wanted = dict(
+                zip(frames["frame_id"][known].tolist(), told[known].tolist(), strict=True)
+            )
+            assert found == pytest.approx(wanted) if path != "state" else found == wanted
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(st.tuples(st.integers(0, 30), st.sampled_from([None, 1.0, 2.0, 5.0])), max_size=8),
+    st.lists(st.integers(-3, 33), min_size=1, max_size=6),
+    st.sampled_from(RULES),
+    st.sampled_from([None, 0, 3]),
+)
+def test_values_are_those_of_the_definition(
+    messages: list[tuple[int, float | None]], times: list[int], rule: str, tolerance: int | None
+) -> None:
+    messages = sorted(messages, key=lambda one: one[0])
+    stamps = np.array([t for t, _ in messages], np.int64)
+    values = np.full(len(messages), None, object)
+    values[:] = [value for _, value in messages]
+    found, known = values_at(stamps, values, np.array(times), rule, tolerance)
+    for at, value, is_known in zip(times, found.tolist(), known.tolist(), strict=True):
+        assert (value if is_known else None) == defined(messages, at, rule, tolerance)
+
+
+def defined(messages: list[Any], at: int, rule: str, tolerance: int | None) -> float | None:
+    """The value at a time, by trying all messages."""
+    last = {t: value for t, value in messages if tolerance is None or abs(t - at) <= tolerance}
+    before = max((t for t in last if t <= at), default=None)
+    after = min((t for t in last if t >= at), default=None)
+    if rule == "last":
+        return None if before is None else last[before]
+    if rule == "nearest":
+        near = [t for t in (before, after) if t is not None]
+        return last[min(near, key=lambda t: (abs(t - at), t))] if near else None
+    if before is None or after is None or None in {last[before], last[after]}:
+        return None
+    share = (at - before) / (after - before) if after > before else 0
+    return pytest.approx(last[before] + (last[after] - last[before]) * share)
