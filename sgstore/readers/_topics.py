@@ -407,6 +407,8 @@ class TopicReading:
 
     Attributes
     ----------
+    known : dict of str to TopicFacts
+        All topics of the recording.
     channels : dict of int to str
         Channel → topic.
     decoders : dict
@@ -422,7 +424,7 @@ class TopicReading:
 
     def __init__(self, recording: Recording, topics: Collection[str]) -> None:
         self.recording = recording
-        known = topics_of(recording)
+        self.known = known = topics_of(recording)
         names = [topic_of(known, name).name for name in topics]
         self.losses = {name: Losses() for name in names}
         for name in names:

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
     from sgstore.store._lease import Stamp
+    from sgstore.store._locking import Access
 
 _MOST_CALLS: Final = 1 << 16
 """Number of calls whose values are returned without a look-up: a pair is measured again in each frame."""
@@ -95,7 +96,7 @@ class _MeasuredQuestion:
 
 _tokens = count()
 _questions: Final[dict[int, _MeasuredQuestion]] = {}
-_paths: Final[dict[int, Path]] = {}
+_places: Final[dict[int, Access]] = {}
 _known: Final[OrderedDict[tuple[Path, Stamp], RecordedValues]] = OrderedDict()
 
 
@@ -108,22 +109,22 @@ def _recorded(token: int, measure: Any, trace: Any, src: Any, dst: Any) -> float
 
 
 @contextmanager
-def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> Generator[None]:
+def recorded_measures(connection: DuckDBPyConnection, access: Access, sql: str) -> Generator[None]:
     """Context manager that adds the SQL function ``recorded()`` to a connection, if a statement uses it.
 
     Parameters
     ----------
     connection : DuckDBPyConnection
-    path : Path
+    access : Access
     sql : str
         First statement. Call :func:`show_recorded` for further statements.
     """
-    _paths[id(connection)] = path
+    _places[id(connection)] = access
     try:
         show_recorded(connection, sql)
         yield
     finally:
-        del _paths[id(connection)]
+        del _places[id(connection)]
         interrupted.discard(id(connection))
         for token, asked in list(_questions.items()):
             if asked.asking is connection:
@@ -133,16 +134,16 @@ def recorded_measures(connection: DuckDBPyConnection, path: Path, sql: str) -> G
 
 def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
     """Add the function ``recorded()``, the view ``encounters`` and values of topics, if SQL uses them."""
-    path = _paths.get(id(connection))
-    if path is None:
+    access = _places.get(id(connection))
+    if access is None:
         return
     if TOPIC in sql:
-        show_topic_values(connection, path, sql)
+        show_topic_values(connection, access, sql)
     if _WANTED.search(sql) is None:
         return
     if any(asked.asking is connection for asked in list(_questions.values())):
         return
-    place = path, stamp_of(path)
+    place = access.path, stamp_of(access.path)
     known = _known.setdefault(place, RecordedValues())
     _known.move_to_end(place)
     while len(_known) > _FILES:

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from mcap.records import Schema
     from numpy.typing import NDArray
 
-    from sgstore.lang.catalog import Catalog
+    from sgstore.lang.catalog import Catalog, TopicFacts, TopicValue
     from sgstore.maps.roads import RoadMap
     from sgstore.model.config import Config
     from sgstore.model.criticality import Meetings
@@ -166,6 +166,25 @@ class StoreFile:
 
             create(path)
         return cls(path, memory=memory, wait_s=wait_s, made=made)
+
+    @staticmethod
+    def recorded_topics(path: Path) -> dict[str, TopicFacts]:
+        """Return the topics of a recording that is replayed without a store, by name."""
+        from sgstore.store._replayed_topics import recorded_topics
+
+        return recorded_topics(path)
+
+    @staticmethod
+    def recorded_values(
+        path: Path,
+        asked: Iterable[TopicValue],
+        time_ns: NDArray[np.int64],
+        log_time_ns: NDArray[np.int64],
+    ) -> dict[TopicValue, list[Any]]:
+        """Return the values of topics at all frames of a recording that is replayed without a store."""
+        from sgstore.store._replayed_topics import recorded_values
+
+        return recorded_values(path, asked, time_ns, log_time_ns)
 
     def snapshot(self) -> AbstractContextManager[object]:
         """Keep the store open for several queries. The queries see the same state and run faster."""
@@ -754,7 +773,7 @@ class StoreFile:
                 try:
                     connection = stack.enter_context(self.access.reading(public=public))
                     with translated(self.path):
-                        stack.enter_context(recorded_measures(connection, self.path, sql))
+                        stack.enter_context(recorded_measures(connection, self.access, sql))
                         self._show_topics(connection, sql)
                         give(connection, given)
                         found = ask(connection, stack)

@@ -1,31 +1,56 @@
-"""Temporary tables with the value of a topic at each frame, made for the statements that name them."""
+"""Views with the value of a topic at each frame, made for the statements that name them.
+
+The values are computed once per process and state of the store, and kept as Parquet files in the folder of user
+tables, because a query has one statement for each window of frames.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import re
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.quoting import quoted
+from sgstore.base.quoting import literal, quoted
 from sgstore.lang.catalog import TOPIC, TopicValue
+from sgstore.store._interrupts import interruptible
+from sgstore.store._lease import stamp_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
 
+    from sgstore.store._locking import Access
+
 _NAMED: Final = re.compile(rf'"({TOPIC}(?:[^"]|"")*)"')
 
 
-def show_topic_values(connection: DuckDBPyConnection, path: Path, sql: str) -> None:
-    """Create the tables of topic values that a statement uses, if the connection lacks them."""
-    from sgstore.store._topics import topic_values  # most statements use no topics
+def show_topic_values(connection: DuckDBPyConnection, access: Access, sql: str) -> None:
+    """Create the views of topic values that a statement uses."""
+    from sgstore.store._joins import tables_folder  # most statements use no topics
 
     for name in dict.fromkeys(_NAMED.findall(sql)):
         relation = name.replace('""', '"')
-        there = "SELECT 1 FROM duckdb_tables() WHERE table_name = ?"
-        if connection.execute(there, [relation]).fetchone() is not None:
-            continue
-        one = TopicValue.of(relation)
-        assert one is not None, relation  # noqa: S101 - the pattern ensures it
-        made = topic_values(connection, path, one.topic, one.field, one.rule, one.tolerance_ns)
-        connection.execute(f"CREATE TEMP TABLE {quoted(relation)} AS {made}")
+        key = repr((str(access.path.resolve()), stamp_of(access.path), relation))
+        digest = hashlib.sha256(key.encode("utf-8", "replace")).hexdigest()
+        place = tables_folder() / "topics" / f"{digest[:32]}.parquet"
+        if not place.exists():
+            _write(connection, access, relation, place)
+        rows = f"FROM read_parquet({literal(str(place))})"
+        connection.execute(f"CREATE OR REPLACE TEMP VIEW {quoted(relation)} AS {rows}")
+
+
+def _write(connection: DuckDBPyConnection, access: Access, relation: str, place: Path) -> None:
+    """Write the values of a topic at all frames to a Parquet file."""
+    from sgstore.store._topic_views import topic_facts, topic_values
+
+    one = TopicValue.of(relation)
+    assert one is not None, relation  # noqa: S101 - the pattern ensures it
+    made = "SELECT CAST(NULL AS BIGINT) AS frame_id, CAST(NULL AS VARCHAR) AS value LIMIT 0"
+    if one.topic in topic_facts(connection, access):  # a part of a collection may lack it
+        made = topic_values(connection, access, one.topic, one.field, one.rule, one.tolerance_ns)
+    place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    part = place.with_suffix(f".{id(connection)}")
+    copy = f"COPY ({made} ORDER BY frame_id) TO {literal(str(part))} (FORMAT parquet)"
+    interruptible(connection, lambda: connection.execute(copy))
+    part.replace(place)

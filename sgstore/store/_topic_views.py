@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
+    from sgstore.readers import Recording
     from sgstore.store._locking import Access
     from sgstore.store._traces import StoredTrace
 
@@ -163,10 +164,7 @@ def converted(
     """Write the messages of a topic of a recording to Parquet files in a folder."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     with open_recording(path) as recording, topic_scratch(folder) as connection:
-        if not recording.channels:
-            # Without a summary, channels are known only after a walk.
-            for _ in recording.walk(Findings()):
-                pass
+        _find_channels(recording)
         reading = TopicReading(recording, [topic])
         writer = TopicWriter(connection, folder, clock, bounded=bounded)
         for batch in reading.batches(Findings()):
@@ -213,12 +211,24 @@ def _fields(access: Access, topic: str) -> Mapping[str, TopicField]:
     return {name: TopicField(name, kind) for name, kind in common_fields(told).items()}
 
 
+def topics_in(path: Path) -> dict[str, TopicFacts]:
+    """Return the topics of a recording, by name, without fields."""
+    with open_recording(path) as recording:
+        _find_channels(recording)
+        return TopicReading(recording, ()).known
+
+
+def _find_channels(recording: Recording) -> None:
+    """Read a recording without a summary once, because its channels are known only then."""
+    if not recording.channels:
+        for _ in recording.walk(Findings()):
+            pass
+
+
 def fields_in(path: Path, topic: str) -> dict[str, str] | None:
     """Return the fields of a topic of a recording, with database types. ``None`` means JSON: read it first."""
     with open_recording(path) as recording:
-        if not recording.channels:
-            for _ in recording.walk(Findings()):
-                pass
+        _find_channels(recording)
         found = TopicReading(recording, [topic]).fields(topic)
     return None if found is None else {name: one.declared for name, one in found.items()}
 
@@ -326,11 +336,20 @@ def topic_values(
         reason = f"field {known.name!r} of topic {facts.name!r} is not a number"
         raise TopicError(reason, "rules for it are last and nearest")
     _show(connection, access, facts.name)
+    number = known.declared in {"FLOAT", "DOUBLE"}
+    return values_text(facts.name, known.name, rule, tolerance_ns, may_be_nan=number)
+
+
+def values_text(
+    topic: str, field: str, rule: str, tolerance_ns: int | None, *, may_be_nan: bool
+) -> str:
+    """Return SQL as :func:`topic_values`, for a connection that has the view of the messages."""
     within = "" if tolerance_ns is None else f" <= {int(tolerance_ns)}"
+    value = _value(field)
     values = _VALUES.format(
         shift=SEQ_BITS,
-        value=_value(known.name),
-        messages=quoted(f":messages {facts.name}"),
+        value=f"CASE WHEN NOT isnan({value}) THEN {value} END" if may_be_nan else value,
+        messages=quoted(f":messages {topic}"),
         inside=INSIDE,
     )
     chosen = {"last": _LAST, "nearest": _NEAREST, "linear": _LINEAR}[rule]

@@ -35,7 +35,7 @@ from sgstore.temporal._sequence_monitor import (
     sequence_monitor,
 )
 from sgstore.temporal._signal_state import StreamClock
-from sgstore.temporal._topic_values import TopicMemory, topics_of
+from sgstore.temporal._topic_values import RecordedTopics, TopicMemory, topics_of
 from sgstore.temporal._valuation import NodeNames, QueryCache
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from sgstore.lang.syntax.tree import Statement
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import SceneGraph
+    from sgstore.model.world import FrameBlock
     from sgstore.readers import Cameras, Sensor
     from sgstore.temporal._robustness import Robustness
 
@@ -74,6 +75,8 @@ class FrameSource:
         True if frames arrive in real time.
     cameras : Cameras, optional
         Camera pictures of the frames read so far.
+    topics : RecordedTopics, optional
+        Topics of the recording.
     """
 
     name: str
@@ -83,6 +86,7 @@ class FrameSource:
     losses: list[str] = field(default_factory=list[str])
     live: bool = False
     cameras: Cameras | None = None
+    topics: RecordedTopics | None = None
 
 
 @contextmanager
@@ -130,11 +134,17 @@ def opened(
         told = FrameSource(path.stem, found, iter(()), warnings, cameras=cameras)
         told.losses += [loss.reason for loss in lost_lanes(trace.info, found)]
 
+        def again() -> Iterator[FrameBlock]:
+            with open_trace(path, ego=ego or config.ego) as same:
+                on_map(same, found)
+                yield from same.blocks()
+
+        told.topics = RecordedTopics(trace.info.path, again)
+
         def frames() -> Iterator[Frame]:
-            yield from replayed(
-                cameras.followed(trace.blocks()),
-                recorded_events(c.schema for c in trace.info.channels),
-            )
+            blocks = told.topics.followed(cameras.followed(trace.blocks()))
+            recorded = recorded_events(c.schema for c in trace.info.channels)
+            yield from map(told.topics.on, replayed(blocks, recorded))
             told.warnings += trace.report.warnings
             told.losses += [loss.reason for loss in trace.report.losses]
 
@@ -214,6 +224,8 @@ class Monitor:
         would violate it by ending there. Such a violation has no reset.
     on_step : callable, optional
         Called after the events of each frame, with its time and its graphs, one for each of :attr:`egos`.
+    topics : RecordedTopics, optional
+        Topics of the replayed recording: :attr:`FrameSource.topics`. By default, frames carry their messages.
 
     Attributes
     ----------
@@ -255,6 +267,7 @@ class Monitor:
         called: str | Sequence[str] = "pattern",
         sgsm_compat: bool = False,
         on_step: Callable[[FrameTime, Sequence[SceneGraph]], object] | None = None,
+        topics: RecordedTopics | None = None,
     ) -> None:
         from sgstore.sgg import SceneGraphGenerator  # searches need no generator
 
@@ -265,9 +278,12 @@ class Monitor:
         answers = frozenset(self.generator.answers)
         reach = RelationScope.of(config.as_dict())
         facts = TraceFacts(0, trace, "", answers, reach)
-        catalog = Catalog(traces=(facts,), online=True)
+        known = topics.facts if topics is not None and "topic" in text.lower() else {}
+        catalog = Catalog(traces=(facts,), online=True, topics=known)
         checks, queries = _bound(text, catalog, parameters or {})
         self._topics = TopicMemory(topics_of([*checks, *queries]))
+        if topics is not None:
+            topics.asked += self._topics.asked
         self._egos: list[str] = []
         self._questions: list[QueryCache] = []
         self._scopes: list[tuple[int, bool]] = []

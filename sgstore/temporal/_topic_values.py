@@ -5,14 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from sgstore.lang.ir import FrameAttribute
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
+    from pathlib import Path
 
-    from sgstore.lang.catalog import TopicValue
+    from sgstore.graphs.online import Frame
+    from sgstore.lang.catalog import TopicFacts, TopicValue
+    from sgstore.model.world import FrameBlock
 
 
 def topics_of(part: object) -> Iterator[TopicValue]:
@@ -28,6 +34,55 @@ def topics_of(part: object) -> Iterator[TopicValue]:
     elif is_dataclass(part):
         for one in fields(part):
             yield from topics_of(getattr(part, one.name))
+
+
+class RecordedTopics:
+    """Topics of a recording, for the monitor that replays it.
+
+    Parameters
+    ----------
+    path : Path
+    again : callable
+        Opens the recording again, and returns its blocks of frames.
+
+    Attributes
+    ----------
+    asked : list of TopicValue
+        Values that the monitor needs. They are decoded with the first frame.
+    """
+
+    def __init__(self, path: Path, again: Callable[[], Iterator[FrameBlock]]) -> None:
+        self._path, self._again = path, again
+        self.asked: list[TopicValue] = []
+        self._waiting: Iterator[dict[str, Any]] = iter(())
+
+    @cached_property
+    def facts(self) -> Mapping[str, TopicFacts]:
+        """Topics by name, with the types of their fields."""
+        from sgstore.store import StoreFile  # online, no database is needed
+
+        return StoreFile.recorded_topics(self._path)
+
+    def followed(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
+        """Yield blocks of frames unchanged, after reading the values of all frames."""
+        if self.asked:
+            from sgstore.store import StoreFile
+
+            asked = [*dict.fromkeys(self.asked)]
+            times = [np.stack([block.time_ns, block.log_time_ns]) for block in self._again()]
+            found = StoreFile.recorded_values(
+                self._path, asked, *np.hstack([np.zeros((2, 0), np.int64), *times])
+            )
+            there: dict[str, Any] = dict.fromkeys((one.topic for one in asked), True)
+            rows = zip(*found.values(), strict=True)
+            names = [one.written for one in found]
+            self._waiting = (there | dict(zip(names, row, strict=True)) for row in rows)
+        yield from blocks
+
+    def on(self, frame: Frame) -> Frame:
+        """Add the values of the next frame to it, and return it."""
+        frame.topics = next(self._waiting, {})
+        return frame
 
 
 class TopicMemory:

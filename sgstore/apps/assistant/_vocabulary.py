@@ -71,6 +71,7 @@ def _here(known: Mapping[str, Any]) -> str:
     ]
     lines += [f"Unknown of {trace}: {', '.join(of)}" for trace, of in known["unknown"].items()]
     lines += [f"Table {name}: {', '.join(columns)}" for name, columns in known["tables"].items()]
+    lines += [f"Topic {name}: {', '.join(fields)}" for name, fields in known["topics"].items()]
     return "\n".join(lines)
 
 
@@ -124,7 +125,9 @@ def _values(attribute: Attribute) -> str:
 def _functions() -> str:
     numbers = [f"  {name}(a, b): {one.meaning}" for name, one in PAIR_FUNCTIONS.items()]
     others = sorted(FUNCTIONS - PAIR_FUNCTIONS.keys())
-    return "\n".join(["Of two entities:", *numbers, f"Others: {', '.join(others)}"])
+    topic = "A recorded topic at the frame: topic('/imu', nearest, 0.1s).angular_velocity.z"
+    topic += " (rules: last, nearest, linear)"
+    return "\n".join(["Of two entities:", *numbers, f"Others: {', '.join(others)}", topic])
 
 
 def _predicates() -> str:

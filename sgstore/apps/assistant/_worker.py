@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.apps.sandbox import plain, serve
 from sgstore.errors import QueryError
+from sgstore.lang.help import words
 from sgstore.lang.library import pattern_named
 from sgstore.lang.sql import for_people
 from sgstore.matches import intervals_for_people
@@ -253,6 +254,10 @@ def _views(store: Store, limit: int) -> Reply:
     return {"views": views}
 
 
+_FIELDS: Final = 40
+"""Largest number of fields of a topic in a vocabulary."""
+
+
 def _vocabulary(store: Store, limit: int) -> Reply:
     """Return the kinds and relations that occur in a store, with their counts."""
     del limit
@@ -279,6 +284,10 @@ def _vocabulary(store: Store, limit: int) -> Reply:
         },
         "own": {name: str(kind) for name, kind in catalog.own.items()},
         "tables": {name: list(table.columns) for name, table in catalog.tables.items()},
+        "topics": {
+            name: [f"{one['name']} ({one['meaning']})" for one in fields[:_FIELDS]]
+            for name, fields in words(catalog)["topics"].items()
+        },
     }
 
 

@@ -96,6 +96,7 @@ def monitor(
             settings,
             parameters=values,
             trace=source.name,
+            topics=source.topics,
             called=_pattern_names(asked),
             sgsm_compat=statements.sgsm_compat,
         )

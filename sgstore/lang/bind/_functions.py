@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _OTHERS: Final = frozenset(
     {
         *("class_count", "coalesce", "dataset_classes", "in_range", "known", "length", "nodes"),
-        *("type", *OF_TEXT),
+        *("topic", "type", *OF_TEXT),
     }
 )
 _COURSES: Final = (

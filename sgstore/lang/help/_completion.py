@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from sgstore.lang.catalog import attributes_of
+from sgstore.errors import SgstoreError
+from sgstore.lang.catalog import TopicValue, Type, attributes_of
 from sgstore.lang.library import patterns
 from sgstore.lang.syntax import keywords
 from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.model.vocabulary import KINDS, RELATIONS, labels
 
 if TYPE_CHECKING:
-    from sgstore.lang.catalog import Catalog
+    from sgstore.lang.catalog import Catalog, TopicFacts
 
 
 def words(catalog: Catalog) -> dict[str, Any]:
-    """Return the words that a query can use, with meanings: labels, relations, attributes, functions, keywords.
+    """Return the words of queries, with meanings: labels, relations, attributes, functions, topics, keywords.
 
     Parameters
     ----------
@@ -45,4 +47,21 @@ def words(catalog: Catalog) -> dict[str, Any]:
         "functions": functions,
         "predicates": predicates,
         "keywords": keywords(),
+        "topics": {name: _fields(catalog.topics[name]) for name in sorted(catalog.topics)},
     }
+
+
+def _fields(topic: TopicFacts) -> list[dict[str, str]]:
+    """Return the fields of a topic as a query writes them. An unreadable topic has none."""
+    from sgstore.lang.topics import fields_of  # imports numpy
+
+    with suppress(SgstoreError):
+        whole = TopicValue(topic.name, "").written
+        return [
+            {
+                "name": TopicValue(topic.name, name).written.removeprefix(f"{whole}."),
+                "meaning": field.declared if field.type is Type.list else field.type.value,
+            }
+            for name, field in fields_of(topic).items()
+        ]
+    return []

@@ -59,6 +59,13 @@ function complete(context) {
     label: one.name, type, detail: one.meaning, info: one.values?.length ? one.values.join(", ") : undefined,
   }));
   const word = context.matchBefore(/\w+/), from = word ? word.from : context.pos, validFor = /^\w*$/;
+  const field = /\btopic\(\s*'([^']*)'[^()]*\)\.([\w.[\]`-]*)$/i.exec(before);
+  if (field) {
+    const start = context.pos - (field[2] || "").length;
+    return { from: start, options: told(known.topics[field[1] || ""] || [], "property"), validFor: /^[\w.[\]`-]*$/ };
+  }
+  const topic = /\btopic\(\s*'([^']*)$/i.exec(before);
+  if (topic) return { from: context.pos - (topic[1] || "").length, options: of(Object.keys(known.topics), "text"), validFor: /^[^']*$/ };
   const owner = /(\w+)\.\w*$/.exec(before)?.[1];
   if (owner) {
     const edges = new RegExp(`\\[\\s*${owner}\\s*[:\\]]`).test(context.state.doc.toString());
