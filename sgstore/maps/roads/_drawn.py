@@ -114,7 +114,11 @@ def _arrows(road_map: RoadMap, centre: NDArray[np.float64]) -> NDArray[np.float3
     nodes, ribbons = road_map.nodes, road_map.ribbons
     found = [np.empty((0, 3))]
     for row, word in enumerate(nodes.lane_type):
-        if word not in DrawnOutlines.MOTOR_LANES or nodes.junction[row] or not 1 <= row < len(ribbons.offsets):
+        if (
+            word not in DrawnOutlines.MOTOR_LANES
+            or nodes.junction[row]
+            or not 1 <= row < len(ribbons.offsets)
+        ):
             continue
         part = slice(*ribbons.offsets[row - 1 : row + 1].tolist())
         x = (ribbons.left_x[part] + ribbons.right_x[part]) / 2
