@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 CHUNK: Final = 300
 """Frames per states request of the page (``CHUNK`` of ``data.js``)."""
 
+MOST_LOOKED_AT: Final = 20_000
+"""Matches from which those of a report are chosen."""
+
 POLICY: Final = (
     "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}';"
     " base-uri 'none'; form-action 'none'; require-trusted-types-for 'script'"
@@ -69,7 +72,7 @@ def report(
     parameters : mapping, optional
         Values of ``$name``.
     most : int
-        Greatest number of matches.
+        Greatest number of matches: as many of each trace, over its whole time.
     around_s : float
         Additional time before and after each match; s.
     pictures : bool
@@ -165,7 +168,8 @@ def _kept(
     """Return the data of a report page as JSON values, the matches, and True if the query has more matches."""
     is_check = re.match(r"\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b", text, re.IGNORECASE)
     question = {"text": text, "parameters": values}
-    told = list(answer(store, {"ask": "check" if is_check else "matches", **question}, most))
+    asked = {"ask": "check" if is_check else "matches", **question}
+    told = _spread(list(answer(store, asked, max(most, MOST_LOOKED_AT))), most)
     check, found = None, list[Found]()
     if is_check:
         (check,) = told
@@ -193,6 +197,50 @@ def _kept(
         "pictures": {},
     }
     return kept, found, bool(told[-1].get("truncated"))
+
+
+def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
+    """Return replies with at most ``most`` matches or violations, as many of each trace."""
+    lists = [(reply, "matches", "") for reply in told if "matches" in reply]
+    lists += [(one, "spans", one["trace"]) for one in told[-1].get("verdicts", ())]
+    traces = [str(trace or row[0]) for part, key, trace in lists for row in part[key]]
+    if len(traces) <= most:
+        return told
+    kept = chosen_spread(traces, most)
+    number = 0
+    for part, key, _ in lists:
+        end = number + len(part[key])
+        part[key] = [row for at, row in enumerate(part[key], number) if at in kept]
+        number = end
+    told[-1] |= {"count": most, "truncated": True}
+    return told
+
+
+def chosen_spread(traces: list[str], most: int) -> set[int]:
+    """Return the places of ``most`` items, as many of each trace as possible, evenly over its items.
+
+    Parameters
+    ----------
+    traces : list of str
+        Trace of each item.
+    most : int
+        Greatest number of items.
+
+    Examples
+    --------
+    >>> sorted(chosen_spread(["a"] * 5 + ["b"], 3))
+    [0, 4, 5]
+    """
+    places: dict[str, list[int]] = {}
+    for at, trace in enumerate(traces):
+        places.setdefault(trace, []).append(at)
+    share, left, many = dict.fromkeys(places, 0), min(most, len(traces)), len(places)
+    for trace, mine in sorted(places.items(), key=lambda item: len(item[1])):  # few leave more
+        share[trace] = min(len(mine), left // many)
+        left, many = left - share[trace], many - 1
+    even = (np.linspace(0, len(mine) - 1, share[trace]).round() for trace, mine in places.items())
+    of = zip(places.values(), even, strict=True)
+    return {mine[int(at)] for mine, some in of for at in some}
 
 
 def _found(told: list[dict[str, Any]]) -> Iterator[Found]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
+import itertools
 import json
 import re
 import struct
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from sgstore.apps.cli import run
-from sgstore.apps.report import report
+from sgstore.apps.report import chosen_spread, report
 from sgstore.errors import QueryError
 from sgstore.query import Store
 
@@ -135,7 +136,30 @@ def test_hostile_names_stay_text(store: Store, tmp_path: Path) -> None:
 def test_no_more_matches_than_wanted(store: Store, tmp_path: Path) -> None:
     assert report(store, NEAR, tmp_path / "r.html", parameters={"least": 1}, most=2) == (2, True)
     told = kept_in(tmp_path / "r.html")["find"]
-    assert sum(len(reply.get("matches", ())) for reply in told) == 2
+    rows = [row for reply in told for row in reply.get("matches", ())]
+    whole = list(store.find(NEAR, least=1).intervals())
+    assert [row[1] for row in rows] == [whole[0].start_seq, whole[-1].start_seq]  # spread in time
+    check = "CHECK far: FORALL (v:Vehicle) ALWAYS dist(ego, v) > 4"
+    report(store, check, tmp_path / "c.html", most=2)
+    (verdict,) = kept_in(tmp_path / "c.html")["check"]["verdicts"]
+    (found,) = store.check(check)
+    spans = found.violations
+    assert [span[0] for span in verdict["spans"]] == [spans[0].start_seq, spans[-1].start_seq]
+    assert verdict["violations"] == len(spans) > 2
+
+
+@pytest.mark.parametrize("most", [1, 4, 7, 9, 30])
+def test_matches_of_a_report_are_spread_over_traces(most: int) -> None:
+    """As many as wanted; no trace has more than one above another that has more to give."""
+    traces = [*"aaaaaaaaaaaa", *"b", *"ccccc", *"aa", *"dd"]
+    kept = chosen_spread(traces, most)
+    share = {trace: sum(traces[at] == trace for at in kept) for trace in "abcd"}
+
+    assert len(kept) == min(most, len(traces))
+    for one, other in itertools.permutations("abcd", 2):
+        assert share[one] <= share[other] + 1 or share[other] == traces.count(other)
+    if share["a"] > 1:
+        assert {0, 19} <= kept  # the first and the last
 
 
 def test_a_hundred_matches_are_small(store: Store, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from thorough import LONG
 
 import sgstore.apps.explorer
 from sgstore.apps.explorer import Explorer, application, serve
+from sgstore.maps.opendrive import read_map
 from sgstore.query import Store
 from sgstore.store import StateColumns
 
@@ -416,6 +417,30 @@ def test_graphs_and_series(page: Page, store: Store) -> None:
     assert (pair["value"] >= 0).all()
 
 
+def test_arrows_of_a_map_follow_its_lanes(page: Page, store: Store) -> None:
+    """Each arrow has the direction of the lane below it; the nodes of the map have both."""
+    header, columns = unpacked(page.get("/api/map", trace="town").content)
+    found = store.file.road_map_text("town")
+    assert found is not None
+    road_map = read_map(found[1], found[0])
+    x, y = (
+        columns[f"arrow.{axis}"] + origin
+        for axis, origin in zip("xy", header["origin"], strict=True)
+    )
+    nodes = road_map.nodes
+    lanes = [
+        row
+        for row, word in enumerate(nodes.lane_type)
+        if word == "driving" and not nodes.junction[row]
+    ]
+    away = np.hypot(x[:, None] - nodes.x[lanes], y[:, None] - nodes.y[lanes])
+    near = away.argmin(axis=1)
+    some = away.min(axis=1) < 2  # near the middle of a lane
+    assert some.sum() > 5
+    turned = columns["arrow.angle"][some] - nodes.heading[lanes][near[some]]
+    assert np.cos(turned).min() > 0.9
+
+
 def test_words_and_library(page: Page) -> None:
     words, library = page.get("/api/words").json(), page.get("/api/library").json()
 
@@ -447,8 +472,12 @@ def test_tags_are_kept_beside_the_store_and_can_be_asked_for(page: Page, town_st
     assert file.read_text().splitlines()[0] == "trace,seq,tag,note,who,at"
     (answer,) = page.find("SELECT seq FROM notes WHERE tag = 'check this'")
     assert answer["rows"] == [[12]]
+    page.post("/api/notes", trace="town", seq=13, last=20, tag="check this")
+    page.post("/api/notes", trace="town", seq=18, last=20, tag="check this", do="remove")
     found = page.find("MATCH (e:Ego) WHERE notes.tag = 'check this'")
-    assert found[2]["matches"][0][1:3] == [12, 12]
+    assert found[2]["matches"][0][1:3] == [12, 17]
+    assert page.post("/api/notes", trace="town", seq=9, last=8, tag="x").status_code == 400
+    assert page.post("/api/notes", trace="town", seq=9, last=10**6, tag="x").status_code == 400
     file.unlink()
 
 

@@ -143,3 +143,41 @@ def test_words_lead_to_a_query(page: Any, town_store: Path) -> None:
     expect(page.locator(".gap")).to_contain_text(near["found"].split(" = ")[0])
     page.locator(".gap button").click()
     expect(page.locator(".status")).not_to_contain_text("0 matches")
+
+
+def test_scene_has_a_legend_and_matches_have_tags_by_mouse(page: Any, town_store: Path) -> None:
+    asked = list[Any]()
+
+    def hold(route: Any) -> None:
+        asked.append(route)
+
+    page.route("**/api/find", hold)
+    page.locator(".cm-content").fill("MATCH (a:Vehicle)-[:near]-(b:Vehicle)")
+    page.keyboard.press("Control+Enter")
+    expect(page.locator(".status .asking")).to_have_text("asking … 1 s")
+    for route in asked:
+        route.continue_()
+    page.unroute("**/api/find")
+    spans = list(
+        Store(town_store).find("MATCH (a:Vehicle)-[:near]-(b:Vehicle)").intervals(bound=True)
+    )
+    pairs = {(s.start_seq, s.end_seq, *sorted((s.values["a"], s.values["b"]))) for s in spans}
+    expect(page.locator(".group")).to_contain_text(f"{len(pairs)} matches")
+    expect(page.locator(".tile", has_text="\u00d72").first).to_be_visible()
+    page.get_by_label("order").select_option("long")
+    longest = max(s.end_seq - s.start_seq for s in spans)
+    first = next(s for s in spans if s.end_seq - s.start_seq == longest)
+    page.locator(".tile").first.hover()
+    page.locator(".tile .tagger").first.click()
+    page.get_by_label("Tag", exact=True).fill("long one")
+    page.locator(".dialog button.main").click()
+    expect(page.locator(".tile .tag").first).to_have_text("long one")
+    search(page, "SELECT MIN(seq), MAX(seq) FROM notes")
+    assert page.locator("td").all_inner_texts() == [str(first.start_seq), str(first.end_seq)]
+    town_store.with_name(f"{town_store.name}.notes.csv").unlink()
+    search(page, "MATCH (e:Ego)")
+    open_first(page)
+    page.get_by_role("button", name="legend").click()
+    expect(page.locator(".legend")).to_contain_text("lane: driving")
+    page.locator(".above canvas").hover()  # the ego is in the middle
+    expect(page.locator(".tip")).to_contain_text("m/s")
