@@ -104,7 +104,7 @@ def test_no_view_has_a_serious_fault_of_accessibility(page: Any) -> None:
         page.locator(".pattern .scroll").wait_for()
         assert faults(page) == []
     page.get_by_role("button", name="Selection").click()
-    page.locator("tbody button").first.wait_for()
+    page.locator(".clip button").first.wait_for()
     assert faults(page) == []
     page.get_by_role("button", name="Coverage").click()
     for tab in ("Growth", "Combinations"):
