@@ -251,27 +251,28 @@ def topic_statements(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for name, told in tables:
-        if _TOPIC.fullmatch(name) and _is_plain(words := statement(told)):
-            found[name] = f"{name}{' '.join(words[3:]).removesuffix(';')}"
+        columns = _plain_columns(statement(told)) if _TOPIC.fullmatch(name) else ""
+        if columns:
+            found[name] = f"{name}({columns})"
     return found
 
 
-def _is_plain(words: Tokens) -> bool:
-    """True if a CREATE TABLE statement has only columns with plain types."""
-    *columns, end = words[4:] if words[-1] != ";" else words[4:-1]
-    if words[3] != "(" or end != ")":
-        return False
+def _plain_columns(words: Tokens) -> str:
+    """Return the columns of a CREATE TABLE statement; empty if one is more than a name and a plain type."""
+    *inner, end = words[4:] if words[-1] != ";" else words[4:-1]
+    found: list[str] = []
     column: list[str] = []
-    for word in (*columns, ","):
+    for word in (*inner, ","):
         if word != ",":
             column.append(word)
             continue
-        kind = column[2:]
-        kind = kind[:-2] if kind[-2:] == ["NOT", "NULL"] else kind
-        if len(column) < 2 or column[1] not in TOPIC_TYPES or kind not in ([], ["[", "]"]):
-            return False
+        name, kind, *more = *column, "", ""
+        rest = " ".join(more[:-2])
+        if kind not in TOPIC_TYPES or rest not in {"", "NOT NULL", "[ ]", "[ ] NOT NULL"}:
+            return ""
+        found.append(f"{name if name.startswith(chr(34)) else quoted(name)} {kind} {rest}")
         column = []
-    return True
+    return ", ".join(found) if (words[3], end) == ("(", ")") else ""
 
 
 def _without_topics(objects: Objects) -> Objects:
