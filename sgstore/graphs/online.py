@@ -138,7 +138,8 @@ class Frame:
         Messages of other topics at this time: ``{"/planner": {"state": "STOP"}}``. A pattern uses their fields
         as ``topic('/planner').state``. A topic that is absent keeps its last message.
     losses : list of (str, str)
-        Id and fault of each implausible number, which is treated as missing: ``("7", "length is -4.5 m")``.
+        Id and fault of each implausible number, which is treated as missing: ``("7", "length is -4.5 m")``;
+        and of each entity without a position.
 
     Examples
     --------
@@ -306,8 +307,8 @@ class Frame:
         Notes
         -----
         A missing or infinite number is unknown, not 0. An entity without a size is a point. An entity without a
-        heading has no front. Sizes below 0 or above 1 km and speeds above 150 m/s are unknown, too;
-        :attr:`losses` lists them.
+        heading has no front. Sizes below 0 or above 1 km and speeds above 150 m/s are unknown, too.
+        An entity without a position is in no graph. :attr:`losses` lists both.
 
         Examples
         --------
@@ -404,7 +405,12 @@ class Frame:
         return frame
 
     def _plausible(self, ident: str, pose: tuple[float, ...]) -> tuple[float, ...]:
-        """Return pose and motion values without implausible ones, which are reported as lost."""
+        """Return pose and motion values without implausible ones, which are reported as lost.
+
+        An unknown position is reported, too, because the graph then lacks the entity.
+        """
+        if not (math.isfinite(pose[0]) and math.isfinite(pose[1])):
+            self.losses.append((ident, "position is unknown"))
         if is_plausible(*pose[6:9], *pose[13:]):
             return pose
         kept, faults = without_implausible(np.array([pose], np.float64))

@@ -841,7 +841,8 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         for ident, words in frame.losses:
             self.roster.faults.add(ident, words)
         for entity in frame.entities:
-            if entity.static and entity.ident not in self._known:
+            placed = np.isfinite(entity.numbers[:2]).all()  # Frame.losses has the others.
+            if entity.static and placed and entity.ident not in self._known:
                 self._stand(entity)
         log_time = int(run.log_time_ns[row])
         if not self.is_inside(log_time):  # A clip contains it for its static entities.

@@ -548,6 +548,20 @@ def test_what_stands_and_is_told_late_is_there_from_then_on(
         assert not column(blocks, "vx")[there].any()
 
 
+def test_an_entity_without_a_position_is_a_loss(tmp_path: Path, plain_reader: None) -> None:
+    worlds = [plain_world(i) for i in range(3)]
+    nowhere = {"kind": "vegetation", "x": float("nan"), "y": 4.0}
+    worlds[0]["entities"].append(nowhere | {"ident": "tree", "static": True})
+    worlds[1]["entities"].append(nowhere | {"ident": "leaf"})
+    _, blocks, report = read(plain(tmp_path / "plain.mcap", worlds))
+
+    assert "tree" not in idents(blocks)
+    assert [loss.reason for loss in report.losses] == [
+        "position of entity 'tree' is unknown: missing in 1 states",
+        "position of entity 'leaf' is unknown: missing in 1 states",
+    ]
+
+
 class HalvesTrace(PlainTrace):
     """Every second message has the entities of the time that the one before it tells."""
 
