@@ -137,6 +137,63 @@ def test_standing_cars_are_stopped_and_parked(tmp_path: Path, wander: bool) -> N
         assert all(3.5 < row.t < 6.5 for row in hard)
 
 
+@pytest.mark.parametrize("sigma", [0.05, 0.2])
+def test_noise_does_not_break_or_begin_terms_of_motion(tmp_path: Path, sigma: float) -> None:
+    rng = np.random.default_rng(2)
+    frames = 120
+    t = np.arange(frames) * PERIOD
+    speed = 5 + 2 * np.clip(
+        t - 3, 0, 3
+    )  # It gets faster from 3 s to 6 s, and turns from 7 s to 10 s.
+    heading = np.radians(15) * np.clip(t - 7, 0, 3)
+    x, y = np.cumsum(speed * np.cos(heading)) * PERIOD, np.cumsum(speed * np.sin(heading)) * PERIOD
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for i in range(frames):
+            off, tilt = rng.normal(0, sigma, (4, 2)), rng.normal(0, 0.03, 4)
+            cars = [moved(1, x[i] + off[0, 0], y[i] + off[0, 1])]
+            cars += [moved(k + 1, 15 * k + off[k, 0], 30 + off[k, 1]) for k in (1, 2, 3)]
+            tilt[0] += heading[i]
+            for one, turned in zip(cars, tilt, strict=True):
+                one.base.orientation.yaw = turned
+            recorder.ground_truth(t[i], cars, host=1)
+    with sgstore.open(tmp_path / "s.sgstore", create=True) as store:
+        store.ingest(path, config=sgstore.Config(noise=sigma))
+        for term, begin, end in (("accelerating", 3, 6), ("turning", 7, 10)):
+            query = f"USING SCOPE world MATCH (v:Car) WHERE {term}(v)"
+            runs = store.find(f"{query} RETURN INTERVALS").rows()
+            told = store.find(f"{query} RETURN v.ident AS i, frame.t AS t").rows()
+            assert {row.i for row in told} == {"1"}
+            assert len(runs) == 1
+            assert abs(min(row.t for row in told) - begin) < 0.8
+            assert abs(max(row.t for row in told) - end) < 0.8
+
+
+@pytest.mark.parametrize(
+    ("term", "value", "enter", "leave"),
+    [("accelerating", "v.accel", 1, 0.5), ("turning", "abs(v.yaw_rate)", 5, 3)],
+)
+def test_terms_with_a_band_equal_their_definition(
+    open_town: Store, term: str, value: str, enter: float, leave: float
+) -> None:
+    rows = open_town.find(
+        f"MATCH (v:Vehicle) RETURN v.ident AS i, frame.seq AS f, {value} AS x ORDER BY v.ident, frame.seq"
+    ).rows()
+    expected: set[tuple[str, int]] = set()
+    on, last = False, ("", -1)
+    for row in rows:
+        here = on and last == (row.i, row.f - 1)
+        on = row.x is not None and (row.x >= enter or (here and row.x >= leave - 1e-6))
+        last = (row.i, row.f)
+        if on:
+            expected.add(last)
+    found = open_town.find(
+        f"MATCH (v:Vehicle) WHERE {term}(v) RETURN v.ident AS i, frame.seq AS f"
+    ).rows()
+    assert expected
+    assert {(row.i, row.f) for row in found} == expected
+
+
 def test_a_jump_gives_no_acceleration(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     path = tmp_path / "a.mcap"
