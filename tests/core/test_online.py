@@ -338,6 +338,37 @@ def same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
             assert ours[name] == value, name
 
 
+@pytest.mark.parametrize("name", ["carla/Town01.carla.mcap", "sumo/Town10HD_sumo_osi.mcap"])
+def test_a_replayed_recording_keeps_the_node_ids_of_its_store(data: Path, name: str) -> None:
+    """Also of entities that the reader lists before the first frame that has them."""
+    online, replay, compared = SceneGraphGenerator(None, Config()), Replay(), 0
+    with open_trace(data / "traces" / name) as recording:
+        block = next(recording.blocks())
+        idents = block.entities.ident
+        for frame in islice(replay.frames(block), 3):
+            for node, about in online.step(frame).nodes.items():
+                assert about["ident"] == idents[node]
+                compared += 1
+    assert compared >= 3
+
+
+def test_a_node_id_of_another_entity_is_not_used_again() -> None:
+    online = SceneGraphGenerator(None, Config())
+    frame = Frame(0)
+    for ident, node in (("a", 5), ("b", -1), ("c", 2)):
+        frame.add(ident, "car", 0.0, 10.0 * node, heading=0.0)
+        frame.entities[-1] = frame.entities[-1]._replace(node=node)
+    assert {about["ident"]: node for node, about in online.step(frame).nodes.items()} == {
+        "a": 5,
+        "b": 6,
+        "c": 2,
+    }
+    later = Frame(100_000_000)
+    later.add("d", "car", 0.0, 90.0, heading=0.0)
+    later.entities[-1] = later.entities[-1]._replace(node=5)
+    assert list(online.step(later).nodes) == [7]
+
+
 BLOCKS = 6 if LONG else 3
 """Blocks of the bundled recording, of 60 frames each, that are driven step by step."""
 

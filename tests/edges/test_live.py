@@ -72,15 +72,16 @@ def test_frames_are_those_of_a_store(watched: Any, open_town: Store) -> None:
         "SELECT n.node_id, n.kind, n.x, n.y, n.speed FROM nodes n JOIN frames f USING (frame_id)"
         " WHERE NOT n.is_static AND n.node_id >= 0 AND f.seq = $seq ORDER BY n.node_id"
     )
-    origin, kinds = None, hello["about"]["codes"]["kind"]
+    kinds = hello["about"]["codes"]["kind"]
+    times = open_town.sql("SELECT t FROM frames ORDER BY frame_id").values
     assert [header["seq"] for _, (header, _) in frames] == list(range(FRAMES))
     for _, (header, columns) in frames[::20]:
         rows = open_town.sql(sql.replace("$seq", str(header["seq"]))).values
         assert columns["node"].tolist() == [row[0] for row in rows]
         assert [kinds[code] for code in columns["kind"]] == [row[1] for row in rows]
-        places = np.array([row[2:4] for row in rows]) - np.stack([columns["x"], columns["y"]], 1)
-        origin = places[0] if origin is None else origin
-        assert np.allclose(places, origin, atol=2e-3)
+        assert header["t"] == times[header["seq"]][0]
+        places = np.stack([columns["x"], columns["y"]], 1) + header["origin"]
+        assert np.allclose(places, [row[2:4] for row in rows], rtol=0, atol=1e-9)
         speeds = np.array([row[4] for row in rows], float)
         assert np.allclose(columns["speed"], speeds, atol=1e-3, equal_nan=True)
         assert columns["node"][columns["ego"] == 1].tolist() == [header["ego"]]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+import hashlib
 import json
 import socket
 import time
@@ -108,13 +110,14 @@ def store(town_store: Path) -> Store:
 
 def test_an_address_that_is_told_can_be_connected_to(town_store: Path) -> None:
     def told(address: str) -> None:
-        port = httpx.URL(address).port
+        port, view = httpx.URL(address).port, address.partition("#")[2]
         assert port is not None
+        assert view == "at=town%237"
         socket.create_connection(("127.0.0.1", port), timeout=5).close()
         raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        serve(town_store, on_start=told)
+        serve(town_store, link="http://127.0.0.1:1/#at=town%237", on_start=told)
 
 
 def test_the_token_in_the_address_becomes_a_cookie(page: Page) -> None:
@@ -125,6 +128,21 @@ def test_the_token_in_the_address_becomes_a_cookie(page: Page) -> None:
     assert cookie.startswith(f"sgstore-8123={TOKEN}")
     assert "httponly" in cookie
     assert "samesite=strict" in cookie
+
+
+def test_a_link_on_another_page_loads_itself_again(page: Page) -> None:
+    """A browser sends no cookie with it at first; the text after # stays in the browser."""
+    first = page.ask("GET", "/", headers={"cookie": "", "sec-fetch-site": "cross-site"})
+    script = first.text.split("<script>")[1].split("</script>")[0]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+    assert first.status_code == 403
+    assert "location.hash" in script
+    assert f"script-src 'sha256-{digest}'" in first.headers["content-security-policy"]
+    assert first.headers["content-security-policy"].startswith("default-src 'none'; ")
+    again = page.get("/", again="")
+    assert (again.status_code, again.headers["location"]) == (303, "/")
+    assert page.ask("GET", "/?again", headers={"cookie": ""}).status_code == 403
 
 
 @pytest.mark.parametrize("path", ["/", "/api/store", "/static/js/main.js", "/api/find"])
@@ -232,6 +250,26 @@ def test_matches_come_as_lines(page: Page, store: Store) -> None:
     assert (head["columns"], head["reasons"]) == (list(store.find(NEAR).columns), {})
     assert [(r[0], r[1], r[2]) for r in rows] == [(s.trace, s.start_seq, s.end_seq) for s in spans]
     assert lines[-1]["count"] == len(spans)
+
+
+def test_answers_carry_the_stamp_of_their_store(page: Page, store: Store) -> None:
+    stamp = page.get("/api/stamp").json()
+
+    assert stamp == {"a": store.file.stamp, "b": store.file.stamp}
+    assert page.get("/api/store").json()["stamp"] == stamp["a"]
+    for text in (NEAR, "SELECT 1 AS x"):
+        assert page.find(text)[0]["stamp"] == stamp["a"]
+    told = page.post("/api/check", text="CHECK slow: ALWAYS ego.speed < 500").json()
+    assert told["stamp"] == stamp["a"]
+
+
+def test_the_times_of_frames_come_once_for_a_trace(page: Page, store: Store) -> None:
+    _, columns = unpacked(page.get("/api/static", trace="town").content)
+    times = store.sql("SELECT t FROM frames ORDER BY frame_id").values
+    _, states = unpacked(page.get("/api/states", trace="town", first=0, last=9).content)
+
+    assert columns["t"].tolist() == [t for (t,) in times]
+    assert "frame.t" not in states
 
 
 def test_sql_is_answered_in_the_same_place(page: Page) -> None:
@@ -499,7 +537,7 @@ def test_coverage_is_that_of_the_verb(page: Page, store: Store) -> None:
 def test_clips_become_a_test_set(page: Page, store: Store) -> None:
     from sgstore.testsets.locks import read_lock, verify
 
-    clips = [["town", 10, 40], ["town", 30, 60], ["town", 100, 120]]
+    clips = [["town", 10, 40, 30, 60], ["town", 100, 120]]
     told = page.post("/api/select", clips=clips).json()
     assert (told["frames"], told["clips"]) == (51 + 21, 3)
     assert told["bytes"] > 0
@@ -510,7 +548,7 @@ def test_clips_become_a_test_set(page: Page, store: Store) -> None:
     assert [(case.first, case.last) for case in lock.cases] == [(10, 60), (100, 120)]
     assert not list(verify(lock, store))
 
-    files = result_of(page.post("/api/export", clips=clips[2:], name="clips").text)
+    files = result_of(page.post("/api/export", clips=clips[1:], name="clips").text)
     assert files["files"]
     assert not files["losses"]
 
@@ -588,6 +626,8 @@ BAD: list[tuple[str, str, dict[str, Any]]] = [
     ),
     ("POST", "/api/parts", {"json": {"text": NEAR, "trace": "town", "seq": 10**9}}),
     ("POST", "/api/select", {"json": {"clips": [["town", 9, 3]]}}),
+    ("POST", "/api/select", {"json": {"clips": [["town", 1, 2, 3]]}}),
+    ("POST", "/api/select", {"json": {"clips": [["town", *[1] * 100_002]]}}),
     ("POST", "/api/notes", {"json": {"trace": "town", "seq": 1, "tag": ""}}),
     ("POST", "/api/notes", {"json": {"trace": "town", "seq": 1, "tag": "-x"}}),
     ("POST", "/api/store", {"json": {}}),
@@ -645,6 +685,9 @@ def test_many_questions_at_once_are_refused_and_cancelled(page: Page) -> None:
             for i in range(10)
         ]
         await asyncio.sleep(1.0)
+        about = {"text": NEAR, "trace": "town", "seq": 100}
+        small = [page.send("POST", f"/api/{name}", json=about) for name in ("parts", "why")]
+        assert ["error" in one.json() for one in await asyncio.gather(*small)] == [False, False]
         began = time.perf_counter()
         for i in range(10):
             await page.send("DELETE", f"/api/find/r{i}")

@@ -56,7 +56,8 @@ LOOK_S: Final = 0.02
 """Polling interval for new frames; s."""
 
 _STATES: Final = {
-    **dict.fromkeys(("x", "y", "heading", "speed", "length", "width"), np.float32),
+    **dict.fromkeys(("x", "y"), np.float64),  # so that places equal those of a store
+    **dict.fromkeys(("heading", "speed", "length", "width"), np.float32),
     "node": np.int32,
     **dict.fromkeys(("kind", "ego", "light"), np.uint8),
 }
@@ -118,15 +119,15 @@ class LiveRun:
         """Send a frame and its events to the page. With several egos, the page shows the first one."""
         graph, monitor = graphs[0], self._monitor
         with self._lock:
+            if self._origin is None:
+                self._origin = _origin_of(graph)
             things = {node: about for node, about in graph.nodes.items() if node >= 0}
-            self._origin = self._origin or _origin_of(things)
-            origin = self._origin or (0.0, 0.0)
-            header = {"seq": here.seq, "t": here.t, "origin": origin, "events": self._events}
+            header = {"seq": here.seq, "t": here.t, "origin": self._origin, "events": self._events}
             header |= {"ego": -1 if graph.ego is None else graph.ego}
             header |= {"names": self._new_names(things), "still": self._new_still(things)}
             header |= {"status": {} if monitor is None else monitor.status}
             self._events = []
-            data = packed(header, _columns(things, graph.ego, origin))
+            data = packed(header, _columns(things, graph.ego, self._origin))
             self._put("frame", base64.b64encode(data))
             self._recent.add(here, graph, self.name if monitor is None else monitor.trace)
 
@@ -310,13 +311,8 @@ def _columns(things: Things, ego: int | None, origin: tuple[float, float]) -> di
     return {name: np.array(columns[name], type_) for name, type_ in _STATES.items()}
 
 
-def _origin_of(things: Things) -> tuple[float, float] | None:
-    """Return the origin of the trace in a store, so that 32-bit coordinates are equal; see ``origin_of``."""
-    placed = [
-        a for a in things.values() if math.isfinite(a.get("x", math.nan) + a.get("y", math.nan))
-    ]
-    chosen = [a for a in placed if not a["is_static"]] or placed
-    if not chosen:
-        return None
-    x, y = (round(float(np.median([a[name] for a in chosen]))) for name in "xy")
-    return float(x), float(y)
+def _origin_of(graph: SceneGraph) -> tuple[float, float]:
+    """Return a point near the entities as the origin."""
+    places = [a for n, a in graph.nodes.items() if n >= 0]
+    first = graph.nodes[graph.ego] if graph.ego is not None else next(iter(places), {})
+    return float(round(first.get("x", 0.0))), float(round(first.get("y", 0.0)))

@@ -34,13 +34,13 @@ export function textOfTicks(all) {
     group.last = first;
     groups.set(head, group);
   }
-  return [...groups].map(([head, { parts }]) => `${head}*${parts.join("_")}`).join("**");
+  return [...groups].map(([head, { parts }]) => `${head}*${parts.join("_")}`).join("*_*");
 }
 
 /** Ticked matches of a text; what is none is left out. @param {string} text @returns {Map<string, Match>} */
 export function ticksOf(text) {
   const found = new Map();
-  for (const group of text ? text.split("**") : []) {
+  for (const group of text ? text.split("*_*") : []) {
     const [told = "", listed = "", parts = ""] = group.split("*");
     const trace = plain(told), names = listed ? listed.split(".").map(plain) : [];
     let before = 0;

@@ -15,7 +15,7 @@ const groupOf = (match) => match?.group ?? (order.value ? ORDERS[order.value] : 
 
 /** Where everything stands: groups and rows, by their heights.
  * @param {import("./state.js").Match[]} found @param {number} width */
-function layout(found, width) {
+export function layout(found, width) {
   const across = Math.max(1, Math.floor((width - GAP) / 214)), wide = (width - GAP) / across - GAP, high = Math.round(wide * 0.62) + 27;
   const rows = [];
   let top = 4, at = 0;
@@ -37,7 +37,7 @@ function layout(found, width) {
 
 /** Index of the match that an arrow key leads to.
  * @param {ReturnType<typeof layout>["rows"]} rows @param {number} at @param {string} key @param {number} page rows in sight */
-function moved(rows, at, key, page) {
+export function moved(rows, at, key, page) {
   const lines = rows.filter((row) => !row.group), line = lines.findIndex((row) => at < row.last), last = (lines.at(-1)?.last || 1) - 1;
   const here = lines[line], down = { ArrowUp: -1, ArrowDown: 1, PageUp: -page, PageDown: page }[key];
   if (key === "Home" || key === "End") return key === "Home" ? 0 : last;
