@@ -18,7 +18,7 @@ from sgstore.readers._registry import (
 )
 from sgstore.readers._roles import channel_rank
 from sgstore.readers._ros2 import decode, parse_definition
-from sgstore.readers._topics import TopicBatch, TopicReading, refusal, topic_series
+from sgstore.readers._topics import TopicBatch, TopicReading, refusal
 from sgstore.readers.carla._live import (
     LiveWorld,
     Sensor,
@@ -72,7 +72,6 @@ __all__ = [
     "read_messages",
     "record_reader",
     "refusal",
-    "topic_series",
 ]
 
 # For authors of readers; see docs/flavours.md.

@@ -26,7 +26,7 @@ from sgstore.readers._ros2 import (
 from sgstore.readers._topic_values import (
     MAX_DEPTH,
     MAX_FIELDS,
-    MAX_VALUE,
+    MAX_TEXT,
     TopicNames,
     column_of,
     field_list,
@@ -306,7 +306,7 @@ def _texts(
 ) -> Column:
     """Return texts of equal size at equal places of some messages."""
     column = np.full(len(rows), "", object)
-    if length > MAX_VALUE:
+    if length > MAX_TEXT:
         losses.values += len(rows)
         return np.full(len(rows), None, object)
     if length < 2:

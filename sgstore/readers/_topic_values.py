@@ -29,9 +29,9 @@ MAX_FIELDS: Final = 2048
 MAX_DEPTH: Final = 12
 """Maximum nesting depth of a field. Deeper values are JSON."""
 MAX_VALUE: Final = 1 << 16
-"""Maximum size of a text, of bytes, or of a list; characters, bytes, or elements."""
-MAX_JSON: Final = 1 << 20
-"""Maximum size of a nested list as JSON; characters."""
+"""Maximum size of bytes, or of a list; bytes, or elements."""
+MAX_TEXT: Final = 1 << 20
+"""Maximum size of a text, or of nested lists as JSON; characters."""
 OWN: Final = ("trace", "t", "log_time_ns", "publish_time_ns")
 """Columns of each topic beside its fields."""
 
@@ -147,15 +147,21 @@ def _text(declared: str, value: Any, losses: Losses) -> str | None:
         found = value if isinstance(value, str) else as_json(value)
     elif declared == "BLOB":
         found = bytes(value[: MAX_VALUE + 1]).hex()
-    elif declared.endswith("[]") and len(value) > MAX_VALUE:
-        found = None
+    elif declared.endswith("[]"):
+        found = None if len(value) > MAX_VALUE else as_json(value)
+        if found and declared in {"FLOAT[]", "DOUBLE[]"}:
+            found = _without_nan(found)
     else:
         found = as_json(value)
-    size = {"JSON": MAX_JSON, "BLOB": 2 * MAX_VALUE}.get(declared, MAX_JSON)
-    if found is None or len(found) > (MAX_VALUE if declared == "VARCHAR" else size):
+    if found is None or len(found) > (2 * MAX_VALUE if declared == "BLOB" else MAX_TEXT):
         losses.values += 1
         return None
     return plain_text(found)
+
+
+def _without_nan(numbers: str) -> str:
+    """Return the text of a list in which NaN is missing, as in a column of numbers."""
+    return numbers.replace("NaN", "null")
 
 
 def plain_text(text: str) -> str:
@@ -187,7 +193,7 @@ def list_column(declared: str, rows: Column, losses: Losses) -> Column:
     if declared == "BLOB":
         column[:] = [row.tobytes().hex() for row in rows]
     else:
-        column[:] = [as_json(row) for row in rows.tolist()]
+        column[:] = [_without_nan(as_json(row)) for row in rows.tolist()]
     return column
 
 

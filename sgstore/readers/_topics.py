@@ -8,16 +8,15 @@ cannot be decoded is a counted loss.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
-from math import isnan
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
 import numpy as np
 
 from sgstore.errors import TraceError
-from sgstore.lang.catalog import TopicFacts, TopicField
-from sgstore.lang.topics import TopicError, field_of, fields_of, topic_of
-from sgstore.mcap import MESSAGE_HEAD, Findings, Messages
+from sgstore.lang.catalog import TopicFacts
+from sgstore.lang.topics import TopicError, fields_of, topic_of
+from sgstore.mcap import MESSAGE_HEAD, Messages
 from sgstore.readers._ros2 import parse_definition
 from sgstore.readers._topic_cdr import CdrColumns
 from sgstore.readers._topic_values import (
@@ -25,7 +24,6 @@ from sgstore.readers._topic_values import (
     MAX_FIELDS,
     Losses,
     TopicNames,
-    as_json,
     as_number,
     column_of,
     field_list,
@@ -41,7 +39,8 @@ if TYPE_CHECKING:
     from mcap.records import Schema
     from numpy.typing import NDArray
 
-    from sgstore.mcap import Recording
+    from sgstore.lang.catalog import TopicField
+    from sgstore.mcap import Findings, Recording
     from sgstore.readers._topic_values import Column
 
     Ints = NDArray[np.int64]
@@ -493,58 +492,6 @@ class TopicReading:
         held.first += stamps.shape[1]
         held.data, held.stamps, held.rows, held.size = [], [], 0, 0
         return batch
-
-
-def topic_series(recording: Recording, topic: str, path: str) -> tuple[Ints, NDArray[np.object_]]:
-    """Return log times and values of a field of a topic, in order of time.
-
-    Parameters
-    ----------
-    recording : Recording
-    topic, path : str
-        ``/imu``; ``linear_acceleration.z``, ``covariance[0]``.
-
-    Returns
-    -------
-    stamps : (n,) int64
-        ns. Messages of equal time come in file order.
-    values : (n,) object
-        Numbers, texts and truth values; ``None``: missing.
-
-    Raises
-    ------
-    TopicError
-        The recording has no such topic or field, or the topic cannot be decoded.
-    """
-    reading = TopicReading(recording, [topic])
-    batches = [*reading.batches(Findings())]
-    fields = {
-        name: TopicField(name, kind) for b in batches for name, (kind, _) in b.columns.items()
-    }
-    facts = topics_of(recording)[next(iter(reading.losses))]
-    name = field_of(replace(facts, source=lambda: fields), path).name
-    stamps = np.concatenate([batch.log_time_ns for batch in batches])
-    values = np.concatenate([_values_of(batch, name) for batch in batches])
-    order = np.argsort(stamps, kind="stable")
-    return stamps[order], values[order]
-
-
-def _values_of(batch: TopicBatch, name: str) -> NDArray[np.object_]:
-    """Return the values of a field, or of an element of a list field, as Python values."""
-    found = np.full(len(batch.number), None, object)
-    of, _, index = name.partition("[") if name not in batch.columns else (name, "", "")
-    if of not in batch.columns:
-        return found
-    declared, values = batch.columns[of]
-    rows: list[Any] = values.tolist()
-    if index:
-        at = int(index.removesuffix("]"))
-        lists = (json.loads(row) if isinstance(row, str) else row for row in rows)
-        rows = [row[at] if row is not None and at < len(row) else None for row in lists]
-    elif declared.endswith("[]") or declared in {"JSON", "BLOB"}:
-        rows = [row if row is None or isinstance(row, str) else as_json(row) for row in rows]
-    found[:] = [None if isinstance(one, float) and isnan(one) else one for one in rows]
-    return found
 
 
 def topics_of(recording: Recording) -> dict[str, TopicFacts]:

@@ -307,6 +307,14 @@ class StoreFile:
 
         return UserSql(self.answered, sql, timeout_s, given)
 
+    @staticmethod
+    def recording_sql(path: Path, sql: str, timeout_s: float | None = None) -> UserSql:
+        """Return a read-only SQL statement of a user on the topics of a recording, without a store."""
+        from sgstore.store._topic_views import RecordingSql
+        from sgstore.store._user_sql import UserSql
+
+        return UserSql(RecordingSql(path).answered, sql, timeout_s, None)
+
     def joined(self) -> dict[str, JoinedTable]:
         """Return the row counts of user tables that are joined with frames, by table name."""
         with self.access.reading() as connection:

@@ -8,21 +8,27 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from sgstore.base.quoting import quoted
-from sgstore.errors import TraceError
+import numpy as np
+
+from sgstore.base.quoting import literal, quoted
+from sgstore.errors import SqlError, TraceError
 from sgstore.lang.catalog import TopicFacts, TopicField, Type
 from sgstore.lang.syntax import TOPIC
 from sgstore.lang.topics import RULES, TopicError, field_of, fields_of, topic_of
-from sgstore.mcap import Findings
+from sgstore.mcap import Findings, mark_of
 from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.readers import TopicReading, open_recording, refusal
 from sgstore.store._joins import tables_folder
+from sgstore.store._locking import default_memory, shut_in
 from sgstore.store._schema import INSIDE
+from sgstore.store._staging import scratch
 from sgstore.store._topics import (
     FRAME,
     KEYS,
@@ -36,7 +42,7 @@ from sgstore.store._topics import (
 from sgstore.store._traces import stored_traces, unchanged
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -44,6 +50,8 @@ if TYPE_CHECKING:
     from sgstore.readers import Recording
     from sgstore.store._locking import Access
     from sgstore.store._traces import StoredTrace
+
+T = TypeVar("T")
 
 _NAMED: Final = re.compile(rf'"({TOPIC}|:messages) ((?:[^"]|"")+)"')
 
@@ -136,8 +144,7 @@ def _of_recording(
 ) -> _Source:
     """Convert a topic of a recording to files, once per process."""
     key = (trace.trace_id, trace.frames, trace.start_ns, trace.end_ns, topic)
-    name = hashlib.sha256(repr(key).encode("utf-8", "replace")).hexdigest()[:16]
-    folder = tables_folder() / "topics" / name
+    folder = _folder(key)
     file = _converted.get((folder, *key))
     if file is None:
         clock = FrameClock.of_stored(connection, trace.trace_id)
@@ -145,6 +152,11 @@ def _of_recording(
         path = _recording(trace, topic)
         file = _converted[folder, *key] = converted(path, topic, folder, clock, bounded=bounded)
     return _Source(f"({file.rows(folder)})", file.fields)
+
+
+def _folder(key: tuple[Any, ...]) -> Path:
+    name = hashlib.sha256(repr(key).encode("utf-8", "replace")).hexdigest()[:16]
+    return tables_folder() / "topics" / name
 
 
 def _recording(trace: StoredTrace, topic: str) -> Path:
@@ -171,6 +183,70 @@ def converted(
             writer.add(batch)
         (file,) = writer.files(reading)
     return file
+
+
+class RecordingSql:
+    """SQL statements of users on the topics of a recording, without a store.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @contextmanager
+    def answered(
+        self, ask: Callable[[DuckDBPyConnection, ExitStack], T], sql: str, *, public: bool = False
+    ) -> Generator[T]:
+        """Context manager that yields the result of a query, as :meth:`StoreFile.answered`."""
+        del public
+        folder = tables_folder() / "topics"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        memory, threads = default_memory(), os.cpu_count() or 1
+        with ExitStack() as stack, scratch(folder, memory=memory, threads=threads) as connection:
+            for topic in dict.fromkeys(topic for _, topic in _NAMED.findall(sql)):
+                self._show(connection, topic)
+            connection.execute(f"CREATE SCHEMA {INSIDE}")
+            connection.execute(f"CREATE TABLE {INSIDE}.store_info (key VARCHAR, value VARCHAR)")
+            shut_in(connection, folder / "none", (folder,))
+            try:
+                yield ask(connection, stack)
+            except SqlError as error:
+                lack = _NO_TABLE.search(str(error))
+                if lack is None:
+                    raise
+                reason = f"{self._path}: a recording has no table {lack[1]!r}; it has only topics"
+                example = "SELECT * FROM topic('/imu')"
+                raise SqlError(f"{reason}: {example}; ingest it for scene graphs") from error
+
+    def _show(self, connection: DuckDBPyConnection, topic: str) -> None:
+        key = (str(self._path), *mark_of(self._path), topic)
+        folder = _folder(key)
+        file = _converted.get((folder, *key))
+        if file is None:
+            first = np.array([_first_ns(self._path)])
+            clock = FrameClock(np.zeros(1, np.int64), np.zeros(1, np.int64), first)
+            file = _converted[folder, *key] = converted(self._path, topic, folder, clock)
+        listed = "".join(f", {quoted(name)}" for name in file.fields)
+        connection.execute(
+            f"CREATE TEMP VIEW {quoted(f'{TOPIC} {topic}')} AS SELECT {literal(self._path.stem)} AS trace,"
+            ' round(":time_ns" / 1e3) / 1e6 AS t, log_time_ns, publish_time_ns'
+            f"{listed} FROM ({file.rows(folder)})"
+        )
+
+
+_NO_TABLE: Final = re.compile(r"Table with name (\S+) does not exist")
+
+
+def _first_ns(path: Path) -> int:
+    """Return the log time at which a recording begins, as far as its first messages show; ns."""
+    with open_recording(path) as recording:
+        for run in recording.walk(Findings()):
+            if len(run):
+                return int(run.log_time_ns.min())
+    return 0
 
 
 def topic_facts(connection: DuckDBPyConnection, access: Access) -> dict[str, TopicFacts]:

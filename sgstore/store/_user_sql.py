@@ -131,7 +131,7 @@ class UserSql:
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
             if re.search(r"(?i)\btrace\b", self.sql) and _lacks_trace(connection):
-                with self._refused():
+                with self._refused(connection):
                     add_trace(connection)
             counted = None if self._given else counted_edges(self.sql)
             given = [(counted[0], {})] if counted else self._given and self._given()

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mcap.reader import make_reader
 from topic_recordings import control, ros, topic_recording
 
 import sgstore
-from sgstore.errors import SgstoreError
+from sgstore.apps.cli import run as run_verb
+from sgstore.errors import SgstoreError, SqlError
 from sgstore.ingest import ingest
-from sgstore.lang.topics import RULES, TopicError, field_of, values_at
-from sgstore.readers import open_recording, topic_series
+from sgstore.lang.topics import RULES, TopicError, field_of
+from sgstore.store import StoreFile
 from sgstore.store._topic_views import topic_values
 
 if TYPE_CHECKING:
@@ -219,6 +218,20 @@ def test_a_missing_recording_has_a_remedy(tmp_path: Path) -> None:
         _ = store.sql("SELECT * FROM topic('/status')").values
 
 
+def test_sql_over_a_recording_needs_no_store(
+    stores: dict[str, sgstore.Store], recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sql = "SELECT * FROM topic('/planner') ORDER BY log_time_ns"
+    asked = StoreFile.recording_sql(recording, sql)
+    assert asked.rows().values == stores["stored"].sql(sql).values
+    assert run_verb(["sql", str(recording), f"SELECT count(*) AS n FROM ({sql})", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == [{"n": 20}]
+    with pytest.raises(SqlError, match="has no table 'frames'; it has only topics"):
+        StoreFile.recording_sql(recording, "SELECT * FROM frames").rows()
+    with pytest.raises(SqlError, match="file system operations are disabled"):
+        StoreFile.recording_sql(recording, f"SELECT * FROM read_text('{recording}')").rows()
+
+
 FIELDS = (
     ("/planner", "state"),
     ("/planner", "plan.speed"),
@@ -230,11 +243,11 @@ FIELDS = (
 @each
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("tolerance", [None, 40_000_000])
-def test_values_at_frames_agree_with_arrays(
+def test_values_at_frames_are_those_of_the_definition(
     stores: dict[str, sgstore.Store], recording: Path, how: str, rule: str, tolerance: int | None
 ) -> None:
     file = stores[how].file
-    frames = file.arrays("SELECT frame_id, log_time_ns FROM frame ORDER BY log_time_ns", plain=True)
+    frames = file.rows("SELECT frame_id, log_time_ns FROM frame").values
     for topic, path in FIELDS:
         if rule == "linear" and path == "state":
             continue
@@ -243,32 +256,12 @@ def test_values_at_frames_agree_with_arrays(
                 at.execute(topic_values(at, file.access, topic, path, rule, tolerance)).fetchall()
             )
         ) as found:
-            with open_recording(recording) as opened:
-                stamps, values = topic_series(opened, topic, path)
-            told, known = values_at(stamps, values, frames["log_time_ns"], rule, tolerance)
-            wanted = dict(
-                zip(frames["frame_id"][known].tolist(), told[known].tolist(), strict=True)
-            )
-            assert found == pytest.approx(wanted) if path != "state" else found == wanted
-
-
-@settings(deadline=None, max_examples=60)
-@given(
-    st.lists(st.tuples(st.integers(0, 30), st.sampled_from([None, 1.0, 2.0, 5.0])), max_size=8),
-    st.lists(st.integers(-3, 33), min_size=1, max_size=6),
-    st.sampled_from(RULES),
-    st.sampled_from([None, 0, 3]),
-)
-def test_values_are_those_of_the_definition(
-    messages: list[tuple[int, float | None]], times: list[int], rule: str, tolerance: int | None
-) -> None:
-    messages = sorted(messages, key=lambda one: one[0])
-    stamps = np.array([t for t, _ in messages], np.int64)
-    values = np.full(len(messages), None, object)
-    values[:] = [value for _, value in messages]
-    found, known = values_at(stamps, values, np.array(times), rule, tolerance)
-    for at, value, is_known in zip(times, found.tolist(), known.tolist(), strict=True):
-        assert (value if is_known else None) == defined(messages, at, rule, tolerance)
+            name, _, index = path.partition("[")
+            messages = [(one["log_time_ns"], one.get(name)) for one in expected(recording, topic)]
+            if index:
+                messages = [(t, value[1] if len(value) > 1 else None) for t, value in messages]
+            wanted = {frame: defined(messages, at, rule, tolerance) for frame, at in frames}
+            assert found == {frame: one for frame, one in wanted.items() if one is not None}
 
 
 def defined(messages: list[Any], at: int, rule: str, tolerance: int | None) -> float | None:

@@ -350,10 +350,10 @@ def sql(
     whole: CollectionOptions,
     ask: AskOptions,
 ) -> int:
-    """Run a read-only SQL statement on a store.
+    """Run a read-only SQL statement on a store, or on the topics of a recording.
 
     Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
-    What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …').
+    What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …'); and messages: FROM topic('/imu').
 
     Parameters
     ----------
@@ -374,20 +374,36 @@ def sql(
         _say_all(answer)
         ask.write(answer.columns, answer.rows)
         return 0
+    if store.suffix not in completion.STORE_ENDINGS and _is_recording(store):
+        from sgstore.store import StoreFile
+
+        seconds = seconds_of(ask.timeout, "--timeout") if ask.timeout else None
+        _write_sql(StoreFile.recording_sql(store, query_of(statement, file), seconds), limit, ask)
+        return 0
     from sgstore.query import UserStatement
 
     opened = ask.opened(store, tables_of(tables))
     with opened.file.snapshot():
         asked = UserStatement(opened.find, opened.catalog().tables, query_of(statement, file))
         say_left_out(asked)
-        sql = asked.on(opened.file)
-        if (form := ask.chosen) in BINARY and not limit:
-            write_binary(sql.parquet, form, ask.to)
-            return 0
-        with sql.batches() as batches:
-            rows = chain.from_iterable(batch.values for batch in batches)
-            ask.write(batches.columns, islice(rows, limit or None), batches.types)
+        _write_sql(asked.on(opened.file), limit, ask)
     return 0
+
+
+def _is_recording(path: Path) -> bool:
+    from sgstore.readers import is_recording
+
+    return path.exists() and is_recording(path)
+
+
+def _write_sql(sql: Any, limit: int, ask: AskOptions) -> None:
+    """Write the rows of an SQL statement in the chosen format."""
+    if (form := ask.chosen) in BINARY and not limit:
+        write_binary(sql.parquet, form, ask.to)
+        return
+    with sql.batches() as batches:
+        rows = chain.from_iterable(batch.values for batch in batches)
+        ask.write(batches.columns, islice(rows, limit or None), batches.types)
 
 
 def _sandbox(store: Path, bounds: QueryLimits, limit: int, tables: list[str] | None) -> Sandbox:
