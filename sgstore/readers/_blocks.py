@@ -768,7 +768,8 @@ def first_noise(decoder: MessageDecoder[Raw], raw: list[Raw]) -> Noise:
     steps = np.diff(time, prepend=time[0]) / 1e9
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     steps[(steps <= 0) | (steps > 3.01 * usual)] = np.nan
-    return noise_of(*_columns(frames, steps))
+    node, frame, seconds, values, fixed = _columns(frames, steps)
+    return noise_of(node, frame, seconds, np.where(np.abs(values) < FAR, values, NAN), fixed)
 
 
 def lacks_velocity(decoder: MessageDecoder[Raw], raw: list[Raw]) -> bool:

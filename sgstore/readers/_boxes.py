@@ -93,7 +93,7 @@ def joined(first: Floats, then: Floats) -> Floats:
 
 def unit(turn: Floats) -> Floats:
     """Scale quaternions (n, 4) to length 1; NaN if the length is far from 1."""
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         length = np.sqrt((turn * turn).sum(axis=1, keepdims=True))
         return np.where((length > 0.5) & (length < 2), turn / length, np.nan)
 

@@ -135,3 +135,22 @@ def test_a_damaged_file_loses_only_itself(log: Path) -> None:
     info, _, report = read(log)
     assert (info.map_text, report.frames) == ("", 8)
     assert len(report.losses) == 2
+
+
+def test_absurd_positions_and_empty_rotations_are_missing_without_a_warning(log: Path) -> None:
+    file = log / f"{EGO}.arrow"
+    table = pa.ipc.open_file(file).read_all()
+    poses = table.column(f"{EGO}.imu_se3").to_pylist()
+    poses[3][:2] = 1e200, 1e200
+    poses[5][3:] = 0.0, 0.0, 0.0, 0.0
+    column = table.schema.get_field_index(f"{EGO}.imu_se3")
+    changed = pa.array(poses, table.schema.field(column).type)
+    table = table.set_column(column, table.schema.field(column), changed)
+    with pa.OSFile(str(file), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table)
+    _, (block,), report = read(log)
+
+    ego = block.states.node == 2
+    assert report.frames == 8
+    assert np.isnan(block.states.x[ego]).tolist() == [i == 3 for i in range(8)]
+    assert np.isnan(block.states.heading[ego]).tolist() == [i == 5 for i in range(8)]
