@@ -153,4 +153,4 @@ def test_absurd_positions_and_empty_rotations_are_missing_without_a_warning(log:
     ego = block.states.node == 2
     assert report.frames == 8
     assert np.isnan(block.states.x[ego]).tolist() == [i == 3 for i in range(8)]
-    assert np.isnan(block.states.heading[ego]).tolist() == [i == 5 for i in range(8)]
+    assert block.states.heading[ego] == pytest.approx([math.pi / 2] * 8)
