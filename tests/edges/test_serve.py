@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import hashlib
+import itertools
 import json
 import socket
 import time
@@ -532,6 +533,30 @@ def test_coverage_is_that_of_the_verb(page: Page, store: Store) -> None:
 
     assert told["of"] == len(table.rows)
     assert [row[1] for row in told["rows"]] == table.column("class")
+    words = told["words"]
+    assert len(words) == min(60, len(table.rows))
+    kinds = {
+        store.graph(str(table.rows[0][-1])).nodes[node]["kind"]
+        for node in store.graph(str(table.rows[0][-1])).nodes
+    }
+    assert kinds & {*words[0].replace(",", "").split()}
+
+
+def test_matrix_of_gaps_is_that_of_the_features(page: Page, store: Store) -> None:
+    """Each number is the number of frames with both features; each query of a gap finds nothing."""
+    from sgstore.testsets.coverage import ChosenFrames, classed, combos
+
+    matrix = page.post("/api/coverage", what="matrix").json()
+    names, frames = matrix["names"], matrix["frames"]
+    table = combos(classed(ChosenFrames("town.sgstore", store), "RSV"), "RSV", 2).covered()
+    known = dict(zip(table.column("combination"), table.column("frames"), strict=True))
+
+    for i, j in itertools.combinations(range(len(names)), 2):
+        pair = known.get(f"{names[i]} & {names[j]}") or known.get(f"{names[j]} & {names[i]}") or 0
+        assert frames[i][j] == frames[j][i] == pair
+        assert (f"{i} {j}" in matrix["queries"]) == (pair == 0)
+    for query in [one for one in matrix["queries"].values() if one][:3]:
+        assert store.find(query).count() == 0
 
 
 def test_clips_become_a_test_set(page: Page, store: Store) -> None:

@@ -181,3 +181,67 @@ def test_scene_has_a_legend_and_matches_have_tags_by_mouse(page: Any, town_store
     expect(page.locator(".legend")).to_contain_text("lane: driving")
     page.locator(".above canvas").hover()  # the ego is in the middle
     expect(page.locator(".tip")).to_contain_text("m/s")
+
+
+def test_coverage_is_told_in_words_pictures_and_gaps(page: Any) -> None:
+    page.get_by_role("button", name="Coverage").click()
+    expect(page.locator(".classes .card").first).to_contain_text("1.")
+    expect(page.locator(".classes .card p").first).to_contain_text("ego")
+    page.get_by_role("checkbox", name="logarithmic axes").uncheck()
+    expect(page.locator(".chart")).to_have_attribute("aria-label", "frames by rank, linear axes")
+    held = list[Any]()
+
+    def hold(route: Any) -> None:
+        held.append(route)
+
+    page.route("**/api/coverage", hold)
+    page.get_by_role("button", name="Growth").click()
+    page.get_by_role("button", name="Stop").click()
+    page.unroute("**/api/coverage")
+    expect(page.get_by_text("stopped")).to_be_visible()
+    page.get_by_role("button", name="Matrix of gaps").click()
+    cell = page.locator(".gap-cell").first
+    label = cell.get_attribute("aria-label")
+    cell.focus()
+    cell.press("Enter")
+    assert label.endswith("in no frame")
+    expect(page.locator(".cm-content")).to_contain_text("MATCH")
+    expect(page.locator(".status")).to_contain_text("0 matches")
+
+
+def test_timeline_zooms_and_marks_frames_by_keys_and_mouse(page: Any) -> None:
+    search(page, f"{NEAR} WHERE e.speed > 3")
+    open_first(page)
+    ticks = page.locator(".timeline .ticks span")
+    whole = ticks.count()
+    page.locator(".timeline [role=slider]").focus()
+    page.keyboard.press("+")
+    page.keyboard.press("+")
+    expect(ticks.last).not_to_have_text("70 s")
+    page.get_by_role("button", name="whole trace").click()
+    expect(ticks).to_have_count(whole)
+    at = int(page.locator(".timeline [role=slider]").get_attribute("aria-valuenow"))
+    for _ in range(3):
+        page.keyboard.press("Shift+ArrowRight")
+    expect(page.locator(".marked")).to_contain_text(f"#{at}\u2013{at + 3}")
+    page.locator(".marked").get_by_role("button", name="tag").click()
+    expect(page.locator(".dialog h2")).to_have_text(f"Tag town#{at}\u2013{at + 3}")
+    page.keyboard.press("Escape")
+    box = page.locator(".timeline svg").first.bounding_box()
+    page.keyboard.down("Shift")
+    page.mouse.move(box["x"] + 20, box["y"] + 8)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 220, box["y"] + 8)
+    page.mouse.up()
+    page.keyboard.up("Shift")
+    page.locator(".marked").get_by_role("button", name="zoom in").click()
+    expect(page.locator(".brush")).to_have_count(0)
+    page.get_by_role("tab", name="nodes").click()
+    page.locator(".pattern tbody button").first.click()
+    page.get_by_role("button", name="accel", exact=True).click()
+    expect(page.locator(".timeline path.series")).to_have_count(2)
+    limit = page.get_by_label("Limit of speed")
+    expect(limit).to_have_value("3")  # of the query
+    limit.fill("5")
+    expect(page.locator(".timeline .limit")).to_have_count(1)
+    expect(page.locator(".axis-high").first).to_contain_text("m/s")

@@ -180,7 +180,7 @@ FIELDS: Final[Mapping[str, Callable[[Any, str], Any]]] = {
     "node": _node,  # map nodes are negative
     "other": lambda value, name: None if value is None else _node(value, name),
     "ask": one_of("matches", "rows"),
-    "what": one_of("classes", "growth", "combos"),
+    "what": one_of("classes", "growth", "combos", "matrix"),
     "do": one_of("add", "remove"),
     "parameters": _parameters,
     "binding": _binding,

@@ -70,6 +70,38 @@ class ClassFeatures:
         """Return a mask (C, F): True if a scene class has a feature."""
         return self.counts > 0
 
+    def matrix(self, most: int) -> dict[str, Any]:
+        """Return the numbers of frames with each pair of the most frequent features, for a drawing.
+
+        Features of all frames are left out, because they have no gaps; and so are relations from the ego
+        where relations to it are known, because most of them are the same in the other direction.
+
+        Returns
+        -------
+        dict
+            ``names`` of the features; ``frames`` with both, a row for each feature; ``queries`` for the pairs
+            without frames, by their places: ``"3 7"``.
+        """
+        alone = self.frames @ self.there
+        order = np.argsort(-alone, kind="stable").tolist()
+        some = [i for i in order if alone[i] < self.frames.sum()]
+        of_ego = [
+            i
+            for i in some
+            if "ego" in {self.names[i][-1], *self.names[i][:1]} and len(self.names[i]) == 3
+        ]
+        to_ego = [i for i in of_ego if self.names[i][2] == "ego" or self.names[i][1] == "isIn"]
+        some = (to_ego or some)[:most]
+        there = self.there[:, some].astype(np.int64)
+        frames = there.T @ (there * self.frames[:, None])
+        gaps = np.argwhere(np.triu(frames == 0)).tolist()
+        pairs = {
+            f"{i} {j}": query_of_features([self.names[some[i]], self.names[some[j]]])
+            for i, j in gaps
+        }
+        names = [" ".join(self.names[i]) for i in some]
+        return {"names": names, "frames": frames.tolist(), "queries": pairs}
+
 
 def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeatures:
     """Return the features of the scene classes that occur in selected frames.

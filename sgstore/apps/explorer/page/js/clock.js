@@ -16,7 +16,9 @@ export const panel = signal("pattern");
 /** Whether the second store is shown beside the first, by the same clock. */
 export const beside = signal(false);
 /** An attribute over time. */
-export const series = signal(/** @type {any} */ (null));
+/** @typedef {{path: string, attribute: string, unit: string, node: number, other: number | undefined, label: string, auto: boolean,
+ *   columns: Record<string, any>}} Curve */
+export const series = signal(/** @type {Curve[]} */ ([]));
 
 export const frame = computed(() => Math.round(seq.value));
 export const asked = computed(() => answer.value.query || text.value.trim());
@@ -56,11 +58,12 @@ function lanesWanted(now, query) {
 
 /** Ask for the lanes and for the curve again, of a monitor that goes on. */
 export async function refresh() {
-  const now = open.value, body = now && lanesWanted(now, ""), curve = series.value;
+  const now = open.value, body = now && lanesWanted(now, ""), curves = series.value;
   const found = body && (await api.json("api/parts", body).catch(() => null));
   if (found && open.value === now) lanes.value = found;
-  const more = curve && (await api.columns(curve.path).catch(() => null));
-  if (more && series.value === curve) series.value = { ...curve, columns: more.columns };
+  if (!curves.length) return;
+  const more = await Promise.all(curves.map(async (one) => ({ ...one, columns: (await api.columns(one.path)).columns }))).catch(() => null);
+  if (more && series.value === curves) series.value = more;
 }
 
 let answered = /** @type {any} */ (null), missed = false, tried = 0;
@@ -71,7 +74,8 @@ effect(() => {
   tried = retries.value;
   if ((retried && !missed) || (now && now === answered)) return;
   missed = false;
-  lanes.value = why.value = series.value = null;
+  lanes.value = why.value = null;
+  series.value = [];
   const body = now && lanesWanted(now, query), current = () => open.value === now && asked.value === query;
   if (!body) return;
   api.json("api/parts", body).then((found) => {
@@ -171,15 +175,20 @@ export function nextMatch(direction) {
   if (next) openMatch(next);
 }
 
-/** @param {string} attribute @param {string} unit @param {number} node @param {number} [other] */
-export async function showSeries(attribute, unit, node, other) {
+const MOST_CURVES = 8;
+
+/** Add a curve, or remove it; the one that a chosen node has of itself is replaced by the next.
+ * @param {string} attribute @param {string} unit @param {number} node @param {number} [other] @param {boolean} [auto] */
+export async function showSeries(attribute, unit, node, other, auto = false) {
   const trace = open.value?.trace;
   if (!trace || (offline.value && !live.value)) return;
   try {
     const body = { trace, attribute, node, ...(other === undefined ? {} : { other }) };
     const path = api.address("api/series", body), { columns } = await api.columns(path);
     const label = `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}`;
-    series.value = { path, attribute, unit, node, other, columns, label };
+    const rest = series.value.filter((one) => one.path !== path && !(auto && one.auto));
+    const known = !auto && rest.length < series.value.length;
+    series.value = known ? rest : [...rest, { path, attribute, unit, node, other, columns, label, auto }].slice(-MOST_CURVES);
   } catch (error) { say(reasonOf(error)); }
 }
 

@@ -86,6 +86,20 @@ function Tile({ match, at, x, y, wide, high, flies, turn, many }) {
     </div></div>`;
 }
 
+/** A small picture of a frame, which was asked for. @param {{trace: string, frame: number}} props */
+export function Thumb({ trace, frame }) {
+  const canvas = useRef(/** @type {HTMLCanvasElement | null} */ (null));
+  arrived.value; paints.value;
+  useLayoutEffect(() => {
+    const thumb = thumbOf(trace, frame), ctx = canvas.current?.getContext("2d");
+    if (!canvas.current || !ctx || !thumb?.columns) return;
+    mapOf(trace); stillOf(trace); // asked for
+    const { width, height, ratio } = fitted(canvas.current);
+    paintScene(ctx, trace, thumb, lookAt(trace, thumb, [], width, height, 45), ratio, { marked: new Set(), lit: new Set(), small: true });
+  });
+  return html`<canvas ref=${canvas} class="thumb" aria-hidden="true"></canvas>`;
+}
+
 /** @param {{found: import("./state.js").Match[], none?: string, word?: [string, string]}} props */
 export function Gallery({ found: all, none, word = ["match", "matches"] }) {
   const { shown: found, many } = useMemo(() => merged(all), [all]);

@@ -1,17 +1,19 @@
 // @ts-check
 // Keys of the scene: what they do, and the list of them.
 import { h, htm, useEffect, useRef } from "../vendor/core.js";
-import { about, askWhy, camera, frame, goBy, goTo, matchEnd, nextMatch, panel } from "./clock.js";
+import { about, askWhy, camera, goBy, matchEnd, nextMatch, panel } from "./clock.js";
+import { timelineKeys } from "./timeline.js";
 import { dialog, open, playing, tick, toast } from "./state.js";
 
 const html = htm.bind(h);
 
 /** Keys as they are listed: their signs, what they do, and the act of each.
- * @type {[string, string, Record<string, () => void>][]} */
+ * @type {[string, string, Record<string, (event: KeyboardEvent) => void>][]} */
 export const keys = [
   ["n  p", "next match, match before", { n: () => nextMatch(1), p: () => nextMatch(-1) }],
   ["space", "play, pause", { " ": () => { if (open.value) playing.value = !playing.value; } }],
-  ["← →", "a frame", { ArrowLeft: () => goTo(frame.value - 1), ArrowRight: () => goTo(frame.value + 1) }],
+  ["← →", "a frame", {}],
+  ...timelineKeys,
   [", .", "a second", { ",": () => goBy(-1), ".": () => goBy(1) }],
   ["[ ]", "ends of the match", { "[": () => matchEnd(-1), "]": () => matchEnd(1) }],
   ["x", "select the match", { x: () => { if (open.value?.match) tick(open.value.match); } }],
@@ -57,5 +59,5 @@ addEventListener("keydown", (event) => {
   const act = keys.find(([, , acts]) => event.key in acts)?.[2][event.key];
   if (!act || (dialog.value && event.key !== "Escape")) return;
   event.preventDefault();
-  act();
+  act(event);
 });

@@ -187,12 +187,13 @@ function NodePanel() {
   const row = states ? rowOf(states, node) : -1, c = states?.columns, ego = states ? egoRow(states) : -1;
   const about = row < 0 || !c ? [] : [["speed", `${c.speed[row].toFixed(2)} m/s`], ["heading", `${((c.heading[row] * 180) / Math.PI).toFixed(1)}°`],
     ["size", `${c.length[row].toFixed(1)} × ${c.width[row].toFixed(1)} m`], ["place", `${placeOf(now.trace, c, row).map((v) => v.toFixed(2)).join(", ")} m`]];
+  const has = (/** @type {string} */ name, /** @type {number} */ of) => series.value.some((one) => one.attribute === name && one.node === of);
   const other = ego >= 0 && c && c.node[ego] !== node ? c.node[ego] : undefined;
   return html`<div class="scroll" style=${{ padding: "8px 12px" }}>
     <table><tbody>${about.map(([name, value]) => html`<tr><td class="faint">${name}</td><td>${value}</td></tr>`)}</tbody></table>
     ${offline.value && !live.value ? null : html`<div class="row wrap" style=${{ marginTop: "8px" }}>
-      ${Object.entries(OF_NODE).map(([name, unit]) => html`<button class="small" aria-pressed=${series.value?.attribute === name} onClick=${() => showSeries(name, unit, node)}>${name}</button>`)}
-      ${other === undefined ? null : Object.entries(PAIRS).map(([name, unit]) => html`<button class="small" onClick=${() => showSeries(name, unit, other, node)}>${name} from ego</button>`)}
+      ${Object.entries(OF_NODE).map(([name, unit]) => html`<button class="small" aria-pressed=${has(name, node)} onClick=${() => showSeries(name, unit, node)}>${name}</button>`)}
+      ${other === undefined ? null : Object.entries(PAIRS).map(([name, unit]) => html`<button class="small" aria-pressed=${has(name, other)} onClick=${() => showSeries(name, unit, other, node)}>${name} from ego</button>`)}
     </div>
     ${live.value ? null : html`<p class="row wrap"><button class="small" onClick=${() => ask(`MATCH (e:Ego), (x) WHERE x.id = ${node} AND trace.name = '${now.trace.replace(/'/g, "\\'")}' AND dist(e, x) < 30`)}>as a query</button></p>`}`}
   </div>`;
@@ -202,7 +203,7 @@ function NodePanel() {
 function choose(node) {
   chosen.value = node;
   panel.value = "node";
-  showSeries("speed", "m/s", node);
+  showSeries("speed", "m/s", node, undefined, true);
 }
 
 /** What lets nodes light up in the view while a row has the pointer or the focus. @param {number[]} nodes */
