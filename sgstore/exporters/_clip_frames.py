@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from sgstore.errors import ExportError
+from sgstore.exporters._clips import safe_name
 from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.model.world import tolerance_ns
 
@@ -103,13 +105,23 @@ class Export:
         ExportError
             A clip has no frames.
         """
-        for number, clip in enumerate(self.clips, 1):
-            frames = ClipFrames.of(self, number, clip)
+        for number, (clip, own) in enumerate(zip(self.clips, self.own_numbers(), strict=True), 1):
+            frames = replace(ClipFrames.of(self, number, clip), own=own)
             if not len(frames):
                 raise ExportError(
                     f"no frame of {clip.trace!r} between {clip.start_ns} and {clip.end_ns} ns"
                 )
             yield frames
+
+    def own_numbers(self) -> list[int]:
+        """Return the number of each clip among those of its trace, from 1."""
+        seen = Counter[str]()
+        numbers: list[int] = []
+        for clip in self.clips:
+            name = safe_name(clip.trace, "clip").lower()  # names of files must differ
+            seen[name] += 1
+            numbers.append(seen[name])
+        return numbers
 
     def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
         """Yield the frames of all clips in groups of ``size`` frames, and report the progress."""
@@ -192,6 +204,8 @@ class ClipFrames:
     frame_id, seq, time_ns, log_time_ns : int64
     t : float64
         Time since the start of the trace; s.
+    own : int
+        Number among the clips of its trace, from 1, for names of files.
     """
 
     number: int
@@ -201,6 +215,7 @@ class ClipFrames:
     time_ns: Ints
     log_time_ns: Ints
     t: np.ndarray[Any, np.dtype[np.float64]]
+    own: int = 0
 
     @classmethod
     def of(cls, export: Export, number: int, clip: Clip) -> ClipFrames:

@@ -169,7 +169,7 @@ def tool() -> str:
 def clip_name(trace: str, number: int, ending: str) -> str:
     """Return a file name for a clip, valid on all systems, such as ``swarm_Town04_003.mcap``.
 
-    Invalid characters become ``_``; the number, unique in an export, prevents collisions.
+    Invalid characters become ``_``; the number, unique in a trace, prevents collisions.
     """
     return f"{safe_name(trace, 'clip')}_{number:03d}{ending}"
 

@@ -146,7 +146,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
             ("clip", "frame_id", "trace", "seq", "time_ns", "log_time_ns", "t", *names)
         )
         for frames in export.frames():
-            place = folder / clip_name(frames.clip.trace, frames.number, "")
+            place = folder / clip_name(frames.clip.trace, frames.own, "")
             place.mkdir()
             places.append(place)
             _write_frames(export, frames, tables)

@@ -63,7 +63,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
             file = folder / f"{name}{f'_{same}' if same else ''}.geojson"
             maps[told[0]] = file
             written.append(_written(file, "parts", _parts_of(*told, placed), note))
-        file = folder / clip_name(frames.clip.trace, frames.number, ".geojson")
+        file = folder / clip_name(frames.clip.trace, frames.own, ".geojson")
         written.append(_written(file, "entities", _entities(export, frames, placed), note))
         export.tell(frames.number, len(export.clips))
     return written

@@ -81,6 +81,7 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
         trace = export.trace(name)
         with _near(trace.path), open_recording(trace.path) as recording:
             source = _survey(recording, trace, export.store.file.context(name))
+            owns = export.own_numbers()
             for number, clip in enumerate(export.clips, 1):
                 if clip.trace == name:
                     cutting = _Cutting(
@@ -91,7 +92,7 @@ def write(export: Export, folder: Path) -> list[WrittenClip]:
                         added,
                         rebased=export.rebase_context,
                     )
-                    file = folder / clip_name(name, number, ".mcap")
+                    file = folder / clip_name(name, owns[number - 1], ".mcap")
                     written[number] = cutting.write(file, number)
                     export.tell(len(written), len(export.clips))
         ego = ego or (added.transforms.ego if added is not None else "")

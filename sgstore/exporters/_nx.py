@@ -50,7 +50,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
         abstraction = abstraction_named(abstraction).name
     written: list[WrittenFile] = []
     for frames in export.frames():
-        name = clip_name(frames.clip.trace, frames.number, "")
+        name = clip_name(frames.clip.trace, frames.own, "")
         lines, drawn = folder / f"{name}.jsonl", folder / name
         if export.graphml:
             drawn.mkdir()

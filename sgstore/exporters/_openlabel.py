@@ -69,7 +69,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
     """Write an OpenLABEL file for each clip, and verify it by reading it again."""
     written: list[WrittenFile] = []
     for frames in export.frames():
-        file = folder / clip_name(frames.clip.trace, frames.number, ".openlabel.json")
+        file = folder / clip_name(frames.clip.trace, frames.own, ".openlabel.json")
         clip = _Labelling(export, frames)
         with file.open("x", encoding="utf-8", newline="\n") as stream:
             clip.write(stream)

@@ -62,7 +62,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
         raise MissingExtraError("writing recordings for Rerun", "rerun") from error
     written: list[WrittenFile] = []
     for frames in export.frames():
-        file = folder / clip_name(frames.clip.trace, frames.number, ".rrd")
+        file = folder / clip_name(frames.clip.trace, frames.own, ".rrd")
         clip = RerunClip(rerun, export, frames)
         clip.write(file)
         _test(file, clip.paths, reader)

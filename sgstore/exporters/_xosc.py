@@ -118,7 +118,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
         if trace not in maps:
             maps[trace] = _write_map(export, folder, trace)
         road_map = maps[trace]
-        file = folder / clip_name(trace, frames.number, ".xosc")
+        file = folder / clip_name(trace, frames.own, ".xosc")
         scenario = Scenario(export, frames, "" if road_map is None else road_map.name)
         scenario.write(file)
         test(file, scenario.vertices)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import asdict, dataclass, replace
-from itertools import chain
+from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -12,8 +14,9 @@ import typer
 from typer import Argument
 
 from sgstore.apps.cli._collection_options import CollectionOptions, url_of
-from sgstore.apps.cli._junit import write_junit
+from sgstore.apps.cli._junit import Evidence, clip_of, write_junit
 from sgstore.apps.cli._options import (
+    ERROR,
     NO_MATCH,
     AskedPath,
     AskOptions,
@@ -23,14 +26,16 @@ from sgstore.apps.cli._options import (
     say_scope,
     say_unknown,
 )
-from sgstore.apps.cli._output import say
+from sgstore.apps.cli._output import complain, say
 from sgstore.apps.cli._sarif import write_sarif
+from sgstore.errors import SgstoreError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from sgstore.collection import CollectionChecks
     from sgstore.matches import Interval
+    from sgstore.query import Store
     from sgstore.temporal import CheckRun, Verdict
 
 PANEL: Final = "Rules over time"
@@ -46,6 +51,7 @@ def check(
     require: bool = False,
     junit: Path | None = None,
     sarif: Path | None = None,
+    evidence: Path | None = None,
     library: bool = False,
     *,
     whole: CollectionOptions,
@@ -69,6 +75,9 @@ def check(
         Also write the verdicts as JUnit XML, for build servers.
     sarif : FILE
         Also write the violations as SARIF 2.1.0, for code scanning.
+    evidence : DIR
+        Also draw the first frame of each violation (at most 50) into this folder; both files
+        name the pictures.
     library
         Check all properties of the library, in one run.
     """
@@ -82,13 +91,61 @@ def check(
     text = joined([*chain.from_iterable(asked.values())])
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask) as opened:
+            if evidence is not None:
+                raise typer.BadParameter("--evidence is not supported for a collection")
             asked_of = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
             files = ReportFiles(str(store), junit, sarif, opened.traces)
             return _reported(asked_of, ask, files, explain=explain, require=require)
     opened = ask.opened(store)
     run = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
-    files = ReportFiles(str(store), junit, sarif, opened.traces)
+    draw = None if evidence is None else partial(_draw_violations, opened, evidence)
+    files = ReportFiles(str(store), junit, sarif, opened.traces, draw)
     return _reported(run, ask, files, explain=explain, require=require)
+
+
+@verbs.command(rich_help_panel=PANEL)
+def lint(files: list[Path]) -> int:
+    """Read files of queries, checks and locks without a store, and report mistakes.
+
+    Names that only recordings have, such as other kinds and topics, are mistakes, too. Exit code 1
+    if a file has one.
+
+    Parameters
+    ----------
+    files : FILE…
+        Texts in the query language, or locks (.lock).
+    """
+    wrong = 0
+    for file in files:
+        try:
+            _read(file)
+        except (OSError, UnicodeDecodeError, SgstoreError) as error:
+            wrong += 1
+            complain(f"{file}: {getattr(error, 'strerror', '') or error}")
+    say(f"{len(files) - wrong} of {len(files)} files have no mistake")
+    return ERROR if wrong else 0
+
+
+def _read(file: Path) -> None:
+    """Raise an error if a file is no lock, or has a mistake in the query language."""
+    from sgstore.lang.catalog import Catalog
+    from sgstore.lang.sql import compile_checks, compile_query
+    from sgstore.lang.syntax import parse
+    from sgstore.lang.syntax.tree import Define
+    from sgstore.testsets.diff import has_checks
+    from sgstore.testsets.locks import ENDING, read_lock
+
+    if file.suffix == ENDING:
+        read_lock(file)
+        return
+    text = file.read_text(encoding="utf-8")
+    statements = parse(text)
+    if re.search(r"\$\w", text) or all(isinstance(one, Define) for one in statements):
+        return  # the values of parameters are unknown
+    if has_checks(text):
+        compile_checks(text, Catalog())
+    else:
+        compile_query(text, Catalog())
 
 
 @dataclass(frozen=True)
@@ -101,23 +158,48 @@ class ReportFiles:
     junit, sarif : Path or None
     traces : function
         Returns the traces of the store.
+    draw : function or None
+        Draws pictures of violations, and returns them by clip.
     """
 
     store: str
     junit: Path | None
     sarif: Path | None
     traces: Callable[[], Iterable[Any]]
+    draw: Callable[[Sequence[Verdict]], dict[str, str]] | None = None
 
     def __bool__(self) -> bool:
         """True if there is a file to write."""
-        return self.junit is not None or self.sarif is not None
+        return self.junit is not None or self.sarif is not None or self.draw is not None
 
     def write(self, verdicts: Sequence[Verdict]) -> None:
         """Write the files."""
+        evidence = Evidence(self.store, {} if self.draw is None else self.draw(verdicts))
         if self.junit is not None:
-            write_junit(self.junit, verdicts)
+            write_junit(self.junit, verdicts, evidence)
         if self.sarif is not None:
-            write_sarif(self.sarif, verdicts, self.store, dict(map(_recording, self.traces())))
+            write_sarif(self.sarif, verdicts, evidence, dict(map(_recording, self.traces())))
+
+
+_MOST_PICTURES: Final = 50
+"""Largest number of pictures of violations."""
+
+
+def _draw_violations(store: Store, folder: Path, verdicts: Sequence[Verdict]) -> dict[str, str]:
+    """Draw the first frame of each violation, and return the pictures by clip."""
+    from sgstore.draw import draw_stored
+
+    folder.mkdir(parents=True, exist_ok=True)
+    spans = {clip_of(one): one for verdict in verdicts for one in verdict.violations}
+    pictures: dict[str, str] = {}
+    for number, (clip, one) in enumerate(islice(spans.items(), _MOST_PICTURES), 1):
+        name = re.sub(r"[^\w.-]+", "_", one.trace)
+        file = folder / f"{number:03d}_{name}_{one.start_seq}.png"
+        draw_stored(store, f"{one.trace}#{one.start_seq}", file)
+        pictures[clip] = file.as_posix()
+    if len(spans) > len(pictures):
+        say(f"{len(pictures)} of {len(spans)} violations have a picture")
+    return pictures
 
 
 def _recording(trace: Any) -> tuple[str, str]:

@@ -3,21 +3,51 @@
 from __future__ import annotations
 
 import re
+import shlex
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from sgstore.base.output_files import write_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
+    from sgstore.matches import Interval
     from sgstore.temporal import Verdict
 
 _NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 """Characters that XML cannot hold, not even as references."""
 
 
-def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
+def clip_of(span: Interval) -> str:
+    """Return the frames of a violation as a clip: ``town#120..160``."""
+    return f"{span.trace}#{span.start_seq}..{span.end_seq}"
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Evidence of violations: the command that shows each, and its picture.
+
+    Attributes
+    ----------
+    store : str
+    pictures : mapping of str to str
+        Clip of a violation → its picture.
+    """
+
+    store: str
+    pictures: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    def of(self, span: Interval) -> dict[str, str]:
+        """Return the clip, the command and the picture of a violation."""
+        clip = clip_of(span)
+        show = ["sgstore", "show", self.store, f"{span.trace}#{span.start_seq}"]
+        found = {"clip": clip, "command": shlex.join(show)}
+        return found | ({"picture": self.pictures[clip]} if clip in self.pictures else {})
+
+
+def write_junit(path: Path, verdicts: Iterable[Verdict], evidence: Evidence) -> None:
     """Write verdicts as a JUnit XML file: a test suite for each check, with a case for each trace.
 
     A violated check is a failure whose text names each violation. A trace that cannot answer, or a
@@ -27,6 +57,7 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
     ----------
     path : Path
     verdicts : iterable of Verdict
+    evidence : Evidence
 
     Raises
     ------
@@ -45,7 +76,7 @@ def write_junit(path: Path, verdicts: Iterable[Verdict]) -> None:
             suites[name] = Xml.SubElement(root, "testsuite", name=name)
         case = Xml.SubElement(suites[name], "testcase", classname=name, name=_plain(one.trace))
         if one.violated:
-            lines = _violations(one)
+            lines = _violations(one, evidence)
             count = f"{len(lines)} violation{'s' * (len(lines) != 1)}"
             Xml.SubElement(case, "failure", message=count).text = "\n".join(lines)
         elif one.verdict != "true":
@@ -68,13 +99,14 @@ def _word(verdict: Verdict) -> str:
     )
 
 
-def _violations(verdict: Verdict) -> list[str]:
-    """Return a text line for each violation of a check: its frames, times and values."""
+def _violations(verdict: Verdict, evidence: Evidence) -> list[str]:
+    """Return a text line for each violation of a check: its frames, times, values and evidence."""
     return [
         _plain(
             f"{one.trace}#{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
             f" {one.frames} frames"
             + "".join(f", {name} {value}" for name, value in one.values.items())
+            + "".join(f"; {name}: {value}" for name, value in evidence.of(one).items())
         )
         for one in verdict.violations
     ]

@@ -29,6 +29,7 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import Format, complain, quiet, say, write_document, write_report
+from sgstore.base.display import excerpts
 from sgstore.errors import StoreError, place_named
 
 if TYPE_CHECKING:
@@ -161,8 +162,9 @@ def _land(
     if not (stroke and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
         raise typer.BadParameter(f"--shard {shard}: expected I/N, such as 3/16; I is 1 to N")
     outcomes = land(url_of(store) or store, paths, shard=(int(number), int(of)), **options)
-    if not outcomes:
-        say(f"share {shard} of {len(paths)} recordings is empty")
+    if shard is not None:
+        names = ", ".join(excerpts([one.trace for one in outcomes])) or "none"
+        say(f"share {shard} of {len(paths)} recordings: {names}")
     return outcomes
 
 

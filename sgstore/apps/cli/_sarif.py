@@ -6,7 +6,6 @@ Source: OASIS Standard, "Static Analysis Results Interchange Format (SARIF) Vers
 from __future__ import annotations
 
 import json
-import shlex
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
@@ -16,14 +15,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
+    from sgstore.apps.cli._junit import Evidence
     from sgstore.temporal import Verdict
 
 _SCHEMA: Final = "https://json.schemastore.org/sarif-2.1.0.json"
-_INFO: Final = "https://pypi.org/project/sgstore/"
+_PACKAGE: Final = "https://pypi.org/project/sgstore/"
 
 
 def write_sarif(
-    path: Path, verdicts: Iterable[Verdict], store: str, recordings: Mapping[str, str]
+    path: Path, verdicts: Iterable[Verdict], evidence: Evidence, recordings: Mapping[str, str]
 ) -> None:
     """Write violations as a SARIF file: a rule for each check, a result for each violation.
 
@@ -33,8 +33,7 @@ def write_sarif(
     ----------
     path : Path
     verdicts : iterable of Verdict
-    store : str
-        Store in the command that shows a violation.
+    evidence : Evidence
     recordings : mapping of str to str
         Trace name → its recording.
 
@@ -67,9 +66,7 @@ def write_sarif(
                     "end": span.end,
                     "frames": span.frames,
                     "values": {name: str(value) for name, value in span.values.items()},
-                    "command": shlex.join(
-                        ["sgstore", "show", store, f"{span.trace}#{span.start_seq}"]
-                    ),
+                    **evidence.of(span),
                 },
             }
             for span in one.violations
@@ -77,7 +74,7 @@ def write_sarif(
     driver = {
         "name": "sgstore check",
         "version": version("sgstore"),
-        "informationUri": _INFO,
+        "informationUri": _address(),
         "rules": [*rules.values()],
     }
     run = {
@@ -87,6 +84,15 @@ def write_sarif(
     }
     document = {"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}
     write_bytes(path, json.dumps(document, indent=1).encode() + b"\n")
+
+
+def _address() -> str:
+    """Return the address of the project: ``Source`` in its metadata, else its package."""
+    from importlib.metadata import metadata
+
+    links = metadata("sgstore").get_all("Project-URL") or []
+    named = dict(link.split(", ", 1) for link in links)
+    return named.get("Source", _PACKAGE)
 
 
 def _location(trace: str, recording: str) -> dict[str, Any]:

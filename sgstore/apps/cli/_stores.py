@@ -23,10 +23,11 @@ from sgstore.apps.cli._options import (
     Verbs,
     jobs_of,
 )
-from sgstore.apps.cli._output import count_bar, say
+from sgstore.apps.cli._output import Format, count_bar, say, write_rows
 from sgstore.base.display import excerpts
 from sgstore.base.output_files import write_bytes
 from sgstore.errors import ExportError, StoreError
+from sgstore.model.vocabulary import suggestion
 
 if TYPE_CHECKING:
     from sgstore.maps.roads import RoadMap
@@ -347,6 +348,50 @@ def config(
         return
     settings = preset_named(preset) if preset else load(file) if file else Config()
     typer.echo(as_toml(settings), nl=False)
+
+
+@verbs.command(rich_help_panel=PANEL)
+def docs(page: Annotated[str, Argument()] = "") -> int:
+    """Print a page of the documentation; without a PAGE, list the pages.
+
+    Parameters
+    ----------
+    page : PAGE
+        Name of a page, such as language, exports or glossary.
+    """
+    pages = _pages()
+    if not pages:
+        raise StoreError("the pages of the documentation are not installed")
+    name = Path(page).stem.lower().replace("_", "-")
+    known = {one.lower().replace("_", "-"): one for one in pages}
+    if not page:
+        rows = [(one, _title(pages[one])) for one in sorted(pages)]
+        write_rows(("page", "title"), rows, Format.table)
+    elif name not in known:
+        like = suggestion(name, known)
+        hint = f"did you mean {known[like]}?" if like else "'sgstore docs' lists the pages"
+        raise typer.BadParameter(f"no page {page!r}; {hint}")
+    else:
+        typer.echo(pages[known[name]].read_text(encoding="utf-8"), nl=False)
+    return 0
+
+
+def _pages() -> dict[str, Path]:
+    """Return the pages of the documentation by name: of a checkout, or installed by the wheel."""
+    from importlib.metadata import files
+
+    folder = Path(__file__).parents[3] / "docs"
+    found = [*folder.glob("*.md")] if (folder / "conf.py").is_file() else []
+    if not found:
+        held = (one for one in files("sgstore") or () if "share/doc/sgstore/" in one.as_posix())
+        found = [Path(str(one.locate())) for one in held if one.suffix == ".md"]
+    return {one.stem: one for one in found}
+
+
+def _title(page: Path) -> str:
+    """Return the first heading of a page."""
+    with page.open(encoding="utf-8") as lines:
+        return next((line[2:].strip() for line in lines if line.startswith("# ")), "")
 
 
 @verbs.command(rich_help_panel=PANEL)

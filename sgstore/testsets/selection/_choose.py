@@ -9,7 +9,7 @@ import hashlib
 import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -324,6 +324,8 @@ def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
             spec, units, np.zeros(0, np.int64), result={"units": 0, "of": 0}, said=said
         )
     found = _selected(spec, units, units.ranks(spec.seed))
+    if spec.strategy is Strategy.minimal and len(found.picked) == len(units) > 1:
+        found.said.append(_saves_nothing(spec, units))
     if not units.overlap:
         return found
     frames, seconds = (units.together(found.picked, m) for m in ("frames", "seconds"))
@@ -333,6 +335,23 @@ def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
     )
     result = found.result | {"frames": int(frames), "seconds": round(seconds, 6)}
     return replace(found, result=result, said=[*found.said, said])
+
+
+_COARSER: Final = ("EL", "ER", "E")
+"""Abstractions with fewer classes than RSV."""
+
+
+def _saves_nothing(spec: SelectionSpec, units: Units) -> str:
+    """Return a note that each unit has an item of its own, with a setting that saves units if one does."""
+    said = f"--minimal saves nothing: each of the {len(units)} {spec.unit}s has an item of its own"
+    if spec.sequences:
+        return said
+    for abstraction in _COARSER:
+        coarser = replace(spec, abstraction=abstraction, combos=0)
+        kept = len(_selected(coarser, units, units.ranks(spec.seed)).picked)
+        if abstraction != spec.abstraction and kept < len(units):
+            return f"{said}; with --abstraction {abstraction}, {kept} are enough"
+    return f"{said}; a shorter --clip or --unit frame splits them"
 
 
 def _selected(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
