@@ -43,27 +43,21 @@ if _source := _project["project"]["urls"].get("Source"):  # the one place that t
     }
 
 CONTENTS = {
-    "Begin": (
-        *("docs/first-hour", "docs/gallery", "docs/pictures/README"),
-        *("docs/commands", "docs/notebooks", "docs/explorer"),
+    "Start": ("docs/install", "docs/first-hour", "docs/gallery", "docs/pictures/README"),
+    "How do I": (
+        *("docs/howto_cut_ins", "docs/howto_carla_pyg", "docs/howto_autoware", "docs/howto_ci"),
+        *("docs/howto_bi", "docs/howto_not_read", "docs/howto_share", "docs/howto_upgrade"),
+        *("docs/cookbook", "docs/notebooks", "docs/explorer", "docs/assistants", "docs/online"),
     ),
-    "Ask": (
-        *("docs/language", "docs/one_page", "docs/cookbook", "docs/patterns", "docs/views"),
-        *("docs/graphs", "docs/relations", "docs/parameters"),
-    ),
-    "Read and write": (
-        "docs/flavours",
-        "docs/noise",
+    "Reference": (
+        *("docs/commands", "docs/api", "docs/language", "docs/one_page", "docs/patterns"),
+        *("docs/views", "docs/graphs", "docs/relations", "docs/parameters", "docs/exports"),
+        *("docs/coverage", "docs/selection", "docs/criticality", "docs/scale", "docs/flavours"),
         *("docs/source_osi", "docs/source_carla", "docs/source_autoware", "docs/source_foxglove"),
         *("docs/source_av2", "docs/source_py123d", "docs/source_rosbags", "docs/source_sumo"),
-        *("docs/source_commonroad", "docs/source_lanelet2"),
-        "docs/exports",
-        "docs/online",
-        "docs/assistants",
-        "docs/scale",
+        *("docs/source_commonroad", "docs/source_lanelet2", "docs/glossary"),
     ),
-    "Measure and choose": ("docs/coverage", "docs/selection", "docs/criticality"),
-    "Reference": ("docs/api", "docs/performance", "docs/reproduction"),
+    "Why": ("docs/why", "docs/noise", "docs/performance", "docs/reproduction"),
     "Work on it": (
         *("docs/architecture", "CONTRIBUTING", "sgstore/mcap/README", "samples/town/README"),
         *("SECURITY", "CODE_OF_CONDUCT", "CHANGELOG"),

@@ -25,7 +25,7 @@ def exports(folder: Path) -> int:
     store = folder / "town.sgstore"
     assert run(["ingest", str(store), str(RECORDING), "--until", "5"]) == 0
     for form in ("duckdb", "parquet"):
-        assert run(["export", str(store), "--format", form, "--to", str(folder / form)]) == 0
+        assert run(["export", str(store), "--as", form, "--to", str(folder / form)]) == 0
     return sgstore.open(store).sql("SELECT count(*) FROM nodes WHERE is_ego").values[0][0]
 
 

@@ -118,14 +118,14 @@ def test_the_file_has_the_storage_version(
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["--format", "duckdb", "--storage", "1"], "expected v1.0.0, v1.2.0, …"),
+        (["--as", "duckdb", "--storage", "1"], "expected v1.0.0, v1.2.0, …"),
         (
-            ["--format", "duckdb", "--storage", "v9.0.0"],
+            ["--as", "duckdb", "--storage", "v9.0.0"],
             "cannot write the storage version 'v9.0.0'",
         ),
         (["--as", "parquet", "--storage", "v1.2.0"], "--storage cannot be used"),
-        (["--format", "geojson", "--crs", "EPSG:0"], "coordinate system 'EPSG:0' is unknown"),
-        (["--format", "mcap"], "the format 'mcap' copies recordings; add a query"),
+        (["--as", "geojson", "--crs", "EPSG:0"], "coordinate system 'EPSG:0' is unknown"),
+        (["--as", "mcap"], "the format 'mcap' copies recordings; add a query"),
         (["--as", "frames"], "the format 'frames' copies recordings; add a query"),
     ],
 )
@@ -141,7 +141,7 @@ def test_a_wrong_option_is_refused_and_nothing_is_written(
 
 @pytest.mark.parametrize("form", ["pyg", "nx", "s3c", "openlabel"])
 def test_an_export_without_a_query_has_all_frames(folder: Path, tmp_path: Path, form: str) -> None:
-    command = ["export", str(folder / "town.sgstore"), "--format", form]
+    command = ["export", str(folder / "town.sgstore"), "--as", form]
 
     assert run([*command, "--to", str(tmp_path / "out")]) == 0
     about = json.loads((tmp_path / "out" / "manifest.json").read_text())
@@ -158,7 +158,7 @@ def test_geojson_has_each_box_in_metres_and_a_note(
     folder: Path, store: Store, tmp_path: Path, capsys: Any
 ) -> None:
     command = ["export", str(folder / "town.sgstore"), "MATCH (e:Ego) WHERE frame.t < 1"]
-    assert run([*command, "--after", "0s", "--format", "geojson", "--to", str(tmp_path / "o")]) == 0
+    assert run([*command, "--after", "0s", "--as", "geojson", "--to", str(tmp_path / "o")]) == 0
     found = features(tmp_path / "o" / "town_001.geojson")
     rows = store.sql(
         "SELECT frame_id, node_id, x, y FROM nodes WHERE node_id >= 0 AND frame_id IN"
@@ -183,7 +183,7 @@ def test_coordinates_are_longitude_and_latitude_with_a_coordinate_system(
     pyproj = pytest.importorskip("pyproj")
     command = ["export", str(folder / "town.sgstore"), "MATCH (e:Ego) WHERE frame.t < 0.5"]
     for number, more in enumerate(([], ["--crs", "EPSG:32632"])):
-        to = ["--format", "geojson", "--to", str(tmp_path / f"{number}")]
+        to = ["--as", "geojson", "--to", str(tmp_path / f"{number}")]
         assert run([*command, *to, *more]) == 0
     local, there = (features(tmp_path / f"{n}" / "town_001.geojson") for n in (0, 1))
     utm = pyproj.Proj(proj="utm", zone=32, ellps="WGS84")
