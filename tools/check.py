@@ -83,7 +83,7 @@ TESTS = {
     "scope": "lang_scope cli",
     "scene_columns": "relations sgg",
     "CONTRIBUTING": "recipes docs_house",
-    "docs": "docs_* lang_docs howto_docs",
+    "docs": "docs_* lang_docs howto_docs ci_files",
     "README": "docs_*",
 }
 """Package or part of one, or folder or page beside sgstore → names of test files, without ``test_``."""

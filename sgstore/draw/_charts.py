@@ -268,22 +268,42 @@ def draw_matrix(
     image[np.triu_indices(len(shown), 1)] = (1.0, 1.0, 1.0)
     gaps = gaps[square]
     names = [printable(names[i]) for i in shown.tolist()]
-    side = len(names) * _CELL
+    rows, columns = _compared(groups, len(names))
+    for group in {*groups}:  # a slot has one value: no pairs
+        same = [i for i, one in enumerate(groups) if one == group]
+        image[np.ix_(same, same)] = (1.0, 1.0, 1.0)
+    image = image[rows, columns]
     label = 12 + 3.7 * max((len(name) for name in names), default=0)
     least = max(480 if groups else 420, 7.4 * len(title))  # for the texts above and below
-    with _page(to, title, below, max(label + side + 30, least), side + label + 90) as page:
-        axes = page.plot(label, 30.0 + label, label + side, 30.0 + label + side)
+    high, wide = image.shape[:2]
+    cell = min(max((least - label - 30) / max(wide, 1), _CELL), _LARGEST_CELL)
+    wider = 2 if groups else 1  # few values, with a long legend below
+    high, wide = high * cell, wide * cell * wider
+    with _page(to, title, below, max(label + wide + 30, least), high + label + 80) as page:
+        axes = page.plot(label, 30.0 + label, label + wide, 30.0 + label + high)
         axes.imshow(image, interpolation="nearest", aspect="auto")
         axes.grid(visible=False)
         axes.spines[:].set_visible(False)
-        places = range(len(names))
         look: dict[str, Any] = {"fontsize": 6, "color": INK, "parse_math": False}
-        axes.set_xticks(places, names, rotation=90, **look)
-        axes.set_yticks(places, names, **look)
-        for place in [i - 0.5 for i in range(1, len(groups)) if groups[i] != groups[i - 1]]:
-            axes.axhline(place, color=INK, linewidth=0.6)
-            axes.axvline(place, color=INK, linewidth=0.6)
-        _explain_colours(page, gaps, cannot=bool(groups))
+        axes.set_xticks(range(len(names[columns])), names[columns], rotation=90, **look)
+        axes.set_yticks(range(len(names[rows])), names[rows], **look)
+        for draw, part in ((axes.axhline, groups[rows]), (axes.axvline, groups[columns])):
+            for place in range(1, len(part)):
+                if part[place] != part[place - 1]:
+                    draw(place - 0.5, color=INK, linewidth=0.6)
+        cannot = bool((image == to_rgb(_CANNOT)).all(axis=2).any())
+        _explain_colours(page, gaps, cannot=cannot)
+
+
+_LARGEST_CELL: Final = 24.0
+"""Largest side of a cell of a small matrix; points."""
+
+
+def _compared(groups: Sequence[str], count: int) -> tuple[slice, slice]:
+    """Return the rows and columns that have pairs: all, or those without the first and the last slot."""
+    if len({*groups}) < 2:
+        return slice(count), slice(count)
+    return slice(groups.count(groups[0]), count), slice(count - groups.count(groups[-1]))
 
 
 def _one_direction(

@@ -310,8 +310,8 @@ def test_clips_may_overlap_and_come_in_any_order(tmp_path: Path) -> None:
 
     assert [clip.file.name for clip in written] == [
         "drive_001.mcap",
-        "other_002.mcap",
-        "drive_003.mcap",
+        "other_001.mcap",
+        "drive_002.mcap",
     ]
     counts = [{c.topic: c.messages for c in clip.messages}["truth"] for clip in written]
     assert counts == [6 + 1, 4, 5 + 1]
