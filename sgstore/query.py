@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
@@ -1529,7 +1529,11 @@ class Store(StoreVerbs):
                     "such relations are unknown of it (no road map, perhaps)",
                 )
             view = self._view(ref, compiled.bound)
-            return why_not(compiled.bound, view, compiled.text)
+            answer = why_not(compiled.bound, view, compiled.text)
+            if isinstance(answer, WhyNot) and answer.failed.startswith("topic("):
+                reason = self.find(text, **values).reasons.get(ref.trace)
+                return replace(answer, found=reason or answer.found)
+            return answer
 
     def parts(
         self,

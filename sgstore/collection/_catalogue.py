@@ -26,6 +26,7 @@ from sgstore.lang.catalog import (
     own_type,
     relations_of_set,
 )
+from sgstore.lang.topics import common_type, topics_of_parts
 from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import NAMES, natural
 from sgstore.store import (
@@ -193,6 +194,18 @@ class Snapshot:
         }
 
     @cached_property
+    def topics(self) -> dict[str, dict[str, str]]:
+        """Return the topics in all bundles (store files), as for :func:`topics_of_parts`."""
+        found: dict[str, dict[str, str]] = {}
+        for _, what, word, kind, _ in self.facts["word"]:
+            if what == "topic":
+                topic, field = json.loads(word)
+                known = found.setdefault(topic, {"": kind})
+                last = known.get(field, kind)
+                known[field] = common_type(last, kind) if field else last and kind
+        return found
+
+    @cached_property
     def classed(self) -> tuple[str, ...]:
         """Return the abstractions whose frame classes are stored in at least one bundle (store file)."""
         return tuple(sorted({row[2] for row in self.facts["word"] if row[1] == "classed"}))
@@ -218,6 +231,7 @@ class Snapshot:
             names=self.words,
             own=self.own["own"],
             own_edges=self.own["own_edges"],
+            topics=topics_of_parts(self.topics),
             sets=sets,
         )
 

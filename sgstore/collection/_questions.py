@@ -474,6 +474,7 @@ class Collection(StoreVerbs):
             "own": {name: kind.value for name, kind in snapshot.own["own"].items()},
             "own_edges": {name: kind.value for name, kind in snapshot.own["own_edges"].items()},
             "classed": [*snapshot.classed],
+            "topics": snapshot.topics,
             "sets": {
                 name: None if (known := snapshot.relations_of(name)) is None else sorted(known)
                 for name in snapshot.sets

@@ -24,6 +24,7 @@ from sgstore.errors import StoreError
 from sgstore.lang.catalog import Type
 from sgstore.lang.sql import Compiled
 from sgstore.lang.sql.collection_parts import parted
+from sgstore.lang.topics import topics_of_parts
 from sgstore.matches import Interval, UnionMatches
 from sgstore.query import Store, UserStatement, matches_of
 from sgstore.store import Example, PartFile, StoreFile, UserTables
@@ -53,8 +54,8 @@ def _in_whole(local: Catalog, whole: Mapping[str, Any]) -> Catalog:
     local : Catalog
     whole : dict
         ``words``: enumeration → additional values; ``own``, ``own_edges``: custom attributes → their
-        types; ``classed``: abstractions with known classes of frames; ``sets``: derived set → its
-        relations, ``None`` if unknown.
+        types; ``classed``: abstractions with known classes of frames; ``topics``: their fields;
+        ``sets``: derived set → its relations, ``None`` if unknown.
     """
     sets = dict(local.sets)
     for name, relations in whole["sets"].items():
@@ -67,6 +68,7 @@ def _in_whole(local: Catalog, whole: Mapping[str, Any]) -> Catalog:
         own={name: Type(kind) for name, kind in whole["own"].items()},
         own_edges={name: Type(kind) for name, kind in whole["own_edges"].items()},
         classed=tuple(whole["classed"]),
+        topics=topics_of_parts(whole["topics"]) | dict(local.topics),
         sets=sets,
         lacks={},
     )

@@ -7,17 +7,16 @@ A topic is a channel of a recording, such as ``/imu``. Its messages are rows, an
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from sgstore.base.display import excerpt, excerpts
 from sgstore.errors import SgstoreError
-from sgstore.lang.catalog import TopicField
+from sgstore.lang.catalog import TopicFacts, TopicField
 from sgstore.model.vocabulary import suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-
-    from sgstore.lang.catalog import TopicFacts
 
 
 RULES: Final = ("last", "nearest", "linear")
@@ -106,3 +105,48 @@ def _like(path: str, fields: Mapping[str, TopicField]) -> str:
     ends = [name for name in fields if name.lower().endswith(f".{path.lower()}")]
     like = ends[0] if ends else like
     return f"did you mean {like!r}?" if like else f"its fields are {excerpts([*fields])}"
+
+
+_WHOLE: Final = frozenset(
+    {"TINYINT", "UTINYINT", "SMALLINT", "USMALLINT", "INTEGER", "UINTEGER", "BIGINT"}
+)
+
+
+def common_fields(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """Return the fields of several recordings of a topic, with database types for all of their values."""
+    found: dict[str, str] = {}
+    for fields in several:
+        for name, kind in fields.items():
+            found[name] = common_type(found.get(name, kind), kind)
+    return found
+
+
+def common_type(one: str, other: str) -> str:
+    """Return a database type for the values of two types."""
+    if one == other:
+        return one
+    if one.endswith("[]") and other.endswith("[]"):
+        return f"{common_type(one.removesuffix('[]'), other.removesuffix('[]'))}[]"
+    both = {one, other}
+    if both <= _WHOLE:
+        return "BIGINT"
+    return "DOUBLE" if both <= {*_WHOLE, "UBIGINT", "FLOAT", "DOUBLE"} else "VARCHAR"
+
+
+def topics_of_parts(told: Mapping[str, Mapping[str, str]]) -> dict[str, TopicFacts]:
+    """Return the topics of the parts of a collection, without their traces.
+
+    Parameters
+    ----------
+    told : mapping
+        Topic → field → type. The field "" has the reason if a topic cannot be decoded.
+    """
+    found: dict[str, TopicFacts] = {}
+    for name, kinds in told.items():
+        fields = {field: TopicField(field, kind) for field, kind in kinds.items() if field}
+        reason = "" if fields else kinds.get("", "")
+        source = partial(dict[str, TopicField], fields)
+        found[name] = TopicFacts(
+            name, frozenset(), stored=bool(fields), refused=reason, source=source
+        )
+    return found

@@ -6,6 +6,7 @@ copied unchanged.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from contextlib import ExitStack, closing
@@ -269,9 +270,10 @@ CATALOGUE: Final = {
 """Tables of a catalogue, with their columns and the types of these in the database.
 
 ``word``: the names that the compiler must know beside its own: of an enumeration (``kind``, ``relation``,
-``light_state``), of user-defined attributes (``own``, ``own_edges``, with their types), and of abstractions
-with stored frame classes (``classed``). ``trace.scope``: counts of excluded data from its report, as JSON;
-empty or NULL: unknown.
+``light_state``), of user-defined attributes (``own``, ``own_edges``, with their types), of abstractions
+with stored frame classes (``classed``), and of topics with their stored fields (``topic``, as JSON;
+their types, or the reason why a topic cannot be decoded). ``trace.scope``: counts of excluded data from its
+report, as JSON; empty or NULL: unknown.
 """
 
 Facts = dict[str, list[tuple[Any, ...]]]
@@ -369,6 +371,10 @@ def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
             yield bundle, what, name, kind.value, 0
     for name in catalog.classed:
         yield bundle, "classed", name, "", 0
+    for name, topic in sorted(catalog.topics.items()):
+        yield bundle, "topic", json.dumps([name, ""]), topic.refused, 0
+        for field in topic.source().values() if topic.stored else ():
+            yield bundle, "topic", json.dumps([name, field.name]), field.declared, 0
 
 
 def split_segment(sealed: Path, to: Path, of_map: Path) -> str:

@@ -46,11 +46,13 @@ def _write(connection: DuckDBPyConnection, access: Access, relation: str, place:
 
     one = TopicValue.of(relation)
     assert one is not None, relation  # noqa: S101 - the pattern ensures it
-    made = "SELECT CAST(NULL AS BIGINT) AS frame_id, CAST(NULL AS VARCHAR) AS value LIMIT 0"
-    if one.topic in topic_facts(connection, access):  # a part of a collection may lack it
+    # Booleans convert to any type, so the columns of several parts can be joined.
+    made = "SELECT CAST(NULL AS BIGINT) AS frame_id, CAST(NULL AS BOOLEAN) AS value LIMIT 0"
+    topic = topic_facts(connection, access).get(one.topic)
+    if topic is not None and topic.source():  # a part of a collection may lack it
         made = topic_values(connection, access, one.topic, one.field, one.rule, one.tolerance_ns)
     place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     part = place.with_suffix(f".{id(connection)}")
-    copy = f"COPY ({made} ORDER BY frame_id) TO {literal(str(part))} (FORMAT parquet)"
+    copy = f"COPY (FROM ({made}) ORDER BY frame_id) TO {literal(str(part))} (FORMAT parquet)"
     interruptible(connection, lambda: connection.execute(copy))
     part.replace(place)

@@ -21,7 +21,14 @@ from sgstore.base.quoting import literal, quoted
 from sgstore.errors import SqlError, TraceError
 from sgstore.lang.catalog import TopicFacts, TopicField, Type
 from sgstore.lang.syntax import TOPIC
-from sgstore.lang.topics import RULES, TopicError, field_of, fields_of, topic_of
+from sgstore.lang.topics import (
+    RULES,
+    TopicError,
+    common_fields,
+    field_of,
+    fields_of,
+    topic_of,
+)
 from sgstore.mcap import Findings, mark_of
 from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.readers import TopicReading, open_recording, refusal
@@ -42,7 +49,7 @@ from sgstore.store._topics import (
 from sgstore.store._traces import stored_traces, unchanged
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Generator, Iterator, Mapping
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -340,31 +347,6 @@ def field_fault(connection: DuckDBPyConnection, sql: str, message: str) -> str:
             except TopicError as error:
                 return str(error)
     return ""
-
-
-_WHOLE: Final = frozenset(
-    {"TINYINT", "UTINYINT", "SMALLINT", "USMALLINT", "INTEGER", "UINTEGER", "BIGINT"}
-)
-
-
-def common_fields(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    """Return the fields of several recordings of a topic, with database types for all of their values."""
-    found: dict[str, str] = {}
-    for fields in several:
-        for name, kind in fields.items():
-            found[name] = _common(found.get(name, kind), kind)
-    return found
-
-
-def _common(one: str, other: str) -> str:
-    if one == other:
-        return one
-    if one.endswith("[]") and other.endswith("[]"):
-        return f"{_common(one.removesuffix('[]'), other.removesuffix('[]'))}[]"
-    both = {one, other}
-    if both <= _WHOLE:
-        return "BIGINT"
-    return "DOUBLE" if both <= {*_WHOLE, "UBIGINT", "FLOAT", "DOUBLE"} else "VARCHAR"
 
 
 # Values at frames.

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang import ir as b
+from sgstore.lang.bind._symbols import of_type
 from sgstore.lang.catalog import Type
 from sgstore.model.vocabulary import normalize_name
 
@@ -113,6 +114,7 @@ def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
         operand = inner.number(e.arguments[0])
     else:
         operand = inner.bind(e.arguments[0])
+        operand = of_type(operand, Type.number) if name in EXTREMES else operand
         if name in EXTREMES and operand.type not in function.of:
             session.refuse(f"{e.name}() takes numbers or texts", e.arguments[0].span)
         if name == "collect" and operand.type not in function.of:

@@ -74,6 +74,8 @@ def _of_recordings(
     except TopicError as error:
         _refuse(error, e.topic.span, session)
     try:
+        if not facts.refused and not facts.source():
+            return facts.name, path, Type.open  # the parts of a collection know the fields
         field = field_of(facts, path)
     except TopicError as error:
         if facts.refused:
