@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import dataclass
 from itertools import islice
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from carla_recordings import Bridge, vehicle
 from library_scenes import LEFT, LIGHTS, RIGHT, SCENES, WAYS, aside, lamp
 from opendrive_maps import a_map, a_road, cubic, line
+from recordings import Recorder, car
 from roundabouts import circling, driven, roundabout
 from scenes import Scene, actor, along, ego, store_of, through
 
@@ -107,7 +109,7 @@ def drawn_store(where: Path) -> Store:
         if scene is not None
     }
     store_of(where, scenes | {name: [scene] for name, scene in OWN.items()})
-    ingest(where, [bump(where.parent / "bump.mcap")])
+    ingest(where, [bump(where.parent / "bump.mcap"), early(where.parent / "early.mcap")])
     return Store(where)
 
 
@@ -121,6 +123,20 @@ def bump(path: Path) -> Path:
             bridge.objects(i / 10, there)
             if i == 40:
                 bridge.collision(4.0, 2, (9000, 0, 0))
+    return path
+
+
+def early(path: Path) -> Path:
+    """A recording in which the planner stops for a car that is still far ahead."""
+    with Recorder(path) as recorder:
+        recorder.map(a_map(a_road("1", line(400.0))))
+        planner = recorder.channel("/planner", "Planner", b'{"type": "object"}')
+        for i in range(60):
+            state = "STOP" if i >= 20 else "FOLLOW"
+            if i % 5 == 0:
+                recorder.write(planner, i / 10, json.dumps({"state": state}).encode())
+            cars = [car(1, x=20 + i, y=-1.75, v=(10, 0)), car(2, x=80 + 0.4 * i, y=-1.75, v=(4, 0))]
+            recorder.ground_truth(i / 10, cars, host=1)
     return path
 
 

@@ -12,6 +12,8 @@ import pytest
 from recordings import Recorder, car
 
 import sgstore
+from sgstore.collection import Collection, pack
+from sgstore.lang.help import words
 from sgstore.model.config import from_dict
 from sgstore.temporal import Monitor, opened
 
@@ -141,3 +143,97 @@ def test_values_are_those_of_the_definition(tmp_path: Path, seed: int) -> None:
                     seen[event.name].append(event.start.seq)
         assert {one.check: one.verdict for one in monitor.finish()} == verdicts
     assert [*seen.values()] == found
+
+
+def drive(path: Path, *, planner: bool = True, z: float = 0.0) -> Path:
+    """A drive of 2 s. The planner says STOP from 1 s on, every 0.3 s; its ``z`` rises by 1 each time."""
+    with Recorder(path) as recorder:
+        for i in range(20):
+            if planner and i % 3 == 0:
+                content = {"state": "STOP" if i >= 10 else "GO", "z": z + i // 3, "values": [i, 7]}
+                channel = recorder.channel("/planner", "Planner", SCHEMA)
+                recorder.write(channel, i / 10, json.dumps(content).encode())
+            cars = [car(1, x=i, v=(10, 0)), car(2, x=70 - i, v=(-10, 0))]
+            recorder.ground_truth(i / 10, cars, host=1)
+    return path
+
+
+def test_topics_are_values_in_every_clause(tmp_path: Path) -> None:
+    """A trace without the topic is left out with the reason; later recordings are seen."""
+    store = sgstore.open(tmp_path / "s.sgstore", create=True)
+    store.ingest([drive(tmp_path / "a.mcap"), drive(tmp_path / "b.mcap", planner=False)])
+    stop, z = "topic('/planner').state = 'STOP'", "topic('/planner').z"
+    with store.file.snapshot():
+        found = store.find(f"MATCH (e:Ego), (v:Vehicle) WHERE {stop} AND gap(e, v) > 30")
+        assert [row.seq for row in found.rows()] == [12, 13, 14, 15, 16, 17]
+        assert found.reasons == {"b": "trace b has no topic /planner"}
+        for text, expected in {
+            f"WHERE {z} > 5 RETURN MAX({z}) AS z, COUNT(*) AS n": [(6, 2)],
+            f"WHERE {stop} RETURN frame.seq AS s ORDER BY {z} DESC, s LIMIT 2": [(18,), (19,)],
+            f"WHERE delta({z}, 0.1s) = 1 AND prev({z}) = 5 RETURN min_over({z}, 0.5s)": [(4,)],
+            f"WITH e, {z} AS z WHERE z = 6 OPTIONAL MATCH (v:Person) RETURN z, v.name": [
+                *(((6, None),) * 2)
+            ],
+            f"WHERE EXISTS {{(v:Car) WHERE v.x = {z} + 54}} RETURN frame.seq": [(12,)],
+            f"WHERE NOT {stop} THEN IMMEDIATELY MATCH (e) WHERE {stop} AS s RETURN t(s)": [(1.2,)],
+            f"WHERE ({stop}) AND HISTORICALLY[0s, 0.3s] {stop} RETURN MIN(frame.seq)": [(15,)],
+            "WHERE topic('/planner').values[0] + topic('/planner').values[1] = 7 RETURN frame.seq": [
+                *((n,) for n in range(3))
+            ],
+        }.items():
+            rows = store.find(f"MATCH (e:Ego) {text}").rows()
+            assert [tuple(row) for row in rows] == expected, text
+        checks = f"CHECK most: ALWAYS {z} < 5 ROBUSTNESS; CHECK stops: EVENTUALLY {stop}"
+        verdicts = {(one.check, one.trace): one for one in store.check(checks)}
+        assert verdicts["most", "a"].robustness.value == -1
+        assert verdicts["stops", "a"].verdict == "true"
+        assert verdicts["stops", "b"].reason == "trace b has no topic /planner"
+        why = store.why_not("a#3", f"MATCH (e:Ego) WHERE {stop}")
+        assert (why.failed, why.found) == (stop, "topic('/planner').state = 'GO'")
+        why = store.why_not("b#3", f"MATCH (e:Ego) WHERE {stop}")
+        assert why.found == "trace b has no topic /planner"
+        assert "state" in {one["name"] for one in words(store.catalog())["topics"]["/planner"]}
+    store.ingest(drive(tmp_path / "c.mcap", z=10))
+    counts = store.find(
+        f"MATCH (e:Ego) WHERE {z} > 5 RETURN COUNT(*) AS n, trace.name AS t ORDER BY t"
+    )
+    assert [tuple(row) for row in counts.rows()] == [(2, "a"), (20, "c")]
+
+
+def test_a_collection_has_topics_of_some_stores(tmp_path: Path) -> None:
+    names = {"one": True, "two": False}
+    for name, planner in names.items():
+        store = sgstore.open(tmp_path / f"{name}.sgstore", create=True)
+        store.ingest(drive(tmp_path / f"{name}.mcap", planner=planner))
+        pack(tmp_path / f"{name}.sgstore", tmp_path / "fleet")
+    with Collection(tmp_path / "fleet") as fleet:
+        rows = fleet.find(
+            "MATCH (e:Ego) RETURN topic('/planner').z AS z, frame.seq AS s ORDER BY z DESC, s LIMIT 2"
+        )
+        assert [tuple(row) for row in rows.rows()] == [(6, 18), (6, 19)]
+        verdicts = fleet.check("CHECK few: ALWAYS topic('/planner').z < 9")
+        assert {one.trace: one.verdict for one in verdicts} == {"one": "true", "two": "unknown"}
+        with pytest.raises(sgstore.QueryError, match="no topic '/planer'"):
+            fleet.find("MATCH (e:Ego) WHERE topic('/planer').z > 1").rows()
+        with pytest.raises(sgstore.SgstoreError, match="topic '/planner' has no field 'zz'"):
+            fleet.find("MATCH (e:Ego) WHERE topic('/planner').zz > 1").rows()
+
+
+def test_online_frames_carry_messages() -> None:
+    """The last message counts within the tolerance; an unknown value is no violation."""
+    checks = "CHECK z: ALWAYS topic('/x', 0.2s).a.z[1] < 3; CHECK no: ALWAYS topic('/y').b = 'ok'"
+    monitor = sgstore.Monitor(checks)
+    events = list[tuple[int, str, str]]()
+    for number in range(6):
+        frame = sgstore.Frame(number * 100_000_000, ego="hero")
+        frame.add("hero", "car", 0, 0)
+        if number in {1, 5}:
+            frame.topics["/x"] = {"a": {"z": [0, number - 1]}}
+        events += [(number, one.kind, one.name) for one in monitor.step(frame)]
+    assert events == [(5, "violated", "z")]
+    z, no = monitor.finish()
+    assert (z.verdict, no.verdict, no.reason) == (
+        "false",
+        "unknown",
+        "trace online has no topic /y",
+    )

@@ -35,8 +35,8 @@ def recorded(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
         yield store
 
 
-def test_there_are_65_questions() -> None:
-    assert [entry.number for entry in ENTRIES] == [*range(1, 66)]
+def test_there_are_66_questions() -> None:
+    assert [entry.number for entry in ENTRIES] == [*range(1, 67)]
     assert all(entry.question.endswith("?") for entry in ENTRIES)
 
 
