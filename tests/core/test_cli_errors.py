@@ -112,10 +112,15 @@ def test_a_file_that_is_no_store_is_told_so_whatever_its_name(
     [
         (["ls"], "write: sgstore info"),
         (["query", "a"], "write: sgstore find"),
-        (["coverage", "a.sgstore"], "write: sgstore coverage COMMAND a.sgstore"),
-        (["lock", "a.sgstore"], "write: sgstore lock COMMAND a.sgstore"),
+        (["coverage", "a.sgstore"], "write: sgstore coverage classes a.sgstore"),
+        (["lock", "a.sgstore"], "write: sgstore select a.sgstore -o tests.lock"),
         (["a.sgstore"], "write: sgstore info a.sgstore"),
         (["a.mcap"], "write: sgstore doctor a.mcap"),
+        (["lock", "tests.lock"], "write: sgstore lock list tests.lock"),
+        (["fnd", "a.sgstore", "cut_in"], "write: sgstore find a.sgstore cut_in"),
+        (["find", "a.sgstore", "--lmit", "3"], "write: sgstore find a.sgstore --limit 3"),
+        (["find", "a.sgstore", "--top=3"], "write: sgstore find a.sgstore --limit=3"),
+        (["find", "MATCH (e:Ego)"], "write: sgstore find STORE 'MATCH (e:Ego)'"),
         (["patterns", "cut_in"], "write: sgstore patterns show cut_in"),
     ],
 )

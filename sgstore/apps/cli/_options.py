@@ -61,11 +61,13 @@ from __future__ import annotations
 import inspect
 import os
 import re
+import shlex
 import sys
 import tomllib
 from collections import Counter
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
+from difflib import get_close_matches
 from functools import cache, partial, wraps
 from importlib import resources
 from itertools import pairwise
@@ -118,7 +120,8 @@ class Verb(TyperCommand):
             whole = args[:-1] if args and args[-1].startswith("-") else args
             return super().parse_args(ctx, _with_store(self, ctx, whole))
         try:
-            args = _with_store(self, ctx, renamed(self, ctx, args))
+            args = renamed(self, ctx, args)
+            args = _with_store(self, ctx, args)
             _, _, order = self.make_parser(ctx).parse_args(args=list(args))
             given: Counter[Any] = Counter(order)
             for parameter, times in given.items():
@@ -126,11 +129,11 @@ class Verb(TyperCommand):
                     raise typer.BadParameter(
                         f"has {times} values; expected one", ctx=ctx, param=parameter
                     )
-            rest = super().parse_args(ctx, args)
+            rest = super().parse_args(ctx, list(args))
         except Exception as error:
-            _advise(error, self)
+            _advise(error, self, ctx, args)
             raise
-        _refuse_late_store(self, ctx)
+        _refuse_late_store(self, ctx, args)
         return rest
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -266,11 +269,17 @@ def _looks_like_store(place: str) -> bool:
     )
 
 
-def _advise(error: Any, verb: Verb) -> None:
-    """Add a remedy to the message of a usage error: the right place of the store."""
-    places = _places(verb)
-    if type(error).__name__ == "MissingParameter" and error.param.name in places[1:]:
-        error.message = "Write the store first."
+def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
+    """Add a remedy to the message of a usage error: the right option, or the right place of the store."""
+    name = getattr(error, "option_name", "")
+    if type(error).__name__ == "NoSuchOption" and (line := _option_instead(verb, ctx, args, name)):
+        error.possibilities = None
+        error.message = f"No such option: {name}; write: {line}"
+    if type(error).__name__ == "MissingParameter":
+        if error.param.name in _places(verb)[1:]:
+            error.message = "Write the store first."
+        elif "\n" in (text := error.format_message()):  # a line for each choice
+            raise typer.BadParameter(" ".join(text.split()), ctx=ctx) from None
 
 
 def _places(verb: Verb) -> list[str]:
@@ -279,7 +288,11 @@ def _places(verb: Verb) -> list[str]:
     return names if names[:1] == ["store"] else []
 
 
-def _refuse_late_store(verb: Verb, ctx: Any) -> None:
+_QUERY: Final = re.compile(r"\s*(?:MATCH|CHECK|SELECT|USING|DEFINE|ALWAYS)\b", re.IGNORECASE)
+"""Start of a query in the place of a store."""
+
+
+def _refuse_late_store(verb: Verb, ctx: Any, args: list[str]) -> None:
     """Raise an error for a store file in the place of another argument, such as ``find QUERY STORE``."""
     values = [ctx.params[name] for name in _places(verb)]
     if not values or _is_database(values[0]):
@@ -287,9 +300,15 @@ def _refuse_late_store(verb: Verb, ctx: Any) -> None:
     later = [one for v in values[1:] for one in (v if isinstance(v, list | tuple) else [v])]
     found = next((one for one in later if one is not None and _is_database(one)), None)
     if found is not None:
-        raise typer.BadParameter(
-            f"{values[0]} is not a store, but {found} is; write the store first", ctx=ctx
-        )
+        rest = [one for one in args if one != str(found)]
+        line = shlex.join([*ctx.command_path.split(), str(found), *rest])
+        reason = f"{values[0]} is not a store, but {found} is; write the store first"
+        raise typer.BadParameter(f"{reason}; write: {line}", ctx=ctx)
+    if _QUERY.match(str(values[0])):
+        stores = [one.name for one in Path().iterdir() if one.suffix in completion.STORE_ENDINGS]
+        store = stores[0] if len(stores) == 1 else "STORE"
+        line = shlex.join([*ctx.command_path.split(), store, *args])
+        raise typer.BadParameter(f"the store is missing; write: {line}", ctx=ctx)
 
 
 def _is_file(path: Path) -> bool:
@@ -366,22 +385,58 @@ _WORDS_OF_OTHERS: Final = {
 """Command → its names in other tools."""
 
 
+_OPTIONS_OF_OTHERS: Final = {
+    "--to": ("--out", "--outfile", "--output-file", "--outdir", "--dest"),
+    "--limit": ("--top", "--head", "--max", "--first", "-n"),
+    "--format": ("--fmt", "--output-format"),
+    "--file": ("--query-file", "--input"),
+    "--pattern": ("--name",),
+    "--param": ("--set", "--var", "--parameter"),
+    "--jobs": ("--threads", "--workers", "--parallel"),
+    "--force": ("--overwrite", "--replace"),
+    "--trace": ("--recording",),
+    "--since": ("--start",),
+    "--until": ("--end", "--stop"),
+    "--require": ("--fail", "--exit-code"),
+    "--by": ("--versus", "--reference", "--baseline"),
+}
+"""Option → its names in other tools."""
+
+
+def _option_instead(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
+    """Return a command line with the right option for an unknown one; an empty text if none is similar."""
+    known = sorted({word for one in verb.params for word in (*one.opts, *one.secondary_opts)})
+    others = [new for new, words in _OPTIONS_OF_OTHERS.items() if name in words and new in known]
+    new = next(iter([*others, *get_close_matches(name, known, 1)]), "")
+    fixed = [f"{new}{one[len(name) :]}" if one.partition("=")[0] == name else one for one in args]
+    return "" if not new or fixed == args else shlex.join([*ctx.command_path.split(), *fixed])
+
+
+_USUAL: Final = {"coverage": "classes", "collection": "verify", "patterns": "run"}
+"""Group of commands → its usual command for a store."""
+
+
 def _command_instead(group: TyperGroup, ctx: Any, args: list[str]) -> str:
     """Return the right command line for an unknown command; an empty text if no command is similar."""
-    word, path = args[0], ctx.command_path
-    place = _looks_like_store(word) or Path(word).suffix in {".mcap", ".osi", ".log"}
-    if path == "sgstore":
-        if place:
-            verb = "info" if _looks_like_store(word) else "doctor"
-            return f"sgstore {verb} {word}"
-        found = (verb for verb, words in _WORDS_OF_OTHERS.items() if word.lower() in words)
-        return next((f"sgstore {verb}" for verb in found), "")
-    if place:
-        names = ", ".join(name for name in group.commands if not group.commands[name].hidden)
-        return f"{path} COMMAND {word}, where COMMAND is one of {names}"
-    from sgstore.lang.library import patterns
+    (word, *rest), path = args, ctx.command_path.partition(" ")[2]
+    place = _looks_like_store(word) or Path(word).suffix in {".mcap", ".osi", ".log", ".lock"}
+    if path and not place:
+        from sgstore.lang.library import patterns
 
-    return f"{path} show {word}" if "show" in group.commands and word in patterns() else ""
+        words = ["show", *args] if "show" in group.commands and word in patterns() else []
+    elif path == "lock":
+        words = ["list", *args] if word.endswith(".lock") else []
+        path, words = (path, words) if words else ("", ["select", *args, "-o", "tests.lock"])
+    elif path:
+        words = [_USUAL[path], *args, *(["--all"] if path == "patterns" else [])]
+    elif place:
+        words = ["info" if _looks_like_store(word) else "doctor", *args]
+    else:
+        verbs = {name: name for name in group.commands}
+        verbs |= {other: verb for verb, known in _WORDS_OF_OTHERS.items() for other in known}
+        close = get_close_matches(word.lower(), verbs, 1)
+        words = [*verbs[close[0]].split(), *rest] if close else []
+    return shlex.join(["sgstore", *path.split(), *words]) if words else ""
 
 
 def _says_one_thing(parameter: Any) -> bool:

@@ -547,6 +547,7 @@ def run_pattern(
 
     if every == bool(name) or (every and clips):
         raise typer.BadParameter("add the name of a pattern, or --all without a name and --clips")
+    offsets = seconds_of(before, "--before"), seconds_of(after, "--after")
     if every:
         return _run_all(store, ask, require=require)
     found = pattern_named(name)
@@ -565,7 +566,6 @@ def run_pattern(
     matches = ask.opened(store).find(text)
     say_left_out(matches)
     if clips:
-        offsets = seconds_of(before, "--before"), seconds_of(after, "--after")
         rows = ((c.trace, c.start_ns, c.end_ns) for c in matches.clips(*offsets))
         number = ask.write(("trace", "start_ns", "end_ns"), rows)
     else:

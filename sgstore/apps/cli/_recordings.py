@@ -123,15 +123,16 @@ def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
 
     for outcome in outcomes:
         _say_warnings(outcome)
+    code = ERROR if any(outcome.error for outcome in outcomes) else 0
+    if out.for_people:  # an error is no row
+        outcomes = [outcome for outcome in outcomes if not outcome.error]
     reports = [{"scope": outcome.scope} if outcome.scope else {} for outcome in outcomes]
     say_scope(scope_of(reports, world=None), out.chosen)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
     rows = map(_outcome_row, outcomes)
     totals = {"frames": "frames", "losses": "losses"}
     out.write(*_with_scopes(columns, rows, reports, out), totals=totals)
-    if any(outcome.error for outcome in outcomes):
-        return ERROR
-    return LOSS if any(outcome.losses for outcome in outcomes) else 0
+    return code or (LOSS if any(outcome.losses for outcome in outcomes) else 0)
 
 
 def _with_scopes(
