@@ -357,7 +357,11 @@ class GapFiller:
 
     def second(self, values: Floats, found: Floats) -> list[Mapping[str, float] | None]:
         """Return speed and acceleration from positions as attributes of rows with recorded velocities."""
-        heading = values[:, _HEADING]
+        added: list[Mapping[str, float] | None] = [None] * len(values)
+        rows = np.flatnonzero(np.isfinite(values[:, _VELOCITY]))
+        if not len(rows):
+            return added
+        found, heading = found[rows], values[rows, _HEADING]
         table = np.column_stack(
             [
                 np.linalg.norm(found[:, :3], axis=1),
@@ -365,21 +369,14 @@ class GapFiller:
                 np.degrees(found[:, 6]),
             ]
         )
-        recorded = np.isfinite(values[:, _VELOCITY])
-        speed = np.linalg.norm(values[:, _VELOCITY : _VELOCITY + 3], axis=1)
+        speed = np.linalg.norm(values[rows, _VELOCITY : _VELOCITY + 3], axis=1)
         apart = np.abs(speed - table[:, 0])
         apart = np.clip(np.rint(100 * apart[np.isfinite(apart)]), 0, len(self.apart) - 1)
         self.apart += np.bincount(apart.astype(np.int64), minlength=len(self.apart))
-        return [
-            {
-                name: value
-                for name, value in zip(FROM_POSITIONS, row, strict=True)
-                if math.isfinite(value)
-            }
-            if told
-            else None
-            for row, told in zip(table.tolist(), recorded.tolist(), strict=True)
-        ]
+        for row, numbers in zip(rows.tolist(), table.tolist(), strict=True):
+            named = zip(FROM_POSITIONS, numbers, strict=True)
+            added[row] = {name: value for name, value in named if math.isfinite(value)}
+        return added
 
     def filled(
         self, values: Floats, found: Floats, fixed: Bools, stands: Bools
@@ -450,7 +447,7 @@ class Smoother(GapFiller):
         tracks = Tracks.of(node, frame, seconds, values, self.noise.jitter, self.period)
         half = self.noise.half(self.period)
         near = tracks.fits(tracks.place, half, 1)
-        calm = tracks.fits(tracks.place, max(HALF, half), 1)
+        calm = tracks.fits(tracks.place, HALF, 1) if half < HALF else near
         if self.noise.jitter:  # At the end of a track, the window on one side must be longer.
             near = near.instead(calm, near.span < 1.9 * half)
         wide = tracks.fits(tracks.place, WIDE, 2)

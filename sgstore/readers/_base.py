@@ -485,8 +485,7 @@ class MessageTrace:
         TraceError
             The file is no longer readable, has no frame, or the requested ego is in no frame.
         """
-        first_steps = self._first_steps()
-        noise = self._noise()
+        first_steps, noise = self._beginning()
         report = self.report = TraceReport()
         decoder = self.decoder(report)
         refs = frame_refs(self.info.channels, self.recording.window)
@@ -499,23 +498,25 @@ class MessageTrace:
             reason = report.losses[0].reason if report.losses else "it contains no messages"
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
 
-    def _first_steps(self) -> list[int]:
-        """Return the time differences between the first frames of the recording; ns."""
-        decoder = self.decoder(TraceReport())
-        times = [frame.time_ns for frame in islice(self._raw(decoder), FIRST_STEPS + 1)]
-        return np.diff(times).tolist()
+    def _beginning(self) -> tuple[list[int], Noise]:
+        """Return the time differences between the first frames in ns, and the noise of the positions.
 
-    def _noise(self) -> Noise:
-        """Return the noise of the positions, from the setting or the first frames."""
-        if self.noise >= 0:
-            return Noise(self.noise, self.noise)
+        The noise is that of the setting, or of the first frames.
+        """
         decoder = self.decoder(TraceReport())
-        raw = self._raw(decoder)
-        frames = [*islice(raw, FIRST_NOISE)]
-        if decoder.measures or lacks_velocity(decoder, frames):
-            frames += islice(raw, ESTIMATED - len(frames))
-            return first_noise(decoder, frames)
-        return Noise()
+        raw, steps = self._raw(decoder), self._surveyed_steps()
+        frames = [] if steps else [*islice(raw, FIRST_STEPS + 1)]
+        steps = steps or np.diff([frame.time_ns for frame in frames]).tolist()
+        if self.noise >= 0:
+            return steps, Noise(self.noise, self.noise)
+        frames = frames or [*islice(raw, FIRST_NOISE)]
+        if not (decoder.measures or lacks_velocity(decoder, frames[:FIRST_NOISE])):
+            return steps, Noise()
+        return steps, first_noise(decoder, frames + [*islice(raw, ESTIMATED - len(frames))])
+
+    def _surveyed_steps(self) -> list[int]:
+        """Return the time differences between the first frames, if the first pass knows them; ns."""
+        return []
 
     def _raw(self, decoder: MessageDecoder[Any]) -> Iterator[Any]:
         """Yield the raw frames of the recording in order."""
@@ -592,9 +593,8 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
     def _decoder(self, report: TraceReport) -> MessageDecoder[Any]:
         raise NotImplementedError
 
-    def _first_steps(self) -> list[int]:
-        stamps = self._survey.leads[self._survey.leading].stamps
-        return stamps.steps[:FIRST_STEPS] or super()._first_steps()
+    def _surveyed_steps(self) -> list[int]:
+        return self._survey.leads[self._survey.leading].stamps.steps[:FIRST_STEPS]
 
     def ego_named(self, name: str) -> str | None:
         """Return the id of the ego vehicle for a name, from the results of the first pass."""

@@ -720,9 +720,9 @@ def _block(
         roster.impossible += impossible
     else:
         values, derived, more = smoother.fill(*columns, rows)
-        own[:] = [
-            {**(told or {}), **one} if one else told for told, one in zip(own, more, strict=True)
-        ]
+        for row, one in enumerate(more):
+            if one:
+                own[row] = {**(own[row] or {}), **one}
     nodes = np.concatenate([frame.node for frame in frames])
     ego = np.array([frame.ego for frame in frames], np.int64)
     entities, scenery = roster.take(known, frames[-1].returned)
