@@ -2,7 +2,7 @@
 // The library and the words of the language: cards before anything is asked, a search in them, what comes near a mistake.
 import { effect, h, htm, signal, useEffect, useRef, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { answer, ask, idle, library, matchesIn, open, store, tally, view, words } from "./state.js";
+import { answer, ask, idle, isLost, library, matchesIn, open, reasonOf, store, tally, view, words } from "./state.js";
 
 const html = htm.bind(h);
 const MOST_CARDS = 24, MOST_WORDS = 12;
@@ -25,20 +25,27 @@ let counting = false;
 export async function countLibrary() {
   if (counting) return;
   counting = true;
-  const left = library.value.filter((one) => one.kind !== "predicate" && one.kind !== "property" && !tally.value[one.name]);
-  for (let one = left.shift(); one; one = left.shift()) {
-    while (answer.value.state !== "idle" || view.value !== "find" || open.value) await new Promise((done) => setTimeout(done, 400));
-    const spots = new Set(), place = placed(), mine = new AbortController();
-    let count = 0, more = "";
+  const next = () => library.value.find((p) => p.kind !== "predicate" && p.kind !== "property" && !tally.value[p.name]);
+  for (let one = next(); one; one = next()) {
+    const busy = () => answer.value.state !== "idle" || view.value !== "find" || open.value || api.trouble.value;
+    while (busy()) await new Promise((done) => setTimeout(done, 400));
+    const spots = new Set(), place = placed(), mine = new AbortController(), { stamp } = store.value;
+    let count = 0, more = "", reason = "";
     idle.stop = () => mine.abort();
+    const lines = api.lines("api/find", { text: one.text }, { signal: mine.signal });
     try {
-      for await (const { trace, first, last } of matchesIn(api.lines("api/find", { text: one.text }, { signal: mine.signal }), () => { more = "+"; })) {
+      for await (const { trace, first, last } of matchesIn(lines, () => { more = "+"; })) {
         count++;
         for (let at = Math.floor(place(trace, first)); at < place(trace, last + 1); at++) spots.add(at);
       }
-    } catch { count = -1; }
-    if (mine.signal.aborted) left.unshift(one); // somebody asks: again later
-    else tally.value = { ...tally.value, [one.name]: { count, more, spots: [...spots] } };
+    } catch (error) {
+      if (isLost(error)) continue; // again later
+      count = -1;
+      reason = reasonOf(error);
+    }
+    // What a question stopped, or another state of the store had, is counted again later.
+    if (mine.signal.aborted || stamp !== store.value.stamp) continue;
+    tally.value = { ...tally.value, [one.name]: { count, more, spots: [...spots], reason } };
   }
   counting = false;
 }
@@ -98,7 +105,7 @@ function useNear(text) {
 function Card({ one }) {
   const told = tally.value[one.name];
   const many = one.kind === "property" ? html`<span class="faint">check</span>`
-    : told ? html`<span class=${told.count > 0 ? "badge" : "faint"}>${told.count < 0 ? "–" : told.count}${told.more}</span>`
+    : told ? html`<span class=${told.count > 0 ? "badge" : "faint"} title=${told.reason}>${told.count < 0 ? "–" : told.count}${told.more}</span>`
     : html`<span class="faint">…</span>`;
   return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
     <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${many}</h3>

@@ -2,9 +2,9 @@
 // A match, or a frame: camera, view from above, the pattern, lanes of truth, all by one clock.
 import { effect, h, htm, signal, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { copyLink } from "./address.js";
+import { copyCommand, copyLink } from "./address.js";
 import { asked, askWhy, beside, camera, frame, holdsAt, lanes, nextMatch, others, panel, series, showSeries, why } from "./clock.js";
-import { arrived, kindOf, lightOf, nameOf, pictureAt, placeOf, seconds, statesAt, timeAt } from "./data.js";
+import { arrived, failureOf, kindOf, lightOf, nameOf, pictureAt, placeOf, seconds, statesAt, timeAt } from "./data.js";
 import { egoRow, fitted, legendOf, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
 import { hop, Neighbours } from "./neighbours.js";
 import { PatternDrawing } from "./pattern.js";
@@ -151,6 +151,7 @@ function Above({ trace }) {
       ${factor !== 1 || dx || dy ? html`<button class="small" onClick=${() => { zoom.value = { factor: 1, dx: 0, dy: 0, north }; }}>reset</button>` : null}
     </div>
     <canvas ref=${canvas} role="img" aria-label=${about?.side ? "View from above, second store" : "View from above"} onWheel=${wheel} onPointerDown=${down} onPointerMove=${move} onPointerUp=${up} onPointerLeave=${() => showTip(null)}></canvas>
+    ${!states && failureOf(trace) ? html`<div class="none" role="status">${failureOf(trace)}</div>` : null}
     ${tip ? html`<${Tip} ...${tip} trace=${trace} states=${seen.current} />` : null}${legend.value ? html`<${Legend} trace=${trace} states=${seen.current} />` : null}
   </div>`;
 }
@@ -266,7 +267,8 @@ function Transport() {
     <span class="grow"></span>
     ${traces.value.has(inOther(now?.trace || "")) ? html`<button aria-pressed=${beside.value} title="the second store by the same clock" onClick=${() => { beside.value = !beside.value; }}>Beside</button>` : null}
     ${offline.value && !now?.match?.pattern ? null : html`<button title="why does this frame match, or not (w)" aria-expanded=${told ? "true" : "false"} onClick=${() => { if (told) why.value = null; else askWhy(); }}>Why?</button>`}
-    ${offline.value ? null : html`<button title="copy a link (y)" onClick=${copyLink}>Link</button>`}
+    ${offline.value ? null : html`<button title="copy a link (y)" onClick=${copyLink}>Link</button>
+      <button title="copy the command that opens this view (Y)" onClick=${copyCommand}>Command</button>`}
     ${live.value ? null : html`<button aria-label="Close" title="close (Esc)" onClick=${() => { playing.value = false; open.value = null; }}>✕</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}

@@ -15,7 +15,8 @@ export const store = signal(/** @type {any} */ (null));
 export const words = signal(/** @type {any} */ (null));
 export const library = signal(/** @type {any[]} */ ([]));
 /** How often each pattern of the library is found, and where. */
-export const tally = signal(/** @type {Record<string, {count: number, more: string, spots: number[]}>} */ ({}));
+export const tally = signal(
+  /** @type {Record<string, {count: number, more: string, spots: number[], reason: string}>} */ ({}));
 export const view = signal("find");
 export const text = signal("");
 /** Values of $name. */
