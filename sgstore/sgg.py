@@ -473,6 +473,7 @@ class SceneGraphGenerator:
             world=self._world_of(view, world.whole, ground, edges),
             left_out=view.left_out,
             uneven=world.uneven,
+            unsure=_unsure(bodies, ground),
         )
 
     def _world_of(
@@ -496,6 +497,7 @@ class SceneGraphGenerator:
             edges=others,
             lanes=self._keeping.lane_states(_lane_states(part.bodies, part.standing)),
             gaps=following,
+            unsure=_unsure(every.bodies, around),
         )
 
     def _beyond_edges(
@@ -518,6 +520,14 @@ class SceneGraphGenerator:
         keys = _keys(*((of.frame, of.src, of.dst) for of in (following, follows)))
         here = np.flatnonzero(_in_ascending(np.sort(keys[1]), keys[0]))
         return Edges.chained([fresh, taken(drawn, gone)]), taken(following, here)
+
+    @classmethod
+    def _of_the_past(cls, road_map: RoadMap | None, config: Config) -> SceneGraphGenerator:
+        """Return a generator whose driven lanes follow from earlier frames alone."""
+        generator = cls(road_map, config)
+        if generator._survey is not None:
+            generator._survey.online = True
+        return generator
 
     def _refuse_undeclared(self, edges: Edges) -> None:
         """Raise if another package returns undeclared edges, which the store cannot hold."""
@@ -593,7 +603,7 @@ class SceneGraphGenerator:
         [<SceneGraph online#0: 2 nodes, 5 edges>, <SceneGraph online#0: 2 nodes, 5 edges>]
         """
         if self._online is None:
-            fresh = partial(SceneGraphGenerator, self._road_map, self._config)
+            fresh = partial(self._of_the_past, self._road_map, self._config)
             shown = map_of_graphs(self._road_map, self._config)
             settings = self._config.ego, self._config.noise
             self._online = Stepper(fresh, shown, DrivenLanes(self._road_map), *settings)
@@ -961,6 +971,10 @@ def _presence(bodies: Bodies, present: Bools | None) -> StaticPresence:
         np.concatenate([bodies.frame[still], frame]),
         np.concatenate([bodies.node[still], -1 - column]),
     )
+
+
+def _unsure(bodies: Bodies, ground: MapContext | None) -> Ints:
+    return np.zeros(0, np.int64) if ground is None else bodies.node[ground.unsure]
 
 
 def _lane_states(bodies: Bodies, standing: Standing | None) -> LaneStates:

@@ -680,7 +680,9 @@ class Records:
             ),
             map=self._map,
         )
-        return next(columns.graphs())
+        unsure = frozenset(outer[states.node[states.lane > 0]].tolist())
+        lead = frozenset(outer[parts[-1].unsure].tolist())
+        return replace(next(columns.graphs()), unsure_lane=unsure, unsure_lead=lead)
 
 
 def _map_node(road_map: RoadMap, node: int) -> Attributes:
@@ -748,9 +750,9 @@ def _lanes(
 ) -> Iterator[tuple[int, int, int, Attributes]]:
     """Yield frame, source, target and attributes of each ``isIn`` edge (object on a lane).
 
-    While the driven lane is unsure, ``is_primary`` of the likely lanes is unknown.
+    While the driven lane is unsure, ``is_primary`` and ``is_own`` are unknown.
     """
-    unsure = lanes.own & np.isin(lanes.node, states.node[states.lane > 0])
+    unsure = np.isin(lanes.node, states.node[states.lane > 0])
     told = (lanes.overlap, lanes.offset, lanes.heading_error, lanes.along)
     columns = (
         *(lanes.frame.tolist(), _outward(lanes.node, outer).tolist(), lanes.lane.tolist()),
@@ -766,7 +768,7 @@ def _lanes(
             "heading_error": math.degrees(error),
             "along": along,
         }
-        known = {"is_own": own} if either else {"is_primary": primary, "is_own": own}
+        known: Attributes = {} if either else {"is_primary": primary, "is_own": own}
         yield frame, node, lane, _numbers(numbers) | known
 
 

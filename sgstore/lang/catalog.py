@@ -264,6 +264,16 @@ IN_GRAPH: Final = Attribute(
 )
 """Used only in generated queries. Queries of users have the scope instead."""
 
+UNSURE_LANE: Final = Attribute(
+    "unsure_lane", Type.boolean, {}, "whether later frames decide the lane that it drives"
+)
+"""Of a vehicle, of its edge ``isIn`` to a lane, or of the ego for a frame. Only in online mode."""
+
+UNSURE_LEAD: Final = Attribute(
+    "unsure_lead", Type.boolean, {}, "whether a vehicle ahead of it depends on an unsure lane"
+)
+"""Of a vehicle, or of any one for a frame. Used only in generated conditions of the online mode."""
+
 COMPUTED: Final = Attribute(
     "computed", Type.boolean, {}, "whether its relations were computed here, and not imported"
 )

@@ -124,6 +124,8 @@ class Edge:
     beyond : Scopes
         For an edge in braces in scope ``world``: the relations of the traces. Empty if the edge covers all
         data, or if there is no data outside the graphs.
+    online : bool
+        True for an edge in braces in online mode: ``leads`` and ``follows`` may be unknown.
     """
 
     key: str
@@ -137,6 +139,7 @@ class Edge:
     span: TextSpan
     known: bool = False
     beyond: Scopes = ()
+    online: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,11 +190,15 @@ class NodeValue:
 
 @dataclass(frozen=True, slots=True)
 class NodeAttribute:
-    """Expression for an attribute of a node, such as ``v.speed``."""
+    """Expression for an attribute of a node, such as ``v.speed``.
+
+    ``online`` means online mode: roles of lanes may be unknown.
+    """
 
     node: str
     attribute: Attribute
     type: Type
+    online: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,19 +220,27 @@ class EdgeRelation:
 
 @dataclass(frozen=True, slots=True)
 class EdgeAttribute:
-    """Expression for an attribute of an edge between an entity and a lane."""
+    """Expression for an attribute of an edge between an entity and a lane.
+
+    ``online`` means online mode: the primary lane may be unknown.
+    """
 
     edge: str
     attribute: Attribute
     type: Type
+    online: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class FrameAttribute:
-    """Expression for an attribute of the frame: ``frame.name``."""
+    """Expression for an attribute of the frame: ``frame.name``.
+
+    ``online`` means online mode: classes of graphs may be unknown.
+    """
 
     attribute: Attribute
     type: Type
+    online: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,12 +253,16 @@ class TraceAttribute:
 
 @dataclass(frozen=True, slots=True)
 class PairNumber:
-    """Number computed for an ordered pair of entities, such as ``gap(a, b)``."""
+    """Number computed for an ordered pair of entities, such as ``gap(a, b)``.
+
+    ``online`` means online mode: distances along lanes may be unknown.
+    """
 
     function: str
     a: str
     b: str
     type: Type = Type.number
+    online: bool = False
 
 
 @dataclass(frozen=True, slots=True)

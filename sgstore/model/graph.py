@@ -6,7 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import starmap
 from operator import eq, itemgetter
 from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
@@ -191,6 +191,8 @@ class WorldBlock:
         Attributes of the additional ``isIn`` edges.
     gaps : LaneGaps
         Gaps of the additional ``leads`` and ``follows`` edges.
+    unsure : int64
+        As in :class:`GraphBlock`, for all data around the ego.
     """
 
     frames: FrameBlock
@@ -198,6 +200,7 @@ class WorldBlock:
     edges: Edges
     lanes: LaneStates
     gaps: LaneGaps
+    unsure: Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,6 +260,8 @@ class GraphBlock:
         Counts of the excluded states.
     uneven : int
         Special pairs of bodies in the block: bits of :data:`sgstore.model.pair_numbers.UNEVEN`.
+    unsure : int64
+        Online: node ids of vehicles without a known next vehicle ahead, because a driven lane is not sure.
     """
 
     frames: FrameBlock
@@ -268,6 +273,7 @@ class GraphBlock:
     world: WorldBlock | None = None
     left_out: LeftOut = LeftOut()
     uneven: int = sum(UNEVEN.values())
+    unsure: Ints = field(default_factory=partial(np.zeros, 0, np.int64))
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -551,6 +557,10 @@ class SceneGraph:
         Online: number of entities out of ``[range] world``, and so unknown.
     excluded : frozenset of str
         Online: kinds in the frame that the settings exclude.
+    unsure_lane : frozenset of int
+        Online: vehicles in junctions whose driven lane later frames decide.
+    unsure_lead : frozenset of int
+        Online: vehicles with a next vehicle ahead that depends on such a lane.
 
     Examples
     --------
@@ -580,6 +590,8 @@ class SceneGraph:
     around: Callable[[], SceneGraph] | None = field(default=None, compare=False, repr=False)
     out_of_world: int = field(default=0, compare=False, repr=False)
     excluded: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
+    unsure_lane: frozenset[int] = field(default=frozenset(), compare=False, repr=False)
+    unsure_lead: frozenset[int] = field(default=frozenset(), compare=False, repr=False)
 
     def known(self) -> SceneGraph:
         """Return the scene graph of all known objects, also of those outside the range of this graph.

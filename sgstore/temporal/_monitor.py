@@ -16,7 +16,15 @@ from urllib.parse import urlsplit
 
 from sgstore.errors import QueryError, TraceError
 from sgstore.graphs.online import GcPaused, replayed
-from sgstore.lang.bind import MOTION, bind_checks, bind_query, not_computed, of_check, of_query
+from sgstore.lang.bind import (
+    MOTION,
+    bind_checks,
+    bind_query,
+    not_computed,
+    of_check,
+    of_query,
+    without_guesses,
+)
 from sgstore.lang.catalog import Catalog, RelationScope, TraceFacts
 from sgstore.lang.library import statement
 from sgstore.lang.memory import FrameView
@@ -639,7 +647,7 @@ def _bound(
             defined.append(one)
         elif isinstance(one, MatchClause):
             query = bind_query(text, [*defined, one], catalog, given([*defined, one]))
-            queries.append(query)
+            queries.append(without_guesses(query))
     return checks, queries
 
 

@@ -10,14 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from builders import Recording, Thing, frame_of, thing
+from oracle_watched import LANE_RULES, Drive, worldwide
+from scenes import Scene, actor, crossroads, ego, store_of, through
 
+from sgstore.graphs.online import replayed
 from sgstore.ingest import ingest
+from sgstore.lang.library import patterns
 from sgstore.maps.roads import PlainLane, lane_text, read_lane_text
 from sgstore.model.config import Config, RangeSettings
 from sgstore.model.vocabulary import RELATION_CODE
 from sgstore.pipeline.derive import derive
 from sgstore.query import Store
 from sgstore.sgg import SceneGraphGenerator
+from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -216,6 +221,111 @@ def test_online_the_primary_lane_is_unknown_while_ambiguous_and_then_stays() -> 
     assert runs(known) == ["in", "", "left", "north"]
     unknown = next(step for step, name in zip(steps, known, strict=True) if not name)
     assert unknown["left"] is unknown["straight"] is None
+
+
+CROSS = crossroads()
+MEETING = {
+    way: Scene(
+        CROSS,
+        ego(through("s", way), 8, start=90),
+        actor("v", through("s", way), 8, start=105),
+        actor("w", through("s", {"n": "e", "e": "w", "w": "n"}[way]), 8, start=118),
+        seconds=8,
+        rate=5,
+    )
+    for way in "new"
+}
+
+
+@pytest.mark.seconds(10)
+def test_a_monitor_never_contradicts_a_store_about_lanes_in_junctions(tmp_path: Path) -> None:
+    role = "CHECK role: ALWAYS NOT EXISTS {(ego)-[:isIn]->(l:Lane) WHERE l.role <> 'Ego Lane'}"
+    checks = f"{worldwide(LANE_RULES)};{role}"
+    config = Config(range=RangeSettings(60, world=150))
+    store = store_of(
+        tmp_path / "s.sgstore",
+        {way: [scene] for way, scene in MEETING.items()},
+        dict.fromkeys(MEETING, config),
+    )
+    stored = {(one.check, one.trace): one.verdict for one in store.check(checks)}
+    known = set[str]()
+    for way, scene in MEETING.items():
+        monitor = Monitor(checks, scene.road, config, trace=way, period_s=0.2)
+        for frame in replayed([scene.block()]):
+            monitor.step(frame)
+        for one in monitor.finish():
+            assert one.verdict in {stored[one.check, way], "unknown"}, (one.check, way)
+            known |= {one.check} if one.verdict == stored[one.check, way] else set()
+    assert {"led", "some_led", "ways", "left", "same", "one_lane", "followed"} <= known
+
+
+def test_rules_of_r157_use_the_driven_lane_in_junctions(tmp_path: Path) -> None:
+    turning = Scene(
+        CROSS,
+        ego(through("s", "n"), 6, start=108),
+        actor("v", through("s", "w"), 6, start=118),
+        seconds=6,
+    )
+    store = store_of(tmp_path / "s.sgstore", {"turning": [turning]})
+
+    def frames(condition: str) -> set[int]:
+        return {f.seq for f in store.find(f"MATCH (e:Ego), (v:Vehicle) WHERE {condition}").frames()}
+
+    assert frames("same_lane(e, v) AND only_in_junction(v)")
+    assert not frames("drives_same_lane(e, v) AND only_in_junction(v)")
+    out = "NOT in_junction(e) AND NOT in_junction(v)"
+    assert frames(f"drives_same_lane(e, v) AND {out}") == frames(f"same_lane(e, v) AND {out}")
+    text = patterns()["r157_cut_in"].text
+    assert "drives_same_lane" in text
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "(e:Ego), (v:Vehicle) WHERE lead(e, v)",
+        "(e:Ego), (v:Vehicle) WHERE NOT lead(e, v) AND dist(e, v) < 30",
+        "(e:Ego) WHERE COUNT {(v:Vehicle)-[:leads]->(e)} = 0",
+        "(e:Ego) WHERE NOT turning_left(e) AND in_junction(e)",
+        "(e:Ego) WHERE to_junction(e) IS NULL",
+        "(e:Ego)-[at:isIn]->(l:Lane) WHERE NOT at.is_primary",
+        "(e:Ego)-[at:isIn]->(l:Lane)<-[on:isIn]-(v:Vehicle) WHERE at.is_own AND on.is_own",
+    ],
+)
+def test_a_monitored_pattern_has_no_match_by_a_guessed_lane(pattern: str, tmp_path: Path) -> None:
+    text = f"MATCH {pattern}"
+    store = store_of(tmp_path / "s.sgstore", {way: [scene] for way, scene in MEETING.items()})
+    found = {(one.trace, one.seq) for one in store.find(text).frames()}
+    for way, scene in MEETING.items():
+        seen = set[tuple[str, int]]()
+        monitor = Monitor(text, scene.road, trace=way, period_s=0.2)
+        monitor._on_event = lambda one, way=way, seen=seen: seen.update(
+            (way, seq) for seq in range(one.start.seq, one.end.seq + 1)
+        )
+        for frame in replayed([scene.block()]):
+            monitor.step(frame)
+        monitor.finish()
+        assert seen <= found
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("carla/Town01.carla", marks=pytest.mark.long),
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in ("esmini/swarm_Town04", "esmini/traffic_lights", "sumo/Town10HD_sumo_osi")
+        ),
+    ],
+)
+@pytest.mark.seconds(20)
+def test_a_monitor_never_contradicts_a_store_of_a_recording(
+    data: Path, tmp_path: Path, name: str
+) -> None:
+    drive = Drive.of(data / "traces" / f"{name}.mcap", tmp_path)
+    found = drive.compare_lanes(LANE_RULES)
+
+    assert found["false", "false"] > 5
 
 
 @pytest.mark.data

@@ -495,9 +495,10 @@ def _sealed(
     generator = SceneGraphGenerator(road, config)
     segment = file.segment(info, config, road_map=road, answers=generator.answers)
     kept.enter_context(segment)
-    first, seq = 0, 0
+    blocks, first, seq = list[FrameBlock](), 0, 0
     for place, scene in enumerate(scenes):
-        block = scene.block(place, first, seq)
+        blocks.append(scene.block(place, first, seq))
+        first, seq = first + len(scene.actors), seq + len(blocks[-1])
+    for block in generator.recorded(blocks):
         segment.append(generator.block(block))
-        first, seq = first + len(scene.actors), seq + len(block)
     return segment.seal(TraceReport(frames=seq), None, (generator.parked, generator.world_parked))

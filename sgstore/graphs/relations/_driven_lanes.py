@@ -9,8 +9,9 @@ back until then. A passage of more than :data:`MOST_STATES` states of the record
 parts, so that memory does not grow with time. Where blocks end does not matter. In online mode only
 the past counts (:meth:`DrivenLanes.now`): the costs so far make the choice stable.
 
-A choice is *unsure* if a lane that is not linked to it costs almost the same, such as at the entry
-of a junction in online mode. At equal costs the lower lane counts.
+A choice is *unsure* if a lane that is not linked to it costs almost the same. In online mode later
+frames can reverse a choice. It is then unsure until the other ways have ended, and while another lane
+fits better. At equal costs the lower lane counts.
 """
 
 from __future__ import annotations
@@ -65,6 +66,12 @@ JUMP: Final = 100.0
 
 SURE: Final = 0.3
 """Difference of costs above which a choice is sure."""
+
+OPEN: Final = 60.0
+"""Difference of costs up to which later frames can still reverse a choice in online mode."""
+
+BESIDE: Final = 1.0
+"""The same difference for a lane beside the chosen one."""
 
 EQUAL: Final = 1e-3
 """Difference of costs that is rounding."""
@@ -253,7 +260,8 @@ class DrivenLanes:
             self._open = taken(of, ~over)
             passages = _Passages(junctions, *_filled(taken(of, over), run[over]))
             cost = passages.of.cost * passages.metres
-            yield passages.chosen(passages.onward(cost) + passages.back(cost) - cost)
+            cost = passages.onward(cost) + passages.back(cost) - cost
+            yield passages.chosen(cost, passages.apart(cost) & (passages.more(cost) < SURE))
 
     def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
         """Return the lanes that footprints of the last yielded block touch, as :class:`RoadMap` does."""
@@ -281,7 +289,7 @@ class DrivenLanes:
         passages = _Passages(self._junctions, of, np.cumsum(begins(of.node), dtype=np.int64))
         here = of.row >= start
         cost = passages.onward(np.where(here, of.cost * passages.metres, of.cost))
-        row, driven = passages.chosen(cost)
+        row, driven = passages.chosen(cost, passages.may_change(cost))
         lane = np.zeros(len(block.states), np.int64)
         lane[row[row >= start] - start] = driven[row >= start]
         over = ~here & np.isin(of.node, found.node)
@@ -424,17 +432,42 @@ class _Passages:
         """Return the least cost among the candidates of the same frame, for each candidate."""
         return np.minimum.reduceat(cost, self._first)[self._frame] if len(cost) else cost
 
-    def chosen(self, cost: Floats) -> tuple[Ints, Ints]:
-        """Return the states in junctions, and their lanes as in ``States``."""
-        lane, more = self.of.lane, cost - self.least(cost)
-        best = np.flatnonzero(more <= EQUAL)
-        best = best[begins(self._frame[best])]
-        chosen, toll = lane[best][self._frame], self._junctions.toll
-        others = (toll(lane, chosen) == JUMP) & (toll(chosen, lane) == JUMP) & (more < SURE)
-        others &= self._junctions.traffic[lane]
+    def more(self, cost: Floats) -> Floats:
+        """Return the cost of each candidate above the least of its frame."""
+        return cost - self.least(cost)
+
+    def best(self, cost: Floats) -> Ints:
+        """Return the cheapest candidate of each frame."""
+        best = np.flatnonzero(self.more(cost) <= EQUAL)
+        return best[begins(self._frame[best])]
+
+    def _toll_of(self, cost: Floats) -> Floats:
+        """Return the cost of a change between each candidate for traffic and the best one; 0 for others."""
+        lane, toll = self.of.lane, self._junctions.toll
+        best = lane[self.best(cost)][self._frame]
+        change = np.minimum(toll(lane, best), toll(best, lane))
+        return np.where(self._junctions.traffic[lane] & (lane != best), change, 0.0)
+
+    def apart(self, cost: Floats) -> Bools:
+        """Return a mask of the candidates that are not linked to the best one of their frame."""
+        return self._toll_of(cost) == JUMP
+
+    def may_change(self, cost: Floats) -> Bools:
+        """Return a mask of the candidates that later frames can prefer to the best one."""
+        toll, more, own = self._toll_of(cost), self.more(cost), self.of.cost
+        fits = own < own[self.best(cost)][self._frame]
+        return (toll == JUMP) & (fits | (more < OPEN)) | (toll == SIDE) & (fits | (more < BESIDE))
+
+    def chosen(self, cost: Floats, others: Bools) -> tuple[Ints, Ints]:
+        """Return the states in junctions, and their lanes as in ``States``.
+
+        ``others`` are the candidates that make a choice unsure.
+        """
+        best = self.best(cost)
+        lane, inside = self.of.lane[best], self.of.inside[best]
         unsure = np.bincount(self._frame, weights=others, minlength=len(best)) > 0
-        driven = np.where(unsure, 2 + lane[best], -2 - lane[best])
-        return self.of.row[best][self.of.inside[best]], driven[self.of.inside[best]]
+        driven = np.where(unsure, 2 + lane, -2 - lane)
+        return self.of.row[best][inside], driven[inside]
 
 
 def _summed(cost: Floats, step: Ints, src: Rows, dst: Rows, toll: Floats) -> Floats:

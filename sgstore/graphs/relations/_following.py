@@ -17,6 +17,9 @@ gaps. Where ways join, vehicles on several ways can have the same next one. At e
 lower node id counts as nearer. Lane changes are not followed. A vehicle farther along the lanes
 than the settings allow leads no other.
 
+*In online mode* an edge exists only if it does so on every lane that an unsure vehicle may drive.
+All other leaders of a vehicle are unknown if such a vehicle may be one of them.
+
 *The gap* is the distance of the centres along the centre lines minus half of both lengths: from
 bumper to bumper, 0 for an overlap, missing for an unknown length. Of several ways the shortest
 counts.
@@ -24,7 +27,7 @@ counts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -133,6 +136,23 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
     a, b = a[first], b[first]
     gap = distance[first] - (bodies.length[a] + bodies.length[b]) / 2
     return a, b, np.maximum(gap, 0)
+
+
+def following(
+    net: LaneNet, bodies: Bodies, standing: Standing, limit: float
+) -> tuple[Column, Rows]:
+    """Return the pairs of :func:`next_ahead` that are certain, and the rows with unknown leaders."""
+    found = next_ahead(net, bodies, standing, limit)
+    if not len(standing.unsure):
+        return found, standing.unsure
+    sure = standing.own & ~np.isin(standing.hits.row, standing.unsure)
+    less = next_ahead(net, bodies, replace(standing, own=sure), limit)
+    one, other = ({*zip(*(c.tolist() for c in of), strict=True)} for of in (found, less))
+    certain = np.array([pair in other for pair in zip(*(c.tolist() for c in found), strict=True)])
+    doubted = np.array([a for a, *_ in one ^ other], np.intp)
+    kept = np.flatnonzero(certain)
+    column = found[0][kept], found[1][kept], found[2][kept]
+    return column, np.union1d(doubted, standing.unsure)
 
 
 def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:

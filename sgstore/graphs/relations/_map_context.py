@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.base.tables import begins
-from sgstore.graphs.relations._following import next_ahead, own_hits
+from sgstore.graphs.relations._following import following, own_hits
 from sgstore.graphs.relations._lane_net import Centrelines, LaneNet
 from sgstore.graphs.relations._scene import (
     IS_SIGNAL,
@@ -66,6 +66,8 @@ class LaneContact:
     ----------
     driving : (K,) bool
         Mask of the map nodes that are lanes for motor traffic.
+    online : bool
+        True if the driven lanes follow from earlier frames alone.
 
     Notes
     -----
@@ -81,6 +83,7 @@ class LaneContact:
         lanes_of: LookUp | None = None,
     ) -> None:
         nodes, lines = road_map.nodes, Centrelines(road_map.ribbons)
+        self.online = False
         self._map = road_map
         self._waypoints = waypoints
         self._ahead = ahead
@@ -157,7 +160,9 @@ class LaneContact:
             ~stands & placed & ~IS_SIGNAL[bodies.kind] & (bodies.moves | ON_OR_OFF[bodies.kind])
         )
         own = own_hits(self._net, bodies, hits) & (hits.primary | ~sure)
-        return Standing(hits, along, own, parts, off_road)
+        unsure = np.flatnonzero(lane > 0) if self.online else np.zeros(0, np.intp)
+        own |= np.isin(hits.row, unsure) & self._net.traffic[-2 - hits.lane]
+        return Standing(hits, along, own, parts, off_road, unsure)
 
     def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> MapContext:
         """Return the map parts below objects, and those in range of the egos.
@@ -183,7 +188,7 @@ class LaneContact:
             self._controls,
             self._affects,
             self._reach.of_map(present),
-            next_ahead(self._net, bodies, standing, self._ahead),
+            *following(self._net, bodies, standing, self._ahead),
         )
 
     def present(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Bools:

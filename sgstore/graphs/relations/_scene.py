@@ -397,6 +397,9 @@ class Standing:
         Rows of :class:`Bodies`, ascending, and node ids of their crosswalks and waypoints.
     off_road : intp array
         Rows of the bodies that touch no driving lane, ascending.
+    unsure : intp array
+        Rows of the bodies whose driven lane is not sure in online mode. All lanes for traffic that they
+        touch are their own.
     """
 
     hits: LaneHits
@@ -404,19 +407,21 @@ class Standing:
     own: Bools
     parts: tuple[Ints, Ints]
     off_road: NDArray[np.intp]
+    unsure: NDArray[np.intp]
 
     def take(self, place: NDArray[np.intp]) -> Standing:
         """Return the map parts below selected objects. The objects get new row numbers."""
         hits, (rows, nodes) = self.hits, self.parts
         kept, there = place[hits.row] >= 0, place[rows] >= 0
         hits = taken(hits, kept)
-        off_road = place[self.off_road]
+        off_road, unsure = place[self.off_road], place[self.unsure]
         return Standing(
             replace(hits, row=place[hits.row]),
             self.along[kept],
             self.own[kept],
             (place[rows[there]], nodes[there]),
             off_road[off_road >= 0],
+            unsure[unsure >= 0],
         )
 
 
@@ -436,6 +441,8 @@ class MapContext:
         Node ids of signals of the map, and of a lane that each may affect.
     following : tuple of intp, intp, float64 arrays
         Rows of bodies: the follower, its leader, and the gap along the lanes; m.
+    unsure : intp array
+        Rows of the bodies whose other leaders are unknown, because a driven lane is not sure.
     """
 
     standing: Standing
@@ -444,6 +451,7 @@ class MapContext:
     affects: tuple[Ints, Ints]
     map_affects: tuple[Ints, Ints]
     following: tuple[NDArray[np.intp], NDArray[np.intp], Floats]
+    unsure: NDArray[np.intp]
 
 
 def _columns_of(count: int) -> Columns:

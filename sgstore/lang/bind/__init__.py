@@ -29,6 +29,7 @@ from sgstore.lang.bind._unknowns import (
     spelled_out,
     undecided,
     unknown,
+    without_guesses,
 )
 from sgstore.lang.bind._world_scope import is_limited, within
 
@@ -67,4 +68,5 @@ __all__ = [
     "undecided",
     "unknown",
     "within",
+    "without_guesses",
 ]

@@ -161,7 +161,7 @@ def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
             e.span,
             "join it in SQL with its own columns",
         )
-    return b.FrameAttribute(found, found.type)
+    return b.FrameAttribute(found, found.type, names.session.online)
 
 
 def _class_attribute(name: str, names: SymbolTable) -> Attribute | None:
@@ -225,7 +225,7 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
             span=span,
             hint=hint,
         )
-    return b.NodeAttribute(key, found, found.type)
+    return b.NodeAttribute(key, found, found.type, names.session.online)
 
 
 def _own_attribute(name: str, own: Mapping[str, Type]) -> Attribute | None:
@@ -291,7 +291,7 @@ def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
             span,
             "write -[:isIn]->",
         )
-    return b.EdgeAttribute(key, found, found.type)
+    return b.EdgeAttribute(key, found, found.type, names.session.online)
 
 
 def _list(e: s.ListOf, names: SymbolTable) -> b.Choices:

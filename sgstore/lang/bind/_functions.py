@@ -203,7 +203,7 @@ def _pair(e: s.Call, names: SymbolTable) -> b.PairNumber:
     if function == LANE_DIST:
         every = [names.scope.kinds(key).every for key in keys]
         function = LANE_DIST if all(kinds & entity_kinds() for kinds in every) else PART_DIST
-    return b.PairNumber(function, keys[0], keys[1])
+    return b.PairNumber(function, keys[0], keys[1], online=names.session.online)
 
 
 def _ttc_lane(e: s.Call, names: SymbolTable) -> b.Bound:
@@ -244,7 +244,7 @@ def _of_one(e: s.Call, names: SymbolTable) -> b.PairNumber:
     name = normalize_name(e.name)
     function = next(one for one in OF_ONE if normalize_name(one) == name)
     node = _entity(function, e.arguments[0], names)
-    return b.PairNumber(function, node, node)
+    return b.PairNumber(function, node, node, online=names.session.online)
 
 
 def _entity(function: str, argument: s.Expression, names: SymbolTable) -> str:

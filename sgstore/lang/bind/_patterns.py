@@ -185,6 +185,7 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str
             edge.span,
             known=names.scope.parent is not None,
             beyond=session.beyond if names.scope.parent is not None else (),
+            online=session.online and names.scope.parent is not None,
         )
     )
     return key

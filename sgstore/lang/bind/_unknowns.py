@@ -15,8 +15,16 @@ from sgstore.lang import ir as b
 from sgstore.lang.bind._in_range import in_traces, related
 from sgstore.lang.bind._needed_values import MEASURED, MOTION
 from sgstore.lang.bind._world_scope import beyond_graph, bounded_in, holds
-from sgstore.lang.catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, RelationScope, Type
-from sgstore.model.pair_numbers import columns_needed
+from sgstore.lang.catalog import (
+    COMPUTED,
+    NODE_ATTRIBUTES,
+    UNSURE_LANE,
+    UNSURE_LEAD,
+    DisplayUnit,
+    RelationScope,
+    Type,
+)
+from sgstore.model.pair_numbers import WAYS, columns_needed
 from sgstore.model.vocabulary import (
     BEYOND,
     DIRECTIONS,
@@ -29,6 +37,8 @@ from sgstore.model.vocabulary import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from sgstore.lang.catalog import Attribute
 
 CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
 """Words that join conditions."""
@@ -53,6 +63,8 @@ _MADE_OF: Final = {
 """Measured attributes of source and destination. Without them, a missing edge does not mean that the relation
 does not hold. Other relations are taken as recorded.
 """
+_CHOSEN: Final = frozenset({"is_primary", "is_own"})
+"""Attributes of edges ``isIn`` that depend on the driven lane."""
 _FALSE: Final = b.Value(value=False, type=Type.boolean)
 _LOOSE: Final = 1 << 20
 """Offset of the number of a block that also includes matches with unknown values."""
@@ -151,15 +163,16 @@ def certain(  # noqa: PLR0911 - a case each
             return condition if decided else _sure(condition)
         case b.Operation("NOT", (operand,)):
             doubt = None if decided else unknown(operand)
-            if _of_blocks(operand):
+            if _of_blocks(operand) or (by_lanes(operand) and not has_pairs(operand)):
                 known = b.Operation("coalesce", (operand, _FALSE), Type.boolean)
                 return b.inverse(known if doubt is None else b.any_of((known, doubt)))
             if has_pairs(operand):
-                return condition
+                guess = doubt if by_lanes(operand) else None
+                return condition if guess is None else b.all_of(condition, b.inverse(guess))
             return b.inverse(b.Operation("coalesce", (operand, doubt or _FALSE), Type.boolean))
         case b.Operation() if not decided and _counted(condition) is not None:
             return _of_counts(condition, least=True)
-        case b.Operation() if _of_blocks(condition):
+        case b.Operation() if _of_blocks(condition) or by_lanes(condition):
             doubt = None if decided else unknown(condition)
             return condition if doubt is None else b.all_of(condition, b.inverse(doubt))
         case _:
@@ -211,13 +224,18 @@ def _is_null(value: b.Bound) -> b.Bound:
     return b.Operation("IS NULL", (value,), Type.boolean)
 
 
-def _unknown(value: b.Bound) -> Iterable[b.Bound]:  # noqa: C901 - a case each
+def _unknown(value: b.Bound) -> Iterable[b.Bound]:  # noqa: C901, PLR0912 - a case each
     match value:
-        case b.Operation(word=word) if word in _ANSWERS:
-            return
+        case b.Operation(word=word, operands=operands) if word in _ANSWERS:
+            doubts = [doubt for one in operands if by_lanes(one) for doubt in _unknown(one)]
+            yield from [b.all_of(_frame(UNSURE_LEAD), one) for one in doubts]
         case b.Operation(operands=operands):
             for operand in operands:
                 yield from _unknown(operand)
+        case b.NodeAttribute() | b.FrameAttribute() | b.EdgeAttribute() | b.PairNumber() if (
+            by_lanes(value)
+        ):
+            yield _later(value)
         case b.NodeAttribute(node=node, attribute=attribute):
             if attribute.name in MEASURED:
                 yield _unmeasured(node, attribute.name, value)
@@ -238,6 +256,71 @@ def _unknown(value: b.Bound) -> Iterable[b.Bound]:  # noqa: C901 - a case each
             yield from _of_block(value)
         case _:
             return
+
+
+def by_lanes(value: b.Bound) -> bool:
+    """True if an expression of the online mode depends on the lanes that vehicles drive in junctions."""
+    match value:
+        case b.NodeAttribute(attribute=attribute, online=True):
+            return attribute.unit is DisplayUnit.role
+        case b.FrameAttribute(attribute=attribute, online=True):
+            return attribute.unit is DisplayUnit.classed
+        case b.EdgeAttribute(attribute=attribute, online=True):
+            return attribute.name in _CHOSEN
+        case b.PairNumber(function=function, online=True):
+            return function in WAYS
+        case b.BlockValue(scope=scope):
+            within = (*scope.where, *([] if value.value is None else [value.value]))
+            return any(map(_leads, scope.edges)) or any(map(by_lanes, within))
+        case _:
+            return any(map(by_lanes, b.operands_of(value)))
+
+
+def _later(value: b.NodeAttribute | b.FrameAttribute | b.EdgeAttribute | b.PairNumber) -> b.Bound:
+    """Return the condition that later frames decide the lane on which a value depends."""
+    match value:
+        case b.EdgeAttribute(edge=edge):
+            return b.EdgeAttribute(edge, UNSURE_LANE, Type.boolean)
+        case b.PairNumber(a=one, b=other):
+            nodes = dict.fromkeys((one, other))
+            return b.any_of(b.NodeAttribute(node, UNSURE_LANE, Type.boolean) for node in nodes)
+        case _:
+            return _frame(UNSURE_LANE)
+
+
+def _leads(edge: b.Edge) -> bool:
+    return edge.online and bool(edge.relations & {"leads", "follows"})
+
+
+def _frame(attribute: Attribute) -> b.Bound:
+    return b.FrameAttribute(attribute, Type.boolean)
+
+
+def without_guesses(query: b.Query) -> b.Query:
+    """Return a query of the online mode that has no match because of an unknown driven lane."""
+
+    def sure(condition: b.Bound) -> b.Bound:
+        if not by_lanes(condition):
+            return condition
+        if b.is_temporal(condition):
+            return b.with_operands(condition, sure)
+        least = certain(pushed(condition))
+        return b.all_of(condition, b.any_of((b.inverse(_frame(UNSURE_LEAD)), least)))
+
+    def limited(scope: b.Scope) -> b.Scope:
+        return replace(scope, where=tuple(map(sure, scope.where)))
+
+    steps = tuple(
+        replace(step, scope=limited(step.scope), when=tuple(map(sure, step.when)))
+        for step in query.steps
+    )
+    stages = tuple(
+        replace(stage, scope=limited(stage.scope))
+        if isinstance(stage, b.MatchStage)
+        else replace(stage, where=tuple(map(sure, stage.where)))
+        for stage in query.stages
+    )
+    return replace(query, scope=limited(query.scope), steps=steps, stages=stages)
 
 
 def _attribute(node: str, name: str) -> b.Bound:
@@ -409,8 +492,21 @@ def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
 
     ``None`` means that it is always known.
     """
-    found = [*_beyond(edge, block.scope), *_unmeasured_ends(edge, block.scope)]
+    found = [*_beyond(edge, block.scope), *_unmeasured_ends(edge, block.scope), *_unsure(edge)]
     return b.any_of(found) if found else None
+
+
+def _unsure(edge: b.Edge) -> Iterable[b.Bound]:
+    """Yield the condition that an edge depends on a driven lane that later frames decide."""
+    if not _leads(edge):
+        return
+    if edge.high > 1:
+        yield _frame(UNSURE_LEAD)
+        return
+    behind = {"leads": edge.dst, "follows": edge.src}
+    ends = {behind[name] for name in behind.keys() & edge.relations}
+    for node in sorted(ends | ({edge.src, edge.dst} if edge.both else set())):
+        yield b.NodeAttribute(node, UNSURE_LEAD, Type.boolean)
 
 
 def _beyond(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:

@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from sgstore.lang import ir as b
-from sgstore.lang.catalog import COMPUTED, NODE_ATTRIBUTES, DisplayUnit, Type
+from sgstore.lang.catalog import (
+    COMPUTED,
+    NODE_ATTRIBUTES,
+    UNSURE_LANE,
+    UNSURE_LEAD,
+    DisplayUnit,
+    Type,
+)
 from sgstore.lang.memory._frame_view import NodeColumns, attribute_of
 from sgstore.lang.operators import OPERATORS, Column
 from sgstore.model.criticality import RECORDED
@@ -73,12 +80,18 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return lambda at: at.view.is_one(at.nodes[node], kinds)
         case b.EdgeRelation(edge=edge):
             return lambda at: at.edges[edge][0]
+        case b.EdgeAttribute(edge=edge, attribute=attribute) if attribute is UNSURE_LANE:
+            return lambda at: _is_unsure(at.edges[edge][1])
         case b.EdgeAttribute(edge=edge, attribute=attribute):
             name = attribute.name
             if attribute.unit is DisplayUnit.own:
                 of = _OWN[attribute.type]
                 return lambda at: of(at.edges[edge][1].get(name))
             return lambda at: at.edges[edge][1].get(name)
+        case b.FrameAttribute(attribute=attribute) if attribute is UNSURE_LANE:
+            return lambda at: at.view.graph.ego in at.view.graph.unsure_lane
+        case b.FrameAttribute(attribute=attribute) if attribute is UNSURE_LEAD:
+            return lambda at: bool(at.view.graph.unsure_lead)
         case b.FrameAttribute(attribute=attribute) if attribute.unit is DisplayUnit.classed:
             (name,) = attribute.columns.values()
             return lambda at: at.view.class_in(name)
@@ -118,6 +131,8 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
         return lambda at: at.nodes[node]
     if attribute.unit is DisplayUnit.role:
         return lambda at: at.view.role_of(at.nodes[node])
+    if attribute in {UNSURE_LANE, UNSURE_LEAD}:
+        return lambda at: at.nodes[node] in getattr(at.view.graph, attribute.name)
     if attribute is NODE_ATTRIBUTES["injunction"]:
         return lambda at: _in_junction(at, at.nodes[node])
     if attribute is NODE_ATTRIBUTES["type"]:
@@ -133,6 +148,11 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
     if name in NOISE_MARKS:
         return lambda at: attribute_of(at.view.nodes[at.nodes[node]], name)
     return lambda at: at.view.nodes[at.nodes[node]].get(name)
+
+
+def _is_unsure(about: Attributes) -> bool:
+    """True for an edge from a vehicle to a lane, if later frames decide the lane that it drives."""
+    return "overlap" in about and "is_own" not in about
 
 
 def _in_junction(at: Binding, node: int) -> bool | None:
@@ -296,7 +316,10 @@ def _is_derived(attribute: Attribute) -> bool:
         DisplayUnit.binding,
         DisplayUnit.role,
         DisplayUnit.own,
-    } or attribute in {NODE_ATTRIBUTES["injunction"], NODE_ATTRIBUTES["lifetime"]}
+    } or attribute in {
+        *(NODE_ATTRIBUTES["injunction"], NODE_ATTRIBUTES["lifetime"]),
+        *(UNSURE_LANE, UNSURE_LEAD),
+    }
 
 
 def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:

@@ -144,6 +144,8 @@ class FrameView:
 
     def class_in(self, abstraction: str) -> str | None:
         """Return the class of the frame's scene graph in an abstraction, or None if unknown."""
+        if self.graph.ego in self.graph.unsure_lane:
+            return None
         if abstraction not in self._classes:
             self._classes[abstraction] = self.classes(abstraction) if self.classes else None
         return self._classes[abstraction]
@@ -154,7 +156,7 @@ class FrameView:
 
     def role_of(self, node: int) -> str | None:
         """Return the role of a lane relative to the ego in this frame, or None if unknown."""
-        return self._roles.get(node)
+        return None if self.graph.ego in self.graph.unsure_lane else self._roles.get(node)
 
     @cached_property
     def _roles(self) -> Mapping[int, str]:

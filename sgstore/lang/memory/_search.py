@@ -90,7 +90,8 @@ class ScopeSearch:
                     step.crowd.append(at_once)
                     continue
                 test = expression(found[0], injective=injective)
-                place = next((n for n in step.named if n.edge.key in found[2]), None)
+                last = reversed(step.named)  # edges of a step are chosen in their order
+                place = next((n for n in last if n.edge.key in found[2]), None)
                 (place.tests if place else step.tests).append(test)
 
     def _order(self) -> list[_SearchStep]:
