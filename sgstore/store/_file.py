@@ -451,6 +451,13 @@ class StoreFile:
         )
         return tuple(Channel(*row) for row in self.rows(sql, [self.trace_id(trace)]).values)
 
+    def stored_topics(self) -> dict[int, dict[str, dict[str, Any]]]:
+        """Return the topics that are stored as columns: trace id → topic → messages, lost, fields."""
+        from sgstore.store._topic_views import listed_topics
+
+        with self.access.reading() as connection:
+            return listed_topics(connection)
+
     def context(self, trace: int | str) -> MessageRefs:
         """Return the file positions of recorded messages that are needed to read later messages of a trace.
 

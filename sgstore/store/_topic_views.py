@@ -128,18 +128,33 @@ def _sources(
 
 def _stored(connection: DuckDBPyConnection) -> dict[str, dict[int, tuple[str, dict[str, str]]]]:
     """Return the stored topics: topic → trace id → table and fields."""
+    found: dict[str, dict[int, tuple[str, dict[str, str]]]] = {}
+    for trace_id, file in _listed(connection):
+        found.setdefault(file.topic, {})[trace_id] = file.table, file.fields
+    return found
+
+
+def listed_topics(connection: DuckDBPyConnection) -> dict[int, dict[str, dict[str, Any]]]:
+    """Return the stored topics: trace id → topic → numbers of messages, and fields."""
+    found: dict[int, dict[str, dict[str, Any]]] = {}
+    for trace_id, file in _listed(connection):
+        about = {"messages": file.messages, "lost": file.lost, "fields": file.fields}
+        found.setdefault(trace_id, {})[file.topic] = about
+    return found
+
+
+def _listed(connection: DuckDBPyConnection) -> Iterator[tuple[int, TopicFile]]:
+    """Yield the stored topics with their trace ids."""
     ((database,),) = connection.execute("SELECT current_database()").fetchall()
     tables = topic_tables(connection, database)
-    found: dict[str, dict[int, tuple[str, dict[str, str]]]] = {}
     if LISTING not in tables:
-        return found
-    sql = f'SELECT topic, trace_id, "table", fields FROM {INSIDE}.{LISTING} ORDER BY ALL'
-    for topic, trace_id, table, fields in connection.execute(sql).fetchall():
-        if table in tables:
-            known = TopicFile(topic, fields=json.loads(fields))
-            if known.table == table:  # so the table has these columns
-                found.setdefault(topic, {})[trace_id] = table, known.fields
-    return found
+        return
+    columns = 'trace_id, topic, "table", schema, encoding, fields, messages, lost'
+    rows = connection.execute(f"SELECT {columns} FROM {INSIDE}.{LISTING} ORDER BY topic, trace_id")
+    for trace_id, topic, table, schema, encoding, fields, messages, lost in rows.fetchall():
+        file = TopicFile(topic, schema, encoding, [], json.loads(fields), messages, lost)
+        if file.table == table in tables:  # so the table has these columns
+            yield trace_id, file
 
 
 _converted: Final[dict[tuple[Any, ...], TopicFile]] = {}

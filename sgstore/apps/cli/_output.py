@@ -547,6 +547,14 @@ def _lists(values: dict[str, Any]) -> Iterator[tuple[str, list[str]]]:
     channels = values.get("channels", [])
     if channels:
         yield "channels", list(_channels(channels))
+    if topics := values.get("topics"):
+        yield (
+            "stored topics",
+            [
+                f"{name}: {one['messages']} messages, {len(one['fields'])} fields"
+                for name, one in topics.items()
+            ],
+        )
     for title, items in (
         ("losses", [_loss(loss) for loss in values.get("losses", [])]),
         ("warnings", list(values.get("warnings", []))),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -239,6 +240,10 @@ def info(
         jumps, gaps = one.report.get("clock_jumps", 0), one.report.get("gaps", 0)
         if jumps or gaps:
             say(f"{one.name}: clock jumps: {jumps}, gaps: {gaps}; info --trace lists them")
+    topics = Counter(topic for its in file.stored_topics().values() for topic in its)
+    if topics:
+        each = ", ".join(f"{name} in {number}" for name, number in sorted(topics.items()))
+        say(f"stored topics: {each} of {len(stored)} traces")
     rows = (
         (
             *(one.name, one.frames, round(one.seconds, 3)),
@@ -285,8 +290,10 @@ def _describe_traces(file: StoreFile, names: list[str], out: PrintedRows) -> Non
     with file.snapshot():
         found = [file.trace(name) for name in names]
         channels = [[asdict(one) for one in file.channels(trace.trace_id)] for trace in found]
+        topics = file.stored_topics()
     documents = [
-        one.as_dict() | {"channels": its} for one, its in zip(found, channels, strict=True)
+        one.as_dict() | {"channels": its, "topics": topics.get(one.trace_id, {})}
+        for one, its in zip(found, channels, strict=True)
     ]
     if out.for_people:
         for number, (one, about) in enumerate(zip(found, documents, strict=True)):
