@@ -485,7 +485,7 @@ class MessageTrace:
         TraceError
             The file is no longer readable, has no frame, or the requested ego is in no frame.
         """
-        first_steps, noise = self._beginning()
+        first_steps, noise = self._steps_and_noise()
         report = self.report = TraceReport()
         decoder = self.decoder(report)
         refs = frame_refs(self.info.channels, self.recording.window)
@@ -498,7 +498,7 @@ class MessageTrace:
             reason = report.losses[0].reason if report.losses else "it contains no messages"
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
 
-    def _beginning(self) -> tuple[list[int], Noise]:
+    def _steps_and_noise(self) -> tuple[list[int], Noise]:
         """Return the time differences between the first frames in ns, and the noise of the positions.
 
         The noise is that of the setting, or of the first frames.
@@ -512,7 +512,7 @@ class MessageTrace:
         frames = frames or [*islice(raw, FIRST_NOISE)]
         if not (decoder.measures or lacks_velocity(decoder, frames[:FIRST_NOISE])):
             return steps, Noise()
-        return steps, first_noise(decoder, frames + [*islice(raw, ESTIMATED - len(frames))])
+        return steps, first_noise(decoder, [*frames, *islice(raw, ESTIMATED - len(frames))])
 
     def _surveyed_steps(self) -> list[int]:
         """Return the time differences between the first frames, if the first pass knows them; ns."""
