@@ -105,6 +105,8 @@ def _in_words(counts: Mapping[tuple[str, ...], int], share: Mapping[tuple[str, .
             to_ego.setdefault(name[0], []).append(many + name[1])
     told = [f"{kind} {', '.join(relations)} ego" for kind, relations in to_ego.items()]
     told += [" ".join(name) for name in ranked if "ego" not in name and "Root Road" not in name]
+    lanes = [name[0].replace(" of Ego Lane", "") for name in ranked if name[-1] == "Root Road"]
+    told += [f"lanes: {', '.join(sorted(lanes))}"] if lanes and not told else []
     told = told or [" ".join(name) for name in ranked]
     more = len(told) - MOST_FEATURES
     return "; ".join(told[:MOST_FEATURES]) + (f"; and {more} more" if more > 0 else "")

@@ -4,7 +4,7 @@ import { computed, effect, signal } from "../vendor/core.js";
 import * as api from "./api.js";
 import { nameOf, seqAt, stillOf, timeAt } from "./data.js";
 import {
-  again, answer, inOther, isLost, live, matches, offline, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, span,
+  again, answer, inOther, isPattern, isLost, live, matches, offline, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, span,
   retries, store, text, traces,
 } from "./state.js";
 
@@ -51,7 +51,7 @@ export function holdsAt(now, of = lanes.value) {
  * @param {NonNullable<typeof open.value>} now @param {string} query @returns {any} */
 function lanesWanted(now, query) {
   if (live.value) return now.match?.pattern ? { text: now.match.pattern, binding: now.binding } : null;
-  if (!/\bMATCH\b/i.test(query)) return null;
+  if (!isPattern(query)) return null;
   const parameters = parametersOf(query), at = Math.round(seq.peek());
   return { text: query, parameters, trace: now.trace, seq: at, binding: now.binding };
 }
@@ -97,7 +97,7 @@ effect(() => {
   const now = open.value, query = asked.value, other = inOther(now?.trace || "");
   again.value;
   others.value = null;
-  if (!now || !beside.value || !traces.value.has(other) || !/\bMATCH\b/i.test(query)) return;
+  if (!now || !beside.value || !traces.value.has(other) || !isPattern(query)) return;
   const parameters = parametersOf(query), at = Math.round(seq.peek());
   const body = { text: query, parameters, trace: now.trace, seq: at, binding: sameIn(other, now), side: "b" };
   api.json("api/parts", body).then((found) => {

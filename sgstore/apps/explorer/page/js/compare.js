@@ -6,7 +6,7 @@ import { beside } from "./clock.js";
 import { Gallery } from "./gallery.js";
 import { abstraction, Table, useWork } from "./sheets.js";
 import {
-  again, find, inOther, matchesIn, openFrame, parametersOf, reasonOf, say, second, side, store, text, traces,
+  again, find, inOther, isPattern, matchesIn, openFrame, parametersOf, reasonOf, say, second, side, store, text, traces,
 } from "./state.js";
 
 const html = htm.bind(h);
@@ -86,7 +86,7 @@ export function Compare() {
     const mine = new AbortController();
     tell(null);
     fail("");
-    if (same || !/\bMATCH\b/i.test(a)) return undefined;
+    if (same || !isPattern(a)) return undefined;
     Promise.all([framesOf(a, "a", mine.signal), framesOf(b, of, mine.signal)])
       .then(([one, two]) => { if (!mine.signal.aborted) tell({ a: one, b: two }); }).catch((error) => { if (!mine.signal.aborted) fail(reasonOf(error)); });
     return () => mine.abort();
@@ -98,7 +98,7 @@ export function Compare() {
   return html`<section class="compare" aria-label="Compare"><form class="sheet row wrap" onSubmit=${submit}>
       <span><b>A</b> ${store.value.store}</span> <code class="cut" title=${a}>${a || "no query yet: type one under Find"}</code>
       <b>B</b>
-      ${both ? html`<select aria-label="Store of B" value=${of} onChange=${(/** @type {any} */ e) => { side.value = e.target.value; }}><option value="b">${both.store}</option><option value="a">${store.value.store}</option></select>` : html`<span>${store.value.store}</span>`}
+      ${both ? html`<select aria-label="Store of B" value=${of} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { side.value = e.target.value; }}><option value="b">${both.store}</option><option value="a">${store.value.store}</option></select>` : html`<span>${store.value.store}</span>`}
       <input name="second" class="query" aria-label="Query of B" defaultValue=${second.value} placeholder="the same query, or another one" /><button>Compare</button>
       <span role="group" aria-label="Form"><button type="button" aria-pressed=${shown.value === "tiles"} onClick=${() => { shown.value = "tiles"; }}>Tiles</button> <button type="button" aria-pressed=${shown.value === "tables"} onClick=${() => { shown.value = "tables"; }}>Tables</button></span></form>
     ${wrong ? html`<p class="sheet error" role="alert">${wrong}</p>` : null}

@@ -127,7 +127,7 @@ export function Near({ text, most = MOST_CARDS }) {
 
 /** The field of the search in words. */
 export const WordSearch = () => html`<input type="search" class="words-field" aria-label="Search the library and the words of the language"
-  placeholder="search in words: pedestrian crosses" value=${sought.value} onInput=${(/** @type {any} */ e) => { sought.value = e.target.value; }}
+  placeholder="search in words: pedestrian crosses" value=${sought.value} onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { sought.value = e.target.value; }}
   onKeyDown=${(/** @type {KeyboardEvent} */ e) => { if (e.key === "Escape") sought.value = ""; }} />`;
 
 export function Start() {
@@ -136,7 +136,7 @@ export function Start() {
   if (!over.current) known.current = tally.value;
   const found = (/** @type {Entry} */ one) => Number((known.current[one.name]?.count || 0) > 0), text = sought.value.trim();
   return html`<div class="sheet" tabindex="0" onPointerEnter=${() => { over.current = true; }} onPointerLeave=${() => { over.current = false; }}>
-    ${text ? html`<${Near} text=${text} />` : html`<p class="faint">Type a pattern above, search in words, or begin with one of these ${some.length}.
+    ${text ? html`<${Near} text=${text} />` : !some.length ? html`<p class="faint">Reading the library …</p>` : html`<p class="faint">Type a pattern above, search in words, or begin with one of these ${some.length}.
       Each card has its matches in this store, and where they are in time.</p>
       ${kinds.map((kind) => html`<h2>${kind}</h2><div class="cards">
         ${some.filter((one) => one.library === kind).sort((a, b) => found(b) - found(a)).map((one) => html`<${Card} one=${one} />`)}</div>`)}`}</div>`;

@@ -14,7 +14,7 @@ import { countLibrary, Near, sought, Start, WordSearch } from "./library.js";
 import { Selection } from "./select.js";
 import { Coverage } from "./sheets.js";
 import {
-  answer, ask, askAgain, cancel, changed, dialog, find, history, keep, library, matches, namesIn, notes, notice, open,
+  answer, ask, askAgain, cancel, changed, dialog, find, history, isPattern, keep, library, matches, namesIn, notes, notice, open,
   openFrame, paints, parametersOf, reasonOf, refresh, retries, say, store, tag, tagged, text, theme, ticked, values, view, words,
 } from "./state.js";
 import { Status } from "./status.js";
@@ -49,10 +49,10 @@ function Search() {
       <${WordSearch} />
       <select aria-label="Library of patterns" onChange=${choose}><option value="">library</option>
         ${groups.map((name) => html`<optgroup label=${name}>${patterns.filter((p) => p.library === name).map((p) => html`<option value=${p.name} title=${p.sentence}>${p.name}</option>`)}</optgroup>`)}</select>
-      <select aria-label="History" onChange=${(/** @type {any} */ e) => { if (e.target.value) { text.value = e.target.value; find(); } e.target.value = ""; }}><option value="">history</option>
+      <select aria-label="History" onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { if (e.target.value) { text.value = e.target.value; find(); } e.target.value = ""; }}><option value="">history</option>
         ${history().map((one) => html`<option value=${one}>${one.replace(/\s+/g, " ").slice(0, 90)}</option>`)}</select>
       ${names.map((name) => html`<label>$${name} <input size="8" aria-label=${`Value of $${name}`} value=${values.value[name] || ""}
-        onInput=${(/** @type {any} */ e) => { values.value = { ...values.value, [name]: e.target.value }; }}
+        onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { values.value = { ...values.value, [name]: e.target.value }; }}
         onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter") find(); }} /></label>`)}
       <${NumberSlider} /><span class="grow"></span>
       ${answer.value.state === "busy" ? html`<button onClick=${cancel}>Stop</button>` : null}
@@ -134,7 +134,7 @@ function Nearest({ query }) {
   useEffect(() => {
     const mine = new AbortController();
     tell(null);
-    if (/\bMATCH\b/i.test(query)) api.json("api/nearest", { text: query, parameters: parametersOf(query) }, { signal: mine.signal }).then(tell, () => {});
+    if (isPattern(query)) api.json("api/nearest", { text: query, parameters: parametersOf(query) }, { signal: mine.signal }).then(tell, () => {});
     return () => mine.abort();
   }, [query]);
   if (!told?.failed) return null;

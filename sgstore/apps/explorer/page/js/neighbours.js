@@ -90,17 +90,20 @@ export function Neighbours({ graph, states, north }) {
   return html`<div class="scroll near"><svg viewBox=${`0 0 ${size[0]} ${size[1]}`} role="group" aria-label="Neighbours">
       ${drawn.map(({ src, dst, labels, both }) => {
         const [ax, ay] = at.get(src) || [0, 0], [bx, by] = at.get(dst) || [0, 0], inside = bound.has(src) && bound.has(dst), on = lit.value.has(src) && lit.value.has(dst);
-        const words = [...labels], text = words.length > 2 && !on ? `${words[0]} +${words.length - 1}` : words.join(", ");
+        const words = [...labels];
         return html`<g class=${on || inside ? "holds" : "faint"} stroke="currentColor" onMouseEnter=${() => { lit.value = new Set([src, dst]); }} onMouseLeave=${() => { lit.value = new Set(); }}>
-          <title>${`${name(src)} ${words.join(", ")} ${name(dst)}${both ? ", and back" : ""}`}</title><path d=${`M${ax} ${ay}L${bx} ${by}`} stroke-width=${on ? 3 : inside ? 2 : 1} /><path d=${`M${ax} ${ay}L${bx} ${by}`} stroke="transparent" stroke-width="9" />
-          ${on || inside || drawn.length < 5 ? html`<text class="halo" x=${((ax || 0) + (bx || 0)) / 2} y=${((ay || 0) + (by || 0)) / 2 - 3} font-size="9.5" text-anchor="middle" fill="currentColor">${text}</text>` : null}</g>`;
+          <title>${`${name(src)} ${words.join(", ")} ${name(dst)}${both ? ", and back" : ""}`}</title><path d=${`M${ax} ${ay}L${bx} ${by}`} stroke-width=${on ? 3 : inside ? 2 : 1} /><path d=${`M${ax} ${ay}L${bx} ${by}`} stroke="transparent" stroke-width="9" /></g>`;
       })}
-      ${shown.map((node) => {
+      ${[...shown].sort((a, b) => Number(a >= 0) - Number(b >= 0)).map((node) => {
         const [x, y] = at.get(node) || [0, 0], one = name(node), wide = widthOf(one);
         return html`<g key=${node} style=${{ cursor: node >= 0 ? "pointer" : "default" }} role=${node >= 0 ? "button" : undefined} tabindex=${node >= 0 ? 0 : undefined} aria-label=${about.get(node)?.name || one}
           onKeyDown=${(/** @type {KeyboardEvent} */ e) => { if (node >= 0 && e.key === "Enter") chosen.value = node; }} onMouseEnter=${() => { lit.value = new Set([node]); }} onMouseLeave=${() => { lit.value = new Set(); }}
           onClick=${() => { if (node >= 0) { chosen.value = node; panel.value = "near"; } }}><title>${about.get(node)?.name || node}</title>
           <rect x=${(x || 0) - wide / 2} y=${(y || 0) - 11} width=${wide} height="22" rx=${node < 0 ? 4 : 11} fill=${bound.has(node) ? "var(--soft)" : "var(--raised)"} stroke=${bound.has(node) ? "var(--mark)" : lit.value.has(node) ? "var(--accent)" : "var(--line)"} stroke-width=${bound.has(node) ? 2 : 1.2} />
           <text x=${x} y=${(y || 0) + 3.5} font-size="10" font-weight=${bound.has(node) ? 600 : 400} text-anchor="middle" fill="var(--ink)">${one}</text></g>`;
+      })}${drawn.map(({ src, dst, labels }) => { // names of relations above all nodes
+        const [ax = 0, ay = 0] = at.get(src) || [], [bx = 0, by = 0] = at.get(dst) || [], inside = bound.has(src) && bound.has(dst), on = lit.value.has(src) && lit.value.has(dst);
+        const words = [...labels], text = words.length > 2 && !on ? `${words[0]} +${words.length - 1}` : words.join(", ");
+        return on || inside || drawn.length < 5 ? html`<text class="halo" x=${(ax + bx) / 2} y=${(ay + by) / 2 - 3} font-size="9.5" text-anchor="middle" pointer-events="none" fill=${on || inside ? "var(--hold)" : "var(--faint)"}>${text}</text>` : null;
       })}</svg>${left > 0 ? html`<p class="faint">and ${left} more: scenery, or farther away</p>` : null}</div>`;
 }

@@ -43,7 +43,7 @@ function Camera() {
   });
   return html`<div class="panel camera">
     <div class="caption">${(about?.cameras.length || 0) > 1
-      ? html`<select aria-label="Camera" value=${camera.value} onChange=${(/** @type {any} */ e) => { camera.value = e.target.value; }}>
+      ? html`<select aria-label="Camera" value=${camera.value} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { camera.value = e.target.value; }}>
           ${about?.cameras.map((c) => html`<option>${c}</option>`)}</select>`
       : html`<span class="chip">${camera.value}</span>`}</div>
     <canvas ref=${canvas} role="img" aria-label="Camera picture" data-frame=${picture?.seq}></canvas>
@@ -261,7 +261,7 @@ function Transport() {
     <button aria-label="Match before" title="match before (p)" onClick=${() => nextMatch(-1)}><${Icon} path="M3 2h2v10H3zM13 2v10L5.5 7z" /></button>
     <button class="main" aria-label=${playing.value ? "Pause" : "Play"} title="space" onClick=${() => { playing.value = !playing.value; }}><${Icon} path=${playing.value ? "M2 2h3.6v10H2zM8.4 2H12v10H8.4z" : "M3 1.5v11L12.5 7z"} /></button>
     <button aria-label="Next match" title="next match (n)" onClick=${() => nextMatch(1)}><${Icon} path="M9 2h2v10H9zM1 2v10l7.5-5z" /></button>
-    <select aria-label="Speed" value=${rate.value} onChange=${(/** @type {any} */ e) => { rate.value = Number(e.target.value); }}>
+    <select aria-label="Speed" value=${rate.value} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { rate.value = Number(e.target.value); }}>
       ${[0.25, 0.5, 1, 2, 4].map((r) => html`<option value=${r}>${r}×</option>`)}</select>
     <span class="time"><b>${now?.trace}</b>#${frame.value} · ${seconds(t)} s</span>
     <span class="grow"></span>

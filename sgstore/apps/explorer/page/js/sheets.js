@@ -117,7 +117,7 @@ export function Coverage() {
   return html`<div class="sheet" tabindex="0"><div class="row wrap">
       ${TABS.map(([key, name]) => html`<button aria-pressed=${what.value === key} class=${what.value === key ? "main" : ""}
         onClick=${() => { what.value = key || ""; }}>${name}</button>`)}
-      <label class="row">abstraction <select value=${abstraction.value} onChange=${(/** @type {any} */ e) => { abstraction.value = e.target.value; }}>
+      <label class="row">abstraction <select value=${abstraction.value} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { abstraction.value = e.target.value; }}>
         ${ABSTRACTIONS.map((one) => html`<option>${one}</option>`)}</select></label></div>
     <${Waiting} told=${told}>${covered}</${Waiting}></div>`;
 }

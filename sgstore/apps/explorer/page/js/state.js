@@ -85,6 +85,9 @@ export const framesFound = computed(() => {
 /** @param {Match} m */
 export const keyOf = (m) => `${m.trace}#${m.first}-${m.last}:${Object.values(m.binding).join(",")}`;
 
+/** True for a pattern, or the name of one: no check, and no SQL. @param {string} query */
+export const isPattern = (query) => /\bMATCH\b/i.test(query) || /^\s*(?!SELECT|FROM|CHECK)\w+\s*(?:\([^)]*\))?\s*$/i.test(query);
+
 /** The last word of the page on a fault or an act. @param {string} message */
 export function say(message) {
   toast.value = message;

@@ -34,9 +34,9 @@ export function Status() {
     ${left.length ? html`<details class="why-left"><summary>${left.length} ${left.length === 1 ? "trace" : "traces"} cannot answer</summary>
       <ul>${left.map(([trace, reason]) => html`<li><b>${trace}</b>: ${reason}</li>`)}</ul></details>` : null}
     <span class="grow"></span>
-    ${/** @type {const} */ (["trace", "map"]).map((of) => (known[of].length < 2 ? null : html`<select aria-label=${of} value=${where[of]} onChange=${(/** @type {any} */ e) => { filter.value = { ...where, [of]: e.target.value }; }}>
+    ${/** @type {const} */ (["trace", "map"]).map((of) => (known[of].length < 2 ? null : html`<select aria-label=${of} value=${where[of]} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { filter.value = { ...where, [of]: e.target.value }; }}>
       <option value="">${`all ${of}s`}</option>${known[of].map((one) => html`<option>${one}</option>`)}</select>`))}
-    ${found > 1 && !told.rows ? html`<select aria-label="order" value=${order.value} onChange=${(/** @type {any} */ e) => { order.value = e.target.value; }}>
+    ${found > 1 && !told.rows ? html`<select aria-label="order" value=${order.value} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { order.value = e.target.value; }}>
       ${Object.entries(ORDERS).map(([key, word]) => html`<option value=${key}>${word}</option>`)}</select>` : null}
     ${found && !told.rows && !offline.value ? html`<button class="small" onClick=${() => tickAll(matches.value)}>select all</button>` : null}
   </div>`;
