@@ -12,7 +12,7 @@ TOOL   := PYTHONPATH=$(FOLDERS) $(BIN)/python
 # compile all packages again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers py123d maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster clients
+.PHONY: help demo check test tests test-edges test-ui test-wheel test-versions docs lint format bench fuzz kill mutants soak soak-explorer pyg viewers py123d maps oracle patterns sample clean duckdb-versions fuzz-queries frozen house reproduce api vendor cluster clients notebooks
 
 help:
 	@echo "make demo    run the main job on the bundled recording: ingest, ask, look, export"
@@ -42,15 +42,16 @@ help:
 	@echo "make oracle  100,000 random patterns and formulas against exhaustive search, 12,000 pairs of graphs against networkx (hours)"
 	@echo "make cluster  1,000 random questions of collections, by each engine; S3, and faults of all (hours; installs ray, pyspark, obstore, moto)"
 	@echo "make clients  DuckDB 1.0 to 2, ibis, dbt, SQLAlchemy, pandas, polars, datasets, Spark and Lance read an export (downloads them)"
+	@echo "make notebooks  run the notebooks of examples/ again, and store their outputs in them"
 	@echo "make duckdb-versions  every construct of the language under DuckDB 1.5 and 2.0: equal answers (minutes)"
 	@echo "make patterns  draw the examples of the library, and write its page, again"
 	@echo "make api     write docs/api.md and docs/relations.md from the code again"
 	@echo "make vendor  make the part of the explorer's page again that is of other packages (npm)"
 	@echo "make sample  record the bundled sample again (runs SUMO)"
 
-# uv installs in a fifth of the time. Where it cannot (an index that only pip is told of), pip does.
+# uv installs in a fifth of the time, without a word. Where it cannot (an index that only pip is told of), pip does.
 # Into that of the tests, or into another one, whose own pip may be too old to know of groups.
-install = $(BIN)/python -m uv pip install -q --python $(or $(2),$(BIN))/python $(1) || \
+install = $(BIN)/python -m uv pip install -qq --python $(or $(2),$(BIN))/python $(1) || \
   $(BIN)/python -m pip --python $(or $(2),$(BIN))/python install -q --disable-pip-version-check $(1)
 
 # One environment, and a stamp for each set of packages in it: made again when pyproject.toml changes.
@@ -204,6 +205,9 @@ cluster: $(VENV)/.base
 # Each in an environment of its own: old versions, and large packages.
 clients: $(VENV)/.dev
 	$(TOOL) tools/client_matrix.py
+
+notebooks: $(VENV)/.dev
+	$(TOOL) tools/notebook_outputs.py
 
 duckdb-versions: $(VENV)/.dev
 	$(TOOL) tools/duckdb_versions.py

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from client_matrix import answer
 from clients import CLIENTS
+from recordings import drive
 
 import sgstore
 from sgstore.apps.cli import run
@@ -273,3 +274,43 @@ def test_an_altered_store_is_refused(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ExportError, match="storage version"):
         store.file.write_portable(tmp_path / "x", np.array([1]), "x'y", {})
     assert not (tmp_path / "x").exists()
+
+
+def printed(capsys: Any, *command: str) -> tuple[str, str]:
+    assert run([*command]) == 0
+    return capsys.readouterr()
+
+
+def test_a_table_shows_names_of_returned_nodes_and_json_their_ids(
+    folder: Path, capsys: Any
+) -> None:
+    store = str(folder / "town.sgstore")
+    query = "MATCH (e:Ego)-[:isIn]->(l:Lane) RETURN e, l AS lane, e.speed LIMIT 1"
+    table, _ = printed(capsys, "find", store, query)
+    rows, _ = printed(capsys, "find", store, query, "--json")
+
+    assert table.splitlines()[0].split() == ["e", "lane", "e.speed"]
+    assert table.splitlines()[2].startswith("car 0")
+    assert json.loads(rows)[0]["e"] == 0
+
+
+def test_groups_by_name_over_several_traces_have_a_note(
+    folder: Path, tmp_path: Path, capsys: Any
+) -> None:
+    path = Path(shutil.copy(folder / "town.sgstore", tmp_path / "two.sgstore"))
+    merging = "MATCH (e:Ego)-[:near]->(v:Vehicle) RETURN v.name, COUNT(*) AS n"
+    single, several = f"{merging}", f"{merging}, trace.name"
+    assert sgstore.open(path).find(single).mistakes == ()
+    ingest(path, [drive(tmp_path / "other.mcap", frames=5)])
+    store = sgstore.open(path)
+    (note,) = store.find(single).mistakes
+
+    assert note == (
+        "v.name is unique only in its trace: entities of several traces merge in a row;"
+        " add trace.name"
+    )
+    assert store.find(several).mistakes == ()
+    assert store.find("MATCH (e:Ego) RETURN DISTINCT e").mistakes[0].startswith("e is unique")
+    assert store.find("MATCH (e:Ego)-[:isIn]->(l:Lane) RETURN l.name, COUNT(*)").mistakes == ()
+    assert store.find("MATCH (v:Vehicle) RETURN v.name, v.speed").mistakes == ()
+    assert note in " ".join(printed(capsys, "find", str(path), single)[1].split())

@@ -294,12 +294,19 @@ def test_names_of_a_notebook_that_does_not_run_here_are_known() -> None:
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_a_notebook_is_kept_without_results_and_uses_no_private_name(path: Path) -> None:
+def test_a_notebook_is_kept_with_its_results_and_uses_no_private_name(path: Path) -> None:
     document = json.loads(path.read_text(encoding="utf-8"))
     code = "\n".join(
         "".join(one["source"]) for one in document["cells"] if one["cell_type"] == "code"
     )
 
     assert not re.search(r"\b_\w|\._", code)
-    assert not any(one.get("outputs") or one.get("execution_count") for one in document["cells"])
+    cells = [one for one in document["cells"] if one["cell_type"] == "code"]
+    if path != LEARNING:  # it needs torch
+        assert [one["execution_count"] for one in cells] == [*range(1, len(cells) + 1)]
+        results = [data for one in cells for data in one["outputs"]]
+        assert len(results) >= 2
+        html = sum("text/html" in one.get("data", {}) for one in results)
+        assert html >= {"coverage": 6, "first_look": 4}.get(path.stem, 0)  # tables, not texts
+        assert path.stat().st_size < 1_000_000
     assert document["nbformat"] == 4

@@ -110,6 +110,8 @@ def find(
         number = ask.write(*_as_shown(answer, answer.rows, ask.chosen))
         return _ended(number, ask, require=require)
     opened = ask.opened(store, tables_of(tables))
+    if ask.chosen is Format.table and not explain:
+        text = _with_names(text)
     with opened.file.snapshot():  # open the store once
         matches = opened.find(text, **values)
         if explain:
@@ -131,6 +133,32 @@ def find(
             number = ask.write(*_as_shown(some, some, ask.chosen))
         _say_absent(matches, number)
     return _ended(number, ask, require=require)
+
+
+def _with_names(text: str) -> str:
+    """Return a query that returns the name of each node instead of its id, if the rows are the same."""
+    from sgstore.lang.syntax import parse
+    from sgstore.lang.syntax.tree import AttributeOf, MatchClause, Variable
+
+    queries = [one for one in parse(text) if isinstance(one, MatchClause)]
+    returns = queries[0].returns if len(queries) == 1 else None
+    if returns is None or returns.distinct or returns.order or returns.having or queries[0].later:
+        return text
+    plain = all(
+        one.form != "value" or isinstance(one.value, Variable | AttributeOf)
+        for one in returns.items
+    )
+    if not plain or returns.top or returns.sample:
+        return text
+    steps = [getattr(step, "block", None) for step in queries[0].sequence.steps]
+    paths = [path for block in steps if block is not None for path in block.paths]
+    nodes = {node.name for path in paths for node in path.nodes}
+    for item in reversed(returns.items):
+        if isinstance(item.value, Variable) and item.value.name in nodes:
+            end = item.value.span.end
+            alias = "" if item.name else f" AS {item.value.name}"
+            text = f"{text[:end]}.name{alias}{text[end:]}"
+    return text
 
 
 def _say_absent(matches: Matches, number: int) -> None:

@@ -23,7 +23,7 @@ from sgstore.lang.bind._symbols import ScopeBuilder, Session, SymbolTable
 from sgstore.lang.bind._temporal import settled
 from sgstore.lang.bind._topics import tolerance_of
 from sgstore.lang.syntax import tree as s
-from sgstore.model.vocabulary import normalize_name
+from sgstore.model.vocabulary import entity_kinds, normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -89,6 +89,7 @@ def bind_query(
     query = _of_match(match, session)
     refuse_unused(session)
     refuse_strange(session, catalog)
+    session.doubts += _merged_names(query, catalog)
     return replace(
         query,
         relations=frozenset(session.relations),
@@ -100,6 +101,32 @@ def bind_query(
         world=settings.scope == "world",
         doubts=tuple(dict.fromkeys(session.doubts)),
     )
+
+
+def _merged_names(query: b.Query, catalog: Catalog) -> list[str]:
+    """Return a note on groups by the name of an entity, which is unique only in its trace."""
+    values = [column.value for column in query.result.columns]
+    parts = [part for value in values for part in b.walk(value)]
+    grouped = query.result.distinct or any(isinstance(part, b.Aggregate) for part in parts)
+    if not grouped or len(catalog.traces) < 2 or query.result.form != "rows":
+        return []
+    if any(isinstance(part, b.TraceAttribute | b.FrameAttribute) for part in parts):
+        return []
+    for value in values:
+        named = isinstance(value, b.NodeAttribute) and value.attribute.name in {"name", "id"}
+        if (named or isinstance(value, b.NodeValue)) and _is_entity(query, value.node):
+            shown = f"{value.node}.name" if named else value.node
+            return [
+                f"{shown} is unique only in its trace: entities of several traces merge in a row;"
+                f" add trace.name"
+            ]
+    return []
+
+
+def _is_entity(query: b.Query, node: str) -> bool:
+    scopes = [query.scope, *(step.scope for step in query.steps)]
+    kinds = [scope.kinds(node) for scope in scopes if node in scope.nodes]
+    return any(one.every & entity_kinds() for one in kinds)
 
 
 def _of_match(match: s.MatchClause, session: Session) -> b.Query:
