@@ -14,6 +14,7 @@ from builders import PaperMap, Patch, Recording, Thing, edges, frames, graph_of,
 
 from sgstore.model.config import Config, Direction, PairSettings, Proximity, RangeSettings
 from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY
+from sgstore.model.world import SMOOTHED, STANDS
 from sgstore.sgg import SceneGraphGenerator
 
 if TYPE_CHECKING:
@@ -396,6 +397,20 @@ def test_what_is_parked_is_known_in_the_end(
         generator.block(recording.block(*part))
 
     assert generator.parked.tolist() == [0, parked]
+
+
+@pytest.mark.parametrize(("share", "parked"), [(0.2, 1), (0.8, 0)])
+def test_a_noisy_parked_vehicle_may_reach_into_a_lane(share: float, parked: int) -> None:
+    found = []
+    for bits in (0, SMOOTHED | STANDS):
+        recording, generator = Recording(), SceneGraphGenerator(STREET, Config())
+        for i in range(5):
+            y = -4 - 2.0 * (0.5 - share)
+            block = recording.block([thing("ego", i, -2), thing("c", 9, y)])
+            derived = np.full(len(block.states), bits)
+            generator.block(replace(block, states=replace(block.states, derived=derived)))
+        found.append(generator.parked.tolist()[1])
+    assert found == [0, parked]
 
 
 def test_without_a_map_only_what_is_static_is_known_to_be_parked() -> None:

@@ -27,6 +27,9 @@ SHARE: Final = 0.3
 DRIFT: Final = 0.2
 """Greatest mean speed of a parked vehicle, from its first to its last noisy position; m/s."""
 
+IN_LANE: Final = 0.4
+"""Least share of the footprint of a noisy box in its primary lane; a parked vehicle may reach into it."""
+
 LEAST_NS: Final = 3_000_000_000 - 1_000
 """Least time for which a parked vehicle is seen if there is no map; ns."""
 
@@ -40,7 +43,8 @@ class Parking:
     A vehicle is parked if the simulator marks it as static. It is also parked if it does not move
     in the whole trace and a lane for driving is never its primary lane. Without a map, it must be
     seen for 3 s. Without time in range of the map, or with less time, the state of an unmoved vehicle is
-    unknown. A moving vehicle is never parked. In a recording with noise, it may stray while it stands.
+    unknown. A moving vehicle is never parked. In a recording with noise, it may stray while it stands, and
+    reach into a lane by a part of its footprint.
 
     Parameters
     ----------
@@ -105,7 +109,8 @@ class Parking:
         ``beyond``: the bodies are all known ones, not only those in graphs.
         """
         hits = standing.hits
-        primary = hits.primary & driving[-1 - hits.lane]
+        noisy = self._seen[2, bodies.node[hits.row]] > 0
+        primary = hits.primary & driving[-1 - hits.lane] & (~noisy | (hits.overlap >= IN_LANE))
         self._drove[int(beyond), bodies.node[hits.row[primary]]] = True
         self._stood[int(beyond), bodies.node] = True
 
