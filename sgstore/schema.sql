@@ -371,7 +371,7 @@ UNION ALL
 SELECT f.frame_id, l.node_id, l.lane, l.kind, l.overlap, l.lane_offset, degrees(l.heading_error), l.is_primary, l.along, l.is_own
 FROM inside.frame f JOIN inside.lane_repeated l ON l.bucket = f.bucket AND (l.mask & (1::BIGINT << f.bit)) <> 0;
 
-COMMENT ON VIEW main.lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane that it is in above all; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: one of the lanes by which lane_dists are told: the primary one and, in a junction, those beside it that the centre is in and, of a vehicle, that run its way.';
+COMMENT ON VIEW main.lane_states IS 'How entities lie in lanes: one row for each edge isIn from an entity (src) to a lane (dst). overlap: share of the footprint in the lane; lane_offset: of the centre, to the left of the lane''s centre line, m; heading_error: heading less the lane''s direction, degrees; is_primary: the one lane of the entity: in a junction the lane that a vehicle drives on its way from entry to exit; along: of the centre along the lane, from its start in its direction, beyond its ends too, m; is_own: a lane of lane_dists and leads: the primary one and, if the driven lane in a junction is not sure, the others that hold the centre and, of a vehicle, have its direction.';
 
 CREATE VIEW main.lane_courses AS
 SELECT s.frame_id, s.src AS node_id, s.src_kind AS kind, s.dst AS lane, s.along, c.curvature, c.slope

@@ -179,6 +179,18 @@ def damaged(folder: Path) -> Path:
     return folder / "hurt.mcap"
 
 
+@pytest.mark.data
+def test_warnings_of_the_map_are_in_the_json_of_an_ingest(data: Path, tmp_path) -> None:
+    case = data / "cases" / "bugs-18-negative-lane-width"
+
+    paths = tmp_path / "s.db", case / "negw.mcap", "--map", case / "negw.xodr"
+    run = sgstore("ingest", *paths, "--json")
+
+    (row,) = json.loads(run.stdout)
+    assert any("width is negative" in warning for warning in row["warnings"]), row
+    assert "width is negative" in run.stderr.decode()
+
+
 def test_the_report_of_a_trace_is_kept_and_told(tmp_path) -> None:
     path = damaged(tmp_path)
 

@@ -127,26 +127,31 @@ def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     code = ERROR if any(outcome.error for outcome in outcomes) else 0
     if out.for_people:  # an error is no row
         outcomes = [outcome for outcome in outcomes if not outcome.error]
-    reports = [{"scope": outcome.scope} if outcome.scope else {} for outcome in outcomes]
+    reports: list[dict[str, Any]] = [
+        {"scope": outcome.scope} if outcome.scope else {} for outcome in outcomes
+    ]
     say_scope(scope_of(reports, world=None), out.chosen)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
     rows = map(_outcome_row, outcomes)
     totals = {"frames": "frames", "losses": "losses"}
-    out.write(*_with_scopes(columns, rows, reports, out), totals=totals)
+    for report, outcome in zip(reports, outcomes, strict=True):
+        report["warnings"] = [*outcome.warnings]
+    out.write(*_with_more(columns, rows, reports, ("scope", "warnings"), out), totals=totals)
     return code or (LOSS if any(outcome.losses for outcome in outcomes) else 0)
 
 
-def _with_scopes(
+def _with_more(
     columns: tuple[str, ...],
     rows: Iterable[tuple[Any, ...]],
     reports: Iterable[Mapping[str, Any]],
+    names: tuple[str, ...],
     out: PrintedRows,
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return result rows; machine formats get a column for the data that settings excluded."""
+    """Return result rows; machine formats get columns for parts of the reports."""
     if out.chosen not in {Format.json, Format.ndjson}:
         return columns, rows
-    scopes = (one.get("scope") for one in reports)
-    return (*columns, "scope"), ((*row, its) for row, its in zip(rows, scopes, strict=True))
+    parts = (tuple(map(one.get, names)) for one in reports)
+    return (*columns, *names), ((*row, *its) for row, its in zip(rows, parts, strict=True))
 
 
 def _land(
@@ -253,7 +258,7 @@ def info(
         for one in stored
     )
     totals = {"frames": "frames", "seconds": "s", "losses": "losses"}
-    out.write(*_with_scopes(columns, rows, reports, out), totals=totals)
+    out.write(*_with_more(columns, rows, reports, ("scope",), out), totals=totals)
     return 0
 
 
