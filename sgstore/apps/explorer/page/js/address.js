@@ -5,7 +5,8 @@ import * as api from "./api.js";
 import { frame } from "./clock.js";
 import { placeIn } from "./data.js";
 import {
-  answer, find, keyOf, matches, notice, open, openFrame, openMatch, parametersOf, playing, reasonOf, refresh, say, second,
+  answer, find, keyOf, matches, notice, open, openFrame, openMatch, parametersOf, playing, reasonOf, refresh, say,
+    second,
   seq, side, store, text, ticked, traces, values, view,
 } from "./state.js";
 
@@ -51,7 +52,8 @@ export function ticksOf(text) {
       const binding = Object.fromEntries(names.map((name, i) => [name, nodes[i] ?? 0]));
       /** @type {Match} */
       const match = {
-        trace, first, last: first + more, start: NaN, end: NaN, binding, names: {}, values: {}, index: `t${found.size}`,
+        trace, first, last: first + more, start: NaN, end: NaN, binding, names: {}, values: {},
+          index: `t${found.size}`,
       };
       found.set(keyOf(match), match);
       before = first;
@@ -170,7 +172,8 @@ export async function readAddress(whole = true) {
   write();
 }
 
-/** Open the frame of an address with its match. @param {string} at @param {string} told @param {() => boolean} current */
+/** Open the frame of an address with its match. @param {string} at @param {string} told
+ * @param {() => boolean} current */
 async function showFrame(at, told, current) {
   const here = await frameOf(at);
   if (!current()) return;

@@ -4,7 +4,8 @@ import { computed, effect, signal } from "../vendor/core.js";
 import * as api from "./api.js";
 import { nameOf, seqAt, stillOf, timeAt } from "./data.js";
 import {
-  again, answer, inOther, isPattern, isLost, live, matches, offline, open, openMatch, parametersOf, playing, rate, reasonOf, say, seq, span,
+  again, answer, inOther, isPattern, isLost, live, matches, offline, open, openMatch, parametersOf, playing, rate,
+    reasonOf, say, seq, span,
   retries, store, text, traces,
 } from "./state.js";
 
@@ -62,7 +63,8 @@ export async function refresh() {
   const found = body && (await api.json("api/parts", body).catch(() => null));
   if (found && open.value === now) lanes.value = found;
   if (!curves.length) return;
-  const more = await Promise.all(curves.map(async (one) => ({ ...one, columns: (await api.columns(one.path)).columns }))).catch(() => null);
+  const more = await Promise.all(curves.map(async (one) => ({ ...one,
+    columns: (await api.columns(one.path)).columns }))).catch(() => null);
   if (more && series.value === curves) series.value = more;
 }
 
@@ -178,7 +180,8 @@ export function nextMatch(direction) {
 const MOST_CURVES = 8;
 
 /** Add a curve, or remove it; the one that a chosen node has of itself is replaced by the next.
- * @param {string} attribute @param {string} unit @param {number} node @param {number} [other] @param {boolean} [auto] */
+ * @param {string} attribute @param {string} unit @param {number} node @param {number} [other]
+ * @param {boolean} [auto] */
 export async function showSeries(attribute, unit, node, other, auto = false) {
   const trace = open.value?.trace;
   if (!trace || (offline.value && !live.value)) return;
@@ -188,7 +191,8 @@ export async function showSeries(attribute, unit, node, other, auto = false) {
     const label = `${attribute} · ${nameOf(trace, node)}${other === undefined ? "" : ` → ${nameOf(trace, other)}`}`;
     const rest = series.value.filter((one) => one.path !== path && !(auto && one.auto));
     const known = !auto && rest.length < series.value.length;
-    series.value = known ? rest : [...rest, { path, attribute, unit, node, other, columns, label, auto }].slice(-MOST_CURVES);
+    series.value = known ? rest : [...rest, { path, attribute, unit, node, other, columns, label,
+      auto }].slice(-MOST_CURVES);
   } catch (error) { say(reasonOf(error)); }
 }
 

@@ -100,12 +100,14 @@ export function mapOf(trace) {
     if (!columns.x) return { origin: [0, 0], rings: [], nodes: new Map(), arrows: [] };
     const rings = [], nodes = new Map();
     for (let i = 0; i + 1 < columns.start.length; i++) {
-      const path = new Path2D(), [xs, ys] = [columns.x, columns.y].map((all) => all.subarray(columns.start[i], columns.start[i + 1]));
+      const path = new Path2D(), [xs, ys] = [columns.x, columns.y].map((all) => all.subarray(columns.start[i],
+        columns.start[i + 1]));
       xs.forEach((/** @type {number} */ x, /** @type {number} */ k) => path.lineTo(x, ys[k]));
       const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
       if (columns.closed[i]) path.closePath();
       const stripes = header.words[columns.word[i]] === "crosswalk" ? stripesOf(xs, ys) : null;
-      const ring = { stripes, path, box, word: header.words[columns.word[i]], closed: columns.closed[i], node: columns.node[i] };
+      const ring = { stripes, path, box, word: header.words[columns.word[i]], closed: columns.closed[i],
+        node: columns.node[i] };
       rings.push(ring);
       if (!nodes.has(ring.node)) nodes.set(ring.node, []);
       nodes.get(ring.node).push(ring);
@@ -121,7 +123,8 @@ function stripesOf(xs, ys) {
     const dx = (xs[i + 1] || 0) - (xs[i] || 0), dy = (ys[i + 1] || 0) - (ys[i] || 0), far = Math.hypot(dx, dy);
     if (far > long) { long = far; ux = dx / far; uy = dy / far; }
   }
-  const along = [...xs].map((x, i) => x * ux + (ys[i] || 0) * uy), across = [...xs].map((x, i) => (ys[i] || 0) * ux - x * uy);
+  const along = [...xs].map((x, i) => x * ux + (ys[i] || 0) * uy),
+    across = [...xs].map((x, i) => (ys[i] || 0) * ux - x * uy);
   const path = new Path2D(), low = Math.min(...across), high = Math.max(...across), end = Math.max(...along);
   for (let s = Math.min(...along) + 0.3; s < end - 0.3; s += 1.1) {
     const corners = [[s, low], [s + 0.55, low], [s + 0.55, high], [s, high]];
@@ -138,10 +141,12 @@ function arrowsOf(columns) {
   /** @type {Map<string, {x: number, y: number, path: Path2D}>} */
   const cells = new Map(), { "arrow.x": xs = [], "arrow.y": ys = [], "arrow.angle": angles = [] } = columns;
   xs.forEach((/** @type {number} */ x, /** @type {number} */ i) => {
-    const y = ys[i], cos = Math.cos(angles[i]), sin = Math.sin(angles[i]), cx = Math.round(x / CELL), cy = Math.round(y / CELL);
+    const y = ys[i], cos = Math.cos(angles[i]), sin = Math.sin(angles[i]), cx = Math.round(x / CELL),
+      cy = Math.round(y / CELL);
     const cell = cells.get(`${cx} ${cy}`) || { x: cx * CELL, y: cy * CELL, path: new Path2D() };
     cells.set(`${cx} ${cy}`, cell);
-    [[-0.5, 0.55], [0.4, 0], [-0.5, -0.55]].forEach(([a = 0, b = 0], k) => cell.path[k ? "lineTo" : "moveTo"](x + a * cos - b * sin, y + a * sin + b * cos));
+    [[-0.5, 0.55], [0.4, 0], [-0.5, -0.55]].forEach(([a = 0, b = 0],
+      k) => cell.path[k ? "lineTo" : "moveTo"](x + a * cos - b * sin, y + a * sin + b * cos));
   });
   return [...cells.values()];
 }
@@ -209,21 +214,24 @@ const FED = 3000; // frames that are kept
 /** @type {Map<number, any>} */
 const fed = new Map();
 
-/** Keep the states of the next frame; the first frame that is kept. @param {string} trace @param {number} seq @param {any} header @param {any} columns */
+/** Keep the states of the next frame; the first frame that is kept. @param {string} trace @param {number} seq
+ * @param {any} header @param {any} columns */
 export function feed(trace, seq, header, columns) {
   fed.set(seq, { columns, from: 0, to: columns.node.length, t: header.t, ego: header.ego });
   for (const old of fed.keys()) { if (fed.size <= FED) return old; fed.delete(old); }
   return seq;
 }
 
-/** Keep what stands, and names. @param {string} trace @param {any[][]} rows @param {Record<string, string[]>} names */
+/** Keep what stands, and names. @param {string} trace @param {any[][]} rows
+ * @param {Record<string, string[]>} names */
 export function feedStill(trace, rows, names) {
   const known = still.get(trace) || { rows: new Map(), header: { names: {} }, columns: null };
   Object.assign(known.header.names, names);
   for (const row of rows) known.rows.set(row[0], row);
   if (rows.length || !known.columns) {
     const all = [...known.rows.values()];
-    known.columns = Object.fromEntries(["node", "kind", "x", "y", "heading", "length", "width"].map((name, i) => [name, all.map((row) => row[i])]));
+    known.columns = Object.fromEntries(["node", "kind", "x", "y", "heading", "length",
+      "width"].map((name, i) => [name, all.map((row) => row[i])]));
   }
   still.set(trace, known);
 }
@@ -313,7 +321,8 @@ async function ask() {
 let fetching = 0;
 
 /** The picture at a frame, or the last one before it that is there.
- * @param {string} trace @param {string} channel @param {number} frame @param {number} ahead frames a picture, 0: none */
+ * @param {string} trace @param {string} channel @param {number} frame
+ * @param {number} ahead frames a picture, 0: none */
 export function pictureAt(trace, channel, frame, ahead) {
   const about = traces.value.get(trace);
   if (!about) return null;

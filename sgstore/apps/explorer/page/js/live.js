@@ -50,7 +50,9 @@ function step({ header, columns }) {
     const trace = { ...store.value.traces[0], frames: at + 1, seconds: header.t, origin: header.origin };
     store.value = { ...store.value, traces: [trace] };
     span.value = [kept, at];
-    for (const [name, state] of Object.entries(header.status)) if (of(name).state !== state) told.value = { ...told.value, [name]: { ...of(name), state } };
+    for (const [name,
+      state] of Object.entries(header.status)) if (of(name).state !== state) told.value = { ...told.value,
+      [name]: { ...of(name), state } };
     take(header.events);
     if (following.value) seq.value = at;
   });
@@ -74,8 +76,10 @@ function take(events) {
     one.many++;
     keepThumb(store.value.store, event.first);
     tiles.unshift({
-      trace: store.value.store, first: event.first, last: event.last, start: event.start, end: event.end, binding: event.nodes,
-      names: { statement: event.name, ...event.names }, values: event.values, index: event.name + key + event.first, pattern: event.kind === "found" ? event.name : "",
+      trace: store.value.store, first: event.first, last: event.last, start: event.start, end: event.end,
+        binding: event.nodes,
+      names: { statement: event.name, ...event.names }, values: event.values, index: event.name + key + event.first,
+        pattern: event.kind === "found" ? event.name : "",
     });
   }
   told.value = next;
@@ -85,9 +89,12 @@ function take(events) {
 function Head() {
   const [from, to] = span.value, kept = timeAt(store.value.store, to) - timeAt(store.value.store, from);
   return html`<header><span class="brand"><img src="static/icon.svg" alt="" />sgstore</span>
-    <h1>${store.value.store} · ${ended.value ? "it has ended" : lost.value ? "the monitor does not answer" : "live"} · ${(to + 1).toLocaleString("en")} frames${from > 0 ? `, the last ${kept.toFixed(0)} s are kept` : ""}</h1>
+    <h1>${store.value.store} · ${ended.value ? "it has ended" : lost.value ? "the monitor does not answer"
+      : "live"} · ${(to + 1).toLocaleString("en")} frames${from > 0 ? `, the last ${kept.toFixed(0)} s are kept`
+      : ""}</h1>
     <span class="grow"></span>
-    <button class=${following.value ? "main" : ""} aria-pressed=${following.value} onClick=${follow}>${following.value ? "● Live" : "Back to live"}</button>
+    <button class=${following.value ? "main" : ""} aria-pressed=${following.value} onClick=${follow}>
+      ${following.value ? "● Live" : "Back to live"}</button>
     <button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>`;
 }
 
@@ -99,17 +106,24 @@ function follow() {
 function Statements() {
   const [from, to] = range.value, checks = new Set(store.value.checks);
   const verdicts = new Map((ended.value?.verdicts || []).map((/** @type {any[]} */ one) => [one[0], one]));
-  return html`<section class="timeline statements" aria-label="Checks and patterns">${Object.entries(told.value).map(([name, one]) => {
+  return html`<section class="timeline statements" aria-label="Checks and patterns">
+    ${Object.entries(told.value).map(([name, one]) => {
     const check = checks.has(name), state = verdicts.get(name)?.[1] || one.state, bad = /false/.test(state);
-    const spans = one.spans.filter(([, z]) => (z ?? 0) >= from).map(([a, z]) => [Math.max(a ?? 0, from), Math.min(z ?? 0, to)]);
-    return html`<div class="lane" key=${name} data-statement=${name}><div class="label" title=${verdicts.get(name)?.[3] || ""}><b>${name}</b>
-        <span class=${!check || state === "unknown" ? "faint" : bad ? "fails" : "holds"}> ${check ? `${state.replace("_", " ")}${one.many ? ` · ${one.many} ${one.many === 1 ? "violation" : "violations"}` : ""}` : `${one.many} found`}</span></div>
+    const spans = one.spans.filter(([, z]) => (z ?? 0) >= from).map(([a, z]) => [Math.max(a ?? 0, from),
+      Math.min(z ?? 0, to)]);
+    return html`<div class="lane" key=${name} data-statement=${name}>
+      <div class="label" title=${verdicts.get(name)?.[3] || ""}><b>${name}</b>
+        <span class=${!check || state === "unknown" ? "faint" : bad ? "fails" : "holds"}> ${check
+          ? `${state.replace("_", " ")}${one.many ? ` · ${one.many} ${one.many === 1 ? "violation" : "violations"}`
+          : ""}` : `${one.many} found`}</span></div>
       <${Bars} spans=${spans} kind=${() => (check ? "bar-fail" : "bar-match")} /></div>`;
   })}</section>`;
 }
 
 function Live() {
-  return html`<${Head} /><${Statements} /><main class="open"><${Gallery} found=${answer.value.matches} word=${["event", "events"]} none=${"What is found, and what is violated, stands here as it comes."} /><${Scene} /></main><${Above} />`;
+  return html`<${Head} /><${Statements} /><main class="open">
+    <${Gallery} found=${answer.value.matches} word=${["event", "events"]}
+    none=${"What is found, and what is violated, stands here as it comes."} /><${Scene} /></main><${Above} />`;
 }
 
 keys.splice(keys.findIndex(([one]) => one === "x"), 1);
@@ -118,14 +132,19 @@ keys.push(["l", "follow what comes", { l: follow }]);
 async function run() {
   const place = /** @type {HTMLElement} */ (document.getElementById("app"));
   const events = new EventSource("api/live");
-  events.addEventListener("hello", (event) => { begin(JSON.parse(event.data)); if (!place.dataset.on) { place.dataset.on = "1"; place.textContent = ""; render(html`<${Live} />`, place); } });
+  events.addEventListener("hello",
+    (event) => { begin(JSON.parse(event.data)); if (!place.dataset.on) { place.dataset.on = "1"; place.textContent = ""; render(html`<${Live} />`, place); } });
   events.addEventListener("frame", (event) => step(unpacked(bytesOf(event.data).buffer)));
-  events.addEventListener("end", (event) => { ended.value = JSON.parse(event.data); take(ended.value.events); events.close(); });
+  events.addEventListener("end",
+    (event) => { ended.value = JSON.parse(event.data); take(ended.value.events); events.close(); });
   events.addEventListener("error", () => { lost.value = !ended.value; });
   // Whoever looks at another frame does not follow; whoever plays to the end does again.
-  effect(() => { const at = frame.value, last = span.peek()[1]; if (at !== last) following.value = false; else if (playing.peek()) follow(); });
-  effect(() => { if (!open.value && store.value) open.value = { trace: store.value.store, match: null, binding: null }; });
+  effect(() => { const at = frame.value,
+    last = span.peek()[1]; if (at !== last) following.value = false; else if (playing.peek()) follow(); });
+  effect(() => { if (!open.value && store.value) open.value = { trace: store.value.store, match: null,
+    binding: null }; });
   setInterval(() => { if (!ended.value) refresh(); }, 500);
 }
 
-api.json("api/store").then(run, (error) => { const place = document.getElementById("app"); if (place) place.textContent = reasonOf(error); });
+api.json("api/store").then(run,
+  (error) => { const place = document.getElementById("app"); if (place) place.textContent = reasonOf(error); });

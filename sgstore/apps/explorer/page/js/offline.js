@@ -23,7 +23,8 @@ export async function json(path, body) {
 /** Columns that are kept. @param {string} key */
 export async function columns(key) {
   const [path, trace] = JSON.parse(key);
-  const map = path === "api/map" ? kept.about.traces.find((/** @type {any} */ one) => one.name === trace)?.map_key : null;
+  const map = path === "api/map" ? kept.about.traces.find((/** @type {any} */ one) => one.name === trace)?.map_key
+    : null;
   const found = kept.columns[map ? JSON.stringify([path, map]) : key];
   if (!found) throw new Error("the report does not hold this");
   const plain = new Blob([bytesOf(found)]).stream().pipeThrough(new DecompressionStream("gzip"));

@@ -15,15 +15,18 @@ const html = htm.bind(h);
 function Head() {
   const given = Object.entries(kept.parameters).map(([name, value]) => `$${name} = ${value}`).join(", ");
   return html`<header><span class="brand">sgstore</span><h1>${kept.about.store} · ${kept.made}</h1>
-    <span class="grow"></span><button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>
-    <section class="search asked"><code>${kept.query}</code>${given ? html`<span class="faint"> ${given}</span>` : null}</section>`;
+    <span class="grow"></span><button class="quiet" onClick=${() => { dialog.value = "keys"; }}>
+      <kbd>?</kbd> keys</button></header>
+    <section class="search asked"><code>${kept.query}</code>
+      ${given ? html`<span class="faint"> ${given}</span>` : null}</section>`;
 }
 
 function Report() {
   const told = answer.value;
   const body = open.value ? html`<main class="open"><${Gallery} found=${matches.value} /><${Scene} /></main>`
     : told.verdicts ? html`<${Verdicts} /><main><${Gallery} found=${matches.value} /></main>`
-    : told.state === "done" && !told.matches.length ? html`<div class="sheet"><h2>Nothing matches</h2></div>` : html`<main><${Gallery} found=${matches.value} /></main>`;
+    : told.state === "done" && !told.matches.length ? html`<div class="sheet"><h2>Nothing matches</h2></div>`
+      : html`<main><${Gallery} found=${matches.value} /></main>`;
   return html`<${Head} /><${Status} />${body}
 <${Above} />`;
 }

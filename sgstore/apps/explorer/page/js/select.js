@@ -30,7 +30,8 @@ const size = (bytes) => (bytes > 1e9 ? `${(bytes / 1e9).toFixed(2)} GB`
 function Clips({ all }) {
   const place = useRef(/** @type {HTMLElement | null} */ (null));
   const [box, setBox] = useState({ top: 0, height: 600 });
-  const measure = () => { if (place.current) setBox({ top: place.current.scrollTop, height: place.current.clientHeight }); };
+  const measure = () => { if (place.current) setBox({ top: place.current.scrollTop,
+    height: place.current.clientHeight }); };
   useLayoutEffect(measure, [all.length]);
   useEffect(() => {
     addEventListener("resize", measure);
@@ -61,11 +62,13 @@ function Keep() {
       const body = { clips: clips.value, name: form.get("name"), format: form.get("format") };
       const found = await api.work(`api/${how}`, body, (done, of) => tell(`${done} of ${of}`));
       const lost = found.losses?.length ? `; lost: ${found.losses.join("; ")}` : "";
-      tell(how === "lock" ? `${found.cases} cases in ${found.file}` : `${found.files.length} files in ${found.folder}${lost}`);
+      tell(how === "lock" ? `${found.cases} cases in ${found.file}`
+        : `${found.files.length} files in ${found.folder}${lost}`);
     } catch (error) { tell(reasonOf(error)); }
   };
   if (!store.value.writing) {
-    return html`<p class="note">Start <code>sgstore serve</code> with <code>--write-to DIR</code> to write locks and clips.</p>`;
+    return html`<p
+      class="note">Start <code>sgstore serve</code> with <code>--write-to DIR</code> to write locks and clips.</p>`;
   }
   return html`<form class="row wrap" onSubmit=${write}>
       <label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" defaultValue="tests" /></label>
@@ -83,7 +86,8 @@ export function Selection() {
   return html`<div class="sheet" tabindex="0">
     <h2>${all.length.toLocaleString("en")} ${all.length === 1 ? "clip" : "clips"}</h2>
     <${Waiting} told=${told}>${(/** @type {any} */ found) => html`<p><b>${found.seconds.toFixed(1)} s</b>,
-      ${" "}${found.frames.toLocaleString("en")} frames, ${size(found.bytes)} of sensor messages</p><${Table} table=${found.kept} />`}</${Waiting}>
+      ${" "}${found.frames.toLocaleString("en")} frames, ${size(found.bytes)} of sensor messages</p>
+        <${Table} table=${found.kept} />`}</${Waiting}>
     <h2>Keep them</h2><${Keep} />
     <h2>Clips</h2><p><button class="small" onClick=${() => { ticked.value = new Map(); }}>remove all</button></p>
     <${Clips} all=${all} /></div>`;

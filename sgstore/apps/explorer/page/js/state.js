@@ -86,7 +86,8 @@ export const framesFound = computed(() => {
 export const keyOf = (m) => `${m.trace}#${m.first}-${m.last}:${Object.values(m.binding).join(",")}`;
 
 /** True for a pattern, or the name of one: no check, and no SQL. @param {string} query */
-export const isPattern = (query) => /\bMATCH\b/i.test(query) || /^\s*(?!SELECT|FROM|CHECK)\w+\s*(?:\([^)]*\))?\s*$/i.test(query);
+export const isPattern = (query) => /\bMATCH\b/i.test(query)
+  || /^\s*(?!SELECT|FROM|CHECK)\w+\s*(?:\([^)]*\))?\s*$/i.test(query);
 
 /** The last word of the page on a fault or an act. @param {string} message */
 export function say(message) {
@@ -121,8 +122,10 @@ export function history() {
 /** Values of the parameters of a text, as numbers where they are numbers.
  * @param {string} query */
 export function parametersOf(query) {
-  const plain = (/** @type {string} */ told) => (told === "true" || told === "false" ? told === "true" : Number.isFinite(Number(told)) ? Number(told) : told);
-  return Object.fromEntries(namesIn(query).flatMap((name) => (values.value[name] ? [[name, plain(values.value[name])]] : [])));
+  const plain = (/** @type {string} */ told) => (told === "true" || told === "false" ? told === "true"
+    : Number.isFinite(Number(told)) ? Number(told) : told);
+  return Object.fromEntries(namesIn(query).flatMap((name) => (values.value[name]
+    ? [[name, plain(values.value[name])]] : [])));
 }
 
 /** Names of parameters in a text, those in quotes and comments left out.
@@ -164,7 +167,8 @@ export async function find(how = {}) {
   const mine = (under = new AbortController());
   const began = performance.now();
   /** @type {any} */
-  const told = { state: "busy", id, query, parameters, matches: [], names: [], reasons: {}, notes: [], columns: [], rows: null };
+  const told = { state: "busy", id, query, parameters, matches: [], names: [], reasons: {}, notes: [], columns: [],
+    rows: null };
   batch(() => {
     answer.value = { ...told };
     if (!how.keep) open.value = null;
@@ -240,9 +244,11 @@ export function askAgain() {
 }
 
 /** An error with what helps on this page: its fields are the place for values. @param {any} error */
-const here = (error) => (/^the parameter \$/.test(error.reason) ? { ...error, hint: "write one into its field above" } : error);
+const here = (error) => (/^the parameter \$/.test(error.reason)
+  ? { ...error, hint: "write one into its field above" } : error);
 
-/** Matches among the lines of an answer; `more` hears of those that it lacks. @param {AsyncIterable<any>} lines @param {(many: number) => void} more @returns {AsyncGenerator<Match>} */
+/** Matches among the lines of an answer; `more` hears of those that it lacks. @param {AsyncIterable<any>} lines
+ * @param {(many: number) => void} more @returns {AsyncGenerator<Match>} */
 export async function* matchesIn(lines, more) {
   const told = { names: [], matches: { length: 0 } };
   for await (const line of lines) {
@@ -273,7 +279,8 @@ function fromVerdicts(told, found) {
   for (const v of found.verdicts) {
     for (const [first, last, start, end, held] of v.spans) {
       /** @type {Match} */
-      const match = { trace: v.trace, first, last, start, end, binding: {}, names: { check: v.check }, values: {}, index: told.matches.length };
+      const match = { trace: v.trace, first, last, start, end, binding: {}, names: { check: v.check }, values: {},
+        index: told.matches.length };
       for (const [name, value] of Object.entries(held)) {
         if (Number.isInteger(value)) match.binding[name] = value;
         else match.names[name.replace(/\.name$/, "")] = value;
