@@ -27,6 +27,7 @@ import threading
 import time
 import traceback
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -49,15 +50,21 @@ from foxglove_scenes import SceneRecorder, cube
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from recordings import bulb, car, ground_truth, house, sign
+from topic_recordings import topic_recording
 
 import sgstore
 import sgstore.mcap._reader as mcap_file
+from sgstore.base.quoting import literal
 from sgstore.errors import TraceError
 from sgstore.exporters import Recorder
 from sgstore.ingest import ingest
+from sgstore.lang.topics import TopicError
 from sgstore.model.world import States
 from sgstore.readers import open_trace
 from sgstore.readers.osi._schema import fields_of
+from sgstore.store import StoreFile
+from sgstore.store._topic_views import converted, topics_in
+from sgstore.store._topics import FrameClock
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -217,6 +224,7 @@ WRITERS: dict[str, Callable[[Path], Any]] = {
     "carla_recorder": lambda path: recorder_logs.as_mcap(
         path, recorder_logs.drive(path.with_suffix(".log"), FRAMES)
     ),
+    "topics": lambda path: topic_recording(path, FRAMES),
 }
 FOLDERS: dict[str, Callable[[Path, int], Path]] = {
     ".av2": av2_logs.drive,
@@ -618,6 +626,21 @@ def whole_way(path: Path) -> None:
     assert beside == [], beside
 
 
+def read_topics(path: Path) -> None:
+    """Read all topics of a recording as columns: each has as many messages as it says, or an error."""
+    folder = path.with_name("columns")
+    shutil.rmtree(folder, ignore_errors=True)
+    with suppress(TraceError):
+        for name in topics_in(path):
+            clock = FrameClock(*np.zeros((3, 1), np.int64))
+            try:
+                file = converted(path, name, folder, clock)
+            except (TopicError, TraceError):
+                continue
+            asked = StoreFile.recording_sql(path, f"SELECT * FROM topic({literal(name)})")
+            assert len(asked.rows().values) == file.messages
+
+
 def read_whole(trace: Any) -> str:
     frames = known = 0
     for block in trace.blocks(4):
@@ -692,6 +715,8 @@ def one_case(kind: str, number: int, path: Path) -> str:
     case(kind, number, path)
     with mock.patch.object(mcap_file, "SMALL", number % 2 * mcap_file.SMALL):
         ending = check(path)
+        if kind == "topics" or number % WHOLE_WAY == 1:
+            read_topics(path)
         if number % WHOLE_WAY == 0:
             whole_way(path)
     return ending

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 
-RULES: Final = ("last", "nearest", "linear")
-"""Rules for the value at a time: of the last message before it, of the nearest one, or interpolated."""
-
 _INDEX: Final = re.compile(r"(?P<list>.+)\[(?P<index>\d{1,6})\]")
 
 

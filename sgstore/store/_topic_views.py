@@ -22,7 +22,6 @@ from sgstore.errors import SqlError, TraceError
 from sgstore.lang.catalog import TopicFacts, TopicField, Type
 from sgstore.lang.syntax import TOPIC
 from sgstore.lang.topics import (
-    RULES,
     TopicError,
     common_fields,
     field_of,
@@ -393,7 +392,7 @@ def topic_values(
     Raises
     ------
     TopicError
-        The topic, the field or the rule does not exist.
+        The topic or the field does not exist, or cannot be interpolated.
 
     Notes
     -----
@@ -403,8 +402,6 @@ def topic_values(
     with access.reading() as reading:
         facts = topic_of(topic_facts(reading, access), topic)
     known = field_of(facts, field)
-    if rule not in RULES:
-        raise TopicError(f"no rule {rule!r}", f"the rules are {', '.join(RULES)}")
     if rule == "linear" and known.type is not Type.number:
         reason = f"field {known.name!r} of topic {facts.name!r} is not a number"
         raise TopicError(reason, "rules for it are last and nearest")

@@ -104,6 +104,10 @@ class TopicFile:
         return f"SELECT {listed} FROM read_parquet([{paths}], union_by_name = true)"
 
 
+_FAR_NS: Final = 1 << 62
+"""Greatest distance of a message from its frame: 146 years; ns."""
+
+
 class FrameClock:
     """Times of the frames of a trace, to find the frame and the time of a message from its log time.
 
@@ -141,7 +145,8 @@ class FrameClock:
         at = np.maximum(np.searchsorted(self.log, log_time_ns, side="right") - 1, 0)
         past = log_time_ns - self.log[at]
         rate = np.where(past >= 0, self._rate[at], 1.0)
-        time_ns = self.time_ns[at] + np.rint(past * rate).astype(np.int64)
+        step = np.clip(np.rint(past * rate), -_FAR_NS, _FAR_NS)  # a log time can be absurd
+        time_ns = self.time_ns[at] + step.astype(np.int64)
         return {FRAME: self.frame_id[at], ":run": self.run[at], ":time_ns": time_ns}
 
 

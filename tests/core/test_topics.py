@@ -14,7 +14,7 @@ import sgstore
 from sgstore.apps.cli import run as run_verb
 from sgstore.errors import SgstoreError, SqlError
 from sgstore.ingest import ingest
-from sgstore.lang.topics import RULES, TopicError, field_of
+from sgstore.lang.topics import TopicError, field_of
 from sgstore.store import StoreFile
 from sgstore.store._topic_views import topic_values
 
@@ -241,7 +241,7 @@ FIELDS = (
 
 
 @each
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", ["last", "nearest", "linear"])
 @pytest.mark.parametrize("tolerance", [None, 40_000_000])
 def test_values_at_frames_are_those_of_the_definition(
     stores: dict[str, sgstore.Store], recording: Path, how: str, rule: str, tolerance: int | None
