@@ -261,17 +261,11 @@ def draw_matrix(
         below += f"; of {len(shown)} {what} the {most} with the most gaps"
         shown = np.sort(shown[np.argsort(-surprise, kind="stable")[:most]])
     square = np.ix_(shown, shown)
-    image = _colours(frames[square], gaps[square])
-    if groups:
-        image[~wanted[square] & ~np.eye(len(shown), dtype=np.bool_)] = to_rgb(_CANNOT)
-        groups = [groups[i] for i in shown.tolist()]
-    image[np.triu_indices(len(shown), 1)] = (1.0, 1.0, 1.0)
+    groups = [groups[i] for i in shown.tolist()] if groups else []
+    image = _cells(frames[square], gaps[square], wanted[square], groups)
     gaps = gaps[square]
     names = [printable(names[i]) for i in shown.tolist()]
     rows, columns = _compared(groups, len(names))
-    for group in {*groups}:  # a slot has one value: no pairs
-        same = [i for i, one in enumerate(groups) if one == group]
-        image[np.ix_(same, same)] = (1.0, 1.0, 1.0)
     image = image[rows, columns]
     label = 12 + 3.7 * max((len(name) for name in names), default=0)
     least = max(480 if groups else 420, 7.4 * len(title))  # for the texts above and below
@@ -293,6 +287,25 @@ def draw_matrix(
                     draw(place - 0.5, color=INK, linewidth=0.6)
         cannot = bool((image == to_rgb(_CANNOT)).all(axis=2).any())
         _explain_colours(page, gaps, cannot=cannot)
+
+
+def _cells(
+    frames: NDArray[np.int64],
+    gaps: NDArray[np.bool_],
+    wanted: NDArray[np.bool_],
+    groups: Sequence[str],
+) -> NDArray[np.float64]:
+    """Return the cell colours below the diagonal; pairs of one slot are white, other impossible ones grey."""
+    from matplotlib.colors import to_rgb
+
+    image = _colours(frames, gaps)
+    if groups:
+        image[~wanted & ~np.eye(len(frames), dtype=np.bool_)] = to_rgb(_CANNOT)
+    for group in {*groups}:  # a slot has one value
+        same = [i for i, one in enumerate(groups) if one == group]
+        image[np.ix_(same, same)] = (1.0, 1.0, 1.0)
+    image[np.triu_indices(len(frames), 1)] = (1.0, 1.0, 1.0)
+    return image
 
 
 _LARGEST_CELL: Final = 24.0

@@ -314,3 +314,20 @@ def test_groups_by_name_over_several_traces_have_a_note(
     assert store.find("MATCH (e:Ego)-[:isIn]->(l:Lane) RETURN l.name, COUNT(*)").mistakes == ()
     assert store.find("MATCH (v:Vehicle) RETURN v.name, v.speed").mistakes == ()
     assert note in " ".join(printed(capsys, "find", str(path), single)[1].split())
+
+
+def test_a_class_has_a_phrase_in_a_table_and_none_in_json(folder: Path, capsys: Any) -> None:
+    store = str(folder / "town.sgstore")
+    table, _ = printed(capsys, "coverage", "classes", store, "--limit", "3")
+    rows, _ = printed(capsys, "coverage", "classes", store, "--limit", "1", "--json")
+    (first,) = json.loads(rows)
+    near = "SELECT count(DISTINCT dst) FROM edges WHERE src_is_ego AND relation IN"
+    near += " ('near_coll', 'super_near', 'very_near', 'near') AND dst_kind = 'car' AND frame_id ="
+    frame = sgstore.open(store).frame(first["frame"]).ref.frame_id
+    ((cars,),) = sgstore.open(store).sql(f"{near} {frame}").values
+    phrase = table.splitlines()[2].rpartition("  ")[2]
+
+    assert "scene" not in first
+    assert table.splitlines()[0].split()[-1] == "scene"
+    assert phrase.startswith("ego")
+    assert (f"{cars} car{'s' * (cars > 1)} near" in phrase) == (cars > 0)
