@@ -65,9 +65,10 @@ def chosen_frames(
             raise ConfigError("--param (parameters) needs a QUERY")
         return ChosenFrames(name, store)
     text, values = statement(query, parameters or {})
-    reasons = store.find(text, **values).reasons
+    matches = store.find(text, **values)
+    about = matches.reasons, query, parameters or {}, matches.notes
     found = frames_of(store, text, **values)
-    return ChosenFrames(f"{name}:{query}", store, found, reasons, query, parameters or {})
+    return ChosenFrames(f"{name}:{query}", store, found, *about)
 
 
 def frames_at(place: Place) -> ChosenFrames:

@@ -45,6 +45,8 @@ class ChosenFrames:
         Query that selected them; empty: none.
     parameters : mapping of str to value
         Values of ``$name`` in the query.
+    notes : tuple of str
+        Notes on likely mistakes in the query.
     """
 
     text: str
@@ -53,6 +55,7 @@ class ChosenFrames:
     reasons: Mapping[str, str] = field(default_factory=dict[str, str])
     query: str = ""
     parameters: Mapping[str, object] = field(default_factory=dict[str, object])
+    notes: tuple[str, ...] = ()
 
     @property
     def left_out(self) -> tuple[str, ...]:
