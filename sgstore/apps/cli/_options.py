@@ -376,7 +376,7 @@ _WORDS_OF_OTHERS: Final = {
     "remove": ("rm", "delete", "drop"),
     "export": ("clip", "clips", "cut", "extract"),
     "check": ("test", "validate", "rules", "assert"),
-    "doctor": ("inspect", "lint", "diagnose"),
+    "doctor": ("inspect", "diagnose"),
     "prioritize": ("rank", "order", "sort"),
     "criticality": ("metrics", "ttc"),
     "config": ("settings", "presets", "parameters"),
