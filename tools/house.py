@@ -310,9 +310,19 @@ def figures(house: House, counts: dict[str, tuple[int, int]]) -> dict[str, dict[
         "test files with inner modules, percent": math.ceil(tests),
         **{f"functions of {verb}": functions for verb, (functions, _) in counts.items()},
     }
+    page = [
+        *(PACKAGE / "apps" / "explorer" / "page").glob("[!v]*/*.js"),
+        *PACKAGE.rglob("page/style.css"),
+    ]
+    texts = [file.read_text(encoding="utf-8") for file in page]
+    of_page = {
+        "any in its types": sum(len(re.findall(r"\bany\b", text)) for text in texts),
+        "longest line": max(len(line) for text in texts for line in text.splitlines()),
+    }
     unclear = {n: math.ceil(1000 * r.unclear / max(r.docstrings, 1)) for n, r in rooms.items()}
     return {
         "code": code,
+        "page of the explorer": of_page,
         "names of an interface": dict(sorted(house.interfaces.items())),
         "unclear docstrings per thousand": dict(sorted(unclear.items())),
     }

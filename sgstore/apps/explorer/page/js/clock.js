@@ -17,8 +17,8 @@ export const panel = signal("pattern");
 /** Whether the second store is shown beside the first, by the same clock. */
 export const beside = signal(false);
 /** An attribute over time. */
-/** @typedef {{path: string, attribute: string, unit: string, node: number, other: number | undefined, label: string, auto: boolean,
- *   columns: Record<string, any>}} Curve */
+/** @typedef {{path: string, attribute: string, unit: string, node: number, other: number | undefined, label: string,
+ *   auto: boolean, columns: Record<string, any>}} Curve */
 export const series = signal(/** @type {Curve[]} */ ([]));
 
 export const frame = computed(() => Math.round(seq.value));

@@ -5,6 +5,8 @@ import * as api from "./api.js";
 import { isLost, live, offline, span, store, traces } from "./state.js";
 
 /** @typedef {import("./state.js").Match} Match */
+/** Columns of states by name, and the rows that are of a frame.
+ * @typedef {Record<string, any>} Columns @typedef {{columns: Columns, from: number, to: number}} States */
 
 const CHUNK = 300; // frames that are asked for together
 const KEPT = 30; // chunks that are kept

@@ -4,32 +4,42 @@ import { computed } from "../vendor/core.js";
 import { kindOf, lightOf, mapOf, stillOf } from "./data.js";
 import { paints, traces } from "./state.js";
 
+/** @typedef {import("./data.js").States} States */
+/** @typedef {import("./data.js").Columns} Columns */
 /** @typedef {{x: number, y: number, turn: number, scale: number, width: number, height: number}} Look */
 /** @typedef {{src: number, dst: number, label: string, both: boolean, holds: boolean | null}} DrawnEdge */
 
 /** @type {Record<string, string>} */
 const LANES = {
-  driving: "#c9d2df", sidewalk: "#efdfbf", walking: "#efdfbf", shoulder: "#cfc8ba", border: "#dedfcb", biking: "#b9e0cd",
-  parking: "#bfdcf4", median: "#b9d49c", crosswalk: "#fdfdfb", stop: "#d9cdd4", curb: "#b8b09c", restricted: "#ebd0c6",
+  driving: "#c9d2df", sidewalk: "#efdfbf", walking: "#efdfbf", shoulder: "#cfc8ba", border: "#dedfcb",
+    biking: "#b9e0cd",
+  parking: "#bfdcf4", median: "#b9d49c", crosswalk: "#fdfdfb", stop: "#d9cdd4", curb: "#b8b09c",
+    restricted: "#ebd0c6",
   bus: "#d3c6e4", taxi: "#d3c6e4", HOV: "#d3c6e4", tram: "#d3c6e4", rail: "#d3c6e4", none: "#e7eae9",
 };
 /** @type {Record<string, string>} */
 const DARK_LANES = {
-  driving: "#39424f", sidewalk: "#4a4233", walking: "#4a4233", shoulder: "#35332c", border: "#33352b", biking: "#2c4a3d",
-  parking: "#2b4256", median: "#2f3d27", crosswalk: "#6d727b", stop: "#463b42", curb: "#3c3931", restricted: "#4a362f",
+  driving: "#39424f", sidewalk: "#4a4233", walking: "#4a4233", shoulder: "#35332c", border: "#33352b",
+    biking: "#2c4a3d",
+  parking: "#2b4256", median: "#2f3d27", crosswalk: "#6d727b", stop: "#463b42", curb: "#3c3931",
+    restricted: "#4a362f",
   bus: "#413655", taxi: "#413655", HOV: "#413655", tram: "#413655", rail: "#413655", none: "#22272c",
 };
 /** @type {Record<string, string>} */
 const KINDS = {
   car: "#c2408f", vehicle: "#c2408f", truck: "#6d2468", bus: "#6d2468", trailer: "#6d2468", motorcycle: "#d873b5",
-  bicycle: "#d873b5", person: "#e3115f", animal: "#e3115f", van: "#93307c", train: "#4a1a4c", traffic_light: "#3a4250",
-  stop_sign: "#5a6b85", yield_sign: "#5a6b85", speed_limit: "#5a6b85", sign: "#5a6b85", prop: "#a9a39b", pole: "#a9a39b",
+  bicycle: "#d873b5", person: "#e3115f", animal: "#e3115f", van: "#93307c", train: "#4a1a4c",
+    traffic_light: "#3a4250",
+  stop_sign: "#5a6b85", yield_sign: "#5a6b85", speed_limit: "#5a6b85", sign: "#5a6b85", prop: "#a9a39b",
+    pole: "#a9a39b",
   barrier: "#a9a39b", building: "#d2cfc9", vegetation: "#c6d4ba", unknown: "#8f8a94",
 };
 /** @type {Record<string, string>} */
-const DARK_KINDS = { ...KINDS, building: "#3d434c", vegetation: "#33432f", prop: "#5f5b56", pole: "#5f5b56", barrier: "#5f5b56" };
+const DARK_KINDS = { ...KINDS, building: "#3d434c", vegetation: "#33432f", prop: "#5f5b56", pole: "#5f5b56",
+  barrier: "#5f5b56" };
 /** @type {Record<string, string>} */
-const LIGHTS = { red: "#e5383b", red_yellow: "#ff8c1a", yellow: "#ffb703", green: "#2ec4a0", flashing: "#ffe08a", off: "#5a626f" };
+const LIGHTS = { red: "#e5383b", red_yellow: "#ff8c1a", yellow: "#ffb703", green: "#2ec4a0", flashing: "#ffe08a",
+  off: "#5a626f" };
 export const SCENERY = new Set(["building", "vegetation", "prop", "pole", "barrier"]);
 
 const CELL_REACH = 50; // m, from the middle of a square of arrows to its corner
@@ -40,17 +50,22 @@ scheme.addEventListener("change", () => { paints.value++; });
 /** Colours of the page, light or dark; looked for again when they change. */
 const inks = computed(() => {
   const { theme } = document.documentElement.dataset, isDark = theme ? theme === "dark" : scheme.matches;
-  const style = getComputedStyle(document.documentElement), of = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
+  const style = getComputedStyle(document.documentElement),
+    of = (/** @type {string} */ name) => style.getPropertyValue(name).trim();
   return {
-    at: paints.value, ink: of("--ink"), faint: of("--faint"), ego: of("--ego"), hold: of("--hold"), fail: of("--fail"),
-    mark: of("--mark"), ground: of("--map-ground"), raised: of("--raised"), lanes: isDark ? DARK_LANES : LANES, kinds: isDark ? DARK_KINDS : KINDS,
-    line: isDark ? "#59636f" : "#ffffff", stripe: isDark ? "#aeb6c1" : "#fdfdfb", arrow: isDark ? "#667180" : "#f7f9fb",
+    at: paints.value, ink: of("--ink"), faint: of("--faint"), ego: of("--ego"), hold: of("--hold"),
+      fail: of("--fail"),
+    mark: of("--mark"), ground: of("--map-ground"), raised: of("--raised"), lanes: isDark ? DARK_LANES : LANES,
+      kinds: isDark ? DARK_KINDS : KINDS,
+    line: isDark ? "#59636f" : "#ffffff", stripe: isDark ? "#aeb6c1" : "#fdfdfb",
+      arrow: isDark ? "#667180" : "#f7f9fb",
     grid: isDark ? "#232a31" : "#dfe4dd",
   };
 });
 /** @typedef {typeof inks.value} Inks */
 
-/** Make the points of a canvas those of the screen; its size in points of the page. @param {HTMLCanvasElement} canvas */
+/** Make the points of a canvas those of the screen; its size in points of the page.
+ * @param {HTMLCanvasElement} canvas */
 export function fitted(canvas) {
   const ratio = Math.min(devicePixelRatio || 1, 2), box = canvas.getBoundingClientRect();
   const width = Math.max(1, Math.round(box.width * ratio)), height = Math.max(1, Math.round(box.height * ratio));
@@ -82,7 +97,8 @@ function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
       ctx.fillStyle = ink.stripe;
       ctx.fill(ring.stripes);
     } else if (ring.closed) {
-      ctx.fillStyle = ink.lanes[ring.word] || (ink.kinds[ring.word] ? `${ink.kinds[ring.word]}38` : ink.lanes.none || "#888");
+      ctx.fillStyle = ink.lanes[ring.word] || (ink.kinds[ring.word] ? `${ink.kinds[ring.word]}38` : ink.lanes.none
+        || "#888");
       ctx.fill(ring.path);
       if (!small && ring.word === "driving") ctx.stroke(ring.path);
     } else if (!small) {
@@ -108,19 +124,23 @@ function paintMap(ctx, trace, look, ratio, ink, marked, lit, small) {
   }
 }
 
-/** Lines each ten metres, where no road map is known. @param {CanvasRenderingContext2D} ctx @param {Look} look @param {number} ratio @param {Inks} ink */
+/** Lines each ten metres, where no road map is known. @param {CanvasRenderingContext2D} ctx @param {Look} look
+ * @param {number} ratio @param {Inks} ink */
 function paintGrid(ctx, look, ratio, ink) {
   const reach = Math.hypot(look.width, look.height) / look.scale / 2, step = look.scale < 0.8 ? 100 : 10;
   ctx.setTransform(axes(look, ratio));
   ctx.strokeStyle = ink.grid;
   ctx.lineWidth = 1 / look.scale;
   ctx.beginPath();
-  for (let k = Math.ceil((look.x - reach) / step) * step; k < look.x + reach; k += step) { ctx.moveTo(k, look.y - reach); ctx.lineTo(k, look.y + reach); }
-  for (let k = Math.ceil((look.y - reach) / step) * step; k < look.y + reach; k += step) { ctx.moveTo(look.x - reach, k); ctx.lineTo(look.x + reach, k); }
+  for (let k = Math.ceil((look.x - reach) / step) * step; k < look.x + reach; k += step) { ctx.moveTo(k,
+    look.y - reach); ctx.lineTo(k, look.y + reach); }
+  for (let k = Math.ceil((look.y - reach) / step) * step; k < look.y + reach; k += step) { ctx.moveTo(look.x - reach,
+    k); ctx.lineTo(look.x + reach, k); }
   ctx.stroke();
 }
 
-/** Rings around the ego, with their distances. @param {CanvasRenderingContext2D} ctx @param {any} states @param {Look} look @param {number} ratio @param {Inks} ink */
+/** Rings around the ego, with their distances. @param {CanvasRenderingContext2D} ctx @param {States} states
+ * @param {Look} look @param {number} ratio @param {Inks} ink */
 function paintRings(ctx, states, look, ratio, ink) {
   const ego = egoRow(states);
   if (ego < 0) return;
@@ -132,7 +152,8 @@ function paintRings(ctx, states, look, ratio, ink) {
   ctx.setLineDash([2, 4]);
   ctx.font = "10.5px system-ui, sans-serif";
   ctx.textBaseline = "alphabetic";
-  for (const far of [10, 20, 50, 100, 200].filter((m) => m * look.scale > 45 && m * look.scale < Math.max(look.width, look.height))) {
+  for (const far of [10, 20, 50, 100, 200].filter((m) => m * look.scale > 45
+    && m * look.scale < Math.max(look.width, look.height))) {
     ctx.beginPath();
     ctx.arc(x, y, far * look.scale, 0, 7);
     ctx.stroke();
@@ -142,7 +163,8 @@ function paintRings(ctx, states, look, ratio, ink) {
   ctx.globalAlpha = 1;
 }
 
-/** A traffic light as its housing with three lamps, upright on the screen. @param {CanvasRenderingContext2D} ctx @param {string} state
+/** A traffic light as its housing with three lamps, upright on the screen. @param {CanvasRenderingContext2D} ctx
+ * @param {string} state
  * @param {number} scale @param {number} turn back to upright */
 function paintLight(ctx, state, scale, turn) {
   const high = Math.max(2.6, 20 / scale), wide = high * 0.46, lamps = ["green", "yellow", "red"];
@@ -165,11 +187,13 @@ function paintLight(ctx, state, scale, turn) {
   ctx.roundRect(-wide / 2, -high / 2, wide, high, wide * 0.3);
 }
 
-/** What the colours of a scene stand for: a colour, its form, and a word. @param {string} trace @param {any} states @returns {[string, string, string][]} */
+/** What the colours of a scene stand for: a colour, its form, and a word. @param {string} trace
+ * @param {States | null} states
+ * @returns {[string, string, string][]} */
 export function legendOf(trace, states) {
   const ink = inks.value, c = states?.columns, kinds = new Set(), lights = new Set(), still = stillOf(trace)?.columns;
   for (let i = states?.from || 0; i < (states?.to || 0); i++) {
-    if (c.ego?.[i]) continue;
+    if (!c || c.ego?.[i]) continue;
     const kind = kindOf(c.kind[i]);
     if (kind === "traffic_light") lights.add(lightOf(c.light?.[i] ?? 0)); else kinds.add(kind);
   }
@@ -180,13 +204,15 @@ export function legendOf(trace, states) {
     ["ego", "box", ink.ego], ["bound in the match", "outline", ink.mark],
     ...[...kinds].sort().map((kind) => [kind, "box", ink.kinds[kind] || ink.kinds.unknown || ""]),
     ...[...lights].sort().map((state) => [`light: ${state}`, "dot", LIGHTS[state] || ink.faint]),
-    ...[...words].filter((word) => ink.lanes[word]).sort().map((word) => [word === "crosswalk" ? word : `lane: ${word}`, "area", ink.lanes[word] || ""]),
+    ...[...words].filter((word) => ink.lanes[word]).sort().map((word) => [word === "crosswalk" ? word
+      : `lane: ${word}`, "area", ink.lanes[word] || ""]),
     ["relation holds", "line", ink.hold], ["relation fails", "dashed", ink.fail],
   ].map(([word = "", form = "", colour = ""]) => [colour, form, word.replace(/_/g, " ")]);
 }
 
-/** @param {CanvasRenderingContext2D} ctx @param {any} c @param {number} i @param {number} scale
- * @param {Inks} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null, small?: boolean}} what @param {number} turn */
+/** @param {CanvasRenderingContext2D} ctx @param {Columns} c @param {number} i @param {number} scale
+ * @param {Inks} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null, small?: boolean}} what
+ * @param {number} turn */
 function paintEntity(ctx, c, i, scale, ink, what, turn) {
   const kind = kindOf(c.kind[i]), node = c.node[i], ego = c.ego ? c.ego[i] : 0;
   const least = (what.marked.has(node) ? 7 : 3.5) / scale;
@@ -226,16 +252,17 @@ function paintEntity(ctx, c, i, scale, ink, what, turn) {
   ctx.restore();
 }
 
-/** The first row of a frame that has a value; -1: none. @param {any} states @param {number} value @param {string} [column] */
+/** The first row of a frame that has a value; -1: none. @param {States} states @param {number} value
+ * @param {string} [column] */
 export function rowOf(states, value, column = "node") {
   const row = states.columns[column].subarray(states.from, states.to).indexOf(value);
   return row < 0 ? row : states.from + row;
 }
 
-/** @param {any} states */
+/** @param {States} states */
 export const egoRow = (states) => rowOf(states, 1, "ego");
 
-/** A place of a node, of a part of the map too. @param {string} trace @param {any} states @param {number} node
+/** A place of a node, of a part of the map too. @param {string} trace @param {States} states @param {number} node
  * @param {number[]} [near] where it should be near, of a long lane */
 export function spotOf(trace, states, node, near) {
   const row = rowOf(states, node);
@@ -262,7 +289,8 @@ function strokeLine(ctx, points) {
 }
 
 /** Paint a scene.
- * @param {CanvasRenderingContext2D} ctx @param {string} trace @param {any} states @param {Look} look @param {number} ratio
+ * @param {CanvasRenderingContext2D} ctx @param {string} trace @param {States} states @param {Look} look
+ * @param {number} ratio
  * @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null, names?: Map<number, string>, edges?: DrawnEdge[],
  *   track?: number[][], small?: boolean}} what */
 export function paintScene(ctx, trace, states, look, ratio, what) {
@@ -276,7 +304,8 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
   ctx.setTransform(axes(look, ratio));
   const reach = Math.hypot(look.width, look.height) / look.scale / 2 + 12;
   const still = stillOf(trace)?.columns;
-  for (const [c, from, to] of [[still, 0, still?.node?.length || 0], [states?.columns, states?.from || 0, states?.to || 0]]) {
+  for (const [c, from, to] of [[still, 0, still?.node?.length || 0],
+    [states?.columns, states?.from || 0, states?.to || 0]]) {
     if (!c) continue;
     for (let i = from; i < to; i++) {
       if (Math.abs(c.x[i] - look.x) > reach || Math.abs(c.y[i] - look.y) > reach) continue;
@@ -299,8 +328,9 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
   paintScale(ctx, look, ink);
 }
 
-/** Names beside what they name, none of them on another, or on what another names. @param {CanvasRenderingContext2D} ctx @param {string} trace
- * @param {any} states @param {Look} look @param {Inks} ink @param {Map<number, string>} names */
+/** Names beside what they name, none of them on another, or on what another names.
+ * @param {CanvasRenderingContext2D} ctx @param {string} trace
+ * @param {States} states @param {Look} look @param {Inks} ink @param {Map<number, string>} names */
 function paintNames(ctx, trace, states, look, ink, names) {
   const place = axes(look), c = states.columns;
   const named = [...names].sort(([a], [b]) => b - a).flatMap(([node, name]) => { // entities before parts of the map
@@ -308,13 +338,16 @@ function paintNames(ctx, trace, states, look, ink, names) {
     if (!at) return [];
     const angle = (c.heading[row] || 0) + look.turn, cos = Math.abs(Math.cos(angle)), sin = Math.abs(Math.sin(angle));
     const long = ((c.length[row] || 0) * look.scale) / 2, wide = ((c.width[row] || 0) * look.scale) / 2;
-    return [{ name, at: place.transformPoint({ x: at[0], y: at[1] }), aside: long * cos + wide * sin, along: long * sin + wide * cos }];
+    return [{ name, at: place.transformPoint({ x: at[0], y: at[1] }), aside: long * cos + wide * sin,
+      along: long * sin + wide * cos }];
   });
-  const taken = named.map(({ at, aside, along }) => ({ x: at.x - aside, y: at.y - along, wide: 2 * aside, high: 2 * along }));
+  const taken = named.map(({ at, aside, along }) => ({ x: at.x - aside, y: at.y - along, wide: 2 * aside,
+    high: 2 * along }));
   for (const { name, at, aside } of named) {
     const wide = ctx.measureText(name).width + 10, right = at.x + aside + 8, left = at.x - aside - 8 - wide;
     const spots = [-24, 6, -46, 28].flatMap((down) => [{ x: right, y: at.y + down }, { x: left, y: at.y + down }]);
-    const free = spots.find(({ x, y }) => taken.every((o) => y > o.y + o.high + 2 || o.y > y + 20 || x > o.x + o.wide + 3 || o.x > x + wide + 3));
+    const free = spots.find(({ x, y }) => taken.every((o) => y > o.y + o.high + 2 || o.y > y + 20
+      || x > o.x + o.wide + 3 || o.x > x + wide + 3));
     const { x, y } = free || { x: right, y: at.y - 24 };
     taken.push({ x, y, wide, high: 18 });
     ctx.fillStyle = ink.raised;
@@ -328,11 +361,12 @@ function paintNames(ctx, trace, states, look, ink, names) {
   }
 }
 
-/** @param {CanvasRenderingContext2D} ctx @param {string} trace @param {any} states @param {Look} look
+/** @param {CanvasRenderingContext2D} ctx @param {string} trace @param {States} states @param {Look} look
  * @param {Inks} ink @param {DrawnEdge} edge */
 function paintEdge(ctx, trace, states, look, ink, edge) {
   const near = spotOf(trace, states, edge.src >= 0 ? edge.src : edge.dst);
-  const from = spotOf(trace, states, edge.src, near || undefined), to = spotOf(trace, states, edge.dst, near || undefined);
+  const from = spotOf(trace, states, edge.src, near || undefined),
+    to = spotOf(trace, states, edge.dst, near || undefined);
   if (!from || !to) return;
   ctx.strokeStyle = edge.holds === false ? ink.fail : edge.holds ? ink.hold : ink.faint;
   ctx.lineWidth = edge.holds === null ? 1.2 : 2.2;
@@ -341,7 +375,8 @@ function paintEdge(ctx, trace, states, look, ink, edge) {
   ctx.setLineDash([]);
 }
 
-/** A bar that says how long some metres are. @param {CanvasRenderingContext2D} ctx @param {Look} look @param {Inks} ink */
+/** A bar that says how long some metres are. @param {CanvasRenderingContext2D} ctx @param {Look} look
+ * @param {Inks} ink */
 function paintScale(ctx, look, ink) {
   const long = [1, 2, 5, 10, 20, 50, 100, 200, 500].find((m) => m * look.scale > 50) || 1000;
   const x = 14, y = look.height - 16;
@@ -354,20 +389,24 @@ function paintScale(ctx, look, ink) {
 }
 
 /** A look that shows some nodes, the ego's heading up.
- * @param {string} trace @param {any} states @param {Iterable<number>} nodes @param {number} width @param {number} height
+ * @param {string} trace @param {States} states @param {Iterable<number>} nodes @param {number} width
+ * @param {number} height
  * @param {number} [most] how far it may reach; m @returns {Look} */
 export function lookAt(trace, states, nodes, width, height, most = 70) {
   const ego = egoRow(states), c = states.columns;
   const centre = ego >= 0 ? [c.x[ego], c.y[ego]] : [c.x[states.from] || 0, c.y[states.from] || 0];
   const turn = ego >= 0 && Number.isFinite(c.heading[ego]) ? Math.PI / 2 - c.heading[ego] : 0;
-  const spots = [...nodes].flatMap((node) => (node < 0 ? [] : [spotOf(trace, states, node) || []])).filter((at) => at.length);
+  const spots = [...nodes].flatMap((node) => (node < 0 ? []
+    : [spotOf(trace, states, node) || []])).filter((at) => at.length);
   // Half way between the ego and the middle of the nodes.
-  const [x, y] = [0, 1].map((i) => (spots.length ? spots.reduce((sum, at) => sum + at[i], centre[i] * spots.length) / spots.length / 2 : centre[i]));
+  const [x, y] = [0, 1].map((i) => (spots.length ? spots.reduce((sum, at) => sum + at[i],
+    centre[i] * spots.length) / spots.length / 2 : centre[i]));
   const reach = Math.max(20, ...[...spots, centre].map((at) => Math.hypot(at[0] - x, at[1] - y) * 1.25 + 6));
   return { x, y, turn, scale: Math.min(width, height) / 2 / Math.min(reach, most), width, height };
 }
 
-/** The node at a place of the canvas. @param {any} states @param {Look} look @param {number} px @param {number} py */
+/** The node at a place of the canvas. @param {States} states @param {Look} look @param {number} px
+ * @param {number} py */
 export function nodeAt(states, look, px, py) {
   const { x, y } = axes(look).inverse().transformPoint({ x: px, y: py }), c = states.columns;
   let best = -1, away = 8 / look.scale;

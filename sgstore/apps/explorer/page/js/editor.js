@@ -1,8 +1,10 @@
 // @ts-check
 // The editor of queries: colours, completion, errors under carets, a slider for the number under the cursor.
 import {
-  autocompletion, bracketMatching, closeBrackets, closeBracketsKeymap, closeCompletion, completionKeymap, defaultKeymap, drawSelection,
-  EditorState, EditorView, highlightSpecialChars, HighlightStyle, history, historyKeymap, keymap, placeholder, setDiagnostics,
+  autocompletion, bracketMatching, closeBrackets, closeBracketsKeymap, closeCompletion, completionKeymap,
+    defaultKeymap, drawSelection,
+  EditorState, EditorView, highlightSpecialChars, HighlightStyle, history, historyKeymap, keymap, placeholder,
+    setDiagnostics,
   StreamLanguage, syntaxHighlighting, tags,
 } from "../vendor/codemirror.js";
 import { effect, h, htm, signal, useEffect, useRef } from "../vendor/core.js";
@@ -65,7 +67,8 @@ function complete(context) {
     return { from: start, options: told(known.topics[field[1] || ""] || [], "property"), validFor: /^[\w.[\]`-]*$/ };
   }
   const topic = /\btopic\(\s*'([^']*)$/i.exec(before);
-  if (topic) return { from: context.pos - (topic[1] || "").length, options: of(Object.keys(known.topics), "text"), validFor: /^[^']*$/ };
+  if (topic) return { from: context.pos - (topic[1] || "").length, options: of(Object.keys(known.topics), "text"),
+    validFor: /^[^']*$/ };
   const owner = /(\w+)\.\w*$/.exec(before)?.[1];
   if (owner) {
     const edges = new RegExp(`\\[\\s*${owner}\\s*[:\\]]`).test(context.state.doc.toString());
@@ -73,9 +76,11 @@ function complete(context) {
     return { from, options: told(known.attributes[group], "property"), validFor };
   }
   if (/\[\s*\w*\s*:(?:[\w!|&]*\|)?\w*$/.test(before)) return { from, options: of(known.relations, "enum"), validFor };
-  if (/\(\s*\w*\s*:(?:[\w!|&()]*[|&!(])?\w*$/.test(before)) return { from, options: of(known.labels, "class"), validFor };
+  if (/\(\s*\w*\s*:(?:[\w!|&()]*[|&!(])?\w*$/.test(before)) return { from, options: of(known.labels, "class"),
+    validFor };
   if (!word && !context.explicit) return null;
-  const variables = [...new Set([...context.state.doc.toString().matchAll(/[([]\s*([A-Za-z_]\w*)/g)].map((m) => m[1] || ""))];
+  const variables = [...new Set([...context.state.doc.toString().matchAll(/[([]\s*([A-Za-z_]\w*)/g)].map((m) => m[1]
+    || ""))];
   return {
     from, validFor, options: [
       ...of(variables.filter((one) => one !== word?.text), "variable", 2), ...of(known.keywords, "keyword"),
@@ -93,7 +98,8 @@ function diagnosed(error) {
   if (error && Number.isInteger(error.start)) {
     // Places are those of the text without the blanks before it; and in characters, not in halves of them.
     const raw = doc.toString(), lead = raw.length - raw.trimStart().length;
-    const at = (/** @type {number} */ n) => Math.min([...raw.trimStart()].slice(0, n).join("").length + lead, doc.length);
+    const at = (/** @type {number} */ n) => Math.min([...raw.trimStart()].slice(0, n).join("").length + lead,
+      doc.length);
     const from = at(error.start), to = Math.max(at(error.end), from);
     found.push({
       from: from === to && from ? from - 1 : from, to, severity: "error",
@@ -128,12 +134,17 @@ export function Editor() {
       state: EditorState.create({
         doc: text.value,
         extensions: [
-          EditorView.cspNonce.of(nonce), highlightSpecialChars(), history(), drawSelection(), bracketMatching(), closeBrackets(),
-          autocompletion({ override: [complete], icons: false, maxRenderedOptions: 60 }), language, syntaxHighlighting(colours),
-          EditorView.lineWrapping, placeholder("MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 5     · or SELECT … · or choose a pattern below"),
+          EditorView.cspNonce.of(nonce), highlightSpecialChars(), history(), drawSelection(), bracketMatching(),
+            closeBrackets(),
+          autocompletion({ override: [complete], icons: false, maxRenderedOptions: 60 }), language,
+            syntaxHighlighting(colours),
+          EditorView.lineWrapping,
+            placeholder("MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 5     · or SELECT …"
+            + " · or choose a pattern below"),
           EditorView.contentAttributes.of({ "aria-label": "Query" }),
           keymap.of([
-            { key: "Mod-Enter", preventDefault: true, run: (/** @type {any} */ view) => { closeCompletion(view); find(); return true; } },
+            { key: "Mod-Enter", preventDefault: true,
+              run: (/** @type {any} */ view) => { closeCompletion(view); find(); return true; } },
             { key: "Escape", run: (/** @type {any} */ view) => { view.contentDOM.blur(); return true; } },
             ...closeBracketsKeymap, ...defaultKeymap, ...historyKeymap, ...completionKeymap,
           ]),
@@ -145,7 +156,8 @@ export function Editor() {
       }),
     });
     const stops = [
-      effect(() => { const query = text.value; if (editor.state.doc.toString() !== query) replacePart(0, editor.state.doc.length, query); }),
+      effect(() => { const query = text.value; if (editor.state.doc.toString() !== query) replacePart(0,
+        editor.state.doc.length, query); }),
       effect(() => diagnosed(answer.value.error)),
     ];
     return () => { stops.forEach((stop) => stop()); editor.destroy(); editor = null; };
@@ -173,5 +185,6 @@ export function NumberSlider() {
     waiting = setTimeout(() => find({ keep: true }), 160);
   };
   return html`<label class="slider">${at.value}
-    <input type="range" aria-label="Number under the cursor" min=${low} max=${high} step=${step} value=${at.value} onInput=${change} /></label>`;
+    <input type="range" aria-label="Number under the cursor" min=${low} max=${high} step=${step} value=${at.value}
+      onInput=${change} /></label>`;
 }

@@ -49,7 +49,8 @@ export function Above({ children }) {
 }
 
 // A button that was clicked does not keep the keys: space plays.
-addEventListener("click", ({ target, detail }) => { if (detail) /** @type {HTMLElement} */ (target).closest("button")?.blur(); });
+addEventListener("click",
+  ({ target, detail }) => { if (detail) /** @type {HTMLElement} */ (target).closest("button")?.blur(); });
 
 addEventListener("keydown", (event) => {
   const at = /** @type {HTMLElement} */ (event.target);

@@ -25,7 +25,8 @@ let counting = false;
 export async function countLibrary() {
   if (counting) return;
   counting = true;
-  const next = () => library.value.find((p) => p.kind !== "predicate" && p.kind !== "property" && !tally.value[p.name]);
+  const next = () => library.value.find((p) => p.kind !== "predicate" && p.kind !== "property"
+    && !tally.value[p.name]);
   for (let one = next(); one; one = next()) {
     const busy = () => answer.value.state !== "idle" || view.value !== "find" || open.value || api.trouble.value;
     while (busy()) await new Promise((done) => setTimeout(done, 400));
@@ -68,8 +69,10 @@ function vocabulary() {
   /** @param {any[]} told @param {(name: string) => string} text @returns {Word[]} */
   const of = (told, text) => told.map(({ name, meaning }) => ({ name, meaning, text: text(name) }));
   return [
-    ...known.relations.map((/** @type {string} */ name) => ({ name, meaning: "relation of two nodes", text: `MATCH (a)-[:${name}]->(b)` })),
-    ...known.labels.map((/** @type {string} */ name) => ({ name, meaning: "label of nodes", text: `MATCH (x:${name})` })),
+    ...known.relations.map((/** @type {string} */ name) => ({ name, meaning: "relation of two nodes",
+      text: `MATCH (a)-[:${name}]->(b)` })),
+    ...known.labels.map((/** @type {string} */ name) => ({ name, meaning: "label of nodes",
+      text: `MATCH (x:${name})` })),
     ...of(known.attributes.node, (name) => `MATCH (x) WHERE x.${name} IS KNOWN RETURN x, x.${name}`),
     ...of(known.functions, (name) => `MATCH (e:Ego), (x:Entity) RETURN e, x, ${name}(e, x)`),
     ...of(known.predicates, (name) => `MATCH (x:Vehicle) WHERE ${name}(x)`),
@@ -81,9 +84,11 @@ function nearWords(text) {
   const wanted = [...new Set(stems(text))];
   const ranked = vocabulary().map((word) => {
     const name = stems(word.name.replace(/([a-z])([A-Z])/g, "$1 $2")), meaning = stems(word.meaning);
-    return { word, rank: wanted.reduce((n, one) => n + (name.includes(one) ? 3 : 0) + (meaning.includes(one) ? 1 : 0), 0) };
+    return { word, rank: wanted.reduce((n, one) => n + (name.includes(one) ? 3 : 0) + (meaning.includes(one) ? 1
+      : 0), 0) };
   });
-  return ranked.filter(({ rank }) => rank).sort((a, b) => b.rank - a.rank || a.word.name.length - b.word.name.length).slice(0, MOST_WORDS).map(({ word }) => word);
+  return ranked.filter(({ rank }) => rank).sort((a, b) => b.rank - a.rank
+    || a.word.name.length - b.word.name.length).slice(0, MOST_WORDS).map(({ word }) => word);
 }
 
 /** Entries of the library that are near some words, the nearest first; null: not known yet. @param {string} text */
@@ -105,13 +110,16 @@ function useNear(text) {
 function Card({ one }) {
   const told = tally.value[one.name];
   const many = one.kind === "property" ? html`<span class="faint">check</span>`
-    : told ? html`<span class=${told.count > 0 ? "badge" : "faint"} title=${told.reason}>${told.count < 0 ? "–" : told.count}${told.more}</span>`
+    : told ? html`<span class=${told.count > 0 ? "badge" : "faint"} title=${told.reason}>
+      ${told.count < 0 ? "–" : told.count}${told.more}</span>`
     : html`<span class="faint">…</span>`;
   return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
     <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${many}</h3>
     <p>${one.sentence}</p>
-    ${told?.spots.length ? html`<svg viewBox="0 0 250 18" preserveAspectRatio="none" shape-rendering="crispEdges" aria-hidden="true">
-      <rect class="bar-back" width="250" height="18" />${told.spots.map((at) => html`<rect class="bar-match" x=${at} width="1" height="18" />`)}</svg>` : null}
+    ${told?.spots.length ? html`<svg viewBox="0 0 250 18" preserveAspectRatio="none" shape-rendering="crispEdges"
+      aria-hidden="true">
+      <rect class="bar-back" width="250" height="18" />${told.spots.map((at) => html`<rect class="bar-match" x=${at}
+        width="1" height="18" />`)}</svg>` : null}
     ${one.drawing ? html`<pre aria-hidden="true">${one.drawing}</pre>` : null}</button>`;
 }
 
@@ -119,25 +127,35 @@ function Card({ one }) {
 export function Near({ text, most = MOST_CARDS }) {
   const cards = useNear(text), some = nearWords(text);
   if (!cards) return null;
-  return html`${cards.length ? html`<div class="cards near-cards">${cards.slice(0, most).map((one) => html`<${Card} one=${one} />`)}</div>` : null}
+  return html`${cards.length ? html`<div class="cards near-cards">
+    ${cards.slice(0, most).map((one) => html`<${Card} one=${one} />`)}</div>` : null}
     ${some.length ? html`<h2>Words of the language</h2><ul class="words">${some.map((one) => html`<li>
-      <button class="small" onClick=${() => ask(one.text)}>${one.name}</button> <span class="faint">${one.meaning}</span></li>`)}</ul>` : null}
-    ${cards.length || some.length ? null : html`<p class="faint">Neither the library nor the language has such words.</p>`}`;
+      <button class="small" onClick=${() => ask(one.text)}>${one.name}</button> <span class="faint">
+        ${one.meaning}</span></li>`)}</ul>` : null}
+    ${cards.length || some.length ? null
+      : html`<p class="faint">Neither the library nor the language has such words.</p>`}`;
 }
 
 /** The field of the search in words. */
-export const WordSearch = () => html`<input type="search" class="words-field" aria-label="Search the library and the words of the language"
-  placeholder="search in words: pedestrian crosses" value=${sought.value} onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { sought.value = e.target.value; }}
+export const WordSearch = () => html`<input type="search" class="words-field"
+  aria-label="Search the library and the words of the language"
+  placeholder="search in words: pedestrian crosses" value=${sought.value}
+    onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { sought.value = e.target.value; }}
   onKeyDown=${(/** @type {KeyboardEvent} */ e) => { if (e.key === "Escape") sought.value = ""; }} />`;
 
 export function Start() {
-  const some = library.value.filter((one) => one.kind !== "predicate"), kinds = [...new Set(some.map((one) => one.library))];
+  const some = library.value.filter((one) => one.kind !== "predicate"),
+    kinds = [...new Set(some.map((one) => one.library))];
   const over = useRef(false), known = useRef(tally.value); // no card moves away from under the pointer
   if (!over.current) known.current = tally.value;
-  const found = (/** @type {Entry} */ one) => Number((known.current[one.name]?.count || 0) > 0), text = sought.value.trim();
-  return html`<div class="sheet" tabindex="0" onPointerEnter=${() => { over.current = true; }} onPointerLeave=${() => { over.current = false; }}>
-    ${text ? html`<${Near} text=${text} />` : !some.length ? html`<p class="faint">Reading the library …</p>` : html`<p class="faint">Type a pattern above, search in words, or begin with one of these ${some.length}.
+  const found = (/** @type {Entry} */ one) => Number((known.current[one.name]?.count || 0) > 0),
+    text = sought.value.trim();
+  return html`<div class="sheet" tabindex="0" onPointerEnter=${() => { over.current = true; }}
+    onPointerLeave=${() => { over.current = false; }}>
+    ${text ? html`<${Near} text=${text} />` : !some.length ? html`<p class="faint">Reading the library …</p>`
+      : html`<p class="faint">Type a pattern above, search in words, or begin with one of these ${some.length}.
       Each card has its matches in this store, and where they are in time.</p>
       ${kinds.map((kind) => html`<h2>${kind}</h2><div class="cards">
-        ${some.filter((one) => one.library === kind).sort((a, b) => found(b) - found(a)).map((one) => html`<${Card} one=${one} />`)}</div>`)}`}</div>`;
+        ${some.filter((one) => one.library === kind).sort((a,
+          b) => found(b) - found(a)).map((one) => html`<${Card} one=${one} />`)}</div>`)}`}</div>`;
 }

@@ -14,8 +14,10 @@ import { countLibrary, Near, sought, Start, WordSearch } from "./library.js";
 import { Selection } from "./select.js";
 import { Coverage } from "./sheets.js";
 import {
-  answer, ask, askAgain, cancel, changed, dialog, find, history, isPattern, keep, library, matches, namesIn, notes, notice, open,
-  openFrame, paints, parametersOf, reasonOf, refresh, retries, say, store, tag, tagged, text, theme, ticked, values, view, words,
+  answer, ask, askAgain, cancel, changed, dialog, find, history, isPattern, keep, library, matches, namesIn, notes,
+    notice, open,
+  openFrame, paints, parametersOf, reasonOf, refresh, retries, say, store, tag, tagged, text, theme, ticked, values,
+    view, words,
 } from "./state.js";
 import { Status } from "./status.js";
 import { runsOfTags } from "./timeline.js";
@@ -25,14 +27,21 @@ const html = htm.bind(h);
 const VIEWS = [["find", "Find"], ["coverage", "Coverage"], ["selection", "Selection"], ["compare", "Compare"]];
 
 function Head() {
-  const about = store.value, frames = about.traces.reduce((/** @type {number} */ n, /** @type {any} */ t) => n + t.frames, 0);
+  const about = store.value, frames = about.traces.reduce((/** @type {number} */ n,
+    /** @type {any} */ t) => n + t.frames, 0);
   const next = theme.value === "" ? "dark" : theme.value === "dark" ? "light" : "";
   const home = () => { open.value = null; view.value = "find"; ask(""); };
-  return html`<header><button class="brand" title="the library" onClick=${home}><img src="static/icon.svg" alt="" />sgstore</button>
-    <h1>${about.store} · ${about.traces.length} ${about.traces.length === 1 ? "trace" : "traces"} · ${frames.toLocaleString("en")} frames</h1>
-    <nav aria-label="Views">${VIEWS.map(([key, name]) => html`<button aria-current=${view.value === key ? "page" : undefined}
-      onClick=${() => { view.value = key || "find"; }}>${name}${key === "selection" && ticked.value.size ? html` <span class="badge">${ticked.value.size}</span>` : null}</button>`)}</nav>
-    <button class="quiet" title="light, dark, or as the system has it" aria-label=${`Colours: ${theme.value || "of the system"}`} onClick=${() => { theme.value = next; }}>${theme.value === "dark" ? "☾" : theme.value === "light" ? "☀" : "◐"}</button>
+  return html`<header><button class="brand" title="the library" onClick=${home}>
+    <img src="static/icon.svg" alt="" />sgstore</button>
+    <h1>${about.store} · ${about.traces.length} ${about.traces.length === 1 ? "trace"
+      : "traces"} · ${frames.toLocaleString("en")} frames</h1>
+    <nav aria-label="Views">${VIEWS.map(([key, name]) => html`<button
+      aria-current=${view.value === key ? "page" : undefined}
+      onClick=${() => { view.value = key || "find"; }}>${name}${key === "selection" && ticked.value.size
+        ? html` <span class="badge">${ticked.value.size}</span>` : null}</button>`)}</nav>
+    <button class="quiet" title="light, dark, or as the system has it"
+      aria-label=${`Colours: ${theme.value || "of the system"}`} onClick=${() => { theme.value = next; }}>
+      ${theme.value === "dark" ? "☾" : theme.value === "light" ? "☀" : "◐"}</button>
     <button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>`;
 }
 
@@ -48,54 +57,81 @@ function Search() {
     <div class="tools">
       <${WordSearch} />
       <select aria-label="Library of patterns" onChange=${choose}><option value="">library</option>
-        ${groups.map((name) => html`<optgroup label=${name}>${patterns.filter((p) => p.library === name).map((p) => html`<option value=${p.name} title=${p.sentence}>${p.name}</option>`)}</optgroup>`)}</select>
-      <select aria-label="History" onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { if (e.target.value) { text.value = e.target.value; find(); } e.target.value = ""; }}><option value="">history</option>
-        ${history().map((one) => html`<option value=${one}>${one.replace(/\s+/g, " ").slice(0, 90)}</option>`)}</select>
-      ${names.map((name) => html`<label>$${name} <input size="8" aria-label=${`Value of $${name}`} value=${values.value[name] || ""}
-        onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { values.value = { ...values.value, [name]: e.target.value }; }}
+        ${groups.map((name) => html`<optgroup label=${name}>
+          ${patterns.filter((p) => p.library === name).map((p) => html`<option value=${p.name} title=${p.sentence}>
+          ${p.name}</option>`)}</optgroup>`)}</select>
+      <select aria-label="History"
+        onChange=${(/** @type {{target: HTMLInputElement}} */ e) => {
+          if (e.target.value) { text.value = e.target.value; find(); }
+          e.target.value = "";
+        }}><option value="">history</option>
+        ${history().map((one) => html`<option value=${one}>${one.replace(/\s+/g, " ").slice(0,
+          90)}</option>`)}</select>
+      ${names.map((name) => html`<label>$${name} <input size="8" aria-label=${`Value of $${name}`}
+        value=${values.value[name] || ""}
+        onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { values.value = { ...values.value,
+          [name]: e.target.value }; }}
         onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter") find(); }} /></label>`)}
       <${NumberSlider} /><span class="grow"></span>
       ${answer.value.state === "busy" ? html`<button onClick=${cancel}>Stop</button>` : null}
-      <button class="main" onClick=${() => find()}>Find <kbd>${navigator.platform.startsWith("Mac") ? "⌘" : "Ctrl "}⏎</kbd></button>
+      <button class="main" onClick=${() => find()}>Find <kbd>
+        ${navigator.platform.startsWith("Mac") ? "⌘" : "Ctrl "}⏎</kbd></button>
     </div></section>`;
 }
 
 function Rows() {
   const { columns, rows } = answer.value;
-  return html`<div class="sheet" tabindex="0"><table><thead><tr>${columns.map((/** @type {string} */ c, /** @type {number} */ i) => html`<th class=${rows.some((/** @type {any[]} */ row) => typeof row[i] === "number") ? "number" : ""}>${c}</th>`)}</tr></thead>
-    <tbody>${rows.slice(0, 2000).map((/** @type {any[]} */ row) => html`<tr>${row.map((v) => html`<td class=${typeof v === "number" ? "number" : ""}>${shown(v)}</td>`)}</tr>`)}</tbody></table>
-    ${rows.length > 2000 ? html`<p class="note">2,000 of ${rows.length} rows are shown; add LIMIT or a condition</p>` : null}</div>`;
+  return html`<div class="sheet" tabindex="0"><table><thead><tr>
+    ${columns.map((/** @type {string} */ c, /** @type {number} */ i) => html`<th
+    class=${rows.some((/** @type {any[]} */ row) => typeof row[i] === "number") ? "number" : ""}>${c}</th>`)}</tr>
+    </thead>
+    <tbody>${rows.slice(0, 2000).map((/** @type {any[]} */ row) => html`<tr>
+      ${row.map((v) => html`<td class=${typeof v === "number" ? "number" : ""}>${shown(v)}</td>`)}</tr>`)}</tbody>
+      </table>
+    ${rows.length > 2000 ? html`<p class="note">2,000 of ${rows.length} rows are shown; add LIMIT or a condition</p>`
+      : null}</div>`;
 }
 
 /** @param {any} v */
-const shown = (v) => (v === null ? "" : typeof v === "object" ? JSON.stringify(v) : typeof v === "number" && !Number.isInteger(v) ? String(Number(v.toPrecision(7))) : String(v));
+const shown = (v) => (v === null ? "" : typeof v === "object" ? JSON.stringify(v) : typeof v === "number"
+  && !Number.isInteger(v) ? String(Number(v.toPrecision(7))) : String(v));
 
 function TagForm() {
   const now = open.value, match = now?.match, chosen = tagged.value;
   const spans = [
     ...(chosen ? [{ ...chosen, word: chosen.first === chosen.last ? "this frame" : "these frames" }] : []),
     ...(now && !chosen ? [{ trace: now.trace, first: frame.value, last: frame.value, word: "this frame" }] : []),
-    ...(now && match && !chosen ? [{ trace: match.trace, first: match.first, last: match.last, word: "the match" }] : []),
+    ...(now && match && !chosen ? [{ trace: match.trace, first: match.first, last: match.last, word: "the match" }]
+      : []),
   ];
   const first = spans[0];
   if (!first) return null;
-  const mine = runsOfTags(notes.value, first.trace).filter((one) => one.first <= first.last && first.first <= one.last);
+  const mine = runsOfTags(notes.value, first.trace).filter((one) => one.first <= first.last
+    && first.first <= one.last);
   const write = async (/** @type {SubmitEvent} */ event) => {
     event.preventDefault();
-    const form = new FormData(/** @type {HTMLFormElement} */ (event.target)), { trace, first: seq, last } = spans[Number(form.get("span") || 0)] || first;
+    const form = new FormData(/** @type {HTMLFormElement} */ (event.target)),
+      { trace, first: seq, last } = spans[Number(form.get("span") || 0)] || first;
     try {
       await tag({ trace, seq, last, tag: form.get("tag"), note: form.get("note") });
       dialog.value = "";
       say("tagged");
     } catch (error) { say(reasonOf(error)); }
   };
-  const remove = (/** @type {typeof mine[0]} */ one) => tag({ trace: first.trace, seq: one.first, last: one.last, tag: one.tag, do: "remove" }).catch((e) => say(reasonOf(e)));
+  const remove = (/** @type {typeof mine[0]} */ one) => tag({ trace: first.trace, seq: one.first, last: one.last,
+    tag: one.tag, do: "remove" }).catch((e) => say(reasonOf(e)));
   const known = [...new Set(notes.value.map((n) => n[2]))];
-  return html`<h2>Tag ${first.trace}#${first.first}${first.last > first.first ? `–${first.last}` : ""}</h2><form onSubmit=${write}>
-    <p><label>Tag <input name="tag" required maxlength="100" list="tags" autofocus /></label><datalist id="tags">${known.map((one) => html`<option value=${one} />`)}</datalist></p>
+  return html`<h2>Tag ${first.trace}#${first.first}${first.last > first.first ? `–${first.last}` : ""}</h2>
+    <form onSubmit=${write}>
+    <p><label>Tag <input name="tag" required maxlength="100" list="tags" autofocus /></label><datalist id="tags">
+      ${known.map((one) => html`<option value=${one} />`)}</datalist></p>
     <p><label>Note <input name="note" size="40" maxlength="2000" /></label></p>
-    ${spans.length < 2 ? null : html`<p><label>For <select name="span">${spans.map((one, i) => html`<option value=${i}>${one.word}, #${one.first}${one.last > one.first ? `–${one.last}` : ""}</option>`)}</select></label></p>`}
-    ${mine.map((one) => html`<p class="row"><span class="chip">${one.tag}</span> ${one.note} <span class="faint">#${one.first}${one.last > one.first ? `–${one.last}` : ""} ${one.who}</span>
+    ${spans.length < 2 ? null : html`<p><label>For <select name="span">
+      ${spans.map((one, i) => html`<option value=${i}>${one.word}, #${one.first}${one.last > one.first
+      ? `–${one.last}` : ""}</option>`)}</select></label></p>`}
+    ${mine.map((one) => html`<p class="row"><span class="chip">
+      ${one.tag}</span> ${one.note} <span class="faint">#${one.first}${one.last > one.first ? `–${one.last}`
+      : ""} ${one.who}</span>
       <button type="button" class="small" onClick=${() => remove(one)}>remove</button></p>`)}
     <button class="main">Tag</button></form>
     <p class="faint">Tags lie in a file beside the store; a query can ask for them: WHERE notes.tag = '…'</p>`;
@@ -105,26 +141,37 @@ function Found() {
   const told = answer.value;
   if (sought.value.trim() || (told.state === "idle" && !open.value)) return html`<${Start} />`;
   if (told.rows) return html`<${Rows} />`;
-  if (!open.value && (told.error || (told.state !== "busy" && !told.matches.length && !told.verdicts))) return html`<${Nothing} />`;
+  if (!open.value && (told.error || (told.state !== "busy" && !told.matches.length
+    && !told.verdicts))) return html`<${Nothing} />`;
   return html`${told.verdicts && !open.value ? html`<${Verdicts} />` : null}<main class=${open.value ? "open" : ""}>
-    <${Gallery} found=${matches.value} word=${told.verdicts ? ["violation", "violations"] : undefined} />${open.value ? html`<${Scene} />` : null}</main>`;
+    <${Gallery} found=${matches.value} word=${told.verdicts ? ["violation", "violations"] : undefined} />
+      ${open.value ? html`<${Scene} />` : null}</main>`;
 }
 
 /** What to do where nothing was found: mend the text, take a pattern that is near, or see how near the store comes. */
 function Nothing() {
-  const { error, query } = answer.value, chars = [...query], could = store.value.traces.filter((/** @type {any} */ t) => !(t.name in answer.value.reasons));
+  const { error, query } = answer.value, chars = [...query],
+    could = store.value.traces.filter((/** @type {any} */ t) => !(t.name in answer.value.reasons));
   if (!error) {
     return html`<div class="sheet"><h2>Nothing matches</h2><${Nearest} query=${query} />
-      <p class="faint">Open a trace: the lanes below it show where each part of the pattern holds, and <kbd>w</kbd> the part that a frame lacks.</p>
-      <p class="row wrap">${could.slice(0, 60).map((/** @type {any} */ t) => html`<button onClick=${() => openFrame(t.name, 0)}>${t.name}</button>`)}</p></div>`;
+      <p class="faint">Open a trace: the lanes below it show where each part of the pattern holds,
+        and <kbd>w</kbd> the part that a frame lacks.</p>
+      <p class="row wrap">${could.slice(0, 60).map((/** @type {any} */ t) => html`<button
+        onClick=${() => openFrame(t.name, 0)}>${t.name}</button>`)}</p></div>`;
   }
-  const placed = Number.isInteger(error.start), { start, end } = placed ? error : { start: 0, end: chars.length }, stop = Math.max(end, start + 1);
-  const before = chars.slice(0, start).join(""), word = chars.slice(start, stop).join(""), line = before.split("\n").length;
-  const better = /did you mean '([^']+)'\?/.exec(error.hint || "")?.[1], pattern = /\b(?:MATCH|CHECK|DEFINE|USING|SELECT|WITH|FROM)\b/.test(query);
-  const mend = () => { text.value = placed ? `${before}${better}${chars.slice(end).join("")}` : `${better}`; find(); };
-  return html`<div class="sheet">${placed ? html`<pre class="wrong">${before}<mark>${word || " "}</mark>${chars.slice(stop).join("")}</pre>` : null}
+  const placed = Number.isInteger(error.start), { start, end } = placed ? error : { start: 0, end: chars.length },
+    stop = Math.max(end, start + 1);
+  const before = chars.slice(0, start).join(""), word = chars.slice(start, stop).join(""),
+    line = before.split("\n").length;
+  const better = /did you mean '([^']+)'\?/.exec(error.hint || "")?.[1],
+    pattern = /\b(?:MATCH|CHECK|DEFINE|USING|SELECT|WITH|FROM)\b/.test(query);
+  const mend = () => { text.value = placed ? `${before}${better}${chars.slice(end).join("")}`
+    : `${better}`; find(); };
+  return html`<div class="sheet">${placed ? html`<pre class="wrong">${before}<mark>${word || " "}</mark>
+    ${chars.slice(stop).join("")}</pre>` : null}
     <p class="error">${placed ? `line ${line}, column ${start - before.lastIndexOf("\n")}: ` : ""}${error.reason}</p>
-    ${better ? html`<p>Did you mean <button class="main" onClick=${mend}>${better}</button></p>` : error.hint ? html`<p>${error.hint}</p>` : null}
+    ${better ? html`<p>Did you mean <button class="main" onClick=${mend}>${better}</button></p>` : error.hint
+      ? html`<p>${error.hint}</p>` : null}
     <h2>Near this</h2><${Near} text=${pattern ? word.replace(/([a-z])([A-Z])/g, "$1 $2") : query} most=${6} /></div>`;
 }
 
@@ -134,24 +181,28 @@ function Nearest({ query }) {
   useEffect(() => {
     const mine = new AbortController();
     tell(null);
-    if (isPattern(query)) api.json("api/nearest", { text: query, parameters: parametersOf(query) }, { signal: mine.signal }).then(tell, () => {});
+    if (isPattern(query)) api.json("api/nearest", { text: query, parameters: parametersOf(query) },
+      { signal: mine.signal }).then(tell, () => {});
     return () => mine.abort();
   }, [query]);
   if (!told?.failed) return null;
   const go = () => { openFrame(told.trace, told.seq); askWhy(); };
   return html`<p class="nearest" role="status">No frame of the store has <code>${told.failed}</code>${told.found
-    ? html`. The nearest is <code>${told.found}</code>: <button onClick=${go}>${told.trace}#${told.seq}</button>` : "."}</p>`;
+    ? html`. The nearest is <code>${told.found}</code>: <button onClick=${go}>${told.trace}#${told.seq}</button>`
+      : "."}</p>`;
 }
 
 function App() {
   if (!store.value) return html`<p class="loading">Reading the store …</p>`;
   const shownView = view.value;
   return html`<${Head} /><${Notices} />${shownView === "find" ? html`<${Search} /><${Status} /><${Found} />`
-    : shownView === "coverage" ? html`<${Coverage} />` : shownView === "selection" ? html`<${Selection} />` : html`<${Compare} />`}<${Above}><${TagForm} /></${Above}>`;
+    : shownView === "coverage" ? html`<${Coverage} />` : shownView === "selection" ? html`<${Selection} />`
+      : html`<${Compare} />`}<${Above}><${TagForm} /></${Above}>`;
 }
 
 keys.unshift(["/", "editor", { "/": focusEditor }], ["Ctrl ⏎", "find", {}]);
-keys.push(["t", "tag this frame", { t: () => { tagged.value = null; if (open.value) dialog.value = "tag"; } }], ["y", "copy a link", { y: copyLink }],
+keys.push(["t", "tag this frame", { t: () => { tagged.value = null; if (open.value) dialog.value = "tag"; } }],
+  ["y", "copy a link", { y: copyLink }],
   ["Y", "copy the command that opens this view", { Y: copyCommand }]);
 
 effect(() => {
@@ -164,7 +215,8 @@ effect(() => {
 function Notices() {
   const close = () => { notice.value = ""; };
   return html`${api.trouble.value ? html`<p class="notice error" role="alert">${api.trouble.value}</p>` : null}
-    ${notice.value ? html`<p class="notice" role="alert">${notice.value} <button class="small" onClick=${close}>Close</button></p>` : null}
+    ${notice.value ? html`<p class="notice" role="alert">${notice.value} <button class="small"
+      onClick=${close}>Close</button></p>` : null}
     ${changed.value ? html`<p class="notice" role="status">The store has changed since this was asked.
       <button class="small" onClick=${askAgain}>Ask again</button></p>` : null}`;
 }

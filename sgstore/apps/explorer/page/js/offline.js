@@ -5,7 +5,8 @@ import { bytesOf, unpacked } from "./wire.js";
 /** @typedef {Record<string, any>} Plain */
 
 const text = document.getElementById("kept")?.textContent || "{}";
-/** @type {Plain & {made: string, query: string, find: Plain[], columns: Record<string, string>, pictures: Record<string, Record<string, string>>}} */
+/** @type {Plain & {made: string, query: string, find: Plain[], columns: Record<string, string>,
+ *   pictures: Record<string, Record<string, string>>}} */
 export const kept = JSON.parse(text);
 
 /** The key under which an answer is kept. @param {string} path @param {Plain} values */

@@ -4,7 +4,8 @@
 /** @typedef {import("./state.js").Match} Match */
 
 /** Orders by their words. @type {Record<string, string>} */
-export const ORDERS = { "": "by trace", long: "longest first", short: "shortest first", random: "random", spread: "spread over traces" };
+export const ORDERS = { "": "by trace", long: "longest first", short: "shortest first", random: "random",
+  spread: "spread over traces" };
 
 /** Numbers from 0 to 1 that are the same for the same number. @param {number} seed */
 function shuffled(seed) {
@@ -28,10 +29,12 @@ export function ordered(found, order) {
       return halving(n, many.get(trace));
     };
   }
-  return found.map((m, at) => ({ m, rank: rank(m, at), at })).sort((a, b) => a.rank - b.rank || a.at - b.at).map(({ m }) => m);
+  return found.map((m, at) => ({ m, rank: rank(m, at), at })).sort((a, b) => a.rank - b.rank
+    || a.at - b.at).map(({ m }) => m);
 }
 
-/** When the place n of many is reached if the longest gap is halved again and again. @param {number} n @param {number} many */
+/** When the place n of many is reached if the longest gap is halved again and again. @param {number} n
+ * @param {number} many */
 function halving(n, many) {
   let low = 0, high = many, depth = 0;
   for (;;) {
@@ -50,7 +53,8 @@ export function merged(found) {
     const nodes = Object.values(m.binding);
     if (nodes.length < 2) { shown.push(m); continue; }
     const key = `${m.trace}#${m.first}-${m.last}:${nodes.sort((a, b) => a - b).join()}`, known = first.get(key);
-    if (known === undefined) { first.set(key, m.index); shown.push(m); } else many.set(known, (many.get(known) || 1) + 1);
+    if (known === undefined) { first.set(key, m.index); shown.push(m); } else many.set(known,
+      (many.get(known) || 1) + 1);
   }
   return { shown: many.size ? shown : found, many };
 }

@@ -47,27 +47,42 @@ export function PatternDrawing({ lanes, holds }) {
     const { found: at, width, height } = places(keys, edges);
     return { labels, edges, conditions, at, width, height };
   }, [lanes]);
-  if (!drawn) return html`<p class="faint" style=${{ padding: "8px 12px" }}>The parts of the pattern stand here when a match of one is open.</p>`;
+  if (!drawn) return html`<p class="faint"
+    style=${{ padding: "8px 12px" }}>The parts of the pattern stand here when a match of one is open.</p>`;
   const binding = open.value?.binding || {};
-  const state = (/** @type {number} */ at) => (holds[at] === null || holds[at] === undefined ? "faint" : holds[at] ? "holds" : "fails");
-  const middle = (drawn.width - Math.max(...[...drawn.at.values()].map(([x]) => x)) - Math.min(...[...drawn.at.values()].map(([x]) => x))) / 2;
-  return html`<div class="scroll drawn"><svg viewBox=${`${-middle} 0 ${drawn.width} ${drawn.height}`} style=${{ maxWidth: `${drawn.width * 1.7}px` }} role="img" aria-label="The pattern">
-    <defs>${["holds", "fails", "faint"].map((name) => html`<marker id=${`head-${name}`} class=${name} viewBox="0 0 8 8" refX="7" refY="4" markerWidth="6" markerHeight="6" orient="auto"><path d="M0 0 8 4 0 8z" fill="currentColor" /></marker>`)}</defs>
+  const state = (/** @type {number} */ at) => (holds[at] === null || holds[at] === undefined ? "faint" : holds[at]
+    ? "holds" : "fails");
+  const xs = [...drawn.at.values()].map(([x]) => x), middle = (drawn.width - Math.max(...xs) - Math.min(...xs)) / 2;
+  return html`<div class="scroll drawn"><svg viewBox=${`${-middle} 0 ${drawn.width} ${drawn.height}`}
+    style=${{ maxWidth: `${drawn.width * 1.7}px` }} role="img" aria-label="The pattern">
+    <defs>${["holds", "fails", "faint"].map((name) => html`<marker id=${`head-${name}`} class=${name}
+      viewBox="0 0 8 8" refX="7" refY="4" markerWidth="6" markerHeight="6" orient="auto">
+      <path d="M0 0 8 4 0 8z" fill="currentColor" /></marker>`)}</defs>
     ${drawn.edges.map((/** @type {any} */ edge, /** @type {number} */ i) => {
       const [ax, ay] = drawn.at.get(edge.src) || [0, 0], [bx, by] = drawn.at.get(edge.dst) || [0, 0];
       const long = Math.hypot(bx - ax, by - ay) || 1, ux = (bx - ax) / long, uy = (by - ay) / long;
-      const twins = drawn.edges.filter((/** @type {any} */ e) => (e.src === edge.src && e.dst === edge.dst) || (e.src === edge.dst && e.dst === edge.src));
+      const twins = drawn.edges.filter((/** @type {any} */ e) => (e.src === edge.src && e.dst === edge.dst)
+        || (e.src === edge.dst && e.dst === edge.src));
       const aside = (twins.indexOf(edge) - (twins.length - 1) / 2) * 22 * (edge.src < edge.dst ? 1 : -1);
       const mx = (ax + bx) / 2 - uy * aside, my = (ay + by) / 2 + ux * aside;
       return html`<g key=${i} class=${state(edge.at)} stroke="currentColor">
-        <path d=${`M${ax + ux * 25} ${ay + uy * 15} Q${mx - uy * aside * 0.6} ${my + ux * aside * 0.6} ${bx - ux * 27} ${by - uy * 17}`} fill="none" stroke-width="1.8"
-          stroke-dasharray=${holds[edge.at] === false ? "4 3" : ""} marker-end=${edge.both ? "" : `url(#head-${state(edge.at)})`} />
-        <text class="halo" x=${mx} y=${my - 6} font-size="10.5" text-anchor="middle" fill="currentColor">${holds[edge.at] ? "✓ " : holds[edge.at] === false ? "✗ " : ""}${edge.label}</text></g>`;
+        <path d=${[`M${ax + ux * 25} ${ay + uy * 15} Q${mx - uy * aside * 0.6} ${my + ux * aside * 0.6}`,
+          `${bx - ux * 27} ${by - uy * 17}`].join(" ")} fill="none" stroke-width="1.8"
+          stroke-dasharray=${holds[edge.at] === false ? "4 3" : ""}
+            marker-end=${edge.both ? "" : `url(#head-${state(edge.at)})`} />
+        <text class="halo" x=${mx} y=${my - 6} font-size="10.5" text-anchor="middle" fill="currentColor">
+          ${holds[edge.at] ? "✓ " : holds[edge.at] === false ? "✗ " : ""}${edge.label}</text></g>`;
     })}
-    ${[...drawn.at].map(([key, [x, y]]) => html`<g key=${key} onMouseEnter=${() => { if (binding[key] !== undefined) lit.value = new Set([binding[key]]); }} onMouseLeave=${() => { lit.value = new Set(); }}>
-      <rect x=${x - 28} y=${y - 15} width="56" height="30" rx="15" fill="var(--soft)" stroke=${binding[key] === undefined ? "var(--line)" : "var(--mark)"} stroke-width="2" />
+    ${[...drawn.at].map(([key, [x, y]]) => html`<g key=${key}
+      onMouseEnter=${() => { if (binding[key] !== undefined) lit.value = new Set([binding[key]]); }}
+      onMouseLeave=${() => { lit.value = new Set(); }}>
+      <rect x=${x - 28} y=${y - 15} width="56" height="30" rx="15" fill="var(--soft)"
+        stroke=${binding[key] === undefined ? "var(--line)" : "var(--mark)"} stroke-width="2" />
       <text x=${x} y=${y - 1} font-size="11.5" font-weight="600" text-anchor="middle" fill="var(--ink)">${key}</text>
-      <text x=${x} y=${y + 10} font-size="8.5" text-anchor="middle" fill="var(--faint)">${String(drawn.labels.get(key) || "").slice(0, 14)}</text></g>`)}
+      <text x=${x} y=${y + 10} font-size="8.5" text-anchor="middle" fill="var(--faint)">
+        ${String(drawn.labels.get(key) || "").slice(0, 14)}</text></g>`)}
   </svg>
-    <ul>${drawn.conditions.map((/** @type {any} */ one) => html`<li class=${state(one.at)}><b>${holds[one.at] ? "✓" : holds[one.at] === false ? "✗" : "·"}</b> <code>${one.condition}</code></li>`)}</ul></div>`;
+    <ul>${drawn.conditions.map((/** @type {any} */ one) => html`<li class=${state(one.at)}><b>
+      ${holds[one.at] ? "✓" : holds[one.at] === false ? "✗" : "·"}</b> <code>${one.condition}</code></li>`)}</ul>
+      </div>`;
 }

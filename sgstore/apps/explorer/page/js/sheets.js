@@ -21,20 +21,31 @@ function go(name) {
 /** A table; columns that hold nothing are left out. @param {{table: any, most?: number}} props */
 export function Table({ table, most = 200 }) {
   const columns = table.columns.map((/** @type {string} */ name, /** @type {number} */ at) => {
-    const all = table.rows.map((/** @type {any[]} */ row) => row[at]), numbers = all.filter(Number.isFinite), top = Math.max(...numbers.map(Math.abs));
+    const all = table.rows.map((/** @type {any[]} */ row) => row[at]), numbers = all.filter(Number.isFinite),
+      top = Math.max(...numbers.map(Math.abs));
     // As many digits behind the point in all of a column, four that count of the largest.
     const digits = numbers.every(Number.isInteger) ? 0 : Math.min(Math.max(3 - Math.floor(Math.log10(top)), 0), 6);
-    return { name, at, digits, number: numbers.length > 0, known: all.some((/** @type {any} */ v) => v !== null && v !== "") };
+    return { name, at, digits, number: numbers.length > 0, known: all.some((/** @type {any} */ v) => v !== null
+      && v !== "") };
   }).filter((/** @type {any} */ one) => one.known);
   return html`${(table.said || []).map((/** @type {string} */ line) => html`<p class="faint">${line}</p>`)}
-    <table><thead><tr>${columns.map((/** @type {any} */ one) => html`<th class=${one.number ? "number" : ""}>${one.name.replace(/_/g, " ")}</th>`)}</tr></thead><tbody>
-    ${table.rows.slice(0, most).map((/** @type {any[]} */ row) => html`<tr>${columns.map((/** @type {any} */ { name, at, digits }) => {
+    <table><thead><tr>${columns.map((/** @type {any} */ one) => html`<th class=${one.number ? "number" : ""}>
+      ${one.name.replace(/_/g, " ")}</th>`)}</tr></thead><tbody>
+    ${table.rows.slice(0, most).map((/** @type {any[]} */ row) => html`<tr>
+      ${columns.map((/** @type {any} */ { name, at, digits }) => {
       const v = row[at];
-      if (name === "query") return html`<td>${v ? html`<button class="small" onClick=${() => ask(v)}>find</button> <code class="cut" title=${v}>${v}</code>` : ""}</td>`;
-      if ((name === "frame" || name === "first") && v) return html`<td><button class="quiet small" onClick=${() => go(v)}>${v}</button></td>`;
-      if (name === "class" && String(v).length > 24) return html`<td><code title=${v}>${String(v).slice(0, 12)}</code></td>`;
-      if ((name === "share" || name === "cumulative") && typeof v === "number") return html`<td class="number">${(v * 100).toFixed(2)} %</td>`;
-      return html`<td class=${typeof v === "number" ? "number" : ""}>${v === null ? "" : typeof v === "number" ? v.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits }) : html`<span class="cut" title=${String(v)}>${v}</span>`}</td>`;
+      if (name === "query") return html`<td>${v ? html`<button class="small"
+        onClick=${() => ask(v)}>find</button> <code class="cut" title=${v}>${v}</code>` : ""}</td>`;
+      if ((name === "frame" || name === "first") && v) return html`<td>
+        <button class="quiet small" onClick=${() => go(v)}>${v}</button></td>`;
+      if (name === "class" && String(v).length > 24) return html`<td><code title=${v}>${String(v).slice(0, 12)}</code>
+        </td>`;
+      if ((name === "share" || name === "cumulative") && typeof v === "number") return html`<td class="number">
+        ${(v * 100).toFixed(2)} %</td>`;
+      return html`<td class=${typeof v === "number" ? "number" : ""}>
+        ${v === null ? "" : typeof v === "number" ? v.toLocaleString("en",
+        { minimumFractionDigits: digits, maximumFractionDigits: digits })
+        : html`<span class="cut" title=${String(v)}>${v}</span>`}</td>`;
     })}</tr>`)}</tbody></table>
     ${table.of > most ? html`<p class="faint">${most} of ${table.of.toLocaleString("en")} rows</p>` : null}`;
 }
@@ -46,50 +57,70 @@ const logarithmic = signal(true);
 function ticksOf(low, high, log) {
   if (!log) return [0, 0.25, 0.5, 0.75, 1].map((s) => low + (high - low) * s);
   const found = [];
-  for (let power = Math.floor(Math.log10(low)); 10 ** power <= high; power++) if (10 ** power >= low) found.push(10 ** power);
+  for (let power = Math.ceil(Math.log10(low)); 10 ** power <= high; power++) found.push(10 ** power);
   return found;
 }
 
-/** A line chart of columns of a table, with linear or logarithmic axes. @param {{table: any, x: string, lines: string[]}} props */
+/** A line chart of columns of a table, with linear or logarithmic axes.
+ * @param {{table: any, x: string, lines: string[]}} props */
 function Chart({ table, x, lines }) {
-  const log = logarithmic.value, column = (/** @type {string} */ name) => table.rows.map((/** @type {any[]} */ row) => row[table.columns.indexOf(name)]);
+  const log = logarithmic.value,
+    column = (/** @type {string} */ name) => table.rows.map((/** @type {any[]} */ row) => row[table.columns.indexOf(name)]);
   const xs = column(x), all = lines.map(column), positive = all.flat().filter((v) => Number.isFinite(v) && v > 0);
-  const right = Math.max(...xs, 1), top = Math.max(...positive, 1), left = log ? Math.max(Math.min(...xs), 1) : 0, low = log ? Math.min(...positive, 1) : 0;
-  const scale = (/** @type {number} */ v, /** @type {number} */ from, /** @type {number} */ to) => (log ? Math.log(Math.max(v, from) / from) / Math.log(to / from || 1) : (v - from) / (to - from)) || 0;
-  const px = (/** @type {number} */ v) => 56 + scale(v, left, right) * 830, py = (/** @type {number} */ v) => 206 - scale(v, low, top) * 170;
-  const colours = ["var(--accent)", "var(--ego)"], said = (/** @type {number} */ v) => v.toLocaleString("en", { maximumFractionDigits: v < 10 ? 1 : 0 });
-  return html`<label class="row"><input type="checkbox" checked=${log} onChange=${() => { logarithmic.value = !log; }} /> logarithmic axes</label>
-    <svg class="chart" viewBox="0 0 900 240" role="img" aria-label=${`${lines.join(" and ")} by ${x}, ${log ? "logarithmic" : "linear"} axes`}>
-    ${ticksOf(low, top, log).map((v) => html`<line class="axis" x1="56" x2="886" y1=${py(v)} y2=${py(v)} /><text class="axis-text" x="50" y=${py(v) + 4} text-anchor="end">${said(v)}</text>`)}
-    ${ticksOf(left, right, log).map((v) => html`<text class="axis-text" x=${px(v)} y="221" text-anchor="middle">${said(v)}</text>`)}
-    ${all.map((ys, k) => html`<polyline class="series" style=${{ stroke: colours[k] }} points=${ys.map((/** @type {number} */ v, /** @type {number} */ i) => `${px(xs[i])},${py(v)}`).join(" ")} />
-      <text x=${56 + k * 110} y="18" font-size="12" font-weight="600" fill=${colours[k]}>${(lines[k] || "").replace(/_/g, " ")}</text>`)}
+  const right = Math.max(...xs, 1), top = Math.max(...positive, 1), left = log ? Math.max(Math.min(...xs), 1) : 0,
+    low = log ? Math.min(...positive, 1) : 0;
+  const scale = (/** @type {number} */ v, /** @type {number} */ from,
+    /** @type {number} */ to) => (log ? Math.log(Math.max(v, from) / from) / Math.log(to / from || 1)
+    : (v - from) / (to - from)) || 0;
+  const px = (/** @type {number} */ v) => 56 + scale(v, left, right) * 830,
+    py = (/** @type {number} */ v) => 206 - scale(v, low, top) * 170;
+  const colours = ["var(--accent)", "var(--ego)"], said = (/** @type {number} */ v) => v.toLocaleString("en",
+    { maximumFractionDigits: v < 10 ? 1 : 0 });
+  return html`<label class="row"><input type="checkbox" checked=${log}
+    onChange=${() => { logarithmic.value = !log; }} /> logarithmic axes</label>
+    <svg class="chart" viewBox="0 0 900 240" role="img" aria-label=${`${lines.join(" and ")} by ${x}, ${log
+      ? "logarithmic" : "linear"} axes`}>
+    ${ticksOf(low, top, log).map((v) => html`<line class="axis" x1="56" x2="886" y1=${py(v)} y2=${py(v)} />
+      <text class="axis-text" x="50" y=${py(v) + 4} text-anchor="end">${said(v)}</text>`)}
+    ${ticksOf(left, right, log).map((v) => html`<text class="axis-text" x=${px(v)} y="221" text-anchor="middle">
+      ${said(v)}</text>`)}
+    ${all.map((ys, k) => html`<polyline class="series" style=${{ stroke: colours[k] }}
+      points=${ys.map((/** @type {number} */ v, /** @type {number} */ i) => `${px(xs[i])},${py(v)}`).join(" ")} />
+      <text x=${56 + k * 110} y="18" font-size="12" font-weight="600" fill=${colours[k]}>
+        ${(lines[k] || "").replace(/_/g, " ")}</text>`)}
     <text class="axis-text" x="470" y="236" text-anchor="middle">${x}</text></svg>`;
 }
 
-/** Something that takes a while: asks once, and says what came of it; what is not looked at any more ends. @param {string} path @param {any} body */
+/** Something that takes a while: asks once, and says what came of it; what is not looked at any more ends.
+ * @param {string} path @param {any} body */
 export function useWork(path, body) {
-  const [told, tell] = useState(/** @type {any} */ ({})), text = useMemo(() => JSON.stringify(body), [body.clips || JSON.stringify(body)]);
+  const [told, tell] = useState(/** @type {any} */ ({})), text = useMemo(() => JSON.stringify(body),
+    [body.clips || JSON.stringify(body)]);
   const asked = `${path}${text} ${again.value} ${retries.value > told.lost ? retries.value : ""}`;
   const ending = useRef(() => {}), [begun, begin] = useState(0);
   useEffect(() => {
     const mine = new AbortController(), how = { signal: mine.signal };
     ending.current = () => mine.abort();
-    (path === "api/diff" ? api.work(path, body, undefined, how) : api.json(path, body, how).then((found) => { if (found.error) throw new Error(found.error.reason); return found; }))
-      .then((found) => tell({ asked, found })).catch((error) => { if (!mine.signal.aborted) tell({ asked, error: reasonOf(error), lost: isLost(error) ? retries.peek() : undefined }); });
+    (path === "api/diff" ? api.work(path, body, undefined, how)
+      : api.json(path, body,
+      how).then((found) => { if (found.error) throw new Error(found.error.reason); return found; }))
+      .then((found) => tell({ asked, found })).catch((error) => { if (!mine.signal.aborted) tell({ asked,
+        error: reasonOf(error), lost: isLost(error) ? retries.peek() : undefined }); });
     return () => mine.abort();
   }, [asked, begun]);
   const [off, stop] = useState(""); // what the user stopped
   useEffect(() => { if (off === asked) ending.current(); }, [off]);
   if (told.asked === asked) return told;
-  return off === asked ? { stopped: true, start: () => { stop(""); begin((n) => n + 1); } } : { stop: () => stop(asked) }; // not the answer to what was asked before
+  return off === asked ? { stopped: true, start: () => { stop(""); begin((n) => n + 1); } }
+    : { stop: () => stop(asked) }; // not the answer to what was asked before
 }
 
 /** How long something is under way. */
 function Elapsed() {
   const [seconds, tell] = useState(0);
   useEffect(() => {
-    const began = performance.now(), tick = setInterval(() => tell(Math.floor((performance.now() - began) / 1000)), 250);
+    const began = performance.now(), tick = setInterval(() => tell(Math.floor((performance.now() - began) / 1000)),
+      250);
     return () => clearInterval(tick);
   }, []);
   return html`${seconds} s`;
@@ -100,7 +131,8 @@ export function Waiting({ told, children }) {
   if (told.error) return html`<p class="error" role="alert">${told.error}</p>`;
   if (told.stopped) return html`<p class="row">stopped <button onClick=${told.start}>start again</button></p>`;
   if (told.found) return children(told.found);
-  return html`<p class="row faint" role="status"><span class="busy" aria-hidden="true"></span> working … <${Elapsed} />
+  return html`<p class="row faint" role="status"><span class="busy" aria-hidden="true">
+    </span> working … <${Elapsed} />
     ${told.stop ? html`<button onClick=${told.stop}>Stop</button>` : null}</p>`;
 }
 
@@ -109,15 +141,18 @@ export function Waiting({ told, children }) {
 export const abstraction = signal("RSV");
 const what = signal("classes");
 
-const TABS = [["classes", "Classes by rank"], ["growth", "Growth"], ["matrix", "Matrix of gaps"], ["combos", "Combinations"]];
+const TABS = [["classes", "Classes by rank"], ["growth", "Growth"], ["matrix", "Matrix of gaps"],
+  ["combos", "Combinations"]];
 const ABSTRACTIONS = ["RSV", "ER", "EL", "E", "junction"];
 
 export function Coverage() {
   const told = useWork("api/coverage", { what: what.value, abstraction: abstraction.value });
   return html`<div class="sheet" tabindex="0"><div class="row wrap">
-      ${TABS.map(([key, name]) => html`<button aria-pressed=${what.value === key} class=${what.value === key ? "main" : ""}
+      ${TABS.map(([key, name]) => html`<button aria-pressed=${what.value === key}
+        class=${what.value === key ? "main" : ""}
         onClick=${() => { what.value = key || ""; }}>${name}</button>`)}
-      <label class="row">abstraction <select value=${abstraction.value} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { abstraction.value = e.target.value; }}>
+      <label class="row">abstraction <select value=${abstraction.value}
+        onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { abstraction.value = e.target.value; }}>
         ${ABSTRACTIONS.map((one) => html`<option>${one}</option>`)}</select></label></div>
     <${Waiting} told=${told}>${covered}</${Waiting}></div>`;
 }
@@ -131,39 +166,56 @@ function covered(found) {
       <h2>Covered</h2><${Table} table=${found.covered} />`;
   }
   if (!found.words) {
-    return html`<h2>Does more data bring more kinds of scenes?</h2><${Chart} table=${found} x="frames" lines=${["classes", "at_random"]} /><${Table} table=${found} />`;
+    return html`<h2>Does more data bring more kinds of scenes?</h2>
+      <${Chart} table=${found} x="frames" lines=${["classes", "at_random"]} /><${Table} table=${found} />`;
   }
-  return html`<h2>Classes of scenes, the most frequent first</h2><${Chart} table=${found} x="rank" lines=${["frames"]} />
+  return html`<h2>Classes of scenes, the most frequent first</h2>
+    <${Chart} table=${found} x="rank" lines=${["frames"]} />
     <${Classes} found=${found} /><${Table} table=${found} />`;
 }
 
 /** Classes with a picture of their first frame, and in words. @param {{found: any}} props */
 function Classes({ found }) {
-  const spots = found.rows.slice(0, found.words.length).map((/** @type {any[]} */ row) => /^(.*)#(\d+)$/.exec(String(row[5])));
-  useEffect(() => wantThumbs(spots.flatMap((/** @type {string[] | null} */ one) => (one ? [[one[1] || "", Number(one[2])]] : []))), [found]);
-  return html`<div class="cards classes">${found.rows.slice(0, found.words.length).map((/** @type {any[]} */ [rank, , frames, share, , frame], /** @type {number} */ i) => {
+  const spots = found.rows.slice(0,
+    found.words.length).map((/** @type {any[]} */ row) => /^(.*)#(\d+)$/.exec(String(row[5])));
+  useEffect(() => wantThumbs(spots.flatMap((/** @type {string[] | null} */ one) => (one
+    ? [[one[1] || "", Number(one[2])]] : []))), [found]);
+  return html`<div class="cards classes">${found.rows.slice(0,
+    found.words.length).map((/** @type {any[]} */ [rank, , frames, share, , frame], /** @type {number} */ i) => {
     const [, trace = "", seq = "0"] = spots[i] || [];
-    return html`<button class="card" key=${frame} onClick=${() => go(frame)}><${Thumb} trace=${trace} frame=${Number(seq)} />
-      <h3>${rank}. <span class="grow"></span><span class="faint">${frames.toLocaleString("en")} frames, ${(share * 100).toFixed(1)} %</span></h3>
+    return html`<button class="card" key=${frame} onClick=${() => go(frame)}>
+      <${Thumb} trace=${trace} frame=${Number(seq)} />
+      <h3>${rank}. <span class="grow"></span><span class="faint">
+        ${frames.toLocaleString("en")} frames, ${(share * 100).toFixed(1)} %</span></h3>
       <p>${(found.words[i] || "no entity near the ego").replace(/_/g, " ")}</p></button>`;
   })}</div>`;
 }
 
-/** How often two features are in the same frame; a gap is its query. @param {{found: {names: string[], frames: number[][], queries: Record<string, string>}}} props */
+/** How often two features are in the same frame; a gap is its query.
+ * @param {{found: {names: string[], frames: number[][], queries: Record<string, string>}}} props */
 function Matrix({ found: { names, frames, queries } }) {
   const size = 17, left = 250, most = Math.max(...frames.flat(), 1), gaps = Object.keys(queries).length;
   const [at, point] = useState(/** @type {[number, number] | null} */ (null));
   const cells = names.flatMap((_, i) => names.slice(0, i + 1).map((_, j) => {
-    const many = frames[i]?.[j] || 0, query = queries[`${j} ${i}`], place = { x: left + j * size, y: 4 + i * size, width: size - 1, height: size - 1 };
+    const many = frames[i]?.[j] || 0, query = queries[`${j} ${i}`],
+      place = { x: left + j * size, y: 4 + i * size, width: size - 1, height: size - 1 };
     const on = { onPointerEnter: () => point([i, j]), onFocus: () => point([i, j]) };
-    if (many) return html`<rect ...${place} ...${on} fill="var(--accent)" opacity=${(0.12 + 0.88 * (Math.log(many + 1) / Math.log(most + 1))).toFixed(3)} />`;
-    return html`<rect ...${place} ...${on} class="gap-cell" role="button" tabindex="0" aria-label=${`${names[j]} with ${names[i]}: in no frame`}
-      onClick=${() => query && ask(query)} onKeyDown=${(/** @type {KeyboardEvent} */ e) => { if (e.key === "Enter" && query) ask(query); }} />`;
+    if (many) return html`<rect ...${place} ...${on} fill="var(--accent)"
+      opacity=${(0.12 + 0.88 * (Math.log(many + 1) / Math.log(most + 1))).toFixed(3)} />`;
+    return html`<rect ...${place} ...${on} class="gap-cell" role="button" tabindex="0"
+      aria-label=${`${names[j]} with ${names[i]}: in no frame`}
+      onClick=${() => query && ask(query)} onKeyDown=${(/** @type {KeyboardEvent} */ e) => { if (e.key === "Enter"
+        && query) ask(query); }} />`;
   }));
-  const told = at ? html`<b>${names[at[1]]}</b> with <b>${names[at[0]]}</b>: ${(frames[at[0]]?.[at[1]] || 0).toLocaleString("en")} frames` : "point at a cell";
+  const told = at ? html`<b>${names[at[1]]}</b> with <b>${names[at[0]]}</b>: ${(frames[at[0]]?.[at[1]]
+    || 0).toLocaleString("en")} frames` : "point at a cell";
   if (!names.length) return html`<p class="faint">This abstraction has no relations of the ego.</p>`;
-  return html`<h2>Pairs of features: ${gaps} ${gaps === 1 ? "gap" : "gaps"}</h2><p class="faint">Each cell is a pair of the most frequent features; dark: many frames. A red cell is in no frame: click it for its query.</p>
+  return html`<h2>Pairs of features: ${gaps} ${gaps === 1 ? "gap" : "gaps"}</h2>
+    <p class="faint">Each cell is a pair of the most frequent features; dark: many frames.
+      A red cell is in no frame: click it for its query.</p>
     <p role="status">${told}</p>
-    <div class="matrix" tabindex="0"><svg width=${left + names.length * size + 4} height=${names.length * size + 8} role="group" aria-label="Matrix of gaps">
-      ${names.map((name, i) => html`<text class="axis-text" x=${left - 6} y=${16 + i * size} text-anchor="end">${name.slice(0, 42)}</text>`)}${cells}</svg></div>`;
+    <div class="matrix" tabindex="0"><svg width=${left + names.length * size + 4} height=${names.length * size + 8}
+      role="group" aria-label="Matrix of gaps">
+      ${names.map((name, i) => html`<text class="axis-text" x=${left - 6} y=${16 + i * size} text-anchor="end">
+        ${name.slice(0, 42)}</text>`)}${cells}</svg></div>`;
 }

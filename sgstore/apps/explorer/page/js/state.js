@@ -25,7 +25,8 @@ export const answer = signal(/** @type {any} */ ({ state: "idle", matches: [], n
 export const filter = signal({ trace: "", map: "" });
 export const order = signal("");
 /** What is open: trace, frame (with its fraction), the match, the nodes. */
-export const open = signal(/** @type {{trace: string, match: Match | null, binding: Record<string, number> | null} | null} */ (null));
+/** @typedef {{trace: string, match: Match | null, binding: Record<string, number> | null}} Opened */
+export const open = signal(/** @type {Opened | null} */ (null));
 export const seq = signal(0);
 export const playing = signal(false);
 export const rate = signal(1);

@@ -10,7 +10,8 @@ const html = htm.bind(h);
 function Busy() {
   const [seconds, tell] = useState(0);
   useEffect(() => {
-    const began = performance.now(), tick = setInterval(() => tell(Math.floor((performance.now() - began) / 1000)), 250);
+    const began = performance.now(), tick = setInterval(() => tell(Math.floor((performance.now() - began) / 1000)),
+      250);
     return () => clearInterval(tick);
   }, []);
   return html`<span class="busy" aria-hidden="true"></span><span class="asking">asking … ${seconds} s</span>`;
@@ -24,20 +25,30 @@ export function Status() {
   const known = { trace: all.map((t) => t.name), map: [...new Set(all.map((t) => t.map).filter(Boolean))] };
   return html`<div class="status" role="status" aria-live="polite">
     ${told.state === "busy" ? html`<${Busy} key=${told.id} />` : null}
-    ${told.error ? html`<div class="error"><b>${told.error.reason}</b>${told.error.hint ? html` · ${told.error.hint}` : null}</div>`
+    ${told.error ? html`<div class="error"><b>${told.error.reason}</b>
+      ${told.error.hint ? html` · ${told.error.hint}` : null}</div>`
       : told.rows ? html`<span><b>${told.rows.length.toLocaleString("en")}</b> rows</span>`
-      : html`<span><b>${found.toLocaleString("en")}</b> ${told.verdicts ? (found === 1 ? "violation" : "violations") : found === 1 ? "match" : "matches"} in ${many} ${many === 1 ? "trace" : "traces"}, ${frames.toLocaleString("en")} frames</span>`}
+      : html`<span><b>${found.toLocaleString("en")}</b> ${told.verdicts ? (found === 1 ? "violation" : "violations")
+        : found === 1 ? "match" : "matches"} in ${many} ${many === 1 ? "trace"
+        : "traces"}, ${frames.toLocaleString("en")} frames</span>`}
     ${told.ms && !offline.value ? html`<span class="faint">${Math.round(told.ms)} ms</span>` : null}
     ${told.state === "cancelled" ? html`<span class="note">stopped: this is what was found before</span>` : null}
-    ${told.truncated ? html`<span class="note">there are more: only the first ${(told.count || told.rows?.length || found).toLocaleString("en")} are shown</span>` : null}
+    ${told.truncated ? html`<span class="note">there are more: only the first ${(told.count || told.rows?.length
+      || found).toLocaleString("en")} are shown</span>` : null}
     ${(told.notes || []).map((/** @type {string} */ note) => html`<span class="note">${note}</span>`)}
-    ${left.length ? html`<details class="why-left"><summary>${left.length} ${left.length === 1 ? "trace" : "traces"} cannot answer</summary>
+    ${left.length ? html`<details class="why-left"><summary>
+      ${left.length} ${left.length === 1 ? "trace" : "traces"} cannot answer</summary>
       <ul>${left.map(([trace, reason]) => html`<li><b>${trace}</b>: ${reason}</li>`)}</ul></details>` : null}
     <span class="grow"></span>
-    ${/** @type {const} */ (["trace", "map"]).map((of) => (known[of].length < 2 ? null : html`<select aria-label=${of} value=${where[of]} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { filter.value = { ...where, [of]: e.target.value }; }}>
+    ${/** @type {const} */ (["trace", "map"]).map((of) => (known[of].length < 2 ? null
+      : html`<select aria-label=${of} value=${where[of]}
+      onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { filter.value = { ...where,
+      [of]: e.target.value }; }}>
       <option value="">${`all ${of}s`}</option>${known[of].map((one) => html`<option>${one}</option>`)}</select>`))}
-    ${found > 1 && !told.rows ? html`<select aria-label="order" value=${order.value} onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { order.value = e.target.value; }}>
+    ${found > 1 && !told.rows ? html`<select aria-label="order" value=${order.value}
+      onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { order.value = e.target.value; }}>
       ${Object.entries(ORDERS).map(([key, word]) => html`<option value=${key}>${word}</option>`)}</select>` : null}
-    ${found && !told.rows && !offline.value ? html`<button class="small" onClick=${() => tickAll(matches.value)}>select all</button>` : null}
+    ${found && !told.rows && !offline.value ? html`<button class="small"
+      onClick=${() => tickAll(matches.value)}>select all</button>` : null}
   </div>`;
 }

@@ -16,13 +16,15 @@ effect(() => { open.value?.trace; zoomed.value = brush.value = null; });
 effect(() => { // what plays stays in sight
   const at = frame.value, window = zoomed.peek();
   if (!window || (at >= window[0] && at <= window[1])) return;
-  const wide = window[1] - window[0], [low, high] = range.peek(), from = Math.max(low, Math.min(high - wide, at < window[0] ? at - wide : at));
+  const wide = window[1] - window[0], [low, high] = range.peek(),
+    from = Math.max(low, Math.min(high - wide, at < window[0] ? at - wide : at));
   zoomed.value = [from, from + wide];
 });
 
 /** Show less or more of the trace, around a frame. @param {number} factor @param {number} [around] */
 function zoomBy(factor, around = frame.value) {
-  const [low, high] = range.value, [from, to] = shown.value, wide = Math.min(Math.max((to - from) * factor, 10), high - low);
+  const [low, high] = range.value, [from, to] = shown.value,
+    wide = Math.min(Math.max((to - from) * factor, 10), high - low);
   const begin = Math.max(low, Math.min(high - wide, around - (around - from) * (wide / Math.max(to - from, 1))));
   zoomed.value = wide >= high - low ? null : [Math.round(begin), Math.round(begin + wide)];
 }
@@ -81,37 +83,44 @@ function useDrag() {
 /** What all bars have: the frames that are marked, and the one that is shown. @param {{height: number}} props */
 function Over({ height }) {
   const marked = brush.value, at = frame.value + 0.5;
-  return html`${marked ? html`<rect class="brush" x=${marked[0]} y="0" width=${marked[1] - marked[0] + 1} height=${height} />` : null}
+  return html`${marked ? html`<rect class="brush" x=${marked[0]} y="0" width=${marked[1] - marked[0] + 1}
+    height=${height} />` : null}
     <line class="cursor" x1=${at} x2=${at} y1="0" y2=${height} vector-effect="non-scaling-stroke" />`;
 }
 
 /** @param {{spans: number[][], kind: (i: number) => string, height?: number}} props */
 export function Bars({ spans, kind, height = 21 }) {
   const [from, to] = shown.value, frames = to - from + 1, least = frames / 500, drag = useDrag();
-  return html`<svg viewBox=${`${from} 0 ${frames} ${height}`} preserveAspectRatio="none" aria-hidden="true" ...${drag}>
+  return html`<svg viewBox=${`${from} 0 ${frames} ${height}`} preserveAspectRatio="none" aria-hidden="true"
+    ...${drag}>
     <rect class="bar-back" x=${from} y="4" width=${frames} height=${height - 8} />
     ${spans.map(([a = 0, z = 0], i) => (z < from || a > to ? null
       : html`<rect class=${kind(i)} x=${a} y="4" width=${Math.max(z - a + 1, least)} height=${height - 8} />`))}
     <${Over} height=${height} /></svg>`;
 }
 
-const HIGH = 84, CURVES = ["var(--accent)", "var(--ego)", "var(--hold)", "var(--code-key)", "var(--fail)", "var(--faint)"];
+const HIGH = 84, CURVES = ["var(--accent)", "var(--ego)", "var(--hold)", "var(--code-key)", "var(--fail)",
+  "var(--faint)"];
 /** Limits that the user set, by attribute. */
 const limits = signal(/** @type {Record<string, string>} */ ({}));
 
-/** The limit of an attribute: what the user set, or the number that the query compares it with. @param {string} attribute */
+/** The limit of an attribute: what the user set, or the number that the query compares it with.
+ * @param {string} attribute */
 function limitOf(attribute) {
   const set = limits.value[attribute];
   if (set !== undefined) return set === "" ? NaN : Number(set);
-  const found = new RegExp(`\\b${attribute === "distance" ? "dist" : attribute}(?:\\([^)]*\\))?\\s*[<>]=?\\s*(-?\\d+(?:\\.\\d+)?)`).exec(answer.value.query || "");
+  const found = new RegExp(`\\b${attribute === "distance" ? "dist"
+    : attribute}(?:\\([^)]*\\))?\\s*[<>]=?\\s*(-?\\d+(?:\\.\\d+)?)`).exec(answer.value.query || "");
   return found ? Number(found[1]) : NaN;
 }
 
-/** Curves of one attribute, with their axis and a limit. @param {{attribute: string, curves: import("./clock.js").Curve[]}} props */
+/** Curves of one attribute, with their axis and a limit.
+ * @param {{attribute: string, curves: import("./clock.js").Curve[]}} props */
 function Series({ attribute, curves }) {
   const [from, to] = shown.value, limit = limitOf(attribute), unit = curves[0]?.unit || "", drag = useDrag();
   let low = Number.isFinite(limit) ? limit : Infinity, high = Number.isFinite(limit) ? limit : -Infinity;
-  for (const { columns } of curves) for (const v of columns.value) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
+  for (const { columns } of curves) for (const v of columns.value) if (Number.isFinite(v)) { low = Math.min(low,
+    v); high = Math.max(high, v); }
   const known = Number.isFinite(low);
   if (high === low) { high += 1; low -= 1; }
   const y = (/** @type {number} */ v) => (HIGH - 6 - ((v - low) / (high - low)) * (HIGH - 14)).toFixed(2);
@@ -127,29 +136,43 @@ function Series({ attribute, curves }) {
     return { path, now, label };
   });
   const digits = Math.abs(high - low) < 5 ? 2 : 1;
-  return html`<div class="lane tall"><div class="label">${drawn.map(({ label, now }, k) => html`<div title=${label}><i style=${{ background: CURVES[k % 6] }}></i>
+  return html`<div class="lane tall"><div class="label">${drawn.map(({ label, now }, k) => html`<div title=${label}>
+    <i style=${{ background: CURVES[k % 6] }}></i>
         <b>${Number.isFinite(now) ? `${now.toFixed(2)} ${unit}` : "–"}</b> ${label}
-        <button class="quiet small" aria-label=${`Remove ${label}`} onClick=${() => { series.value = series.value.filter((one) => one.label !== label); }}>✕</button></div>`)}
-      <label>limit <input size="5" inputmode="decimal" aria-label=${`Limit of ${attribute}`} value=${Number.isFinite(limit) ? limit : ""}
-        onInput=${(/** @type {InputEvent} */ e) => { limits.value = { ...limits.value, [attribute]: /** @type {HTMLInputElement} */ (e.target).value }; }} /></label></div>
-    <div class="axis-box">${known ? html`<span class="axis-high">${high.toFixed(digits)} ${unit}</span><span class="axis-low">${low.toFixed(digits)}</span>` : html`<span class="axis-high">never known</span>`}
+        <button class="quiet small" aria-label=${`Remove ${label}`}
+          onClick=${() => { series.value = series.value.filter((one) => one.label !== label); }}>✕</button></div>`)}
+      <label>limit <input size="5" inputmode="decimal" aria-label=${`Limit of ${attribute}`}
+        value=${Number.isFinite(limit) ? limit : ""}
+        onInput=${(/** @type {InputEvent} */ e) => { limits.value = { ...limits.value,
+          [attribute]: /** @type {HTMLInputElement} */ (e.target).value }; }} /></label></div>
+    <div class="axis-box">${known ? html`<span class="axis-high">${high.toFixed(digits)} ${unit}</span>
+      <span class="axis-low">${low.toFixed(digits)}</span>` : html`<span class="axis-high">never known</span>`}
       <svg viewBox=${`${from} 0 ${to - from + 1} ${HIGH}`} preserveAspectRatio="none" aria-hidden="true" ...${drag}>
-      ${[y(high), y(low)].map((at) => html`<line class="axis" x1=${from} x2=${to + 1} y1=${at} y2=${at} vector-effect="non-scaling-stroke" />`)}
-      ${Number.isFinite(limit) ? html`<line class="limit" x1=${from} x2=${to + 1} y1=${y(limit)} y2=${y(limit)} vector-effect="non-scaling-stroke" />` : null}
-      ${drawn.map(({ path }, k) => html`<path class="series" d=${path} style=${{ stroke: CURVES[k % 6] }} vector-effect="non-scaling-stroke" />`)}
+      ${[y(high), y(low)].map((at) => html`<line class="axis" x1=${from} x2=${to + 1} y1=${at} y2=${at}
+        vector-effect="non-scaling-stroke" />`)}
+      ${Number.isFinite(limit) ? html`<line class="limit" x1=${from} x2=${to + 1} y1=${y(limit)} y2=${y(limit)}
+        vector-effect="non-scaling-stroke" />` : null}
+      ${drawn.map(({ path }, k) => html`<path class="series" d=${path} style=${{ stroke: CURVES[k % 6] }}
+        vector-effect="non-scaling-stroke" />`)}
       <${Over} height=${HIGH} /></svg></div></div>`;
 }
 
 /** What can be done with the frames that are marked, and with the part of the trace in sight. */
 function Marked() {
   const marked = brush.value, trace = open.value?.trace || "", part = zoomed.value;
-  const tagThem = () => { if (marked) { tagged.value = { trace, first: marked[0], last: marked[1] }; dialog.value = "tag"; } };
+  const tagThem = () => { if (marked) { tagged.value = { trace, first: marked[0],
+    last: marked[1] }; dialog.value = "tag"; } };
   return html`<div class="marked">
-    <button class="small" aria-label="Less of the timeline" title="less of the timeline (+)" onClick=${() => zoomBy(0.5)}>+</button>
-    <button class="small" aria-label="More of the timeline" title="more of the timeline (−)" onClick=${() => zoomBy(2)} disabled=${!part}>−</button>
+    <button class="small" aria-label="Less of the timeline" title="less of the timeline (+)"
+      onClick=${() => zoomBy(0.5)}>+</button>
+    <button class="small" aria-label="More of the timeline" title="more of the timeline (−)"
+      onClick=${() => zoomBy(2)} disabled=${!part}>−</button>
     ${part ? html`<button class="small" onClick=${zoomOut}>whole trace</button>` : null}
-    ${marked ? html`<span class="faint">#${marked[0]}–${marked[1]}</span> <button class="small" onClick=${() => { zoomed.value = [marked[0], Math.max(marked[1], marked[0] + 10)]; brush.value = null; }}>zoom in</button>
-      ${offline.value ? null : html`<button class="small" onClick=${tagThem}>tag</button>`} <button class="small" aria-label="Unmark" onClick=${() => { brush.value = null; }}>✕</button>` : null}</div>`;
+    ${marked ? html`<span class="faint">#${marked[0]}–${marked[1]}</span> <button class="small"
+      onClick=${() => { zoomed.value = [marked[0], Math.max(marked[1],
+      marked[0] + 10)]; brush.value = null; }}>zoom in</button>
+      ${offline.value ? null : html`<button class="small" onClick=${tagThem}>tag</button>`} <button class="small"
+        aria-label="Unmark" onClick=${() => { brush.value = null; }}>✕</button>` : null}</div>`;
 }
 
 /** Tags of a trace as runs of frames. @param {any[][]} all @param {string} trace */
@@ -170,7 +193,8 @@ export function Timeline() {
   const now = open.value, about = traces.value.get(now?.trace || "");
   if (!now || !about) return null;
   const [from, to] = shown.value, frames = to - from + 1, mine = matches.value.filter((m) => m.trace === now.trace);
-  const tags = runsOfTags(notes.value, now.trace), holds = holdsAt(frame.value), word = live.value ? "event" : answer.value.verdicts ? "violation" : "match";
+  const tags = runsOfTags(notes.value, now.trace), holds = holdsAt(frame.value),
+    word = live.value ? "event" : answer.value.verdicts ? "violation" : "match";
   const all = lanes.value?.lanes || [], steps = new Set(all.map((/** @type {any} */ l) => l.step)).size > 1;
   const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
   const [begun, end] = arrived.value >= 0 ? [timeAt(now.trace, from), timeAt(now.trace, to)] : [0, 0];
@@ -178,20 +202,34 @@ export function Timeline() {
   const low = Math.ceil(begun / every - 1e-6), many = Math.max(Math.floor(end / every + 1e-6) - low + 1, 0) || 0;
   const ticks = [...Array(many).keys()].map((i) => (low + i) * every);
   return html`<div class="timeline" role="group" aria-label="Timeline" tabindex="0">
-    <div class="lane"><div class="label">${mine.length} ${word}${mine.length === 1 ? "" : word === "match" ? "es" : "s"} <span class="faint">in this trace</span></div>
+    <div class="lane"><div class="label">${mine.length} ${word}${mine.length === 1 ? "" : word === "match" ? "es"
+      : "s"} <span class="faint">in this trace</span></div>
       <${Bars} spans=${first.map((m) => [m.first, m.last])}
-        kind=${(/** @type {number} */ i) => (first[i] && now.match && keyOf(first[i]) === keyOf(now.match) ? "bar-match" : "bar-match other")} /></div>
+        kind=${(/** @type {number} */ i) => (first[i] && now.match && keyOf(first[i]) === keyOf(now.match)
+          ? "bar-match" : "bar-match other")} /></div>
     ${all.map((/** @type {any} */ lane, /** @type {number} */ i) => {
       const nodes = Object.keys(lane.nodes).map((key) => now.binding?.[key]).filter((n) => n !== undefined);
-      return html`<div class="lane" key=${i} data-holds=${String(holds[i])} onMouseEnter=${() => { lit.value = new Set(/** @type {number[]} */ (nodes)); }} onMouseLeave=${() => { lit.value = new Set(); }}>
-        <div class="label mono" title=${lane.unknown.length ? `nothing is known of ${lane.unknown.join(", ")}` : lane.text}><span class=${`now ${holds[i] ? "holds" : "fails"}`}>${holds[i] === null ? "?" : holds[i] ? "✓" : "✗"}</span>${steps ? `${lane.step}. ` : ""}${lane.text}</div>
+      return html`<div class="lane" key=${i} data-holds=${String(holds[i])}
+        onMouseEnter=${() => { lit.value = new Set(/** @type {number[]} */ (nodes)); }}
+        onMouseLeave=${() => { lit.value = new Set(); }}>
+        <div class="label mono" title=${lane.unknown.length ? `nothing is known of ${lane.unknown.join(", ")}`
+          : lane.text}><span class=${`now ${holds[i] ? "holds" : "fails"}`}>
+          ${holds[i] === null ? "?" : holds[i] ? "✓" : "✗"}</span>${steps ? `${lane.step}. ` : ""}${lane.text}</div>
         <${Bars} spans=${lane.spans} kind=${() => "bar-hold"} /></div>`;
     })}
-    ${tags.length ? html`<div class="lane"><div class="label">${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div><${Bars} spans=${tags.map((n) => [n.first, Math.max(n.last, n.first + frames / 200)])} kind=${() => "bar-tag"} /></div>` : null}
-    ${[...new Set(series.value.map((one) => one.attribute))].map((name) => html`<${Series} key=${name} attribute=${name} curves=${series.value.filter((one) => one.attribute === name)} />`)}
-    <div class="lane"><${Marked} /><div class="ticks" role="slider" tabindex="0" aria-label="Frame" aria-valuemin=${range.value[0]} aria-valuemax=${range.value[1]}
-        aria-valuenow=${frame.value} aria-valuetext=${`frame ${frame.value}, ${timeAt(now.trace, frame.value).toFixed(2)} s`}
-        onKeyDown=${(/** @type {KeyboardEvent} */ e) => { const to = { Home: range.value[0], End: range.value[1] }[e.key]; if (to !== undefined) { e.preventDefault(); goTo(to); } }}>
-      ${ticks.map((t) => html`<span style=${{ left: `${(100 * (seqAt(now.trace, t) - from + 0.5)) / frames}%` }}>${Number(t.toFixed(1))} s</span>`)}</div></div>
+    ${tags.length ? html`<div class="lane"><div class="label">
+      ${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div>
+      <${Bars} spans=${tags.map((n) => [n.first, Math.max(n.last, n.first + frames / 200)])}
+      kind=${() => "bar-tag"} /></div>` : null}
+    ${[...new Set(series.value.map((one) => one.attribute))].map((name) => html`<${Series} key=${name}
+      attribute=${name} curves=${series.value.filter((one) => one.attribute === name)} />`)}
+    <div class="lane"><${Marked} /><div class="ticks" role="slider" tabindex="0" aria-label="Frame"
+      aria-valuemin=${range.value[0]} aria-valuemax=${range.value[1]}
+        aria-valuenow=${frame.value} aria-valuetext=${`frame ${frame.value}, ${timeAt(now.trace,
+          frame.value).toFixed(2)} s`}
+        onKeyDown=${(/** @type {KeyboardEvent} */ e) => { const to = { Home: range.value[0],
+          End: range.value[1] }[e.key]; if (to !== undefined) { e.preventDefault(); goTo(to); } }}>
+      ${ticks.map((t) => html`<span style=${{ left: `${(100 * (seqAt(now.trace, t) - from + 0.5)) / frames}%` }}>
+        ${Number(t.toFixed(1))} s</span>`)}</div></div>
   </div>`;
 }
