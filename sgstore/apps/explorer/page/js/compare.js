@@ -25,7 +25,10 @@ const inB = computed(() => side.value || (store.value?.other ? "b" : "a"));
 async function framesOf(query, of, signal) {
   /** @type {Found} */
   const by = new Map(),
-    more = (/** @type {number} */ many) => { throw new Error(`There are more than ${many.toLocaleString("en")} matches, and only whole answers can be compared: add a condition.`); };
+    more = (/** @type {number} */ many) => {
+      const told = `There are more than ${many.toLocaleString("en")} matches`;
+      throw new Error(`${told}, and only whole answers can be compared: add a condition.`);
+    };
   for await (const match of matchesIn(api.lines("api/find",
     { text: query, parameters: parametersOf(query), side: of }, { signal }), more)) {
     const one = by.get(match.trace) || { frames: new Set(), matches: [] };
@@ -121,7 +124,8 @@ export function Compare() {
     ${both ? html`<${OfStores} found=${found} />` : same || !found
       ? html`<div class="sheet"><p class="faint" role="status">
       ${!a ? "Type a query under Find; then another one for B here, or start sgstore serve with --compare OTHER."
-      : same ? "Type another query for B, or start sgstore serve with --compare OTHER to see two stores side by side." : "working …"}</p></div>`
+      : same ? "Type another query for B, "
+        + "or start sgstore serve with --compare OTHER to see two stores side by side." : "working …"}</p></div>`
       : html`<${Differing} found=${found} />`}</section>`;
 }
 
@@ -146,7 +150,8 @@ function Differing({ found, diff, waits }) {
     ${only("B").toLocaleString("en")}</b></span>` : null}
       ${diff ? html`<span class="faint">${diff.scenes.said[0]}</span>` : waits
         ? html`<span class="faint">scenes are compared …</span>` : null}${all.length > MOST
-        ? html`<span class="note">the first ${MOST.toLocaleString("en")} of ${all.length.toLocaleString("en")} pictures</span>` : null}</div>
+        ? html`<span class="note">the first ${MOST.toLocaleString("en")} of
+          ${" "}${all.length.toLocaleString("en")} pictures</span>` : null}</div>
     ${shown.value === "tiles" ? html`<main>${all.length ? html`<${Gallery} found=${all.slice(0, MOST)}
       word=${["stretch", "stretches"]} />` : waits ? null : html`<div class="sheet"><h2>Nothing differs</h2>
       <p class="faint">${found ? "Both find the same frames."

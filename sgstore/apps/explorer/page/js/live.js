@@ -17,7 +17,8 @@ const TILES = 300; // events that are shown as small pictures, the last ones
 /** Whether the page shows the last frame as it comes. */
 const following = signal(true);
 /** What is told of each check and pattern, by name: its state, and where it was violated or found. */
-const told = signal(/** @type {Record<string, {state: string, many: number, spans: number[][], open: Map<string, number[]>}>} */ ({}));
+/** @typedef {{state: string, many: number, spans: number[][], open: Map<string, number[]>}} Told */
+const told = signal(/** @type {Record<string, Told>} */ ({}));
 const ended = signal(/** @type {any} */ (null));
 const lost = signal(false);
 let count = 0;
@@ -133,7 +134,13 @@ async function run() {
   const place = /** @type {HTMLElement} */ (document.getElementById("app"));
   const events = new EventSource("api/live");
   events.addEventListener("hello",
-    (event) => { begin(JSON.parse(event.data)); if (!place.dataset.on) { place.dataset.on = "1"; place.textContent = ""; render(html`<${Live} />`, place); } });
+    (event) => {
+      begin(JSON.parse(event.data));
+      if (place.dataset.on) return;
+      place.dataset.on = "1";
+      place.textContent = "";
+      render(html`<${Live} />`, place);
+    });
   events.addEventListener("frame", (event) => step(unpacked(bytesOf(event.data).buffer)));
   events.addEventListener("end",
     (event) => { ended.value = JSON.parse(event.data); take(ended.value.events); events.close(); });
