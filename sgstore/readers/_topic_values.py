@@ -208,7 +208,7 @@ def joined_columns(
     if len(parts) == 1 and len(parts[0][0]) == count and _is_short(declared, parts[0][1]):
         return parts[0][1]
     if (kind := NUMPY.get(declared)) is not None:
-        whole: Any = np.ma.masked_all(count, kind)
+        whole: Any = np.ma.masked_array(np.zeros(count, kind), mask=True)
         for rows, values in parts:
             whole[rows] = values
         return whole

@@ -217,8 +217,7 @@ _KINDS: Final = (
     ),
     *("JSON", "JSON", "BLOB", "UINTEGER", "VARCHAR", "INTEGER", "BIGINT", "INTEGER", "BIGINT"),
 )
-"""Database type of each type of a protobuf field, by its number. 14: enumeration."""
-_ENUM: Final = 14
+"""Database type of each type of a protobuf field, by its number."""
 
 
 def _declared(one: FieldDescriptor) -> str:
@@ -230,7 +229,7 @@ def _declared(one: FieldDescriptor) -> str:
 
 def _is_repeated(one: FieldDescriptor) -> bool:
     known = getattr(one, "is_repeated", None)  # protobuf before 6 has only the label
-    return one.label == _REPEATED if known is None else known
+    return cast("Any", one).label == _REPEATED if known is None else known
 
 
 _REPEATED: Final = 3
@@ -249,7 +248,7 @@ def _plain(one: FieldDescriptor, value: Any) -> Any:
 
 
 def _single(one: FieldDescriptor, value: Any) -> Any:
-    if one.type == _ENUM:
+    if one.enum_type is not None:
         found = one.enum_type.values_by_number.get(value)
         return found.name if found else str(value)
     if one.message_type is not None:

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.readers import Recording
+    from sgstore.mcap import Recording
     from sgstore.store._locking import Access
     from sgstore.store._traces import StoredTrace
 

@@ -118,7 +118,7 @@ class FrameClock:
     """
 
     def __init__(self, frame_id: Ints, time_ns: Ints, log_time_ns: Ints) -> None:
-        run = np.cumsum(np.diff(time_ns, prepend=time_ns[:1]) < 0)
+        run = np.cumsum(np.diff(time_ns, prepend=time_ns[:1]) < 0, dtype=np.int64)
         order = np.argsort(log_time_ns, kind="stable")
         self.frame_id, self.time_ns, self.log = frame_id[order], time_ns[order], log_time_ns[order]
         self.run = run[order]
