@@ -23,6 +23,7 @@ from sgstore.readers import (
     parse_definition,
     read_message,
 )
+from sgstore.readers.rosbags._sqlite import SqliteBag
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -140,6 +141,30 @@ def test_damage_loses_only_what_it_hits(tmp_path: Path) -> None:
     file.write_bytes(b"SQLite format 3\0" + bytes(500))
     with pytest.raises(TraceError, match=r"a\.db3 cannot be read"):
         open_trace(file)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_damaged_page_loses_only_its_messages(tmp_path: Path, cut: bool) -> None:
+    file = rosbag_files.as_db3(tmp_path / "a.db3", DRIVES["carla"](tmp_path / "a.mcap", 8))
+    connection = sqlite3.connect(file)
+    rows = [(1, 10**8 * i, bytes(300)) for i in range(500)]
+    connection.execute("DELETE FROM messages")
+    connection.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+    connection.commit()
+    connection.close()
+    content, size = bytearray(file.read_bytes()), 4096
+    if cut:
+        del content[len(content) // 2 // size * size :]
+    else:
+        middle = len(content) // 2 // size * size
+        content[middle : middle + size] = b"\xff" * size
+    file.write_bytes(content)
+    lost: list[str] = []
+    bag = SqliteBag(tmp_path, [file], lost.append)
+    assert 200 < len(bag.times) < 500
+    assert np.all(np.diff(bag.times) > 0)
+    assert any("damaged parts cannot be read" in words for words in lost)
+    bag.close()
 
 
 def test_headers_of_ros_1_have_a_number(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sqlite3
 from bisect import bisect_right
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,7 +17,7 @@ import zstandard
 from sgstore.errors import TraceError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 MAX_FILE: Final = 4 << 30
@@ -24,6 +25,9 @@ MAX_FILE: Final = 4 << 30
 MAX_MESSAGE: Final = 256 << 20
 """Maximum size of a message; bytes."""
 MAX_TOPICS: Final = 10_000
+MAX_TORN: Final = 1_000
+"""Maximum number of damaged parts of a table."""
+MAX_ROW: Final = 1 << 60
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"
 _FAULTS: Final = (sqlite3.Error, zstandard.ZstdError, OSError, OverflowError, UnicodeDecodeError)
 
@@ -121,25 +125,17 @@ class SqliteBag:
             connection.close()
             raise
         self._files.append((len(self._rows), connection))
-        rows = connection.execute("SELECT rowid, topic_id, timestamp FROM messages ORDER BY rowid")
         odd = 0
-        while True:
-            try:
-                row = rows.fetchone()
-            except _FAULTS as error:
-                lose(
-                    f"{file.name}: messages after number {len(self._rows)} cannot be read: {error}"[
-                        :200
-                    ]
-                )
-                break
-            if row is None:
-                break
+        torn: list[str] = []
+        for row in _rows(connection, "rowid, topic_id, timestamp", "messages", torn):
             usable = isinstance(row[2], int) and row[1] in topics and 0 <= row[2] < 1 << 62
             odd += not usable
             if usable:
                 self._rows.append(row[0])
                 columns.append((topics[row[1]], row[2]))
+        if torn:
+            words = f"{file.name}: messages in {len(torn)} damaged parts cannot be read: {torn[0]}"
+            lose(words[:200])
         if odd:
             lose(f"{file.name}: {odd} messages without a topic or a time")
 
@@ -151,11 +147,10 @@ class SqliteBag:
             query = (
                 "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             )
-            texts = {row[0]: (str(row[1]), str(row[2])) for row in connection.execute(query)}
+            with suppress(*_FAULTS):  # The types of known packages need no definition.
+                texts = {row[0]: (str(row[1]), str(row[2])) for row in connection.execute(query)}
         found: dict[int, int] = {}
-        for ident, name, kind in connection.execute(
-            "SELECT id, name, type FROM topics LIMIT 10001"
-        ):
+        for ident, name, kind in _rows(connection, "id, name, type", "topics", []):
             key = str(name), str(kind)
             if key not in self._numbers:
                 if len(self._numbers) >= MAX_TOPICS:
@@ -164,6 +159,51 @@ class SqliteBag:
                 self.topics[number] = Topic(*key, *texts.get(key[1], ("", "")))
             found[ident] = self._numbers[key]
         return found
+
+
+def _rows(
+    connection: sqlite3.Connection, columns: str, table: str, torn: list[str]
+) -> Iterator[tuple[Any, ...]]:
+    """Yield the readable rows of a table in order of their numbers; the faults are added to ``torn``."""
+    start = 0
+    while len(torn) < MAX_TORN:
+        query = f"SELECT rowid, {columns} FROM {table} WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
+        try:
+            for row in connection.execute(query, (start,)):
+                if row[0] < start:
+                    raise sqlite3.DatabaseError("rows are out of order")
+                start = row[0] + 1
+                yield row[1:]
+        except _FAULTS as error:
+            torn.append(str(error))
+            start = _next_readable(connection, table, start)
+            if start < 0:
+                return
+        else:
+            return
+
+
+def _next_readable(connection: sqlite3.Connection, table: str, start: int) -> int:
+    """Return the first row number after a damaged part from which rows can be read; -1: none."""
+
+    def fails(number: int) -> bool:
+        query = f"SELECT rowid FROM {table} WHERE rowid >= ? ORDER BY rowid LIMIT 1"  # noqa: S608
+        try:
+            connection.execute(query, (number,)).fetchone()
+        except _FAULTS:
+            return True
+        return False
+
+    step = 1
+    while fails(start + step):
+        step *= 2
+        if step > MAX_ROW:
+            return -1
+    low, high = start + step // 2, start + step
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fails(middle) else (low, middle)
+    return high
 
 
 def _opened(file: Path) -> sqlite3.Connection:
@@ -187,4 +227,8 @@ def _opened(file: Path) -> sqlite3.Connection:
         )
     connection.execute("PRAGMA trusted_schema = 0")
     connection.execute("PRAGMA cell_size_check = 1")
+    try:
+        connection.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
+    except sqlite3.DatabaseError:  # SQLite then reads files that were cut, too.
+        connection.execute("PRAGMA writable_schema = 1")
     return connection
