@@ -200,7 +200,7 @@ def _kept(
 
 
 def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Return replies with at most ``most`` matches or violations, as many of each trace."""
+    """Return replies with at most ``most`` matches or violations, spread over the traces."""
     lists = [(reply, "matches", "") for reply in told if "matches" in reply]
     lists += [(one, "spans", one["trace"]) for one in told[-1].get("verdicts", ())]
     traces = [str(trace or row[0]) for part, key, trace in lists for row in part[key]]
@@ -217,7 +217,7 @@ def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
 
 
 def chosen_spread(traces: list[str], most: int) -> set[int]:
-    """Return the places of ``most`` items, as many of each trace as possible, evenly over its items.
+    """Return the places of ``most`` items, spread over the traces and evenly over the items of each trace.
 
     Parameters
     ----------
