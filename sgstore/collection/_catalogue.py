@@ -200,9 +200,11 @@ class Snapshot:
         for _, what, word, kind, _ in self.facts["word"]:
             if what == "topic":
                 topic, field = json.loads(word)
-                known = found.setdefault(topic, {"": kind})
-                last = known.get(field, kind)
-                known[field] = common_type(last, kind) if field else last and kind
+                reason_or_type = str(kind)
+                known = found.setdefault(topic, {"": reason_or_type})
+                last = known.get(field, reason_or_type)
+                same = last and reason_or_type
+                known[field] = common_type(last, reason_or_type) if field else same
         return found
 
     @cached_property

@@ -147,12 +147,12 @@ def opened(
                 on_map(same, found)
                 yield from same.blocks()
 
-        told.topics = RecordedTopics(trace.info.path, again)
+        told.topics = topics = RecordedTopics(trace.info.path, again)
 
         def frames() -> Iterator[Frame]:
-            blocks = told.topics.followed(cameras.followed(trace.blocks()))
+            blocks = topics.followed(cameras.followed(trace.blocks()))
             recorded = recorded_events(c.schema for c in trace.info.channels)
-            yield from map(told.topics.on, replayed(blocks, recorded))
+            yield from map(topics.on, replayed(blocks, recorded))
             told.warnings += trace.report.warnings
             told.losses += [loss.reason for loss in trace.report.losses]
 
