@@ -388,7 +388,7 @@ class Frame:
                 raise ValueError(f"an entity has {len(numbers)} numbers, or an infinite one")
             if not (-1 <= lights < 1 << len(VEHICLE_LIGHTS) and -1 <= state < len(LIGHT_STATES)):
                 raise ValueError(f"an entity has impossible lights: {lights}, {state}")
-            texts = {name: str(one.get(name, "")) for name in _TEXTS}
+            texts: dict[str, Any] = {name: str(one.get(name, "")) for name in _TEXTS}
             frame.entities.append(
                 Entity(
                     kind=_kind_code(str(one["kind"])),

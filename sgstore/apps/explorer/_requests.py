@@ -135,7 +135,7 @@ def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
 
 def _clips(value: object, name: str) -> list[tuple[Any, ...]]:
     """Return validated rows of clips: the name of a trace, then first and last frame of each clip in it."""
-    rows = value if isinstance(value, list) else [None]
+    rows: list[Any] = value if isinstance(value, list) else [None]
     if any(
         not isinstance(row, list) or len(row) % 2 == 0 or not isinstance(row[0], str)
         for row in rows

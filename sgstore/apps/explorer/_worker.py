@@ -56,7 +56,7 @@ def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator
 def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
     """Yield rows of a pattern or of an SQL statement, as JSON values."""
     key, stamp = "sql" if question["ask"] == "sql" else "find", store.file.stamp
-    told = {"stamp": stamp} | rows_found(
+    told: Reply = {"stamp": stamp} | rows_found(
         store, {key: question["text"], "parameters": question["parameters"]}, most
     )
     for row in told["rows"]:  # frame ids exceed the exact integers of a browser
