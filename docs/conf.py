@@ -51,7 +51,14 @@ CONTENTS = {
     ),
     "Reference": (
         *("docs/commands", "docs/api", "docs/language", "docs/one_page", "docs/patterns"),
-        *("docs/views", "docs/graphs", "docs/relations", "docs/parameters", "docs/exports"),
+        *(
+            "docs/views",
+            "docs/graphs",
+            "docs/relations",
+            "docs/parameters",
+            "docs/exports",
+            "docs/topics",
+        ),
         *("docs/coverage", "docs/selection", "docs/criticality", "docs/scale", "docs/flavours"),
         *("docs/source_osi", "docs/source_carla", "docs/source_autoware", "docs/source_foxglove"),
         *("docs/source_av2", "docs/source_py123d", "docs/source_rosbags", "docs/source_sumo"),

@@ -231,7 +231,8 @@ class ClipFrames:
                 "end": reach.end_ns,
             },
         )
-        return cls(number, clip, **{name: found[name].astype(of) for name, of in _TYPES.items()})
+        columns: dict[str, Any] = {name: found[name].astype(of) for name, of in _TYPES.items()}
+        return cls(number, clip, **columns)
 
     def __len__(self) -> int:
         return len(self.frame_id)

@@ -331,3 +331,11 @@ def test_a_class_has_a_phrase_in_a_table_and_none_in_json(folder: Path, capsys: 
     assert table.splitlines()[0].split()[-1] == "scene"
     assert phrase.startswith("ego")
     assert (f"{cars} car{'s' * (cars > 1)} near" in phrase) == (cars > 0)
+
+
+def test_a_shard_names_its_traces(tmp_path: Path, capsys: Any) -> None:
+    drive(tmp_path / "one.mcap", frames=3)
+    command = ["ingest", str(tmp_path / "fleet"), str(tmp_path / "one.mcap"), "--shard", "1/1"]
+
+    assert run(command) == 0
+    assert "share 1/1 of 1 recordings: one" in capsys.readouterr().err

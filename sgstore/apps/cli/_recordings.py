@@ -170,7 +170,7 @@ def _land(
         raise typer.BadParameter(f"--shard {shard}: expected I/N, such as 3/16; I is 1 to N")
     outcomes = land(url_of(store) or store, paths, shard=(int(number), int(of)), **options)
     if shard is not None:
-        names = ", ".join(excerpts([one.trace for one in outcomes])) or "none"
+        names = excerpts([one.name or one.path.name for one in outcomes]) or "none"
         say(f"share {shard} of {len(paths)} recordings: {names}")
     return outcomes
 

@@ -113,12 +113,17 @@ def _merged_names(query: b.Query, catalog: Catalog) -> list[str]:
     if any(isinstance(part, b.TraceAttribute | b.FrameAttribute) for part in parts):
         return []
     for value in values:
-        named = isinstance(value, b.NodeAttribute) and value.attribute.name in {"name", "id"}
-        if (named or isinstance(value, b.NodeValue)) and _is_entity(query, value.node):
-            shown = f"{value.node}.name" if named else value.node
+        match value:
+            case b.NodeAttribute(node=node, attribute=one) if one.name in {"name", "id"}:
+                shown = f"{node}.{one.name}"
+            case b.NodeValue(node=node):
+                shown = node
+            case _:
+                continue
+        if _is_entity(query, node):
             return [
                 f"{shown} is unique only in its trace: entities of several traces merge in a row;"
-                f" add trace.name"
+                " add trace.name"
             ]
     return []
 
