@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from sgstore.draw import Timeline
     from sgstore.exporters import WrittenClip, WrittenFile
     from sgstore.matches import Matches
-    from sgstore.store import Fault
     from sgstore.testsets.coverage import ChosenFrames, Classed, ReportTable
-    from sgstore.testsets.locks import Difference, Lock
+    from sgstore.testsets.locks import Lock
     from sgstore.testsets.selection import Prioritized, PrioritySpec, Selection, SelectionSpec
 
     Place = str | Path | Store | Collection
@@ -231,7 +230,7 @@ def coverage(  # noqa: PLR0913 - the options of the command
         return of.specification(chosen, query, how["cells"], *other)[listed]
     if kind == "sequences":
         named, within = of.manoeuvres_named(how["manoeuvres"]), seconds(how["within"], "--within")
-        found = of.sequences(chosen, how["k"], *(other or [None]), named, within)
+        found = of.sequences(chosen, how["k"], other[0] if other else None, named, within)
         return (found.shares, found.covered, found.missing)[listed]
     options = how["abstraction"], how["window"], how["incomplete"]
     both = [
@@ -258,7 +257,7 @@ def _of_classes(kind: str, both: list[Classed], **how: Any) -> ReportTable:
         )
     if kind == "explain":
         about = {"by_frame": how["by_frame"], "depth": how["depth"]}
-        return of.explain(*both, how["abstraction"], **about)[how["tree"]]
+        return of.explain(both[0], both[1], how["abstraction"], **about)[how["tree"]]
     return {"of": of.covered, "venn": of.venn, "novel": novel}[kind](*both)
 
 
@@ -412,7 +411,7 @@ def export(  # noqa: PLR0913 - the options of the command
 
 
 def lock(
-    store: Store | Collection,
+    store: Store | Collection | None,
     *,
     cases: Selection | Prioritized,
     to: str | Path | None,
@@ -445,7 +444,7 @@ def lock(
 
 def verify(
     store: Store | Collection, *, lock: str | Path | None, payloads: bool | None, strict: bool
-) -> list[Fault] | list[Difference] | list[tuple[str, str, str]]:
+) -> list[Any]:
     """Verify a store, or that it has the cases of a lock; see :meth:`sgstore.query.StoreVerbs.verify`."""
     if lock is not None:
         from sgstore.testsets.locks import read_lock

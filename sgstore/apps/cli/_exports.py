@@ -84,6 +84,9 @@ def export(
     from sgstore.apps.verbs import export as export_clips
 
     opened = bounds.opened(store)
+    options: dict[str, Any] = {
+        name: () if value is None else value for name, value in vars(clip).items()
+    }
     with count_bar(to.name or "export", "clips") as progress:
         written = export_clips(
             opened,
@@ -95,7 +98,7 @@ def export(
             parameters=parameters_of(question.parameters),
             progress=progress,
             on_matches=say_left_out,
-            **{name: () if value is None else value for name, value in vars(clip).items()},
+            **options,
         )
     if not written:
         say("no matches to export")

@@ -142,7 +142,8 @@ class Verb(TyperCommand):
         Options of a method of the library have the help of its docstring.
         """
         about = library_help(_path_of(ctx))
-        for one in self.params:
+        options: list[Any] = self.params
+        for one in options:
             one.help = one.help or about.get(one.name or "")
         super().format_help(ctx, formatter)
         _write_examples(ctx)
