@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import oracle_turned
 import pytest
 from builders import Recording, Thing, frame_of, thing
 from oracle_watched import LANE_RULES, Drive, worldwide
@@ -305,6 +306,16 @@ def test_a_monitored_pattern_has_no_match_by_a_guessed_lane(pattern: str, tmp_pa
             monitor.step(frame)
         monitor.finish()
         assert seen <= found
+
+
+@pytest.mark.parametrize("way", MEETING)
+def test_results_of_driven_lanes_stay_in_a_turned_and_mirrored_world(way: str) -> None:
+    scene = MEETING[way]
+
+    for world, apart in oracle_turned.compare(
+        scene.road, [scene.block()], oracle_turned.WORLDS[2:4]
+    ).items():
+        assert apart == [], world
 
 
 @pytest.mark.data
