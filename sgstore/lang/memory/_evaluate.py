@@ -80,18 +80,14 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
             return lambda at: at.view.is_one(at.nodes[node], kinds)
         case b.EdgeRelation(edge=edge):
             return lambda at: at.edges[edge][0]
-        case b.EdgeAttribute(edge=edge, attribute=attribute) if attribute is UNSURE_LANE:
-            return lambda at: _is_unsure(at.edges[edge][1])
+        case b.EdgeAttribute() | b.FrameAttribute() if expression.attribute in _UNSURE:
+            return _unsure(expression)
         case b.EdgeAttribute(edge=edge, attribute=attribute):
             name = attribute.name
             if attribute.unit is DisplayUnit.own:
                 of = _OWN[attribute.type]
                 return lambda at: of(at.edges[edge][1].get(name))
             return lambda at: at.edges[edge][1].get(name)
-        case b.FrameAttribute(attribute=attribute) if attribute is UNSURE_LANE:
-            return lambda at: at.view.graph.ego in at.view.graph.unsure_lane
-        case b.FrameAttribute(attribute=attribute) if attribute is UNSURE_LEAD:
-            return lambda at: bool(at.view.graph.unsure_lead)
         case b.FrameAttribute(attribute=attribute) if attribute.unit is DisplayUnit.classed:
             (name,) = attribute.columns.values()
             return lambda at: at.view.class_in(name)
@@ -131,7 +127,7 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
         return lambda at: at.nodes[node]
     if attribute.unit is DisplayUnit.role:
         return lambda at: at.view.role_of(at.nodes[node])
-    if attribute in {UNSURE_LANE, UNSURE_LEAD}:
+    if attribute in _UNSURE:
         return lambda at: at.nodes[node] in getattr(at.view.graph, attribute.name)
     if attribute is NODE_ATTRIBUTES["injunction"]:
         return lambda at: _in_junction(at, at.nodes[node])
@@ -150,9 +146,17 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
     return lambda at: at.view.nodes[at.nodes[node]].get(name)
 
 
-def _is_unsure(about: Attributes) -> bool:
-    """True for an edge from a vehicle to a lane, if later frames decide the lane that it drives."""
-    return "overlap" in about and "is_own" not in about
+_UNSURE: Final = frozenset({UNSURE_LANE, UNSURE_LEAD})
+
+
+def _unsure(value: b.EdgeAttribute | b.FrameAttribute) -> Evaluate:
+    """Return a function for "later frames decide the lane" of an edge to a lane, the ego, or any vehicle."""
+    if isinstance(value, b.FrameAttribute) and value.attribute is UNSURE_LANE:
+        return lambda at: at.view.graph.ego in at.view.graph.unsure_lane
+    if isinstance(value, b.FrameAttribute):
+        return lambda at: bool(at.view.graph.unsure_lead)
+    edge = value.edge
+    return lambda at: "overlap" in at.edges[edge][1] and "is_own" not in at.edges[edge][1]
 
 
 def _in_junction(at: Binding, node: int) -> bool | None:
@@ -318,7 +322,7 @@ def _is_derived(attribute: Attribute) -> bool:
         DisplayUnit.own,
     } or attribute in {
         *(NODE_ATTRIBUTES["injunction"], NODE_ATTRIBUTES["lifetime"]),
-        *(UNSURE_LANE, UNSURE_LEAD),
+        *_UNSURE,
     }
 
 
