@@ -185,6 +185,20 @@ def test_headers_of_ros_1_have_a_number(tmp_path: Path) -> None:
     assert told["point"] == {"x": 1.5, "y": 2.5, "z": 3.5}
 
 
+def test_an_absurd_number_of_elements_is_a_loss(tmp_path: Path) -> None:
+    """A message claims 16 million poses, and ends after its header: each has no length of its own."""
+    typesys = pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
+    name = "geometry_msgs/msg/PoseArray"
+    with pytest.importorskip("rosbags.rosbag1").Writer(tmp_path / "a.bag") as writer:
+        connection = writer.add_connection("/at", name, typestore=store)
+        writer.write(connection, 9, struct.pack("<4I", 7, 5, 6, 0) + struct.pack("<I", 1 << 24))
+    report = TraceReport()
+    with open_recording(tmp_path / "a.bag") as recording:
+        assert [*recording.walk(report)] == []
+    assert "Invalid sequence length" in report.losses[0].reason
+
+
 def decoded(bag: Path) -> list[tuple[float, ...]]:
     """Independent decoder of a bag of ROS 1: places in the messages of ``nav_msgs/Odometry``."""
     data, at, found, wanted = bag.read_bytes(), 13, [], b""

@@ -75,6 +75,8 @@ class Definitions:
         store, name = self._store, _full(topic.type)
 
         def convert(data: bytes) -> bytes:
+            # Without this bound, a damaged count of elements is a loop of hours.
+            store.max_sequence_length = max(len(data), 1)
             try:
                 return bytes(store.ros1_to_cdr(data, name))
             except Exception as error:  # the package has errors of many types
