@@ -279,7 +279,7 @@ class JsonColumns:
     def fields(self) -> Mapping[str, TopicField]:
         """Fields by name, so far."""
         return field_list(
-            (self._names.of(path), kind) for path, kind in self._types.items() if kind
+            (self._names.of(path), _stored_type(kind)) for path, kind in self._types.items() if kind
         )
 
     def _declare(self, schema: Any, path: str, depth: int) -> None:
@@ -313,7 +313,10 @@ class JsonColumns:
             flat.append(found)
         self._learn(flat, losses)
         return {
-            self._names.of(path): (kind, column_of(kind, self._values(path, kind, flat), losses))
+            self._names.of(path): (
+                _stored_type(kind),
+                column_of(_stored_type(kind), self._values(path, kind, flat), losses),
+            )
             for path, kind in self._types.items()
             if kind
         }, np.array(rows, np.intp)
@@ -338,6 +341,11 @@ class JsonColumns:
         if kind == "DOUBLE":
             return [None if value is None else as_number(value) for value in values]
         return values
+
+
+def _stored_type(kind: str) -> str:
+    """Return the type of a column. Lists that are all empty so far count as lists of numbers."""
+    return "DOUBLE[]" if kind == "[]" else kind
 
 
 def _of_schema(schema: dict[str, Any]) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from recordings import Recorder
 from topic_recordings import control, ros, topic_recording
 
 import sgstore
@@ -230,6 +231,13 @@ def test_sql_over_a_recording_needs_no_store(
         StoreFile.recording_sql(recording, "SELECT * FROM frames").rows()
     with pytest.raises(SqlError, match="file system operations are disabled"):
         StoreFile.recording_sql(recording, f"SELECT * FROM read_text('{recording}')").rows()
+
+
+def test_lists_that_are_all_empty_are_lists(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        recorder.write(recorder.channel("/a", "A", b""), 0.1, b'{"a": [], "b": 1}')
+    asked = StoreFile.recording_sql(tmp_path / "a.mcap", "SELECT a, b FROM topic('/a')")
+    assert asked.rows().values == [([], 1)]
 
 
 FIELDS = (
