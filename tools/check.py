@@ -71,6 +71,7 @@ TESTS = {
     "user_notes": "serve",
     "explorer": "serve live report explorer explorer_* sandbox_pool",
     "online": "online identity",
+    "online_noise": "noise online",
     "store": "everyday store store_* doors events world_rows fault_messages",
     "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink"
     " windows tolerance clock",
