@@ -57,7 +57,7 @@ TESTS = {
     "plugins": "plugins relations abstractions flavours",
     "query": "query api datasets",
     "quoting": "user_tables",
-    "readers": "osi osi_* noise carla carla_* carlasgg autoware av2 foxglove commonroad py123d rosbags"
+    "readers": "osi osi_* noise topics carla carla_* carlasgg autoware av2 foxglove commonroad py123d rosbags"
     " sumo cdr flavours stamps identity",
     "rebuild": "rebuilding",
     "relations": "relations relations_* motion bodies bounds driven_lanes",
@@ -69,10 +69,10 @@ TESTS = {
     "sumo_net": "sumo",
     "sgg": "sgg sgg_* crowds world_rows",
     "user_notes": "serve",
-    "explorer": "serve live report explorer explorer_* sandbox_pool",
+    "explorer": "serve live report explorer explorer_* page_units sandbox_pool",
     "online": "online identity",
     "online_noise": "noise online",
-    "store": "everyday store store_* doors events world_rows fault_messages",
+    "store": "everyday store store_* topics topics_travel doors events world_rows fault_messages",
     "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink"
     " windows tolerance clock",
     "trace_sampling": "ingest",

@@ -9,7 +9,7 @@ Of a body that was seen for a short time, the motion is unknown.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -98,8 +98,8 @@ class _Followed:
 
     def put(self, rows: Ints | Bools, other: _Followed) -> None:
         """Replace rows by those of another table, except their nodes."""
-        for name in self.__slots__[1:]:
-            getattr(self, name)[rows] = getattr(other, name)
+        for column in fields(self)[1:]:
+            getattr(self, column.name)[rows] = getattr(other, column.name)
 
 
 @dataclass(slots=True)
@@ -125,7 +125,7 @@ class OnlineSmoother(GapFiller):
         for number in range(first, int(frame[-1]) + 1 if len(frame) else 0):
             of = np.flatnonzero((frame == number) & placed)
             of = of[np.argsort(node[of])]
-            place = values[np.ix_(of, _FOLLOWED)]
+            place = values[of][:, _FOLLOWED]
             found[of], stands[of] = self._step(node[of], float(seconds[number]), place)
         found[stands & np.isfinite(found[:, 2]), 2] = 0.0
         filled, derived = self.filled(values, found, fixed, stands)

@@ -14,11 +14,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
+from weakref import ref
 
 import numpy as np
 
 from sgstore.base.quoting import literal, quoted
-from sgstore.errors import SqlError, TraceError
+from sgstore.errors import SqlError, StoreError, TraceError
 from sgstore.lang.catalog import TopicFacts, TopicField, Type
 from sgstore.lang.syntax import TOPIC
 from sgstore.lang.topics import (
@@ -283,13 +284,17 @@ def topic_facts(connection: DuckDBPyConnection, access: Access) -> dict[str, Top
         ids = frozenset(traces) | (known.traces if known else frozenset())
         reason = (known.refused if known else "") or refusal(encoding, schema)
         whole = stored.get(topic, {}).keys() >= ids
-        source = cache(partial(_fields, access, topic))
+        # Compiled statements keep the facts; they must not keep the file open.
+        source = cache(partial(_fields, ref(access), topic))
         found[topic] = TopicFacts(topic, ids, whole, "" if whole else reason, source)
     return found
 
 
-def _fields(access: Access, topic: str) -> Mapping[str, TopicField]:
+def _fields(held: ref[Access], topic: str) -> Mapping[str, TopicField]:
     """Return the fields of a topic: of its tables, and of the first recording without."""
+    access = held()
+    if access is None:
+        raise StoreError("the store of these topics is closed")
     with access.reading() as connection:
         stored = _stored(connection).get(topic, {})
         told = [fields for _, fields in stored.values()]

@@ -39,7 +39,16 @@ FULL = {*TALKING, *some([*LINES], 5)}
 UNHEARD = {*TALKING, *some([*LINES], 23)}
 """Verbs whose reader goes away: the same stream of ours ends all of them; in ``make oracle`` every one."""
 WITHOUT_OUTPUT = {
-    *("record", "lock union", "lock intersect", "lock minus", "mcp", "serve", "collection unpack"),
+    *(
+        "record",
+        "lint",
+        "lock union",
+        "lock intersect",
+        "lock minus",
+        "mcp",
+        "serve",
+        "collection unpack",
+    ),
 }
 """Verbs that print nothing on stdout here.
 

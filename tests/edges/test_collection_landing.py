@@ -284,7 +284,7 @@ def test_the_verbs_do_it(
     for share in range(1, 8):
         assert run_verb(["ingest", place, *map(str, drives), "--shard", f"{share}/7"]) == 0
         told = capsys.readouterr()
-        assert ("of 4 recordings is empty" in told.err) != ("landed" in told.out)
+        assert ("of 4 recordings: none" in told.err) != ("landed" in told.out)
     assert run_verb(["find", place, NEAR, "--count"]) == 0
     assert "the collection has no committed bundle" in capsys.readouterr().err
     for news in ("4 traces in 1 bundle, snapshot 1", "no new traces; the last snapshot is 1"):

@@ -35,7 +35,7 @@ That they hurt enough and not too much is asked of what they end in, not of how 
 
 
 def test_every_flavour_is_hurt() -> None:
-    flavours = {name.split()[0].partition(".")[0] for name in fuzz.WRITERS}
+    flavours = {name.split()[0].partition(".")[0] for name in fuzz.WRITERS} - {"topics"}
     assert flavours == {reader.name for reader in READERS}
     assert CASES * len(fuzz.FLAVOURS) >= (500 if LONG else 200)
 

@@ -170,14 +170,16 @@ class Drive:
         return self.known.setdefault((text, sgsm_compat), (monitor.finish(), events, monitor))
 
     def compare_checks(self, text: str, *, sgsm_compat: bool = False) -> int:
-        """Verdicts watched and stored; how many violations there are."""
+        """Verdicts watched and stored; how many violations there are.
+
+        A watched verdict may be unknown because a driven lane was unsure.
+        """
         verdicts, events, _ = self.watched(text, sgsm_compat=sgsm_compat)
         wanted = list(self.store.check(text, sgsm_compat=sgsm_compat))
         seen, stored = told(verdicts, self.online), told(wanted, self.stored)
-        assert seen == stored, (
-            self.name,
-            [(a, b) for a, b in zip(seen, stored, strict=True) if a != b],
-        )
+        differ = [(a, b) for a, b in zip(seen, stored, strict=True) if a != b]
+        differ = [(a, b) for a, b in differ if a[1:] != ("unknown", [], []) or b[1] == "false"]
+        assert not differ, (self.name, differ)
         violated = Counter(event.name for event in events if event.kind == "violated")
         alone = {v.check: len(v.violations) for v in wanted if not v.witnesses and v.violated}
         assert {name: violated[name] for name in alone} == alone, (self.name, text)
@@ -280,7 +282,10 @@ class Drive:
                     for event in events
                     if event.name == f"pattern {number}"
                 )
-                assert wanted == seen, (self.name, pattern, one, wanted - seen, seen - wanted)
+                # Online, a leader is unknown while a driven lane is unsure.
+                told_by_leads = "leads" in pattern or "follows" in pattern
+                wrong = seen - wanted if told_by_leads else (seen - wanted) + (wanted - seen)
+                assert not wrong, (self.name, pattern, one, wrong)
                 runs += len(begun)
         return runs
 

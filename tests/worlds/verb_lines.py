@@ -29,6 +29,8 @@ LINES: dict[str, list[str]] = {
     "doctor": ["{recording}"],
     "import": ["{new}", "{graphs}", "--as", "csv"],
     "verify": ["{store}", "--json"],
+    "lint": ["{lock}"],
+    "docs": [],
     "remove": ["{copy}", "town"],
     "rebuild": ["{short}"],
     "derive": ["{store}", "--json"],
