@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import httpx
 import pytest
 from explorer_page import AXE, NEAR, expect, faults, open_first, search, seen, time_shown
-from thorough import some
+from thorough import LONG
 
 from sgstore.apps.demo import RECORDING
 from sgstore.apps.report import inline, report
@@ -36,14 +36,18 @@ def test_an_answer_does_not_wait_for_the_one_before_it(
     served: Callable[[Path], str], town_store: Path
 ) -> None:
     """Small packets that are held back until others are confirmed take 40 ms each."""
-    took: list[float] = []
-    with httpx.Client(base_url=served(town_store)) as client:
-        for _ in range(20):
-            begun = time.perf_counter()
-            client.get("/api/nothing")
-            took.append(time.perf_counter() - begun)
 
-    assert min(took[1:]) < 0.03
+    def fastest(client: httpx.Client, headers: dict[str, str]) -> float:
+        took: list[float] = []
+        for _ in range(15):
+            begun = time.perf_counter()
+            client.get("/api/nothing", headers=headers)
+            took.append(time.perf_counter() - begun)
+        return min(took[1:])
+
+    with httpx.Client(base_url=served(town_store)) as client:
+        alone = fastest(client, {"Connection": "close"})
+        assert fastest(client, {}) < 5 * alone
 
 
 def test_the_library_is_there_before_anything_is_typed(page: Any, town_store: Path) -> None:
@@ -121,7 +125,9 @@ def test_lanes_are_the_parts_of_the_pattern(page: Any, town_store: Path) -> None
 # What a person does, from a search to a test set ----------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=some(["sample", "Town01.carla", "Town10HD_sumo_osi"], 2))
+@pytest.fixture(
+    scope="module", params=["sample", *(["Town01.carla", "Town10HD_sumo_osi"] if LONG else [])]
+)
 def place(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store: of the sample, and of recordings of other simulators."""
     if request.param == "sample":
@@ -336,12 +342,13 @@ def test_every_width_and_both_schemes_fit(page: Any, scheme: str) -> None:
     open_first(page)
     for width, height in ((1280, 800), (2560, 1400)):
         page.set_viewport_size({"width": width, "height": height})
-        page.wait_for_timeout(100)
-
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        box = page.locator(".above canvas").bounding_box()
-        assert box["width"] > 300
-        assert box["height"] > 250
+        page.wait_for_function(
+            """width => {
+              const box = document.querySelector(".above canvas").getBoundingClientRect();
+              return document.documentElement.scrollWidth <= width && box.width > 300 && box.height > 250;
+            }""",
+            arg=width,
+        )
         seen(page, f"scene-{width}-{scheme}")
 
 
