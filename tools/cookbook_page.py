@@ -148,7 +148,7 @@ def answer_to(entry: Entry, store: Store) -> str:
     if entry.language == "sgql-check":
         return table(*verdicts(entry, store))
     found = store.find(entry.text)
-    assert not found.notes
+    assert not found.notes, (entry.number, found.notes)
     return table(*short(found.columns, found))
 
 

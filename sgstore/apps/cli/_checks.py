@@ -127,7 +127,7 @@ def lint(files: list[Path]) -> int:
 
 
 def _read(file: Path) -> None:
-    """Raise an error if a file is no lock, or has a mistake in the query language."""
+    """Raise an error for a file that is neither a valid lock nor a valid text of the query language."""
     from sgstore.lang.catalog import Catalog
     from sgstore.lang.sql import compile_checks, compile_query
     from sgstore.lang.syntax import parse
