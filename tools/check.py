@@ -69,7 +69,7 @@ TESTS = {
     "sumo_net": "sumo",
     "sgg": "sgg sgg_* crowds world_rows",
     "user_notes": "serve",
-    "explorer": "serve live report explorer explorer_* page_units sandbox_pool",
+    "explorer": "serve live report explorer explorer_* sandbox_pool",
     "online": "online identity",
     "online_noise": "noise online",
     "store": "everyday store store_* topics topics_travel doors events world_rows fault_messages",

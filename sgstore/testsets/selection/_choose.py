@@ -315,7 +315,11 @@ def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
     if spec.one_of_alike and not isinstance(chosen.store, Store):
         units, held = cheapest_units(chosen, chosen.store, spec.wished)
         if units.total:
-            return _covering(spec, units, units.ranks(spec.seed), held)
+            found = _covering(spec, units, units.ranks(spec.seed), held)
+            if len(found.picked) == units.total > 1:
+                every = units_of(chosen, spec.unit, spec.clip_s, spec.stride_s)
+                found.said.append(_saves_nothing(spec, every))
+            return found
     else:
         units = units_of(chosen, spec.unit, spec.clip_s, spec.stride_s)
     if not units.total:
