@@ -51,7 +51,7 @@ def schema_version() -> str:
 
 
 TEXT: Final = (
-    "e9ebc59d420611f3c67a44adb57d4dc0075386363355a2e2d66a66a4417e8e16",
+    "1dd5ae585b258bb6ce8ca77ae469040829f80c6da68771f461419ac47af9c2af",
     "b97bda47e1fdf0a4a970985fd707ae4ee0fa509ef4d7056cbef17b61ee7f0bb5",
 )
 """Digests of the text and of the statements of ``schema.sql``. Parsing the statements takes 10 ms."""
@@ -385,14 +385,14 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 
 _MOST_COMPARED: Final = 64
 
-KNOWN: Final = "301269ba8fdf3e61843f4f12dba454cd03f1b3245979edf008de02d16f63eaaf"
+KNOWN: Final = "c1120163ae1e3e28cff199bb5cd2dcb4d0e6a712c280e3391c9b619a30691b79"
 """Digest of a store's objects in DuckDB 2. A comparison of tokens takes 30 ms.
 
 Objects of other versions are compared token by token.
 """
 
 
-KNOWN_BEFORE_TRACE: Final = "08b87305aed75d1f55843ceca6095e634f77b883d65c0bc40a289432f91d08ff"
+KNOWN_BEFORE_TRACE: Final = "00fb0323a035b16d0080d34433e0e113b97fafec157fc98bc1b7cb7873778ca9"
 """The same of a store without the column ``trace`` in ``nodes`` and ``edges``."""
 
 

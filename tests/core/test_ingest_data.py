@@ -75,7 +75,7 @@ def test_lights_change_their_state(ingested) -> None:
     store, _ = ingested
     sql = """
       SELECT n.name, count(DISTINCT n.light_state) FROM nodes n JOIN frames USING (frame_id)
-      WHERE trace = 'traffic_lights' AND n.kind = 'traffic_light' AND NOT n.is_static GROUP BY n.name
+      WHERE n.trace = 'traffic_lights' AND n.kind = 'traffic_light' AND NOT n.is_static GROUP BY n.name
     """
 
     assert max(states for _, states in store.rows(sql)) > 1

@@ -286,10 +286,12 @@ def of_trace(store: Path, name: str) -> dict[str, list[tuple[Any, ...]]]:
     low, high = trace.trace_id << 24, (trace.trace_id + 1) << 24
     return {
         "nodes": rows(
-            store, f"SELECT * FROM nodes WHERE frame_id BETWEEN {low} AND {high} ORDER BY ALL"
+            store,
+            f"SELECT * EXCLUDE (trace) FROM nodes WHERE frame_id BETWEEN {low} AND {high} ORDER BY ALL",
         ),
         "edges": rows(
-            store, f"SELECT * FROM edges WHERE frame_id BETWEEN {low} AND {high} ORDER BY ALL"
+            store,
+            f"SELECT * EXCLUDE (trace) FROM edges WHERE frame_id BETWEEN {low} AND {high} ORDER BY ALL",
         ),
         "frames": rows(
             store,

@@ -324,7 +324,7 @@ def test_it_stands_in_conditions_blocks_orders_and_counts_and_under_an_abstracti
         row[0]
         for row in store.sql(
             "SELECT DISTINCT node_id, kind FROM nodes JOIN frames USING (frame_id)"
-            " WHERE speed > -1 AND trace = 'drive'"
+            " WHERE speed > -1 AND nodes.trace = 'drive'"
         ).values
         if row[1] not in SIGNALS
     }

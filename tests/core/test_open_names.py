@@ -277,7 +277,7 @@ def test_a_store_made_before_takes_new_kinds_beside_what_it_has(
     before = sgstore.open(path).sql("SELECT * FROM nodes ORDER BY ALL").values
     store = brought_in(tmp_path, scene("a.jpg"), words=Words(unknown_as="own"))
     of_town = (
-        "SELECT n.* FROM nodes n JOIN frames USING (frame_id) WHERE trace = 'town' ORDER BY ALL"
+        "SELECT n.* FROM nodes n JOIN frames USING (frame_id) WHERE n.trace = 'town' ORDER BY ALL"
     )
 
     assert store.sql(of_town).values == before

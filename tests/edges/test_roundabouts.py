@@ -216,10 +216,10 @@ def test_a_monitor_tells_what_a_store_answers(drive: Store) -> None:
     monitor.finish()
     rows = drive.find(f"{text}, v.id, INTERVALS").rows()
 
-    assert sorted(e.values["nearest"] for e in events) == pytest.approx(
-        sorted(r.nearest for r in rows), abs=1e-3
-    )
-    assert rows
+    # Online, a match ends in frames whose driven lane is unsure, and begins again.
+    nearest = {round(row.nearest, 3) for row in rows}
+    assert {round(event.values["nearest"], 3) for event in events} == nearest
+    assert len(events) >= len(rows) > 0
 
 
 @pytest.mark.parametrize(
