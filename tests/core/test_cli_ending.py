@@ -46,7 +46,7 @@ NOT_ASKING = {
 
 ``mcp`` and ``serve`` bound each question by itself.
 """
-ASKING = [verb for verb in LINES if verb not in NOT_ASKING]
+ASKING = [verb for verb in LINES if verb not in NOT_ASKING | {"lint", "docs"}]
 OUTPUTS = {
     "select": ["-o", "{new}.lock", "--no-payloads"],
     "prioritize": ["-o", "{new}.lock", "--no-payloads"],

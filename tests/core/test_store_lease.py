@@ -46,7 +46,7 @@ def instance(store: StoreFile) -> duckdb.DuckDBPyConnection | None:
     return lease.files[store.path.resolve()].instance
 
 
-def until(true: Callable[[], bool], within: float = 20.0) -> float:
+def until(true: Callable[[], bool], within: float = 120.0) -> float:
     """Wait until something is true; how long that took."""
     start = time.monotonic()
     while not true():
