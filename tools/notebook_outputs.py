@@ -12,11 +12,13 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from IPython.core.interactiveshell import InteractiveShell
 from IPython.utils.capture import capture_output
-from traitlets.config import Config
+from notebooks import notebook_shell
+
+if TYPE_CHECKING:
+    from IPython.core.interactiveshell import InteractiveShell
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 KINDS = ("text/plain", "text/html", "image/png", "text/markdown")
@@ -35,30 +37,21 @@ def bundle(data: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def shell() -> InteractiveShell:
-    made = InteractiveShell.instance(history_load_length=0)
-    made.history_manager.enabled = False
-    made.config.IPKernelApp = Config()  # by which packages, DuckDB among them, know Jupyter
-    for formatter in made.display_formatter.formatters.values():
-        formatter.enabled = True
-    return made
-
-
-def outputs_of(made: InteractiveShell, source: str, number: int) -> list[dict[str, Any]]:
+def outputs_of(shell: InteractiveShell, source: str, number: int) -> list[dict[str, Any]]:
     """The outputs of a cell: printed text, displayed objects, and the result."""
     results: list[dict[str, Any]] = []
-    forms = made.displayhook.compute_format_data
+    forms = shell.displayhook.compute_format_data
 
     def compute(result: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        data, _ = made.display_formatter.format(result)
+        data, _ = shell.display_formatter.format(result)
         results.append(bundle(data))
         return {"text/plain": ""}, {}
 
-    made.displayhook.compute_format_data = compute
-    made.displayhook.write_output_prompt = lambda: None
+    shell.displayhook.compute_format_data = compute
+    shell.displayhook.write_output_prompt = lambda: None
     with capture_output() as held:
-        done = made.run_cell(source, store_history=False)
-    made.displayhook.compute_format_data = forms
+        done = shell.run_cell(source, store_history=False)
+    shell.displayhook.compute_format_data = forms
     error = done.error_before_exec or done.error_in_exec
     if error:
         raise SystemExit(f"{source}\n{error!r}")
@@ -76,12 +69,12 @@ def outputs_of(made: InteractiveShell, source: str, number: int) -> list[dict[st
 def run(path: Path) -> None:
     """Run one notebook in an empty folder, and store its outputs."""
     document = json.loads(path.read_text(encoding="utf-8"))
-    made = shell()
+    shell = notebook_shell()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         cells = [one for one in document["cells"] if one["cell_type"] == "code"]
         for number, cell in enumerate(cells, 1):
-            cell["outputs"] = outputs_of(made, "".join(cell["source"]), number)
+            cell["outputs"] = outputs_of(shell, "".join(cell["source"]), number)
             cell["execution_count"] = number
         os.chdir(path.parent)
     text = json.dumps(document, indent=1, ensure_ascii=False)

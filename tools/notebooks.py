@@ -39,12 +39,18 @@ def watched(shell: InteractiveShell) -> dict[str, Any]:
     return held
 
 
-def main() -> int:
+def notebook_shell() -> InteractiveShell:
+    """An IPython that shows results as a notebook does."""
     shell = InteractiveShell.instance(history_load_length=0)
     shell.history_manager.enabled = False
     shell.config.IPKernelApp = Config()  # by which packages, DuckDB among them, know Jupyter
     for formatter in shell.display_formatter.formatters.values():
         formatter.enabled = True  # as a notebook has it; a terminal shows plain texts
+    return shell
+
+
+def main() -> int:
+    shell = notebook_shell()
     held = watched(shell)
     for number, text in enumerate(cells_of(Path(sys.argv[1]))):
         held.clear()
