@@ -51,6 +51,17 @@ def fields_of(facts: TopicFacts) -> Mapping[str, TopicField]:
     return facts.source()
 
 
+_READ: Final = {("protobuf", "protobuf"), ("cdr", "ros2msg")}
+
+
+def refusal(message_encoding: str, schema_encoding: str) -> str:
+    """Return the reason why messages of an encoding cannot be decoded; empty if they can."""
+    if message_encoding == "json" or (message_encoding, schema_encoding) in _READ:
+        return ""
+    by = f" with a schema in {schema_encoding!r}" if schema_encoding else " without a schema"
+    return f"its encoding is {message_encoding!r}{by}; protobuf, JSON, and CDR with ros2msg can be decoded"
+
+
 def topic_of(topics: Mapping[str, TopicFacts], name: str) -> TopicFacts:
     """Return the facts of a topic.
 

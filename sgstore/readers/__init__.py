@@ -18,7 +18,7 @@ from sgstore.readers._registry import (
 )
 from sgstore.readers._roles import channel_rank
 from sgstore.readers._ros2 import decode, parse_definition
-from sgstore.readers._topics import TopicBatch, TopicReading, refusal
+from sgstore.readers._topics import TopicBatch, TopicReading
 from sgstore.readers.carla._live import (
     LiveWorld,
     Sensor,
@@ -71,7 +71,6 @@ __all__ = [
     "read_message",
     "read_messages",
     "record_reader",
-    "refusal",
 ]
 
 # For authors of readers; see docs/flavours.md.

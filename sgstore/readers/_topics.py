@@ -15,7 +15,7 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.lang.catalog import TopicFacts
-from sgstore.lang.topics import TopicError, fields_of, topic_of
+from sgstore.lang.topics import TopicError, fields_of, refusal, topic_of
 from sgstore.mcap import MESSAGE_HEAD, Messages
 from sgstore.readers._ros2 import parse_definition
 from sgstore.readers._topic_cdr import CdrColumns
@@ -115,17 +115,6 @@ def decoder_of(message_encoding: str, schema: Schema | None) -> TopicColumns:
     if schema is not None and message_encoding == "cdr":
         return CdrColumns(parse_definition(schema.name, schema.data), names)
     return ProtobufColumns(message_class(cast("Schema", schema), whole=True), names)
-
-
-_READ: Final = {("protobuf", "protobuf"), ("cdr", "ros2msg")}
-
-
-def refusal(message_encoding: str, schema_encoding: str) -> str:
-    """Return the reason why messages of an encoding cannot be decoded; empty if they can."""
-    if message_encoding == "json" or (message_encoding, schema_encoding) in _READ:
-        return ""
-    by = f" with a schema in {schema_encoding!r}" if schema_encoding else " without a schema"
-    return f"its encoding is {message_encoding!r}{by}; protobuf, JSON, and CDR with ros2msg can be decoded"
 
 
 class ProtobufColumns:

@@ -765,7 +765,7 @@ class StoreFile:
 
     def _show_topics(self, connection: DuckDBPyConnection, sql: str) -> None:
         """Create the views of the topics that a statement names."""
-        if '":' in sql:
+        if '":topic ' in sql:
             from sgstore.store._topic_views import show_topics
 
             show_topics(connection, self.access, sql)

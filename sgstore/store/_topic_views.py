@@ -27,11 +27,11 @@ from sgstore.lang.topics import (
     common_fields,
     field_of,
     fields_of,
+    refusal,
     topic_of,
 )
 from sgstore.mcap import Findings, mark_of
 from sgstore.model.frame_ids import SEQ_BITS
-from sgstore.readers import TopicReading, open_recording, refusal
 from sgstore.store._joins import tables_folder
 from sgstore.store._locking import default_memory, shut_in
 from sgstore.store._schema import INSIDE
@@ -49,18 +49,18 @@ from sgstore.store._topics import (
 from sgstore.store._traces import stored_traces, unchanged
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Mapping
+    from collections.abc import Callable, Collection, Generator, Iterator, Mapping
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
 
-    from sgstore.mcap import Recording
+    from sgstore.readers import TopicReading
     from sgstore.store._locking import Access
     from sgstore.store._traces import StoredTrace
 
 T = TypeVar("T")
 
-_NAMED: Final = re.compile(rf'"({TOPIC}|:messages) ((?:[^"]|"")+)"')
+_NAMED: Final = re.compile(rf'"{TOPIC} ((?:[^"]|"")+)"')
 
 
 def show_topics(connection: DuckDBPyConnection, access: Access, sql: str) -> None:
@@ -71,8 +71,13 @@ def show_topics(connection: DuckDBPyConnection, access: Access, sql: str) -> Non
     TopicError
         A topic does not exist, or its recording cannot be read.
     """
-    for topic in {name.replace('""', '"') for _, name in _NAMED.findall(sql)}:
+    for topic in _topics_in(sql):
         _show(connection, access, topic)
+
+
+def _topics_in(sql: str) -> list[str]:
+    """Return the topics whose views an SQL statement names, each once."""
+    return [name.replace('""', '"') for name in dict.fromkeys(_NAMED.findall(sql))]
 
 
 def _show(connection: DuckDBPyConnection, access: Access, topic: str) -> dict[str, str]:
@@ -197,14 +202,24 @@ def converted(
 ) -> TopicFile:
     """Write the messages of a topic of a recording to Parquet files in a folder."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    with open_recording(path) as recording, topic_scratch(folder) as connection:
-        _find_channels(recording)
-        reading = TopicReading(recording, [topic])
+    with _reading(path, [topic]) as reading, topic_scratch(folder) as connection:
         writer = TopicWriter(connection, folder, clock, bounded=bounded)
         for batch in reading.batches(Findings()):
             writer.add(batch)
         (file,) = writer.files(reading)
     return file
+
+
+@contextmanager
+def _reading(path: Path, topics: Collection[str]) -> Generator[TopicReading]:
+    """Open a recording, and yield the reading of some of its topics."""
+    from sgstore.readers import TopicReading, open_recording  # most queries name no topic
+
+    with open_recording(path) as recording:
+        if not recording.channels:  # without a summary, the channels are known after a reading
+            for _ in recording.walk(Findings()):
+                pass
+        yield TopicReading(recording, topics)
 
 
 class RecordingSql:
@@ -228,7 +243,7 @@ class RecordingSql:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         memory, threads = default_memory(), os.cpu_count() or 1
         with ExitStack() as stack, scratch(folder, memory=memory, threads=threads) as connection:
-            for topic in dict.fromkeys(topic for _, topic in _NAMED.findall(sql)):
+            for topic in _topics_in(sql):
                 self._show(connection, topic)
             connection.execute(f"CREATE SCHEMA {INSIDE}")
             connection.execute(f"CREATE TABLE {INSIDE}.store_info (key VARCHAR, value VARCHAR)")
@@ -264,8 +279,8 @@ _NO_TABLE: Final = re.compile(r"Table with name (\S+) does not exist")
 
 def _first_ns(path: Path) -> int:
     """Return the log time at which a recording begins, as far as its first messages show; ns."""
-    with open_recording(path) as recording:
-        for run in recording.walk(Findings()):
+    with _reading(path, ()) as reading:
+        for run in reading.recording.walk(Findings()):
             if len(run):
                 return int(run.log_time_ns.min())
     return 0
@@ -315,23 +330,14 @@ def _fields(held: ref[Access], topic: str) -> Mapping[str, TopicField]:
 
 def topics_in(path: Path) -> dict[str, TopicFacts]:
     """Return the topics of a recording, by name, without fields."""
-    with open_recording(path) as recording:
-        _find_channels(recording)
-        return TopicReading(recording, ()).known
-
-
-def _find_channels(recording: Recording) -> None:
-    """Read a recording without a summary once, because its channels are known only then."""
-    if not recording.channels:
-        for _ in recording.walk(Findings()):
-            pass
+    with _reading(path, ()) as reading:
+        return reading.known
 
 
 def fields_in(path: Path, topic: str) -> dict[str, str] | None:
     """Return the fields of a topic of a recording, with database types. ``None`` means JSON: read it first."""
-    with open_recording(path) as recording:
-        _find_channels(recording)
-        found = TopicReading(recording, [topic]).fields(topic)
+    with _reading(path, [topic]) as reading:
+        found = reading.fields(topic)
     return None if found is None else {name: one.declared for name, one in found.items()}
 
 
@@ -344,7 +350,7 @@ def field_fault(connection: DuckDBPyConnection, sql: str, message: str) -> str:
     ``message``: error of the database.
     """
     found = _UNKNOWN.search(message)
-    topics = dict.fromkeys(topic for view, topic in _NAMED.findall(sql) if view == TOPIC)
+    topics = _topics_in(sql)
     if found is None or not topics:
         return ""
     name = found["name"]

@@ -410,6 +410,7 @@ import sys
 from sgstore.apps.cli import run
 assert run(["--help"]) == 0
 assert run(["find", sys.argv[1], "MATCH (e:Ego) WHERE e.speed > 5", "--count"]) == 0
+assert "sgstore.readers" not in sys.modules  # only topics of recordings need them
 import sgstore
 with sgstore.open(sys.argv[1]) as store:
     assert store.find("MATCH (e:Ego)").rows()
