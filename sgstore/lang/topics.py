@@ -84,6 +84,11 @@ def unknown_topic(name: str, known: Iterable[str]) -> TopicError:
     return TopicError(f"no topic {excerpt(name)!r}", f"did you mean {like!r}?" if like else listed)
 
 
+def field_list(names: Iterable[tuple[str, str]]) -> dict[str, TopicField]:
+    """Return fields by name, from names and database types."""
+    return {name: TopicField(name, declared) for name, declared in names}
+
+
 def field_of(facts: TopicFacts, path: str) -> TopicField:
     """Return a field of a topic, or an element of a list field: ``covariance[0]``.
 
@@ -92,7 +97,11 @@ def field_of(facts: TopicFacts, path: str) -> TopicField:
     TopicError
         The topic has no such field, or cannot be decoded. The hint has the most similar field.
     """
-    fields = fields_of(facts)
+    return field_named(fields_of(facts), facts.name, path)
+
+
+def field_named(fields: Mapping[str, TopicField], topic: str, path: str) -> TopicField:
+    """Return a field of a topic, as :func:`field_of`, from all of its fields."""
     folded = {name.lower(): field for name, field in fields.items()}
     found = fields.get(path) or folded.get(path.lower())
     if found is not None:
@@ -102,7 +111,7 @@ def field_of(facts: TopicFacts, path: str) -> TopicField:
     if element and of and of.declared.endswith("[]"):
         return TopicField(f"{of.name}[{int(element['index'])}]", of.declared.removesuffix("[]"))
     hint = _like(path, fields)
-    raise TopicError(f"topic {excerpt(facts.name)!r} has no field {excerpt(path)!r}", hint)
+    raise TopicError(f"topic {excerpt(topic)!r} has no field {excerpt(path)!r}", hint)
 
 
 def _like(path: str, fields: Mapping[str, TopicField]) -> str:
@@ -151,7 +160,7 @@ def topics_of_parts(told: Mapping[str, Mapping[str, str]]) -> dict[str, TopicFac
     """
     found: dict[str, TopicFacts] = {}
     for name, kinds in told.items():
-        fields = {field: TopicField(field, kind) for field, kind in kinds.items() if field}
+        fields = field_list((field, kind) for field, kind in kinds.items() if field)
         reason = "" if fields else kinds.get("", "")
         source = partial(dict[str, TopicField], fields)
         found[name] = TopicFacts(

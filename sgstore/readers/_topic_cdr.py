@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.errors import TraceError
+from sgstore.lang.topics import field_list
 from sgstore.readers._ros2 import (
     HEAD,
     LENGTH,
@@ -29,7 +30,6 @@ from sgstore.readers._topic_values import (
     MAX_TEXT,
     TopicNames,
     column_of,
-    field_list,
     joined_columns,
 )
 

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.lang.catalog import TopicField
-
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
@@ -266,8 +264,3 @@ def as_number(value: Any) -> Any:
         return float(value)
     except OverflowError:
         return math.inf if value > 0 else -math.inf
-
-
-def field_list(names: Iterable[tuple[str, str]]) -> dict[str, TopicField]:
-    """Return fields by name, from names and database types."""
-    return {name: TopicField(name, declared) for name, declared in names}

@@ -15,7 +15,7 @@ import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.lang.catalog import TopicFacts
-from sgstore.lang.topics import TopicError, fields_of, refusal, topic_of
+from sgstore.lang.topics import TopicError, field_list, fields_of, refusal, topic_of
 from sgstore.mcap import MESSAGE_HEAD, Messages
 from sgstore.readers._ros2 import parse_definition
 from sgstore.readers._topic_cdr import CdrColumns
@@ -26,7 +26,6 @@ from sgstore.readers._topic_values import (
     TopicNames,
     as_number,
     column_of,
-    field_list,
     guessed,
     wider,
 )

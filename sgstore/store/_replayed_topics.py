@@ -10,7 +10,7 @@ import numpy as np
 
 from sgstore.base.quoting import quoted
 from sgstore.base.temporary_folders import working_folder
-from sgstore.lang.catalog import TopicField
+from sgstore.lang.topics import field_list, field_named
 from sgstore.store._schema import INSIDE
 from sgstore.store._topic_views import converted, fields_in, topics_in, values_text
 from sgstore.store._topics import FrameClock, topic_scratch
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from sgstore.lang.catalog import TopicFacts, TopicValue
+    from sgstore.lang.catalog import TopicFacts, TopicField, TopicValue
     from sgstore.model.world import Ints
 
 
@@ -39,7 +39,7 @@ def _fields(path: Path, topic: str) -> Mapping[str, TopicField]:
         with working_folder("topics") as folder:
             clock = FrameClock(nothing, nothing, nothing)
             fields = converted(path, topic, folder, clock).fields
-    return {name: TopicField(name, kind) for name, kind in fields.items()}
+    return field_list(fields.items())
 
 
 def recorded_values(
@@ -62,19 +62,19 @@ def recorded_values(
         connection.execute(f"CREATE SCHEMA {INSIDE}")
         connection.register("frames", {**frames, "trace_id": np.zeros_like(number)})
         connection.execute(f"CREATE TABLE {INSIDE}.frame AS FROM frames")
-        kinds: dict[str, Mapping[str, str]] = {}
+        fields: dict[str, Mapping[str, TopicField]] = {}
         for place, topic in enumerate(dict.fromkeys(one.topic for one in asked)):
             held = folder / str(place)
             file = converted(path, topic, held, clock)
-            kinds[topic] = file.fields
+            fields[topic] = field_list(file.fields.items())
             view = quoted(f":messages {topic}")
             connection.execute(f"CREATE TEMP VIEW {view} AS {file.rows(held)}")
         for one in asked:
-            kind = kinds[one.topic].get(one.field, "DOUBLE")
-            nan = kind in {"FLOAT", "DOUBLE"}
-            text = values_text(one.topic, one.field, one.rule, one.tolerance_ns, may_be_nan=nan)
-            column: list[Any] = [None] * len(number)
+            found[one] = column = [None] * len(number)
+            if not fields[one.topic]:  # JSON without messages
+                continue
+            field = field_named(fields[one.topic], one.topic, one.field)
+            text = values_text(one.topic, field, one.rule, one.tolerance_ns)
             for frame, value in connection.execute(text).fetchall():
                 column[frame] = value
-            found[one] = column
     return found

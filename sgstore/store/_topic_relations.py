@@ -50,7 +50,7 @@ def _write(connection: DuckDBPyConnection, access: Access, relation: str, place:
     made = "SELECT CAST(NULL AS BIGINT) AS frame_id, CAST(NULL AS BOOLEAN) AS value LIMIT 0"
     topic = topic_facts(connection, access).get(one.topic)
     if topic is not None and topic.source():  # a part of a collection may lack it
-        made = topic_values(connection, access, one.topic, one.field, one.rule, one.tolerance_ns)
+        made = topic_values(connection, access, topic, one.field, one.rule, one.tolerance_ns)
     place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     part = place.with_suffix(f".{id(connection)}")
     copy = f"COPY (FROM ({made}) ORDER BY frame_id) TO {literal(str(part))} (FORMAT parquet)"

@@ -25,7 +25,8 @@ from sgstore.lang.syntax import TOPIC
 from sgstore.lang.topics import (
     TopicError,
     common_fields,
-    field_of,
+    field_list,
+    field_named,
     fields_of,
     refusal,
     topic_of,
@@ -71,8 +72,10 @@ def show_topics(connection: DuckDBPyConnection, access: Access, sql: str) -> Non
     TopicError
         A topic does not exist, or its recording cannot be read.
     """
+    with access.reading() as reading:
+        known = topic_facts(reading, access)
     for topic in _topics_in(sql):
-        _show(connection, access, topic)
+        _show(connection, access, topic_of(known, topic), topic)
 
 
 def _topics_in(sql: str) -> list[str]:
@@ -80,12 +83,11 @@ def _topics_in(sql: str) -> list[str]:
     return [name.replace('""', '"') for name in dict.fromkeys(_NAMED.findall(sql))]
 
 
-def _show(connection: DuckDBPyConnection, access: Access, topic: str) -> dict[str, str]:
-    """Create the views of a topic, and return its fields with their database types."""
+def _show(connection: DuckDBPyConnection, access: Access, facts: TopicFacts, topic: str) -> None:
+    """Create the views of a topic, with a name as in the statement: the ``/`` can be missing."""
+    if facts.refused:
+        fields_of(facts)
     with access.reading() as reading:
-        facts = topic_of(topic_facts(reading, access), topic)
-        if facts.refused:
-            fields_of(facts)
         sources = [*_sources(reading, access, facts)]
     fields = common_fields(one.fields for one in sources)
     rows = " UNION ALL ".join(one.rows(fields) for one in sources)
@@ -98,7 +100,6 @@ def _show(connection: DuckDBPyConnection, access: Access, topic: str) -> dict[st
         f" m.publish_time_ns{listed} FROM {view} m"
         f" JOIN {INSIDE}.trace t ON t.trace_id = m.{quoted(FRAME)} >> {SEQ_BITS}"
     )
-    return fields
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,20 +171,23 @@ def _of_recording(
     connection: DuckDBPyConnection, access: Access, trace: StoredTrace, topic: str
 ) -> _Source:
     """Convert a topic of a recording to files, once per process."""
-    key = (trace.trace_id, trace.frames, trace.start_ns, trace.end_ns, topic)
-    folder = _folder(key)
-    file = _converted.get((folder, *key))
-    if file is None:
+
+    def convert(folder: Path) -> TopicFile:
         clock = FrameClock.of_stored(connection, trace.trace_id)
         bounded = (trace.since, trace.until) != (None, None)
-        path = _recording(trace, topic)
-        file = _converted[folder, *key] = converted(path, topic, folder, clock, bounded=bounded)
-    return _Source(f"({file.rows(folder)})", file.fields)
+        return converted(_recording(trace, topic), topic, folder, clock, bounded=bounded)
+
+    return _once((trace.trace_id, trace.frames, trace.start_ns, trace.end_ns, topic), convert)
 
 
-def _folder(key: tuple[Any, ...]) -> Path:
+def _once(key: tuple[Any, ...], convert: Callable[[Path], TopicFile]) -> _Source:
+    """Return the files of a topic. They are made in a new folder if this process has not made them before."""
     name = hashlib.sha256(repr(key).encode("utf-8", "replace")).hexdigest()[:16]
-    return tables_folder() / "topics" / name
+    folder = tables_folder() / "topics" / name
+    file = _converted.get((folder, *key))
+    if file is None:
+        file = _converted[folder, *key] = convert(folder)
+    return _Source(f"({file.rows(folder)})", file.fields)
 
 
 def _recording(trace: StoredTrace, topic: str) -> Path:
@@ -259,18 +263,17 @@ class RecordingSql:
                 raise SqlError(f"{reason}: {example}; ingest it for scene graphs") from error
 
     def _show(self, connection: DuckDBPyConnection, topic: str) -> None:
-        key = (str(self._path), *mark_of(self._path), topic)
-        folder = _folder(key)
-        file = _converted.get((folder, *key))
-        if file is None:
+        def convert(folder: Path) -> TopicFile:
             first = np.array([_first_ns(self._path)])
             clock = FrameClock(np.zeros(1, np.int64), np.zeros(1, np.int64), first)
-            file = _converted[folder, *key] = converted(self._path, topic, folder, clock)
-        listed = "".join(f", {quoted(name)}" for name in file.fields)
+            return converted(self._path, topic, folder, clock)
+
+        source = _once((str(self._path), *mark_of(self._path), topic), convert)
+        listed = "".join(f", {quoted(name)}" for name in source.fields)
         connection.execute(
             f"CREATE TEMP VIEW {quoted(f'{TOPIC} {topic}')} AS SELECT {literal(self._path.stem)} AS trace,"
             ' round(":time_ns" / 1e3) / 1e6 AS t, log_time_ns, publish_time_ns'
-            f"{listed} FROM ({file.rows(folder)})"
+            f"{listed} FROM {source.table}"
         )
 
 
@@ -325,7 +328,7 @@ def _fields(held: ref[Access], topic: str) -> Mapping[str, TopicField]:
         for trace in others[:1]:
             fields = fields_in(_recording(trace, topic), topic)
             told.append(fields or dict(_of_recording(connection, access, trace, topic).fields))
-    return {name: TopicField(name, kind) for name, kind in common_fields(told).items()}
+    return field_list(common_fields(told).items())
 
 
 def topics_in(path: Path) -> dict[str, TopicFacts]:
@@ -356,19 +359,14 @@ def field_fault(connection: DuckDBPyConnection, sql: str, message: str) -> str:
     name = found["name"]
     for topic in topics:
         rows = connection.execute(f"DESCRIBE {quoted(f'{TOPIC} {topic}')}").fetchall()
-        fields = {str(row[0]): TopicField(str(row[0]), str(row[1])) for row in rows}
+        fields = field_list((str(row[0]), str(row[1])) for row in rows)
         within = [one for one in fields if one.lower().startswith(f"{name.lower()}.")]
         if found["what"] == "table" and within:
             reason = f"topic {topic!r} has no table {name!r}"
             return f'{reason}; write a dotted field in double quotes: "{within[0]}"'
         if found["what"] == "column":
             try:
-                field_of(
-                    TopicFacts(
-                        topic, frozenset(), stored=True, refused="", source=lambda f=fields: f
-                    ),
-                    name,
-                )
+                field_named(fields, topic, name)
             except TopicError as error:
                 return str(error)
     return ""
@@ -380,7 +378,7 @@ def field_fault(connection: DuckDBPyConnection, sql: str, message: str) -> str:
 def topic_values(
     connection: DuckDBPyConnection,
     access: Access,
-    topic: str,
+    facts: TopicFacts,
     field: str,
     rule: str = "last",
     tolerance_ns: int | None = None,
@@ -392,8 +390,9 @@ def topic_values(
     connection : DuckDBPyConnection
         Connection of the statement. It gets the views of the topic.
     access : Access
-    topic, field : str
-        ``/imu``; ``linear_acceleration.z``, ``covariance[0]``.
+    facts : TopicFacts
+    field : str
+        ``linear_acceleration.z``, ``covariance[0]``
     rule : str
         ``last``: of the last message at or before the frame; ``nearest``: of the nearest one, the earlier one
         of two; ``linear``: interpolated between the messages before and after.
@@ -403,33 +402,30 @@ def topic_values(
     Raises
     ------
     TopicError
-        The topic or the field does not exist, or cannot be interpolated.
+        The topic cannot be decoded; or the field does not exist, or cannot be interpolated.
 
     Notes
     -----
     Values never cross a backward step of the clock of the frames. Among messages of equal log time, the last
     one counts.
     """
-    with access.reading() as reading:
-        facts = topic_of(topic_facts(reading, access), topic)
-    known = field_of(facts, field)
+    known = field_named(fields_of(facts), facts.name, field)
     if rule == "linear" and known.type is not Type.number:
         reason = f"field {known.name!r} of topic {facts.name!r} is not a number"
         raise TopicError(reason, "rules for it are last and nearest")
-    _show(connection, access, facts.name)
-    number = known.declared in {"FLOAT", "DOUBLE"}
-    return values_text(facts.name, known.name, rule, tolerance_ns, may_be_nan=number)
+    _show(connection, access, facts, facts.name)
+    return values_text(facts.name, known, rule, tolerance_ns)
 
 
-def values_text(
-    topic: str, field: str, rule: str, tolerance_ns: int | None, *, may_be_nan: bool
-) -> str:
+def values_text(topic: str, field: TopicField, rule: str, tolerance_ns: int | None) -> str:
     """Return SQL as :func:`topic_values`, for a connection that has the view of the messages."""
     within = "" if tolerance_ns is None else f" <= {int(tolerance_ns)}"
-    value = _value(field)
+    value = _value(field.name)
+    if field.declared in {"FLOAT", "DOUBLE"}:
+        value = f"CASE WHEN NOT isnan({value}) THEN {value} END"
     values = _VALUES.format(
         shift=SEQ_BITS,
-        value=f"CASE WHEN NOT isnan({value}) THEN {value} END" if may_be_nan else value,
+        value=value,
         messages=quoted(f":messages {topic}"),
         inside=INSIDE,
     )

@@ -145,7 +145,7 @@ def test_values_are_those_of_the_definition(tmp_path: Path, seed: int) -> None:
     assert [*seen.values()] == found
 
 
-def drive(path: Path, *, planner: bool = True, z: float = 0.0) -> Path:
+def drive(path: Path, *, planner: bool = True, z: float = 0.0, words: bool = False) -> Path:
     """A drive of 2 s. The planner says STOP from 1 s on, every 0.3 s; its ``z`` rises by 1 each time."""
     with Recorder(path) as recorder:
         for i in range(20):
@@ -153,6 +153,10 @@ def drive(path: Path, *, planner: bool = True, z: float = 0.0) -> Path:
                 content = {"state": "STOP" if i >= 10 else "GO", "z": z + i // 3, "values": [i, 7]}
                 channel = recorder.channel("/planner", "Planner", SCHEMA)
                 recorder.write(channel, i / 10, json.dumps(content).encode())
+            if words:
+                recorder.channel("/empty", "Empty", b"")
+                channel = recorder.channel("/words", "Words", b"")
+                recorder.write(channel, i / 10, b'{"words": ["a", "b"]}')
             cars = [car(1, x=i, v=(10, 0)), car(2, x=70 - i, v=(-10, 0))]
             recorder.ground_truth(i / 10, cars, host=1)
     return path
@@ -198,6 +202,24 @@ def test_topics_are_values_in_every_clause(tmp_path: Path) -> None:
         f"MATCH (e:Ego) WHERE {z} > 5 RETURN COUNT(*) AS n, trace.name AS t ORDER BY t"
     )
     assert [tuple(row) for row in counts.rows()] == [(2, "a"), (20, "c")]
+
+
+def test_a_replay_has_the_verdicts_of_the_store(tmp_path: Path) -> None:
+    """Of an element of a list of texts, and of a topic without messages."""
+    path = drive(tmp_path / "d.mcap", words=True)
+    store = sgstore.open(tmp_path / "s.sgstore", create=True)
+    store.ingest(path)
+    text = (
+        "CHECK words: ALWAYS topic('/words', INF).words[1] = 'b';"
+        " CHECK none: ALWAYS topic('/empty').z > 1"
+    )
+    verdicts = {one.check: one.verdict for one in store.check(text)}
+    assert verdicts == {"words": "true", "none": "unknown"}
+    with opened(str(path), sgstore.Config()) as source:
+        monitor = Monitor(text, source.road_map, topics=source.topics, trace=source.name)
+        for frame in source.frames:
+            monitor.step(frame)
+        assert {one.check: one.verdict for one in monitor.finish()} == verdicts
 
 
 def test_a_collection_has_topics_of_some_stores(tmp_path: Path) -> None:
