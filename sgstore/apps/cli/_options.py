@@ -141,10 +141,11 @@ class Verb(TyperCommand):
 
         Options of a method of the library have the help of its docstring.
         """
-        about = library_help(_path_of(ctx))
         options: list[Any] = self.params
-        for one in options:
-            one.help = one.help or about.get(one.name or "")
+        undescribed = [one for one in options if not one.help]
+        about = library_help(_path_of(ctx)) if undescribed else {}
+        for one in undescribed:
+            one.help = about.get(one.name or "")
         super().format_help(ctx, formatter)
         _write_examples(ctx)
 

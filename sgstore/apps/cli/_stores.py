@@ -27,7 +27,6 @@ from sgstore.apps.cli._output import Format, count_bar, say, write_rows
 from sgstore.base.display import excerpts
 from sgstore.base.output_files import write_bytes
 from sgstore.errors import ExportError, StoreError
-from sgstore.model.vocabulary import suggestion
 
 if TYPE_CHECKING:
     from sgstore.maps.roads import RoadMap
@@ -359,6 +358,8 @@ def docs(page: Annotated[str, Argument()] = "") -> int:
     page : PAGE
         Name of a page, such as language, exports or glossary.
     """
+    from sgstore.model.vocabulary import suggestion
+
     pages = _pages()
     if not pages:
         raise StoreError("the pages of the documentation are not installed")
