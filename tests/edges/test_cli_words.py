@@ -181,6 +181,12 @@ def test_no_help_has_a_placeholder_of_a_flag(capsys: pytest.CaptureFixture[str])
         assert "bool" not in capsys.readouterr().out
 
 
+def test_no_help_has_a_type_of_python(capsys: pytest.CaptureFixture[str]) -> None:
+    for path in ("check", "info", "lint", "patterns list", "select", "timeline"):
+        assert run([*path.split(), "--help"]) == 0
+        assert not re.search(r"list\[|<(?:str|Path|int|float)\b", capsys.readouterr().out), path
+
+
 # Old words
 
 

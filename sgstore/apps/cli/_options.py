@@ -109,10 +109,6 @@ if TYPE_CHECKING:
 class Verb(TyperCommand):
     """Command of ``sgstore`` that rejects a repeated option, unless the option collects several values."""
 
-    def get_params(self, ctx: Any) -> list[Any]:
-        """Return the arguments and options of a command; flags show no type in the help."""
-        return _plain(super().get_params(ctx))
-
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments of a command, and return the unparsed ones."""
         if ctx.resilient_parsing:  # completion of an unfinished command line
@@ -141,11 +137,13 @@ class Verb(TyperCommand):
 
         Options of a method of the library have the help of its docstring.
         """
-        options: list[Any] = self.params
+        options: list[Any] = self.get_params(ctx)
         undescribed = [one for one in options if not one.help]
         about = library_help(_path_of(ctx)) if undescribed else {}
         for one in undescribed:
             one.help = about.get(one.name or "")
+        for one in options:
+            _show_plainly(one, ctx)
         super().format_help(ctx, formatter)
         _write_examples(ctx)
 
@@ -214,12 +212,18 @@ def _means_files(path: str, args: Sequence[str]) -> bool:
     return path == "import" or not {*values} <= {*Format} - {Format.parquet}
 
 
-def _plain(parameters: list[Any]) -> list[Any]:
-    """Return parameters whose flags have no placeholder, such as ``<bool>``, in the help."""
-    for one in parameters:
-        if getattr(one, "is_flag", False):
-            one.metavar = ""
-    return parameters
+_TYPES: Final = {"str": "text", "Path": "path", "int": "number", "float": "number"}
+"""Types of Python → placeholders in the help."""
+
+
+def _show_plainly(parameter: Any, ctx: Any) -> None:
+    """Give a parameter a placeholder in the help without types of Python; a flag needs none."""
+    if getattr(parameter, "is_flag", False):
+        parameter.metavar = ""
+    kind = parameter.display_type(ctx).strip("<>").removeprefix("list[").removesuffix("]")
+    kind = kind.removesuffix(" range")
+    shown = f"<{_TYPES.get(kind, kind)}>"
+    parameter.display_type = lambda *_: shown  # pyright: ignore[reportUnknownLambdaType]
 
 
 @cache
@@ -351,7 +355,7 @@ class Group(TyperGroup):
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the options of the group; none while the help lists its commands."""
-        return _plain(super().get_params(ctx)) if self._shows_options else []
+        return super().get_params(ctx) if self._shows_options else []
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help of a group: its commands, its options and its examples."""
