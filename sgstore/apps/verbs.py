@@ -276,34 +276,28 @@ def diff(
     parameters: Any,
 ) -> ReportTable:
     """Compare two stores; see :meth:`sgstore.query.StoreVerbs.diff`."""
-    return compared(
-        chosen_frames(store, "", None),
-        frames_at(other),
-        query,
-        parameters or {},
-        by_frame,
-        abstraction,
-    )
+    text, values = statement(query, parameters or {}, check=True) if query else ("", {})
+    whole, than = chosen_frames(store, "", None), frames_at(other)
+    return compared(whole, than, text, values, by_frame, abstraction)
 
 
 def compared(
     a: ChosenFrames,
     b: ChosenFrames,
-    query: str,
-    parameters: Mapping[str, object],
+    text: str,
+    values: Mapping[str, object],
     by_frame: bool,  # noqa: FBT001 - named by the callers
     abstraction: str,
 ) -> ReportTable:
-    """Return the differences of two selections of frames: their scenes, or the results of a query."""
+    """Return the differences of two selections of frames: their scenes, or the results of a statement."""
     from sgstore.testsets import diff as differences
     from sgstore.testsets.coverage import classed
 
-    if query and by_frame:
+    if text and by_frame:
         raise ConfigError("expected one of a query and --by-frame")
-    if not query:
+    if not text:
         compare = differences.by_frame if by_frame else differences.scenes
         return compare(*(classed(one, abstraction) for one in (a, b)))
-    text, values = statement(query, parameters, check=True)
     results = differences.verdicts if differences.has_checks(text) else differences.matches
     return results(a.store, b.store, text, values)
 

@@ -40,8 +40,6 @@ from sgstore.apps.cli._options import (
 from sgstore.apps.cli._output import count_bar, say
 
 if TYPE_CHECKING:
-    from sgstore.collection import Collection
-    from sgstore.query import Store
     from sgstore.testsets.coverage import ChosenFrames
     from sgstore.testsets.locks import Lock
     from sgstore.testsets.selection import Prioritized, Selection
@@ -288,32 +286,22 @@ def diff(
     require
         End with exit code 4 if the results differ.
     """
+    from sgstore.apps.verbs import compared
     from sgstore.testsets import diff as differences
-    from sgstore.testsets.coverage import classed
+    from sgstore.testsets.coverage import ChosenFrames
 
     if sum(one is not None for one in (name, query, file)) + by_frame > 1:
         raise typer.BadParameter("expected one of -p NAME, -q TEXT, -f FILE, --by-frame")
-    values = parameters_of(parameters)
+    text, values = "", parameters_of(parameters)
     if name or query or file:
         text, values = asked_of(query, file, name, values)
-        compare = differences.verdicts if differences.has_checks(text) else differences.matches
-        before, after = (ask.opened_at(Path(one), ask) for one in (a, b))
-        _say_sources(before, after)
-        table = compare(before, after, text, values)
+        before, after = (ChosenFrames(one, ask.opened_at(Path(one), ask)) for one in (a, b))
     else:
-        chosen = [*ask.frames(a, b)]
-        _say_sources(*(one.store for one in chosen))
-        compare = differences.by_frame if by_frame else differences.scenes
-        table = compare(*(classed(one, abstraction) for one in chosen))
+        before, after = ask.frames(a, b)
+    for difference in differences.sources(before.store, after.store):
+        say(difference)
+    table = compared(before, after, text, values, by_frame, abstraction)
     # In a table the reasons are below it, each once.
     ask.report(table.without(*differences.REASONS) if ask.for_people else table)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0
-
-
-def _say_sources(*stores: Store | Collection) -> None:
-    """Print the differences of two stores that no scene causes."""
-    from sgstore.testsets.diff import sources
-
-    for text in sources(*stores):
-        say(text)
