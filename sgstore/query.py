@@ -496,7 +496,7 @@ class StoreVerbs:
         Parameters
         ----------
         other : str, Path, Store or Collection
-            The later store, or STORE:QUERY, or a lock.
+            The later store; without a query also STORE:QUERY or a lock.
         query : str
             Compare by a query, or by 'CHECK …'.
         by_frame : bool

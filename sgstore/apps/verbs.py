@@ -298,6 +298,8 @@ def compared(
     if not text:
         compare = differences.by_frame if by_frame else differences.scenes
         return compare(*(classed(one, abstraction) for one in (a, b)))
+    if any(one.frame_id is not None for one in (a, b)):
+        raise ConfigError("a query compares whole stores; expected no STORE:QUERY and no lock")
     results = differences.verdicts if differences.has_checks(text) else differences.matches
     return results(a.store, b.store, text, values)
 

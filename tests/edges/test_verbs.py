@@ -113,6 +113,11 @@ def test_wrong_options_are_named(
         getattr(open_town, verb)(*filter(None, places), **options)
 
 
+def test_a_query_compares_whole_stores(open_town: sgstore.Store) -> None:
+    with pytest.raises(sgstore.ConfigError, match="whole stores"):
+        open_town.diff(f"{open_town.file.path}:{FAST}", "cut_in")
+
+
 def test_words_of_other_libraries_name_the_method(open_town: sgstore.Store) -> None:
     for word, method in {"pl": "polars", "to_pandas": "df", "to_arrow": "arrow"}.items():
         with pytest.raises(AttributeError, match=rf"write {method}\(\)"):
