@@ -226,6 +226,15 @@ def test_new_words_are_not_renamed(
     assert "is now" not in capsys.readouterr().err
 
 
+def test_an_old_word_of_other_commands_is_not_renamed(
+    town_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["info", str(town_store), "--output", "x"]) == 2
+    told = capsys.readouterr().err
+    assert "No such option: --output" in told
+    assert "is now" not in told
+
+
 def test_library_help_is_that_of_the_docstring() -> None:
     about = split_docstring(Store.select)[1]
     assert library_help("select")["minimal"] == about["minimal"][1]

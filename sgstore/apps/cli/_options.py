@@ -188,7 +188,7 @@ OLD_WORDS: Final[dict[str, dict[str, str]]] = {
 def renamed(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
     """Return the arguments of a command with new words for old options, and note each on stderr."""
     known = {word for one in verb.params for word in (*one.opts, *one.secondary_opts)}
-    words = {old: new for old, new in OLD_WORDS[""].items() if old not in known}
+    words = {old: new for old, new in OLD_WORDS[""].items() if new in known}
     words |= OLD_WORDS.get(_path_of(ctx), {})
     if words.get("--format") == "--as" and not _means_files(_path_of(ctx), args):
         del words["--format"]
