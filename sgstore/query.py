@@ -638,7 +638,7 @@ class StoreVerbs:
         to : str or Path
             Write to this file or folder.
         frames : sequence of str or int
-            Instead of a query: a file with a FRAME a line; - is stdin.
+            Instead of a query: frames by id, TRACE#SEQ or TRACE@12.3s.
         lock : str or Path
             Instead of a query: each case of a lock, a clip each.
         form : str

@@ -22,15 +22,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 COMMANDS = verbs(typer.main.get_command(app))
-PATHS = {
-    **dict.fromkeys(("select", "prioritize", "criticality", "diff", "report", "export"), ""),
-    **{path: "" for path in COMMANDS if path.startswith("coverage ")},
-    "timeline": "",
-    "verify": "",
-    "lock verify": "",
-    "like": "",
-    "shrink": "",
-}
+PATHS = [
+    *("select", "prioritize", "criticality", "diff", "report", "export", "timeline"),
+    *(path for path in COMMANDS if path.startswith("coverage ")),
+    *("verify", "lock verify", "like", "shrink"),
+]
 """Commands with a method of the library."""
 
 OWN_OPTIONS = {
@@ -49,6 +45,7 @@ DIFFERENT = {
     ("diff", "query"): "an option, because B is an argument",
     ("coverage spec", "query"): "its own sentence",
     ("timeline", "parts"): "Store.parts",
+    ("export", "frames"): "a file with their names",
     ("timeline", "to"): "without it the terminal shows lanes",
     **dict.fromkeys((("report", "to"), ("export", "to"), ("shrink", "to")), "a file or a folder"),
     **dict.fromkeys((("select", "to"), ("prioritize", "to")), "Store.lock writes a lock"),
@@ -111,7 +108,7 @@ def test_types_are_the_same() -> None:
     for path in PATHS:
         for name, (option, parameter) in shared(path).items():
             kind = str(parameter.annotation)
-            multiple = kind.startswith(("Sequence", "Mapping", "object")) and name != "frames"
+            multiple = kind.startswith(("Sequence", "Mapping", "object"))
             assert option.multiple is multiple or option.param_type_name == "argument", name
             choices = re.findall(r"'(\w+)'|\"(\w+)\"", kind) if kind.startswith("Literal") else []
             shown = choices and option.get_help_record(typer.Context(COMMANDS[path]))[0]

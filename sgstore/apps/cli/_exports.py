@@ -80,6 +80,8 @@ def export(
     ----------
     to : DIR
         Folder to write; no file is overwritten.
+    frames : FILE
+        Instead of a query: a file with a FRAME a line; - is stdin.
     """
     from sgstore.apps.verbs import export as export_clips
 
