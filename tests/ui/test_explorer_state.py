@@ -164,6 +164,16 @@ def test_back_and_forward_lead_through_places(page: Any, served: Served) -> None
     expect(shown(page)).to_be_visible()
 
 
+def test_a_link_to_another_query_drops_the_answer(page: Any, served: Served) -> None:
+    page.goto(served.link(q=f"{NEAR} WHERE e.speed > 3"))
+    expect(page.locator(".tile").first).to_be_visible()
+    page.goto(served.link(q="MATCH (e:Ego)", show="coverage"))
+    expect(page.get_by_role("button", name="Growth")).to_be_visible()
+    page.get_by_role("button", name="Find", exact=True).click()
+    expect(page.locator(".cm-content")).to_have_text("MATCH (e:Ego)")
+    expect(page.get_by_role("button", name="select all")).to_have_count(0)
+
+
 def test_a_link_on_a_page_of_another_site_opens(page: Any, served: Served) -> None:
     link = served.link(q=f"{NEAR} WHERE e.speed > 3", at="town#12")
     site = "http://127.0.0.2:9/"

@@ -5,7 +5,7 @@ import * as api from "./api.js";
 import { frame } from "./clock.js";
 import { placeIn } from "./data.js";
 import {
-  answer, find, keyOf, matches, notice, open, openFrame, openMatch, parametersOf, playing, reasonOf, refresh, say,
+  answer, drop, find, keyOf, matches, notice, open, openFrame, openMatch, parametersOf, playing, reasonOf, refresh, say,
     second,
   seq, side, store, text, ticked, traces, values, view,
 } from "./state.js";
@@ -160,6 +160,7 @@ export async function readAddress(whole = true) {
   });
   const { query: asked = "", parameters = {} } = answer.value;
   const other = query !== asked || JSON.stringify(parametersOf(query)) !== JSON.stringify(parameters);
+  if (other) drop(); // another view does not ask
   try {
     const done = view.value !== "find" || !other || (await find());
     if (done && current()) await showFrame(parts.get("at") || "", parts.get("bind") || "", current);

@@ -21,7 +21,8 @@ export const view = signal("find");
 export const text = signal("");
 /** Values of $name. */
 export const values = signal(/** @type {Record<string, string>} */ ({}));
-export const answer = signal(/** @type {any} */ ({ state: "idle", matches: [], names: [], reasons: {}, notes: [] }));
+const NO_ANSWER = { state: "idle", matches: [], names: [], reasons: {}, notes: [] };
+export const answer = signal(/** @type {any} */ (NO_ANSWER));
 export const filter = signal({ trace: "", map: "" });
 export const order = signal("");
 /** What is open: trace, frame (with its fraction), the match, the nodes. */
@@ -144,6 +145,13 @@ export function cancel() {
   if (answer.value.state === "busy") answer.value = { ...answer.value, state: "cancelled" };
 }
 
+/** Stop the query, and drop its answer. */
+export function drop() {
+  cancel();
+  answer.value = NO_ANSWER;
+  changed.value = false;
+}
+
 /** Ask for a pattern of the library, or of a table. @param {string} query */
 export function ask(query) {
   batch(() => {
@@ -157,12 +165,11 @@ export function ask(query) {
  * @param {{keep?: boolean}} [how] */
 export async function find(how = {}) {
   const query = text.value.trim();
-  cancel();
   if (!query) {
-    answer.value = { state: "idle", matches: [], names: [], reasons: {}, notes: [] };
-    changed.value = false;
+    drop();
     return true;
   }
+  cancel();
   idle.stop();
   const id = `q${Date.now().toString(36)}${number++}`, parameters = parametersOf(query);
   const mine = (under = new AbortController());
