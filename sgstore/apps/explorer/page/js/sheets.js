@@ -6,6 +6,7 @@ import { beside } from "./clock.js";
 import { wantThumbs } from "./data.js";
 import { Thumb } from "./gallery.js";
 import { again, ask, isLost, openFrame, reasonOf, retries, view } from "./state.js";
+import { Elapsed } from "./status.js";
 
 const html = htm.bind(h);
 
@@ -113,17 +114,6 @@ export function useWork(path, body) {
   if (told.asked === asked) return told;
   return off === asked ? { stopped: true, start: () => { stop(""); begin((n) => n + 1); } }
     : { stop: () => stop(asked) }; // not the answer to what was asked before
-}
-
-/** How long something is under way. */
-function Elapsed() {
-  const [seconds, tell] = useState(0);
-  useEffect(() => {
-    const began = performance.now(), tick = setInterval(() => tell(Math.floor((performance.now() - began) / 1000)),
-      250);
-    return () => clearInterval(tick);
-  }, []);
-  return html`${seconds} s`;
 }
 
 /** What stands in the place of an answer while it is under way. @param {{told: any, children?: any}} props */

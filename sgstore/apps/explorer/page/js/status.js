@@ -6,15 +6,15 @@ import { answer, filter, framesFound, matches, offline, order, store, tickAll } 
 
 const html = htm.bind(h);
 
-/** How long a question is under way. */
-function Busy() {
+/** How long something is under way. */
+export function Elapsed() {
   const [seconds, tell] = useState(0);
   useEffect(() => {
     const began = performance.now(), tick = setInterval(() => tell(Math.floor((performance.now() - began) / 1000)),
       250);
     return () => clearInterval(tick);
   }, []);
-  return html`<span class="busy" aria-hidden="true"></span><span class="asking">asking … ${seconds} s</span>`;
+  return html`${seconds} s`;
 }
 
 export function Status() {
@@ -24,7 +24,8 @@ export function Status() {
   const where = filter.value, all = /** @type {import("./state.js").Trace[]} */ (store.value.traces);
   const known = { trace: all.map((t) => t.name), map: [...new Set(all.map((t) => t.map).filter(Boolean))] };
   return html`<div class="status" role="status" aria-live="polite">
-    ${told.state === "busy" ? html`<${Busy} key=${told.id} />` : null}
+    ${told.state === "busy" ? html`<span class="busy" aria-hidden="true"></span>
+      <span class="asking">asking … <${Elapsed} key=${told.id} /></span>` : null}
     ${told.error ? html`<div class="error"><b>${told.error.reason}</b>
       ${told.error.hint ? html` · ${told.error.hint}` : null}</div>`
       : told.rows ? html`<span><b>${told.rows.length.toLocaleString("en")}</b> rows</span>`
