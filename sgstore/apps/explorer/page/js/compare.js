@@ -6,8 +6,8 @@ import { beside } from "./clock.js";
 import { Gallery } from "./gallery.js";
 import { abstraction, Table, useWork } from "./sheets.js";
 import {
-  again, find, inOther, isPattern, matchesIn, openFrame, parametersOf, reasonOf, say, second, side, store, text,
-    traces,
+  again, find, frameNamed, inOther, isPattern, matchesIn, openFrame, parametersOf, reasonOf, say, second, side, store,
+    text, traces,
 } from "./state.js";
 
 const html = htm.bind(h);
@@ -77,9 +77,9 @@ function onlyIn(a, b, of, word, query) {
 /** Scenes that one store has alone, as matches. @param {any} table */
 function scenesOf(table) {
   return table.rows.flatMap((/** @type {any[]} */ [change, name, inA, ofB, frame], /** @type {number} */ i) => {
-    const found = /^(.*)#(\d+)$/.exec(String(frame)), b = change !== "vanished";
+    const found = frameNamed(frame), b = change !== "vanished";
     if (!found || change === "changed") return [];
-    const trace = found[1] || "", first = Number(found[2]), frames = `${inA || ofB} frames of ${name.slice(0, 8)}`;
+    const [trace, first] = found, frames = `${inA || ofB} frames of ${name.slice(0, 8)}`;
     return [{
       trace: b ? inOther(trace) : trace, first, last: first, start: NaN, end: NaN, binding: {}, names: { frames },
       values: {}, index: `scene ${i}`, group: `Scenes that only ${b ? "B" : "A"} has`,

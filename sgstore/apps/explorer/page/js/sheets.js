@@ -5,18 +5,18 @@ import * as api from "./api.js";
 import { beside } from "./clock.js";
 import { wantThumbs } from "./data.js";
 import { Thumb } from "./gallery.js";
-import { again, ask, isLost, openFrame, reasonOf, retries, view } from "./state.js";
+import { again, ask, frameNamed, isLost, openFrame, reasonOf, retries, view } from "./state.js";
 import { Elapsed } from "./status.js";
 
 const html = htm.bind(h);
 
 // Tables and charts --------------------------------------------------------------------------------------------------
 
-/** A frame by its name: TRACE#SEQ. @param {any} name */
+/** Open a frame by its name. @param {string} name */
 function go(name) {
-  const found = /^(.*)#(\d+)$/.exec(String(name));
+  const found = frameNamed(name);
   if (view.value === "compare") beside.value = true;
-  if (found) openFrame(found[1] || "", Number(found[2]));
+  if (found) openFrame(...found);
 }
 
 /** A table; columns that hold nothing are left out. @param {{table: any, most?: number}} props */
@@ -166,15 +166,16 @@ function covered(found) {
 
 /** Classes with a picture of their first frame, and in words. @param {{found: any}} props */
 function Classes({ found }) {
-  const spots = found.rows.slice(0,
-    found.words.length).map((/** @type {any[]} */ row) => /^(.*)#(\d+)$/.exec(String(row[5])));
-  useEffect(() => wantThumbs(spots.flatMap((/** @type {string[] | null} */ one) => (one
-    ? [[one[1] || "", Number(one[2])]] : []))), [found]);
-  return html`<div class="cards classes">${found.rows.slice(0,
-    found.words.length).map((/** @type {any[]} */ [rank, , frames, share, , frame], /** @type {number} */ i) => {
-    const [, trace = "", seq = "0"] = spots[i] || [];
+  const rows = found.rows.slice(0, found.words.length);
+  useEffect(() => wantThumbs(rows.flatMap((/** @type {any[]} */ row) => {
+    const one = frameNamed(row[5]);
+    return one ? [one] : [];
+  })), [found]);
+  return html`<div class="cards classes">${rows.map((/** @type {any[]} */ [rank, , frames, share, , frame],
+    /** @type {number} */ i) => {
+    const [trace, seq] = frameNamed(frame) || ["", 0];
     return html`<button class="card" key=${frame} onClick=${() => go(frame)}>
-      <${Thumb} trace=${trace} frame=${Number(seq)} />
+      <${Thumb} trace=${trace} frame=${seq} />
       <h3>${rank}. <span class="grow"></span><span class="faint">
         ${frames.toLocaleString("en")} frames, ${(share * 100).toFixed(1)} %</span></h3>
       <p>${(found.words[i] || "no entity near the ego").replace(/_/g, " ")}</p></button>`;

@@ -84,6 +84,13 @@ export const framesFound = computed(() => {
   return { frames, traces: ends.size };
 });
 
+/** Trace and number of a frame by its name, TRACE#SEQ; null: it names none.
+ * @param {string} name @returns {[string, number] | null} */
+export function frameNamed(name) {
+  const found = /^(.*)#(\d+)$/s.exec(name);
+  return found && [found[1] || "", Number(found[2])];
+}
+
 /** @param {Match} m */
 export const keyOf = (m) => `${m.trace}#${m.first}-${m.last}:${Object.values(m.binding).join(",")}`;
 
