@@ -99,10 +99,10 @@ effect(() => {
   const now = open.value, query = asked.value, other = inOther(now?.trace || "");
   again.value;
   others.value = null;
-  if (!now || !beside.value || !traces.value.has(other) || !isPattern(query)) return;
-  const parameters = parametersOf(query), at = Math.round(seq.peek());
-  const body = { text: query, parameters, trace: now.trace, seq: at, binding: sameIn(other, now), side: "b" };
-  api.json("api/parts", body).then((found) => {
+  if (!now || !beside.value || !traces.value.has(other)) return;
+  const wanted = lanesWanted(now, query);
+  if (!wanted) return;
+  api.json("api/parts", { ...wanted, binding: sameIn(other, now), side: "b" }).then((found) => {
     if (open.value !== now) return;
     if (found.error) say(`no lanes of the second store: ${found.error.reason}`); else others.value = found;
   }).catch((error) => say(reasonOf(error)));
