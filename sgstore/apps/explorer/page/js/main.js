@@ -92,6 +92,9 @@ function Rows() {
       : null}</div>`;
 }
 
+/** @param {{first: number, last: number}} frames */
+const spanOf = ({ first, last }) => `#${first}${last > first ? `–${last}` : ""}`;
+
 /** @param {any} v */
 const shown = (v) => (v === null ? "" : typeof v === "object" ? JSON.stringify(v) : typeof v === "number"
   && !Number.isInteger(v) ? String(Number(v.toPrecision(7))) : String(v));
@@ -121,17 +124,15 @@ function TagForm() {
   const remove = (/** @type {typeof mine[0]} */ one) => tag({ trace: first.trace, seq: one.first, last: one.last,
     tag: one.tag, do: "remove" }).catch((e) => say(reasonOf(e)));
   const known = [...new Set(notes.value.map((n) => n[2]))];
-  return html`<h2>Tag ${first.trace}#${first.first}${first.last > first.first ? `–${first.last}` : ""}</h2>
+  return html`<h2>Tag ${first.trace}${spanOf(first)}</h2>
     <form onSubmit=${write}>
     <p><label>Tag <input name="tag" required maxlength="100" list="tags" autofocus /></label><datalist id="tags">
       ${known.map((one) => html`<option value=${one} />`)}</datalist></p>
     <p><label>Note <input name="note" size="40" maxlength="2000" /></label></p>
     ${spans.length < 2 ? null : html`<p><label>For <select name="span">
-      ${spans.map((one, i) => html`<option value=${i}>${one.word}, #${one.first}${one.last > one.first
-      ? `–${one.last}` : ""}</option>`)}</select></label></p>`}
+      ${spans.map((one, i) => html`<option value=${i}>${one.word}, ${spanOf(one)}</option>`)}</select></label></p>`}
     ${mine.map((one) => html`<p class="row"><span class="chip">
-      ${one.tag}</span> ${one.note} <span class="faint">#${one.first}${one.last > one.first ? `–${one.last}`
-      : ""} ${one.who}</span>
+      ${one.tag}</span> ${one.note} <span class="faint">${spanOf(one)} ${one.who}</span>
       <button type="button" class="small" onClick=${() => remove(one)}>remove</button></p>`)}
     <button class="main">Tag</button></form>
     <p class="faint">Tags lie in a file beside the store; a query can ask for them: WHERE notes.tag = '…'</p>`;

@@ -109,11 +109,10 @@ export function useWork(path, body) {
         error: reasonOf(error), lost: isLost(error) ? retries.peek() : undefined }); });
     return () => mine.abort();
   }, [asked, begun]);
-  const [off, stop] = useState(""); // what the user stopped
-  useEffect(() => { if (off === asked) ending.current(); }, [off]);
+  const [off, setOff] = useState(""), stop = () => { ending.current(); setOff(asked); }; // what the user stopped
   if (told.asked === asked) return told;
-  return off === asked ? { stopped: true, start: () => { stop(""); begin((n) => n + 1); } }
-    : { stop: () => stop(asked) }; // not the answer to what was asked before
+  return off === asked ? { stopped: true, start: () => { setOff(""); begin((n) => n + 1); } }
+    : { stop }; // not the answer to what was asked before
 }
 
 /** What stands in the place of an answer while it is under way. @param {{told: any, children?: any}} props */
