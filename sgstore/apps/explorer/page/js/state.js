@@ -114,7 +114,7 @@ let under = null;
 export const idle = { stop: () => {} };
 
 /** What the browser kept for the page; nothing where it may keep nothing. @param {string} name */
-export function remembered(name) {
+function remembered(name) {
   try { return localStorage.getItem(`sgstore ${name}`) || ""; } catch { return ""; }
 }
 
