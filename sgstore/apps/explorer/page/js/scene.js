@@ -80,8 +80,8 @@ const Legend = ({ trace, states }) => html`<ul class="legend" aria-label="Legend
     ? html`<path d="M1 6H21" stroke=${colour} stroke-width="2.4" stroke-dasharray=${form === "line" ? "" : "4 3"} />`
     : form === "dot" ? html`<circle cx="11" cy="6" r="5" fill=${colour} />`
     : html`<rect x="2" y="1" width="18" height="10" rx=${form === "area" ? 0 : 3}
-      fill=${form === "outline" ? "none" : colour} stroke=${form === "outline" ? colour : "none"}
-      stroke-width="2.4" />`}</svg>${word}</li>`)}</ul>`;
+      fill=${form === "outline" ? "none" : colour} stroke=${form === "outline" ? colour : "var(--line)"}
+      stroke-width=${form === "outline" ? 2.4 : 1} />`}</svg>${word}</li>`)}</ul>`;
 
 /** @param {{trace: string}} props */
 function Above({ trace }) {

@@ -59,7 +59,7 @@ function ticksOf(low, high, log) {
   if (!log) return [0, 0.25, 0.5, 0.75, 1].map((s) => low + (high - low) * s);
   const found = [];
   for (let power = Math.ceil(Math.log10(low)); 10 ** power <= high; power++) found.push(10 ** power);
-  return found;
+  return found.length > 1 ? found : [low, high];
 }
 
 /** A line chart of columns of a table, with linear or logarithmic axes.
@@ -201,8 +201,8 @@ function Matrix({ found: { names, frames, queries } }) {
     || 0).toLocaleString("en")} frames` : "point at a cell";
   if (!names.length) return html`<p class="faint">This abstraction has no relations of the ego.</p>`;
   return html`<h2>Pairs of features: ${gaps} ${gaps === 1 ? "gap" : "gaps"}</h2>
-    <p class="faint">Each cell is a pair of the most frequent features; dark: many frames.
-      A red cell is in no frame: click it for its query.</p>
+    <p class="faint">Each cell is a pair of the most frequent features. A strong colour means many frames.
+      No frame has the pair of a red cell; click it for its query.</p>
     <p role="status">${told}</p>
     <div class="matrix" tabindex="0"><svg width=${left + names.length * size + 4} height=${names.length * size + 8}
       role="group" aria-label="Matrix of gaps">

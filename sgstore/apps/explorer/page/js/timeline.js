@@ -2,7 +2,7 @@
 // The whole trace in time: matches, a lane for each part of the pattern, tags, values; drag to go there.
 import { computed, effect, h, htm, signal, useRef } from "../vendor/core.js";
 import { frame, goTo, holdsAt, lanes, range, series } from "./clock.js";
-import { arrived, seqAt, timeAt } from "./data.js";
+import { arrived, seconds, seqAt, timeAt } from "./data.js";
 import { answer, dialog, keyOf, lit, live, matches, notes, offline, open, playing, tagged, traces } from "./state.js";
 
 const html = htm.bind(h);
@@ -225,8 +225,8 @@ export function Timeline() {
       attribute=${name} curves=${series.value.filter((one) => one.attribute === name)} />`)}
     <div class="lane"><${Marked} /><div class="ticks" role="slider" tabindex="0" aria-label="Frame"
       aria-valuemin=${range.value[0]} aria-valuemax=${range.value[1]}
-        aria-valuenow=${frame.value} aria-valuetext=${`frame ${frame.value}, ${timeAt(now.trace,
-          frame.value).toFixed(2)} s`}
+        aria-valuenow=${frame.value}
+        aria-valuetext=${`frame ${frame.value}, ${seconds(timeAt(now.trace, frame.value))} s`}
         onKeyDown=${(/** @type {KeyboardEvent} */ e) => { const to = { Home: range.value[0],
           End: range.value[1] }[e.key]; if (to !== undefined) { e.preventDefault(); goTo(to); } }}>
       ${ticks.map((t) => html`<span style=${{ left: `${(100 * (seqAt(now.trace, t) - from + 0.5)) / frames}%` }}>
