@@ -82,8 +82,8 @@ class NotesFile:
             return 0, 0
         return found.st_size, found.st_mtime_ns
 
-    def add(self, note: Note, *, gone: bool = False) -> Note:
-        """Append a tag (or the removal of a tag) to the file, and return it.
+    def add(self, note: Note, last: int, *, gone: bool = False) -> None:
+        """Append a tag (or the removal of a tag) to the file, for each frame from that of the note to ``last``.
 
         Raises
         ------
@@ -96,25 +96,24 @@ class NotesFile:
                 raise StoreError(
                     f"{name}: expected a text of at most {most} letters that does not begin with '-'"
                 )
-        known = Note(note.trace, note.seq, note.tag.strip(), note.note, _account(), _now())
-        line = io.StringIO()
-        told = (known.trace, known.seq, "-" * gone + known.tag, *astuple(known)[3:])
-        csv.writer(line, lineterminator="\n").writerow(told)
+        told = "-" * gone + note.tag.strip(), note.note, _account(), _now()
+        lines = io.StringIO()
+        rows = ((note.trace, seq, *told) for seq in range(note.seq, last + 1))
+        csv.writer(lines, lineterminator="\n").writerows(rows)
         try:
-            self._append(line.getvalue().encode())
+            self._append(lines.getvalue().encode())
         except OSError as error:
             raise StoreError(f"{self.path}: {error.strerror}") from error
-        return known
 
-    def _append(self, line: bytes) -> None:
+    def _append(self, lines: bytes) -> None:
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
         file = os.open(self.path, flags, 0o644)
         try:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX)
             if os.fstat(file).st_size == 0:
-                line = ",".join(COLUMNS).encode() + b"\n" + line
-            os.write(file, line)
+                lines = ",".join(COLUMNS).encode() + b"\n" + lines
+            os.write(file, lines)
         finally:
             os.close(file)
 

@@ -305,21 +305,16 @@ class Explorer:
         if request.method == "POST":
             told = taken(fields, "trace", "seq", "tag", "note", "do")
             gone = told.pop("do") == "remove"
-            first = told.pop("seq")
+            first = told["seq"]
             last = taken({"last": fields.get("last", first)}, "last")["last"]
             if not first <= last < first + MOST_TAGGED:
                 raise RequestError(f"last: expected at most {MOST_TAGGED} frames from seq")
             for seq in {first, last}:
                 await self.threaded(self.reads["a"].frame_id, told["trace"], seq)
-            await self.threaded(partial(self._tag, range(first, last + 1), told, gone=gone))
+            await self.threaded(partial(self.notes.add, Note(**told), last, gone=gone))
         found = await self.threaded(self.notes.read)
         notes = [astuple(note) for note in found]
         return JSONResponse({"notes": notes, "file": self.notes.path.name})
-
-    def _tag(self, frames: range, told: Mapping[str, str], *, gone: bool) -> None:
-        """Add a tag to frames, or remove it from them."""
-        for seq in frames:
-            self.notes.add(Note(seq=seq, **told), gone=gone)
 
     async def work(self, request: Request, name: str) -> Response:
         """Endpoint that runs a long task, such as an export, and streams its progress and result as JSON."""
