@@ -91,19 +91,21 @@ function nearWords(text) {
     || a.word.name.length - b.word.name.length).slice(0, MOST_WORDS).map(({ word }) => word);
 }
 
-/** Entries of the library that are near some words, the nearest first; null: not known yet. @param {string} text */
+/** The words that were sought last, and entries of the library near them, the nearest first; null: not known yet.
+ * @param {string} text */
 function useNear(text) {
-  const [found, tell] = useState(/** @type {{text: string, names: string[]} | null} */ (null));
+  const [found, tell] = useState(/** @type {{of: string, names: string[]} | null} */ (null));
   useEffect(() => {
     const mine = new AbortController();
     if (text) {
       api.json(api.address("api/search", { text: text.slice(0, 300) }), undefined, { signal: mine.signal })
-        .then((names) => tell({ text, names }), () => {});
+        .then((names) => tell({ of: text, names }), () => {});
     }
     return () => mine.abort();
   }, [text]);
   if (!text || !found) return null;
-  return found.names.flatMap((name) => library.value.filter((one) => one.name === name && one.kind !== "predicate"));
+  return { of: found.of, cards: found.names.flatMap((name) => library.value.filter((one) => one.name === name
+    && one.kind !== "predicate")) };
 }
 
 /** @param {{one: Entry}} props */
@@ -125,8 +127,9 @@ function Card({ one }) {
 
 /** Cards and words of the language that come near some words. @param {{text: string, most?: number}} props */
 export function Near({ text, most = MOST_CARDS }) {
-  const cards = useNear(text), some = nearWords(text);
-  if (!cards) return null;
+  const near = useNear(text);
+  if (!near) return null;
+  const { cards } = near, some = nearWords(near.of);
   return html`${cards.length ? html`<div class="cards near-cards">
     ${cards.slice(0, most).map((one) => html`<${Card} one=${one} />`)}</div>` : null}
     ${some.length ? html`<h2>Words of the language</h2><ul class="words">${some.map((one) => html`<li>
