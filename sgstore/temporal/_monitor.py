@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -30,7 +30,7 @@ from sgstore.lang.library import statement
 from sgstore.lang.memory import FrameView
 from sgstore.lang.sql import each_match, recorded_events
 from sgstore.lang.syntax import parse
-from sgstore.lang.syntax.tree import CheckClause, Define, MatchClause, Parameter
+from sgstore.lang.syntax.tree import CheckClause, Define, MatchClause, parameters_in
 from sgstore.model.config import Config
 from sgstore.model.world import seconds_of
 from sgstore.temporal._check_monitor import CheckMonitor
@@ -624,14 +624,14 @@ def _bound(
     text, parameters = statement(text, parameters, check=True)
     statements = [*each_match(parse(text))]
     written = [one for one in statements if not isinstance(one, MatchClause)]
-    named = {name for one in statements for name in _parameters(one)}
+    named = {name for one in statements for name in parameters_in(one)}
     unused = sorted(set(parameters) - named)
     if unused:
         hint = f"write a parameter as ${unused[0]}"
         raise QueryError(f"the text has no parameter '{unused[0]}'", hint=hint)
 
     def given(some: Sequence[Statement]) -> dict[str, Any]:
-        names = {name for one in some for name in _parameters(one)}
+        names = {name for one in some for name in parameters_in(one)}
         return {name: value for name, value in parameters.items() if name in names}
 
     checks: list[BoundCheck] = []
@@ -649,15 +649,3 @@ def _bound(
             query = bind_query(text, [*defined, one], catalog, given([*defined, one]))
             queries.append(without_guesses(query))
     return checks, queries
-
-
-def _parameters(part: object) -> Iterator[str]:
-    """Yield the names of the query parameters (``$name``) in a part of a syntax tree."""
-    if isinstance(part, Parameter):
-        yield part.name
-    elif isinstance(part, tuple | list):
-        for item in part:  # pyright: ignore[reportUnknownVariableType]
-            yield from _parameters(item)  # pyright: ignore[reportUnknownArgumentType]
-    elif is_dataclass(part):
-        for one in fields(part):
-            yield from _parameters(getattr(part, one.name))

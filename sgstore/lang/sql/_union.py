@@ -7,7 +7,7 @@ joins their answers.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from sgstore.base.quoting import quoted
@@ -113,20 +113,22 @@ def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
 
 def _parameters_of(part: s.MatchClause, defined: Iterable[s.Define]) -> set[str]:
     """Return the names of the parameters that one query of a union uses, also through definitions."""
-    found, waiting = set(parameters_in(part)), {*_called(part)}
+    found, waiting = set(s.parameters_in(part)), {*_called(part)}
     by_name = {normalize_name(one.name): one for one in defined}
     while used := waiting & by_name.keys():
         definition = by_name.pop(used.pop())
         waiting |= {*_called(definition.body)}
         own = isinstance(definition.body, s.SequenceClause)
         formals = {formal.name for formal in definition.parameters} if own else set[str]()
-        found |= set(parameters_in(definition.body)) - formals
+        found |= set(s.parameters_in(definition.body)) - formals
     return found
 
 
 def _called(part: object) -> Iterator[str]:
     return (
-        normalize_name(one.name) for one in _walk(part) if isinstance(one, s.Call | s.ScenarioStep)
+        normalize_name(one.name)
+        for one in s.parts_of(part)
+        if isinstance(one, s.Call | s.ScenarioStep)
     )
 
 
@@ -187,18 +189,3 @@ def each_match(statements: Iterable[s.Statement]) -> Iterator[s.Statement]:
     """Yield query statements, with each ``UNION`` replaced by its single queries."""
     for statement in statements:
         yield from statement.parts if isinstance(statement, s.UnionClause) else (statement,)
-
-
-def parameters_in(part: object) -> Iterator[str]:
-    """Yield the names of the query parameters (``$name``) in a part of a syntax tree."""
-    return (one.name for one in _walk(part) if isinstance(one, s.Parameter))
-
-
-def _walk(part: object) -> Iterator[object]:
-    """Yield a part of a syntax tree and all its subparts."""
-    yield part
-    inner = part if isinstance(part, tuple) else ()
-    if is_dataclass(part):
-        inner = tuple(getattr(part, one.name) for one in fields(part))
-    for one in inner:  # pyright: ignore[reportUnknownVariableType]
-        yield from _walk(one)  # pyright: ignore[reportUnknownArgumentType]

@@ -6,10 +6,12 @@ these trees from text.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from sgstore.errors import TextSpan
 
 
@@ -617,3 +619,18 @@ class CheckClause:
 
 
 Statement = MatchClause | UnionClause | Define | CheckClause
+
+
+def parameters_in(part: object) -> Iterator[str]:
+    """Yield the names of the query parameters (``$name``) in a part of a syntax tree."""
+    return (one.name for one in parts_of(part) if isinstance(one, Parameter))
+
+
+def parts_of(part: object) -> Iterator[object]:
+    """Yield a part of a syntax tree and all its subparts."""
+    yield part
+    inner = part if isinstance(part, tuple) else ()
+    if is_dataclass(part):
+        inner = tuple(getattr(part, one.name) for one in fields(part))
+    for one in inner:  # pyright: ignore[reportUnknownVariableType]
+        yield from parts_of(one)  # pyright: ignore[reportUnknownArgumentType]
