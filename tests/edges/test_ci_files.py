@@ -19,6 +19,7 @@ from sgstore.apps.demo import RECORDING
 ROOT = Path(__file__).parents[2]
 ACTION = (ROOT / "action.yml").read_text(encoding="utf-8")
 HOOKS = (ROOT / ".pre-commit-hooks.yaml").read_text(encoding="utf-8")
+UNION = "MATCH (e:Ego) RETURN e UNION MATCH (e:Person) RETURN e"
 RULES = "CHECK slow: FORALL (v:Vehicle) ALWAYS v.speed < 12.3"
 
 
@@ -144,6 +145,17 @@ def entries() -> dict[str, tuple[str, str]]:
             "no mistake",
         ),
         ("sgstore-queries", "a.sgql", "MATCH (e:Ego) WHERE e.sped > 3", 1, "did you mean 'speed'?"),
+        ("sgstore-queries", "a.sgql", UNION, 0, "no mistake"),
+        ("sgstore-queries", "a.sgql", f"{UNION}.sped", 1, "unknown attribute 'sped'"),
+        ("sgstore-queries", "a.sgql", f"{RULES}; MATCH (e:Ego)", 0, "no mistake"),
+        (
+            "sgstore-queries",
+            "a.sgql",
+            f"{RULES}; MATCH (e:Ego) WHERE e.sped > 3",
+            1,
+            "did you mean 'speed'?",
+        ),
+        ("sgstore-queries", "a.sgql", "MATCH (e:Ego) WHERE e.sped > 3 -- $x", 1, "'speed'?"),
         ("sgstore-queries", "a.sgql", "MATCH (e:Ego", 1, "a.sgql: "),
         ("sgstore-locks", "a.lock", "no lock", 1, "a.lock: "),
     ],

@@ -129,21 +129,27 @@ def lint(files: list[Path]) -> int:
 def _read(file: Path) -> None:
     """Raise an error for a file that is neither a valid lock nor a valid text of the query language."""
     from sgstore.lang.catalog import Catalog
-    from sgstore.lang.sql import compile_checks, compile_query
+    from sgstore.lang.sql import compile_checks, compile_query, union_parts
     from sgstore.lang.syntax import parse
-    from sgstore.lang.syntax.tree import Define
-    from sgstore.testsets.diff import has_checks
+    from sgstore.lang.syntax.tree import CheckClause, Define, parameters_in
+    from sgstore.temporal import Monitor
     from sgstore.testsets.locks import ENDING, read_lock
 
     if file.suffix == ENDING:
         read_lock(file)
         return
     text = file.read_text(encoding="utf-8")
-    statements = parse(text)
-    if re.search(r"\$\w", text) or all(isinstance(one, Define) for one in statements):
+    parsed = parse(text)
+    statements = [one for one in parsed if not isinstance(one, Define)]
+    if not statements or any(chain.from_iterable(map(parameters_in, parsed))):
         return  # the values of parameters are unknown
-    if has_checks(text):
+    checks = sum(isinstance(one, CheckClause) for one in statements)
+    if checks == len(statements):
         compile_checks(text, Catalog())
+    elif len(statements) > 1:
+        Monitor(text)  # only monitors take several queries, or queries and checks
+    elif union := union_parts(text, {}):
+        union.each(lambda part, _: compile_query(part, Catalog()), text)
     else:
         compile_query(text, Catalog())
 
