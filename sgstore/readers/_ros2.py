@@ -460,6 +460,11 @@ class MessageReader:
             raise TraceError(f"a {what} has a length of {count}; its definition allows {bound}")
         return count
 
+    def prefix(self, start: int) -> tuple[int, int]:
+        """Return the position and the value of the length of a string or sequence that has been read."""
+        place = start + -start % LENGTH
+        return place, _unpacker(self.order + "I")(self.values, place)[0]
+
     def text(self, kind: Text) -> str:
         """Read a string from a message. Invalid UTF-8 bytes become U+FFFD."""
         count = self.length(1, kind.bound + 1 if kind.bound >= 0 else -1, "string")
@@ -496,7 +501,7 @@ class MessageReader:
         if isinstance(element, Number):
             # An empty sequence has no alignment for its first element.
             start = self.take(count * element.size, element.size if count else 1)
-            return np.frombuffer(self.values, _dtype(self.order, element), count, start)
+            return np.frombuffer(self.values, dtype_of(self.order, element.code), count, start)
         self.spend(count * members(element))
         return [self.value(element) for _ in range(count)]
 
@@ -507,8 +512,9 @@ class MessageReader:
             raise TraceError(f"a message of more than {MAX_VALUES} values")
 
 
-def _dtype(order: str, kind: Number) -> np.dtype[Any]:
-    return np.dtype(order + kind.code.replace("?", "B"))
+def dtype_of(order: str, code: str) -> np.dtype[Any]:
+    """Return the type of numbers in a message. Booleans are bytes there."""
+    return np.dtype(order + code.replace("?", "B"))
 
 
 @dataclass(slots=True)
@@ -688,11 +694,10 @@ class _ElementWalk:
     def _note(self, path: str, place: int, kind: Number) -> None:
         column = self._columns.get(path)
         if column is not None:
-            self.found[column] = place - self.start, _dtype(self._reader.order, kind)
+            self.found[column] = place - self.start, dtype_of(self._reader.order, kind.code)
 
     def _prefix(self, start: int) -> None:
-        place = start + -start % LENGTH
-        length = _unpacker(self._reader.order + "I")(self._reader.values, place)[0]
+        place, length = self._reader.prefix(start)
         self.prefixes.append((place - self.start, length))
 
 

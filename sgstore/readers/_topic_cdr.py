@@ -16,13 +16,13 @@ from sgstore.errors import TraceError
 from sgstore.lang.topics import field_list
 from sgstore.readers._ros2 import (
     HEAD,
-    LENGTH,
     MessageReader,
     Number,
     Sequence,
     Struct,
     Text,
     decode,
+    dtype_of,
 )
 from sgstore.readers._topic_values import (
     MAX_DEPTH,
@@ -260,8 +260,7 @@ class _MessageLayout:
             self.numbers.append((name, place + HEAD, count, element.code))
 
     def _prefix(self, reader: MessageReader, start: int) -> int:
-        place = start + -start % LENGTH
-        size = int(np.frombuffer(reader.values, f"{reader.order}u4", 1, place)[0])
+        place, size = reader.prefix(start)
         self.prefixes.append((place + HEAD, size))
         return size
 
@@ -283,7 +282,7 @@ class _MessageLayout:
         whole = len(rows) == count
         found: dict[str, Column] = {}
         for name, place, length, code in self.numbers:
-            dtype = np.dtype(self.order + code.replace("?", "B"))
+            dtype = dtype_of(self.order, code)
             shape, strides = (
                 ((count,), (size,))
                 if length < 0

@@ -198,15 +198,14 @@ def list_column(declared: str, rows: Column, losses: Losses) -> Column:
 def joined_columns(
     declared: str, count: int, parts: Iterable[tuple[NDArray[np.intp], Column]], losses: Losses
 ) -> Column:
-    """Return one column from parts with their row numbers.
+    """Return one column from parts that have all of its rows, with their row numbers.
 
-    Lists of different lengths become texts. Rows without a part are missing.
+    Lists of different lengths become texts.
     """
     parts = list(parts)
-    if len(parts) == 1 and len(parts[0][0]) == count and _is_short(declared, parts[0][1]):
-        return parts[0][1]
-    if (kind := NUMPY.get(declared)) is not None:
-        whole: Any = np.ma.masked_array(np.zeros(count, kind), mask=True)
+    shapes = {values.shape[1:] for _, values in parts}
+    if len(shapes) == 1 and _is_short(declared, parts[0][1]):
+        whole = np.empty((count, *shapes.pop()), parts[0][1].dtype)
         for rows, values in parts:
             whole[rows] = values
         return whole
