@@ -26,7 +26,7 @@ from sgstore.store._publish import SCATTERED, SHARED
 from sgstore.store._rows import run
 from sgstore.store._staging import Sealed, scratch
 from sgstore.store._table_stream import FILE, TableFile
-from sgstore.store._topics import FRAME, LISTING, TOPIC_FILES, copy_topic_tables, topic_tables
+from sgstore.store._topics import FRAME, LISTING, TOPIC_FILES, copy_topic_tables
 from sgstore.store._traces import stored_traces
 
 if TYPE_CHECKING:
@@ -177,19 +177,16 @@ def _copied(
         words = {enum: shape.labels_of(connection, database, enum) for enum in NAMES}
         shape.widen(connection, "fresh", words)
     _choose(connection, traces, maps)
-    topics = {name: topic_tables(connection, name) for name in sources}
-    for table in (*shape.expected().tables, *copy_topic_tables(connection, sources, "fresh")):
+    topics = copy_topic_tables(connection, sources, "fresh")
+    for table, having in (dict.fromkeys(shape.expected().tables, sources) | topics).items():
         if table not in {"store_info", "bits"}:  # every new store has their rows
-            having = [
-                name for name in sources if table in {**shape.expected().tables, **topics[name]}
-            ]
             rows = " UNION ALL BY NAME ".join(_chosen(table, name) for name in having)
             if table in _ONCE or table == "manifest":
                 rows = f"SELECT DISTINCT * FROM ({rows})"
             order = (
                 f" ORDER BY {ORDERS.get(table, 'ALL')}" if table in SCATTERED else " ORDER BY ALL"
             )
-            if table in topics[having[0]]:
+            if table in topics:
                 order = ""  # in order of time in each trace
             if table in {"map", "map_node"}:  # map texts are long, and a map has few rows
                 order = f" ORDER BY map_id{', node_id DESC' * (table == 'map_node')}"

@@ -286,12 +286,22 @@ def topic_tables(connection: DuckDBPyConnection, database: str) -> dict[str, str
     return topic_statements(rows)
 
 
-def copy_topic_tables(connection: DuckDBPyConnection, sources: Iterable[str], to: str) -> list[str]:
-    """Create the empty tables of topics of some attached stores in another one, and return their names."""
-    made = {name: sql for one in sources for name, sql in topic_tables(connection, one).items()}
-    for sql in made.values():
-        connection.execute(f"CREATE TABLE IF NOT EXISTS {quoted(to)}.{INSIDE}.{sql}")
-    return [*made]
+def copy_topic_tables(
+    connection: DuckDBPyConnection, sources: Iterable[str], to: str
+) -> dict[str, list[str]]:
+    """Create the empty tables of topics of some attached stores in another one.
+
+    Returns
+    -------
+    dict
+        Name of the table → sources that have it.
+    """
+    found: dict[str, list[str]] = {}
+    for one in sources:
+        for name, sql in topic_tables(connection, one).items():
+            connection.execute(f"CREATE TABLE IF NOT EXISTS {quoted(to)}.{INSIDE}.{sql}")
+            found.setdefault(name, []).append(one)
+    return found
 
 
 def publish_topics(connection: DuckDBPyConnection, sealed: Sealed) -> list[str]:
