@@ -155,6 +155,14 @@ def kept_open() -> Iterator[Callable[[Path | str], None]]:
         yield lambda path: open_stores.enter_context(StoreFile(Path(path)).snapshot())
 
 
+@pytest.fixture(scope="module")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """The cache of collections is in a folder of the tests of one file."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("SGSTORE_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture
 def own_names() -> Iterator[None]:
     """Names of kinds, relations and states of lights that a test makes known are forgotten behind it."""

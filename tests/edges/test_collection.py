@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import shutil
 import sys
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang.sql import Compiled
 
-pytestmark = pytest.mark.seconds(25)
+pytestmark = [pytest.mark.seconds(25), pytest.mark.usefixtures("own_cache")]
 
 TRACES = 5
 
@@ -137,17 +136,6 @@ CHECKS = [
     "CHECK seen: FORSOME (a:Car) EVENTUALLY EXISTS {(a)-[:near]->(b)}; CHECK still: ALWAYS ego.speed < 3",
     "USING RANGE 5 CHECK close: FORALL (a:Car) ALWAYS NOT EXISTS {(a)-[:near]->(b)}",
 ]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What is remembered of bundles is remembered in a folder of these tests."""
-    before = os.environ.get("SGSTORE_CACHE")
-    os.environ["SGSTORE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    os.environ.pop("SGSTORE_CACHE")
-    if before is not None:
-        os.environ["SGSTORE_CACHE"] = before
 
 
 @pytest.fixture(scope="module")

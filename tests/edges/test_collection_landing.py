@@ -29,23 +29,12 @@ from sgstore.ingest import ingest
 from sgstore.query import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(20)
+pytestmark = [pytest.mark.seconds(20), pytest.mark.usefixtures("own_cache")]
 
 NEAR = "MATCH (a:Car)-[:near]->(b:Car)"
 COUNTED = "MATCH (a:Car)-[:near]->(b:Car) RETURN trace.name, a, COUNT(*) AS n, AVG(b.x)"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    before = os.environ.get("SGSTORE_CACHE")
-    os.environ["SGSTORE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    os.environ.pop("SGSTORE_CACHE")
-    if before is not None:
-        os.environ["SGSTORE_CACHE"] = before
 
 
 @pytest.fixture(scope="module")

@@ -31,10 +31,11 @@ from sgstore.testsets.selection import (
 from sgstore.testsets.selection._bundles import cheapest_units
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from sgstore.testsets.selection import Selection
+
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 SEEDS = range(8)
 TRACES = 6
@@ -54,13 +55,6 @@ SPECS = [
 ]
 SPECS.append(SelectionSpec(Strategy.per_class, SelectionUnit.clip, 0.4, "E", objective="frames"))
 SPECS.append(replace(SPECS[2], stride_s=SPECS[2].clip_s))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("SGSTORE_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 def split_at_random(seed: int, folder: Path) -> tuple[Store, Collection]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 import shlex
 from importlib import import_module
@@ -20,8 +19,10 @@ from sgstore.errors import StoreError
 from sgstore.ingest import ingest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
+
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 TRACES = 12 if LONG else 5
 FRAMES = (22, 34) if LONG else (12, 20)
@@ -65,16 +66,6 @@ VERBS = [
     f"coverage novel {{}} --by {{}}:{CAR} --items clips --json",
     "coverage sequences {} --k 2 --manoeuvre 'near=MATCH (e:Ego)-[:near]->(v:Car)' --json",
 ]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    before = os.environ.get("SGSTORE_CACHE")
-    os.environ["SGSTORE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    os.environ.pop("SGSTORE_CACHE")
-    if before is not None:
-        os.environ["SGSTORE_CACHE"] = before
 
 
 def drives(folder: Path, seed: int, count: int) -> Path:

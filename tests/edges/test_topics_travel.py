@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import duckdb
 import pytest
@@ -19,22 +18,9 @@ from sgstore.ingest import ingest
 from sgstore.pipeline.rebuild import rebuild
 from sgstore.store import BundleSource, Sealed, verify_file
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-pytestmark = pytest.mark.seconds(6)
+pytestmark = [pytest.mark.seconds(6), pytest.mark.usefixtures("own_cache")]
 
 TOPICS = ("/imu", "/planner")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    before = os.environ.get("SGSTORE_CACHE")
-    os.environ["SGSTORE_CACHE"] = str(tmp_path_factory.mktemp("cache"))
-    yield
-    os.environ.pop("SGSTORE_CACHE")
-    if before is not None:
-        os.environ["SGSTORE_CACHE"] = before
 
 
 @pytest.fixture(scope="module")
