@@ -392,10 +392,10 @@ class Matches(Tabular):
             if told is None:
                 return {}
             failed, value, text = told
-            using = " ".join(_SETTING.findall(self._text))
+            using, values = self._settings()
             try:
-                asked = Matches(self._file, self._catalog, f"{using} {text}", {}) if text else None
-                rows = asked.rows() if asked is not None else []
+                rows = Matches(self._file, self._catalog, using + text, values) if text else ()
+                rows = list(rows)
             except QueryError:  # texts have no difference
                 rows = []
         for trace, seq, found in rows:
@@ -403,6 +403,16 @@ class Matches(Tabular):
                 shown = f"{value} = {found:.4g}"
                 return {"failed": failed, "trace": trace, "seq": seq, "found": shown}
         return {"failed": failed}
+
+    def _settings(self) -> tuple[str, dict[str, object]]:
+        """Return the settings of the query as text, and the values of their parameters."""
+        from sgstore.lang.syntax import parse
+
+        settings = [one for part in parse(self._text) for one in getattr(part, "settings", ())]
+        names = [getattr(one.value, "name", "") for one in settings]
+        values = {name: self._parameters[name] for name in names if name}
+        texts = [self._text[one.span.start : one.span.end] for one in settings]
+        return f"USING {', '.join(texts)} " if texts else "", values
 
     @property
     def scope(self) -> dict[str, Any]:
@@ -888,9 +898,6 @@ class Matches(Tabular):
                 for low in range(0, len(block[0]), BLOCK):
                     yield [column[low : low + BLOCK] for column in block]
 
-
-_SETTING: Final = re.compile(r"\bUSING\s+\w+\s+(?:'[^']*'|\w+)", re.IGNORECASE)
-"""Setting of a query."""
 
 _INTERVALS: Final = {"intervals": Compiled.intervals, "bound": Compiled.bound_intervals}
 

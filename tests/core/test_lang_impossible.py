@@ -150,6 +150,16 @@ def test_nearest_frame_of_a_pattern_without_matches(open_town: Store, text: str)
     assert near["failed"] in str(shown)
 
 
+def test_the_nearest_frame_has_the_settings_of_the_query(open_town: Store) -> None:
+    fast = "MATCH (v:Vehicle) WHERE v.speed > 99"
+    world = open_town.find(f"USING SCOPE world {fast}").nearest()
+    listed = open_town.find(f"USING NODES any, SCOPE $scope {fast}", scope="world")
+
+    assert listed.nearest() == world != open_town.find(fast).nearest()
+    quoted = open_town.find(f"{fast} AND v.name <> 'USING SCOPE world'")
+    assert quoted.nearest() == open_town.find(fast).nearest()
+
+
 def test_parts_without_a_value_have_no_nearest_frame(open_town: Store) -> None:
     train = open_town.find("MATCH (e:Ego)-[:near]->(v:Train)").nearest()
     assert train == {"failed": "(v:Train)"}
