@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -306,6 +307,29 @@ def test_a_monitored_pattern_has_no_match_by_a_guessed_lane(pattern: str, tmp_pa
             monitor.step(frame)
         monitor.finish()
         assert seen <= found
+
+
+@pytest.mark.parametrize("length", [4.5, np.nan])
+def test_a_leader_is_certain_if_another_vehicle_is_unsure(length: float) -> None:
+    scene = Scene(
+        CROSS,
+        ego(through("s", "w"), 8, start=90),
+        actor("v", through("n", "s"), 0.5, start=102),
+        actor("w", through("n", "s"), 0.5, start=112),
+        seconds=8,
+        rate=5,
+    )
+    block = scene.block()
+    lengths = np.where(block.states.node == 0, block.states.length, length)
+    block = replace(block, states=replace(block.states, length=lengths))
+    online, compared = SceneGraphGenerator(scene.road, Config()), 0
+    for frame in replayed([block]):
+        graph = online.step(frame)
+        if graph.unsure_lane:
+            assert graph.unsure_lane == graph.unsure_lead == {graph.ego}
+            assert [(a, b) for a, relation, b, _ in graph.edges if relation == "leads"] == [(2, 1)]
+            compared += 1
+    assert compared > 5
 
 
 @pytest.mark.parametrize("way", MEETING)

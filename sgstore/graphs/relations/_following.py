@@ -147,10 +147,10 @@ def following(
         return found, standing.unsure
     sure = standing.own & ~np.isin(standing.hits.row, standing.unsure)
     less = next_ahead(net, bodies, replace(standing, own=sure), limit)
-    one, other = ({*zip(*(c.tolist() for c in of), strict=True)} for of in (found, less))
-    certain = np.array([pair in other for pair in zip(*(c.tolist() for c in found), strict=True)])
-    doubted = np.array([a for a, *_ in one ^ other], np.intp)
-    kept = np.flatnonzero(certain)
+    known = ([np.nan_to_num(c, nan=-1).tolist() for c in of] for of in (found, less))
+    one, other = (dict.fromkeys(zip(*columns, strict=True)) for columns in known)
+    kept = np.flatnonzero([pair in other for pair in one])
+    doubted = np.array([a for a, *_ in one.keys() ^ other.keys()], np.intp)
     column = found[0][kept], found[1][kept], found[2][kept]
     return column, np.union1d(doubted, standing.unsure)
 
