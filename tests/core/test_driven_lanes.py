@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import GraphBlock, SceneGraph
     from sgstore.model.world import FrameBlock
+    from sgstore.temporal import MonitorEvent
 
 WIDE = Config(range=RangeSettings(400))
 TURNS = (math.pi / 4, 2.5)
@@ -299,13 +300,12 @@ def test_a_monitored_pattern_has_no_match_by_a_guessed_lane(pattern: str, tmp_pa
     found = {(one.trace, one.seq) for one in store.find(text).frames()}
     for way, scene in MEETING.items():
         seen = set[tuple[str, int]]()
-        monitor = Monitor(text, scene.road, trace=way, period_s=0.2)
-        monitor._on_event = lambda one, way=way, seen=seen: seen.update(
-            (way, seq) for seq in range(one.start.seq, one.end.seq + 1)
-        )
+        events: list[MonitorEvent] = []
+        monitor = Monitor(text, scene.road, trace=way, period_s=0.2, on_event=events.append)
         for frame in replayed([scene.block()]):
             monitor.step(frame)
         monitor.finish()
+        seen.update((way, seq) for one in events for seq in range(one.start.seq, one.end.seq + 1))
         assert seen <= found
 
 
@@ -343,14 +343,12 @@ def test_results_of_driven_lanes_stay_in_a_turned_and_mirrored_world(way: str) -
 
 
 @pytest.mark.data
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("carla/Town01.carla", marks=pytest.mark.long),
-        *(
-            pytest.param(name, marks=pytest.mark.long)
-            for name in ("esmini/swarm_Town04", "esmini/traffic_lights", "sumo/Town10HD_sumo_osi")
-        ),
+        *("carla/Town01.carla", "esmini/swarm_Town04", "esmini/traffic_lights"),
+        "sumo/Town10HD_sumo_osi",
     ],
 )
 @pytest.mark.seconds(20)
