@@ -227,21 +227,13 @@ def database_of(connection: DuckDBPyConnection) -> str:
 
 
 _TOPIC: Final = re.compile(r"topic(_[0-9a-f]{16})?")
-TOPIC_TYPES: Final = frozenset(
-    {
-        *(
-            "BOOLEAN",
-            "TINYINT",
-            "UTINYINT",
-            "SMALLINT",
-            "USMALLINT",
-            "INTEGER",
-            "UINTEGER",
-            "BIGINT",
-        ),
-        *("UBIGINT", "FLOAT", "DOUBLE", "VARCHAR", "BLOB", "JSON"),
-    }
+TOPIC_TYPES: Final[frozenset[str]] = frozenset(
+    (
+        *("BOOLEAN", "TINYINT", "UTINYINT", "SMALLINT", "USMALLINT", "INTEGER", "UINTEGER"),
+        *("BIGINT", "UBIGINT", "FLOAT", "DOUBLE", "VARCHAR", "BLOB", "JSON"),
+    )
 )
+"""Types of the columns of a topic."""
 
 
 def topic_statements(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
