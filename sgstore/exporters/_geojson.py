@@ -40,7 +40,7 @@ SELECT n.frame_id, f.time_ns, f.t, n.node_id, n.kind::VARCHAR AS kind, n.is_ego,
        n.x::DOUBLE AS x, n.y::DOUBLE AS y, n.heading::DOUBLE AS heading, n.length::DOUBLE AS length,
        n.width::DOUBLE AS width, n.speed::DOUBLE AS speed, n.light_state::VARCHAR AS light_state
 FROM nodes n JOIN frames f USING (frame_id)
-WHERE n.frame_id >= $first AND n.frame_id <= $last AND n.node_id >= 0 AND n.x IS NOT NULL
+WHERE n.frame_id >= $first AND n.frame_id <= $last AND n.node_id >= 0 AND isfinite(n.x) AND isfinite(n.y)
 ORDER BY n.frame_id, n.node_id
 """
 _GEO: Final = re.compile(r"<geoReference>\s*(?:<!\[CDATA\[)?\s*([^<\]]+)")
@@ -48,6 +48,8 @@ _OFFSET: Final = re.compile(r"<offset\b([^>]*)>")
 _NUMBER: Final = re.compile(r"(\w+)\s*=\s*[\"']([-+.\deE]+)[\"']")
 _DIGITS: Final = {True: 8, False: 3}
 """Digits of coordinates in degrees and in metres: about a millimetre."""
+_TEXTS: Final = ("name", "lane_type", "road", "junction", "turn")
+"""Columns of texts of a road map that are properties of its features."""
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
@@ -103,9 +105,9 @@ def _entities(export: Export, frames: ClipFrames, placed: Placed | None) -> Iter
     """Yield a feature for each entity of each frame of a clip."""
     for window in frames.windows():
         found = export.store.file.rows(_NODES, window.bounds).dicts()
+        columns = export.label_columns(window.frame_id)
         labels = {
             int(frame): {name: values[i] for name, values in columns.items()}
-            for columns in (export.label_columns(window.frame_id),)
             for i, frame in enumerate(window.frame_id)
         }
         rows = [row for row in found if row["frame_id"] in labels]
@@ -113,10 +115,9 @@ def _entities(export: Export, frames: ClipFrames, placed: Placed | None) -> Iter
             continue
         size = [[row[name] or 0 for name in ("length", "width")] for row in rows]
         places = [[row["x"], row["y"], np.radians(row["heading"] or 0)] for row in rows]
-        boxes = corners(np.column_stack([places, size]).astype(np.float64)).reshape(-1, 2)
-        if not np.isfinite(boxes).all():
-            boxes = np.nan_to_num(boxes)
-        points = _rounded(boxes, placed)
+        poses = np.column_stack([places, size]).astype(np.float64)
+        boxes = corners(np.nan_to_num(poses, posinf=0.0, neginf=0.0))
+        points = _rounded(boxes.reshape(-1, 2), placed)
         for i, row in enumerate(rows):
             ring = points[4 * i : 4 * i + 4]
             known = all(size[i])
@@ -147,14 +148,11 @@ def _parts_of(name: str, text: str, placed: Placed | None) -> Iterator[Any]:
         }
         row = -1 - node
         about = {"map": name, "node_id": node, "kind": KINDS[int(nodes.kind[row])]}
-        texts = {column: getattr(nodes, column)[row] for column in ("name", *_TEXTS)}
+        texts = {column: getattr(nodes, column)[row] for column in _TEXTS}
         limit = float(nodes.speed_limit[row])
         if np.isfinite(limit):
             texts["speed_limit"] = limit
         yield _feature(shape, about | {key: value or None for key, value in texts.items()})
-
-
-_TEXTS: Final = ("lane_type", "road", "junction", "turn")
 
 
 def _feature(shape: dict[str, Any], about: dict[str, Any]) -> dict[str, Any]:

@@ -178,6 +178,19 @@ def test_geojson_has_each_box_in_metres_and_a_note(
     assert named == {name for (name,) in store.sql("SELECT name FROM lanes").values}
 
 
+def test_an_entity_without_a_place_is_no_feature(tmp_path: Path) -> None:
+    graph = {"directed": True, "multigraph": True, "links": []}
+    places = ({"x": 3.0, "y": 4.0}, {"x": 3.0})
+    graph["nodes"] = [{"id": i, "kind": "car", **place} for i, place in enumerate(places)]
+    (tmp_path / "one.jsonl").write_text(json.dumps(graph))
+    store = str(tmp_path / "one.sgstore")
+    assert run(["import", store, str(tmp_path / "one.jsonl"), "--as", "nodelink"]) == 0
+    assert run(["export", store, "--as", "geojson", "--to", str(tmp_path / "out")]) == 0
+    (found,) = features(tmp_path / "out" / "one_001.geojson")
+
+    assert found["geometry"]["coordinates"] == [3.0, 4.0]
+
+
 def test_coordinates_are_longitude_and_latitude_with_a_coordinate_system(
     folder: Path, tmp_path: Path
 ) -> None:
