@@ -817,7 +817,7 @@ class TopicValue:
     ----------
     topic, field : str
     rule : str
-        One of :data:`sgstore.lang.topics.RULES`.
+        ``last``, ``nearest`` or ``linear``.
     tolerance_ns : int or None
         Largest time between message and frame; ``None`` means unlimited.
     """

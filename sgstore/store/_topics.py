@@ -236,13 +236,8 @@ class TopicWriter:
         for topic, file in self._files.items():
             schema, encoding = reading.schema(topic)
             lost = reading.losses[topic].messages
-            told = {
-                "fields": self._types(file),
-                "schema": schema,
-                "encoding": encoding,
-                "lost": lost,
-            }
-            found.append(replace(file, **told))
+            fields = self._types(file)
+            found.append(replace(file, fields=fields, schema=schema, encoding=encoding, lost=lost))
         return found
 
     def _types(self, file: TopicFile) -> dict[str, str]:
