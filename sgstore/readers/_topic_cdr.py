@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 
     Part = tuple[NDArray[np.intp], Column]
 
+MAX_LAYOUTS: Final = 256
+"""Largest number of layouts of messages of one size that are decoded in groups."""
+
 _DECLARED: Final = {
     "?": "BOOLEAN",
     "b": "TINYINT",
@@ -157,9 +160,15 @@ class CdrColumns:
     def _alike(
         self, data: bytes, size: int, count: int, losses: Losses
     ) -> Iterator[tuple[NDArray[np.intp], dict[str, Column]]]:
-        """Yield messages of one size in groups of equal layout: row numbers and columns."""
+        """Yield messages of one size in groups of equal layout: row numbers and columns.
+
+        After :data:`MAX_LAYOUTS` groups, the rest is decoded one by one. Otherwise, time would grow with the
+        square of the number of layouts.
+        """
         left = np.arange(count)
-        while len(left):
+        for _ in range(MAX_LAYOUTS):
+            if not len(left):
+                return
             first = int(left[0]) * size
             message = memoryview(data)[first : first + size]
             try:
@@ -171,6 +180,9 @@ class CdrColumns:
             agrees = layout.agreeing(data, size, left)
             yield left[agrees], layout.read(data, size, left[agrees], losses)
             left = left[~agrees]
+        rest = b"".join(data[row * size : (row + 1) * size] for row in left.tolist())
+        found, rows = self._one_by_one(rest, np.full(len(left), size), losses)
+        yield left[rows], {name: values for name, (_, values) in found.items()}
 
     def _one_by_one(
         self, data: bytes, lengths: NDArray[np.int64], losses: Losses

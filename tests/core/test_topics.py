@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from sgstore.apps.cli import run as run_verb
 from sgstore.errors import SgstoreError, SqlError
 from sgstore.ingest import ingest
 from sgstore.lang.topics import TopicError, field_of
+from sgstore.readers import _topic_cdr
 from sgstore.store import StoreFile
 from sgstore.store._topic_views import topic_values
 
@@ -238,6 +240,22 @@ def test_lists_that_are_all_empty_are_lists(tmp_path: Path) -> None:
         recorder.write(recorder.channel("/a", "A", b""), 0.1, b'{"a": [], "b": 1}')
     asked = StoreFile.recording_sql(tmp_path / "a.mcap", "SELECT a, b FROM topic('/a')")
     assert asked.rows().values == [([], 1)]
+
+
+def test_messages_of_one_size_in_many_layouts_are_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some layouts in groups, the others one by one."""
+    monkeypatch.setattr(_topic_cdr, "MAX_LAYOUTS", 3)
+    texts = [("x" * (4 * i), "y" * (40 - 4 * i)) for i in range(10)] * 2
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        kind = recorder.writer.register_schema("x/msg/Two", "ros2msg", b"string a\nstring b\n")
+        channel = recorder.writer.register_channel("/a", "cdr", kind)
+        for i, pair in enumerate(texts):
+            parts = (struct.pack("<I", len(one) + 1) + one.encode() + bytes(4) for one in pair)
+            recorder.write(channel, i / 10, b"\0\1\0\0" + b"".join(parts))
+    asked = StoreFile.recording_sql(tmp_path / "a.mcap", "SELECT a, b FROM topic('/a') ORDER BY t")
+    assert asked.rows().values == texts
 
 
 FIELDS = (
