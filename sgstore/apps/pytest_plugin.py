@@ -37,7 +37,6 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import pytest
 
 from sgstore.errors import SgstoreError
-from sgstore.model.vocabulary import natural
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -352,7 +351,7 @@ def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> l
     OSError
         The file cannot be read.
     """
-    from sgstore.model.world import Clip
+    from sgstore.exporters import whole_clips
     from sgstore.temporal import Verdict
 
     run = store.check(path.read_text(encoding="utf-8"), **parameters)
@@ -365,10 +364,7 @@ def traces_checked(path: Path, store: Store, parameters: Mapping[str, Any]) -> l
         return verdicts().get((trace, check)) or Verdict(check, trace, "unknown")
 
     with store.file.snapshot():
-        spans = store.file.rows(
-            "SELECT trace, min(log_time_ns), max(log_time_ns) FROM frames GROUP BY trace"
-        ).values
-    clips = [Clip(*span) for span in sorted(spans, key=lambda span: natural(span[0]))]
+        clips = whole_clips(store)
     return [
         ClipScene(store, clip, f"{clip.trace}-{name}", asked=partial(verdict, clip.trace, name))
         for clip in clips

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.errors import ConfigError, one_store_needed
+from sgstore.errors import ConfigError, ExportError, one_store_needed
 from sgstore.lang.library import statement
 from sgstore.model.world import Clip
 from sgstore.query import Store
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from sgstore.collection import Collection
     from sgstore.draw import Timeline
-    from sgstore.exporters import WrittenClip, WrittenFile
+    from sgstore.exporters import Exporter, WrittenClip, WrittenFile
     from sgstore.matches import Matches
     from sgstore.testsets.coverage import ChosenFrames, Classed, ReportTable
     from sgstore.testsets.locks import Lock
@@ -372,11 +372,10 @@ def export(  # noqa: PLR0913 - the options of the command
         labelled,
         parse_labels,
         parse_mounts,
-        whole_clips,
         write_export,
     )
 
-    exporter_named(form)  # before the search starts
+    exporter = exporter_named(form)  # before the search starts
     check_folder(Path(to))
     texts, margins = parse_labels(labels), (seconds(before, "--before"), seconds(after, "--after"))
     same |= {"mounts": parse_mounts(mounts), "channels": tuple(channels), "progress": progress}
@@ -399,11 +398,22 @@ def export(  # noqa: PLR0913 - the options of the command
             on_matches(matches)
         clips = list(matches.clips(*margins))
     else:
-        clips = whole_clips(opened, form)
+        clips = _whole_clips(opened, exporter)
     if not clips:
         return []
     order = Export(opened, tuple(clips), provenance=told, **same)
     return write_export(labelled(order, texts, **(held if query else values)), to, form)
+
+
+def _whole_clips(store: Store, exporter: Exporter) -> list[Clip]:
+    from sgstore.exporters import whole_clips
+
+    if exporter.recorded:
+        raise ExportError(
+            f"the format '{exporter.name}' copies recordings; add a query: 'MATCH (e:Ego)' is"
+            " every frame with an ego"
+        )
+    return whole_clips(store)
 
 
 def lock(

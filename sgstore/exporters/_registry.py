@@ -47,27 +47,30 @@ class Exporter:
     options : frozenset of str
         Supported options of an :class:`Export`: ``abstraction``, ``with_graph``, ``mounts``,
         ``rebase_context``, ``graphml``, ``channels``, ``clouds``, ``storage``, ``crs``.
+    recorded : bool
+        True if the format copies messages of recordings. Then an export needs a query.
     """
 
     name: str
     write: Write
     options: frozenset[str] = frozenset()
+    recorded: bool = False
 
 
-def _of(module: str, *options: str) -> Exporter:
+def _of(module: str, *options: str, recorded: bool = False) -> Exporter:
     """Return a built-in export format. Its module is imported on first use."""
 
     def write(export: Export, folder: Path) -> Sequence[WrittenClip | WrittenFile]:
         found: Any = import_module(f"sgstore.exporters._{module}")
         return found.write(export, folder)
 
-    return Exporter(module, write, frozenset(options))
+    return Exporter(module, write, frozenset(options), recorded)
 
 
 EXPORTERS: Final = (
-    _of("mcap", "with_graph", "mounts", "rebase_context"),
+    _of("mcap", "with_graph", "mounts", "rebase_context", recorded=True),
     _of("parquet"),
-    _of("frames", "channels", "clouds"),
+    _of("frames", "channels", "clouds", recorded=True),
     _of("nx", "abstraction", "graphml"),
     _of("pyg", "abstraction"),
     _of("s3c", "abstraction"),

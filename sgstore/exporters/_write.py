@@ -62,29 +62,8 @@ def around_frames(
     )
 
 
-_RECORDED: Final = ("mcap", "frames")
-"""Formats that copy messages of recordings."""
-
-
-def whole_clips(store: Store, form: str) -> list[Clip]:
-    """Return a clip for each whole trace of a store.
-
-    Parameters
-    ----------
-    store : Store
-    form : str
-        Name of an exporter.
-
-    Raises
-    ------
-    ExportError
-        The format copies recordings.
-    """
-    if form in _RECORDED:
-        raise ExportError(
-            f"the format '{form}' copies recordings; add a query: 'MATCH (e:Ego)' is every frame"
-            " with an ego"
-        )
+def whole_clips(store: Store) -> list[Clip]:
+    """Return a clip for each whole trace of a store."""
     found = store.file.rows(
         "SELECT trace, min(log_time_ns), max(log_time_ns) FROM frames GROUP BY trace"
     )

@@ -47,7 +47,7 @@ def store(folder: Path) -> Store:
 @pytest.fixture(scope="module")
 def scenes(store: Store, folder: Path) -> Path:
     """A database of all frames."""
-    whole = Export(store, tuple(whole_clips(store, "duckdb")))
+    whole = Export(store, tuple(whole_clips(store)))
     write_export(whole, folder / "duckdb", "duckdb")
     return folder / "duckdb" / "scenes.duckdb"
 
@@ -269,7 +269,7 @@ def installed(name: str) -> bool:
 def test_a_client_reads_the_export(name: str, store: Store, scenes: Path, folder: Path) -> None:
     tables = folder / "parquet"
     if not tables.exists():
-        write_export(Export(store, tuple(whole_clips(store, "parquet"))), tables, "parquet")
+        write_export(Export(store, tuple(whole_clips(store))), tables, "parquet")
     store.close()
 
     assert answer(sys.executable, CLIENTS[name], folder) == "41"
