@@ -61,6 +61,11 @@ def _in_whole(local: Catalog, whole: Mapping[str, Any]) -> Catalog:
     for name, relations in whole["sets"].items():
         if name in sets:
             sets[name] = _with_relations(sets[name], relations)
+    topics = topics_of_parts(whole["topics"])
+    for name, facts in local.topics.items():
+        # Other parts may have more fields. They are unknown here.
+        more = {"source": topics[name].source} if name in topics and topics[name].stored else {}
+        topics[name] = replace(facts, **more)
     return replace(
         local,
         part=True,
@@ -68,7 +73,7 @@ def _in_whole(local: Catalog, whole: Mapping[str, Any]) -> Catalog:
         own={name: Type(kind) for name, kind in whole["own"].items()},
         own_edges={name: Type(kind) for name, kind in whole["own_edges"].items()},
         classed=tuple(whole["classed"]),
-        topics=topics_of_parts(whole["topics"]) | dict(local.topics),
+        topics=topics,
         sets=sets,
         lacks={},
     )

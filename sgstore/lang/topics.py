@@ -102,6 +102,15 @@ def field_of(facts: TopicFacts, path: str) -> TopicField:
 
 def field_named(fields: Mapping[str, TopicField], topic: str, path: str) -> TopicField:
     """Return a field of a topic, as :func:`field_of`, from all of its fields."""
+    found = find_field(fields, path)
+    if found is None:
+        hint = _like(path, fields)
+        raise TopicError(f"topic {excerpt(topic)!r} has no field {excerpt(path)!r}", hint)
+    return found
+
+
+def find_field(fields: Mapping[str, TopicField], path: str) -> TopicField | None:
+    """Return a field or an element of a list field by name. ``None`` means an unknown name."""
     folded = {name.lower(): field for name, field in fields.items()}
     found = fields.get(path) or folded.get(path.lower())
     if found is not None:
@@ -110,8 +119,7 @@ def field_named(fields: Mapping[str, TopicField], topic: str, path: str) -> Topi
     of = element and folded.get(element["list"].lower())
     if element and of and of.declared.endswith("[]"):
         return TopicField(f"{of.name}[{int(element['index'])}]", of.declared.removesuffix("[]"))
-    hint = _like(path, fields)
-    raise TopicError(f"topic {excerpt(topic)!r} has no field {excerpt(path)!r}", hint)
+    return None
 
 
 def _like(path: str, fields: Mapping[str, TopicField]) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.base.quoting import literal, quoted
 from sgstore.lang.catalog import TOPIC, TopicValue
+from sgstore.lang.topics import find_field
 from sgstore.store._interrupts import interruptible
 from sgstore.store._lease import stamp_of
 
@@ -49,7 +50,8 @@ def _write(connection: DuckDBPyConnection, access: Access, relation: str, place:
     # Booleans convert to any type, so the columns of several parts can be joined.
     made = "SELECT CAST(NULL AS BIGINT) AS frame_id, CAST(NULL AS BOOLEAN) AS value LIMIT 0"
     topic = topic_facts(connection, access).get(one.topic)
-    if topic is not None and topic.source():  # a part of a collection may lack it
+    # A part of a collection may lack the topic, or the field.
+    if topic is not None and find_field(topic.source(), one.field):
         made = topic_values(connection, access, topic, one.field, one.rule, one.tolerance_ns)
     place.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     part = place.with_suffix(f".{id(connection)}")

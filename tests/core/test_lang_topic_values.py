@@ -145,7 +145,10 @@ def test_values_are_those_of_the_definition(tmp_path: Path, seed: int) -> None:
     assert [*seen.values()] == found
 
 
-def drive(path: Path, *, planner: bool = True, z: float = 0.0, words: bool = False) -> Path:
+WORDS = b'{"words": ["a", "b"]}'
+
+
+def drive(path: Path, *, planner: bool = True, z: float = 0.0, words: bytes = b"") -> Path:
     """A drive of 2 s. The planner says STOP from 1 s on, every 0.3 s; its ``z`` rises by 1 each time."""
     with Recorder(path) as recorder:
         for i in range(20):
@@ -156,7 +159,7 @@ def drive(path: Path, *, planner: bool = True, z: float = 0.0, words: bool = Fal
             if words:
                 recorder.channel("/empty", "Empty", b"")
                 channel = recorder.channel("/words", "Words", b"")
-                recorder.write(channel, i / 10, b'{"words": ["a", "b"]}')
+                recorder.write(channel, i / 10, words)
             cars = [car(1, x=i, v=(10, 0)), car(2, x=70 - i, v=(-10, 0))]
             recorder.ground_truth(i / 10, cars, host=1)
     return path
@@ -206,7 +209,7 @@ def test_topics_are_values_in_every_clause(tmp_path: Path) -> None:
 
 def test_a_replay_has_the_verdicts_of_the_store(tmp_path: Path) -> None:
     """Of an element of a list of texts, and of a topic without messages."""
-    path = drive(tmp_path / "d.mcap", words=True)
+    path = drive(tmp_path / "d.mcap", words=WORDS)
     store = sgstore.open(tmp_path / "s.sgstore", create=True)
     store.ingest(path)
     text = (
@@ -239,6 +242,18 @@ def test_a_collection_has_topics_of_some_stores(tmp_path: Path) -> None:
             fleet.find("MATCH (e:Ego) WHERE topic('/planer').z > 1").rows()
         with pytest.raises(sgstore.SgstoreError, match="topic '/planner' has no field 'zz'"):
             fleet.find("MATCH (e:Ego) WHERE topic('/planner').zz > 1").rows()
+
+
+def test_a_stored_field_of_some_parts_of_a_collection_is_unknown_in_the_others(
+    tmp_path: Path,
+) -> None:
+    for name, told in (("one", WORDS), ("two", b'{"words": ["a"], "only": 4}')):
+        store = sgstore.open(tmp_path / f"{name}.sgstore", create=True)
+        store.ingest(drive(tmp_path / f"{name}.mcap", words=told), topics=("/words",))
+        pack(tmp_path / f"{name}.sgstore", tmp_path / "fleet")
+    text = "MATCH (e:Ego) WHERE topic('/words').only = 4 AND topic('/words').words[0] = 'a' RETURN FRAMES"
+    with Collection(tmp_path / "fleet") as fleet:
+        assert [row.trace for row in fleet.find(text).rows()] == ["two"] * 20
 
 
 def test_online_frames_carry_messages() -> None:
