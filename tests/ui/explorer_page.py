@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +37,14 @@ def open_first(page: Any) -> None:
 
 def time_shown(page: Any) -> Any:
     return page.locator(".transport .time")
+
+
+def expect_to_play(page: Any) -> None:
+    """Press the key that plays. The time that is shown then changes."""
+    expect(time_shown(page)).to_have_text(re.compile(r"\d s$"))
+    was = time_shown(page).inner_text()
+    page.keyboard.press(" ")
+    expect(time_shown(page)).not_to_have_text(was)
 
 
 def seen(page: Any, name: str) -> None:

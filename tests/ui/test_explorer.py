@@ -17,7 +17,17 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
-from explorer_page import AXE, NEAR, expect, faults, open_first, search, seen, time_shown
+from explorer_page import (
+    AXE,
+    NEAR,
+    expect,
+    expect_to_play,
+    faults,
+    open_first,
+    search,
+    seen,
+    time_shown,
+)
 from thorough import LONG
 
 from sgstore.apps.demo import RECORDING
@@ -51,9 +61,7 @@ def test_an_answer_does_not_wait_for_the_one_before_it(
 
 
 def test_the_library_is_there_before_anything_is_typed(page: Any, town_store: Path) -> None:
-    page.locator(".card").first.wait_for()
-
-    assert page.locator(".card").count() > 50
+    expect(page.locator(".card").nth(50)).to_be_visible()
     card = page.locator(".card", has_text="jaywalking")
     card.locator(".badge").wait_for()
     # Where in time it is found, in 250 spots.
@@ -62,7 +70,7 @@ def test_the_library_is_there_before_anything_is_typed(page: Any, town_store: Pa
     ends = [(s.start_seq * 250 / frames, (s.end_seq + 1) * 250 / frames) for s in spans]
     spots = {at for a, z in ends for at in range(math.floor(a), math.ceil(z))}
     marks = card.locator(".bar-match").evaluate_all("all => all.map(one => one.getAttribute('x'))")
-    assert card.locator(".badge").inner_text() == str(len(spans))
+    expect(card.locator(".badge")).to_have_text(str(len(spans)))
     assert {int(mark) for mark in marks} == spots
     seen(page, "start")
     search(page, NEAR)
@@ -74,10 +82,10 @@ def test_the_library_is_there_before_anything_is_typed(page: Any, town_store: Pa
 def test_matches_are_those_of_the_store(page: Any, town_store: Path) -> None:
     spans = list(Store(town_store).find(NEAR).intervals())
     search(page, NEAR)
-    page.locator(".tile").first.wait_for()
-    told = page.locator(".status").inner_text()
-
-    assert f"{len(spans)} matches in 1 trace, {Store(town_store).find(NEAR).count()} frames" in told
+    frames = Store(town_store).find(NEAR).count()
+    told = f"{len(spans)} matches in 1 trace, {frames} frames"
+    expect(page.locator(".status")).to_contain_text(told)
+    expect(page.locator(".tile").first).to_be_visible()
     seen(page, "gallery")
 
 
@@ -90,7 +98,7 @@ def test_a_parameter_is_a_field(page: Any, town_store: Path) -> None:
     many = len(list(Store(town_store).find(query, least=3).intervals()))
     expect(page.locator(".status")).to_contain_text(f"{many} matches")
     search(page, "SELECT 'a' AS word, 1 AS number")
-    assert page.locator("th.number").all_inner_texts() == ["number"]
+    expect(page.locator("th.number")).to_have_text(["number"])
 
 
 def test_lanes_are_the_parts_of_the_pattern(page: Any, town_store: Path) -> None:
@@ -100,21 +108,20 @@ def test_lanes_are_the_parts_of_the_pattern(page: Any, town_store: Path) -> None
     store = Store(town_store)
     first = next(store.find(query).intervals())
     lanes = store.parts(query, f"town#{first.start_seq}")
-    texts = page.locator(".timeline .label.mono").all_inner_texts()
+    texts = page.locator(".timeline .label.mono")
 
-    assert [text.lstrip("✓✗? ").strip() for text in texts] == [one.part.text for one in lanes.lanes]
-    assert page.locator(".timeline .lane[data-holds=true]").count() == len(lanes.lanes)
-    marks = page.locator(".timeline .ticks span").all_inner_texts()
-    assert marks == [f"{t} s" for t in range(0, 80, 10)]  # of 74.9 s
+    expect(texts).to_have_text([f"✓{one.part.text}" for one in lanes.lanes])
+    expect(page.locator(".timeline .lane[data-holds=true]")).to_have_count(len(lanes.lanes))
+    marks = [f"{t} s" for t in range(0, 80, 10)]  # of 74.9 s
+    expect(page.locator(".timeline .ticks span")).to_have_text(marks)
     seen(page, "scene")
     page.get_by_role("tab", name="neighbours").click()
     graph = store.graph(f"town#{first.start_seq}")
     bound = [first.values["e"], first.values["v"]]
     met = {n for a, b, _ in graph.edges if {a, b} & {*bound} for n in (a, b)}
     drawn = page.locator("svg[aria-label=Neighbours] g rect")
-    drawn.first.wait_for(state="attached")
-    shown = drawn.count()
-    assert len(bound) < shown <= len(met)
+    expect(drawn.nth(len(bound))).to_be_attached()
+    assert drawn.count() <= len(met)
     seen(page, "neighbours")
     page.get_by_role("button", name="Beside").click()
     expect(page.locator(".views .above canvas")).to_have_count(2)
@@ -164,22 +171,20 @@ def test_from_a_mistake_to_a_test_set(
 
 def mend_a_mistake(page: Any, query: str) -> None:
     search(page, "MATCH (e:Ego)-[:near_kol]->(v)")
-    assert "near_coll" in page.locator(".status .error").inner_text()
-    assert page.locator(".cm-lintRange-error").inner_text() == "near_kol"
+    expect(page.locator(".status .error")).to_contain_text("near_coll")
+    expect(page.locator(".cm-lintRange-error")).to_have_text("near_kol")
     search(page, query)
     expect(page.locator(".status .error")).to_have_count(0)
 
 
 def play_to_the_end_of_a_match(page: Any, store: Store, query: str) -> None:
     open_first(page)
-    was = time_shown(page).inner_text()
     page.get_by_role("button", name="Farther").click()
-    page.keyboard.press(" ")  # plays, and does not press that button again
-    expect(time_shown(page)).not_to_have_text(was)
+    expect_to_play(page)  # the key does not press that button again
     page.keyboard.press(" ")
     page.keyboard.press("]")
     first = next(store.find(query).intervals())
-    assert f"{first.trace}#{first.end_seq}" in time_shown(page).inner_text()
+    expect(time_shown(page)).to_contain_text(f"{first.trace}#{first.end_seq} ")
 
 
 def relax_what_a_frame_lacks(page: Any, store: Store, seq: int, limit: str) -> None:
@@ -189,7 +194,7 @@ def relax_what_a_frame_lacks(page: Any, store: Store, seq: int, limit: str) -> N
     expect(time_shown(page)).to_contain_text(f"#{seq} ")
     page.get_by_role("button", name="Why?").click()
     gap = page.locator(".gap")
-    assert f"e.speed > {limit.rstrip('0')}" in gap.inner_text()
+    expect(gap).to_contain_text(f"e.speed > {limit.rstrip('0')}")
     seen(page, f"why-{trace}")
     gap.locator("button").click()
     expect(page.locator(".cm-content")).not_to_contain_text(f"> {limit}")
@@ -203,7 +208,7 @@ def tag_a_frame(page: Any, place: Path) -> None:
     page.locator(".dialog button.main").click()
     page.get_by_text("1 tag", exact=True).wait_for()
     search(page, "SELECT tag FROM notes")
-    assert "<script>alert(1)</script>" in page.locator("td").first.inner_text()
+    expect(page.locator("td").first).to_have_text("<script>alert(1)</script>")
     place.with_name(f"{place.name}.notes.csv").unlink()
 
 
@@ -241,10 +246,10 @@ def test_names_of_recordings_stay_text(
 
     page.on("dialog", on_dialog)
     search(page, NEAR)
-    assert name in page.locator(".group").inner_text()
+    expect(page.locator(".group")).to_contain_text(name)
     open_first(page)
-    assert name in time_shown(page).inner_text()
-    assert page.locator("img[src=x], body script:not([src])").count() == 0
+    expect(time_shown(page)).to_contain_text(name)
+    expect(page.locator("img[src=x], body script:not([src])")).to_have_count(0)
     assert asked == []
 
 
@@ -299,7 +304,7 @@ def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
         page.locator(".tile canvas[data-painted]").first.wait_for()
         was = time_shown(page).inner_text()
         expect(time_shown(page)).not_to_have_text(was)
-        assert page.locator("[data-statement]").count() == 2
+        expect(page.locator("[data-statement]")).to_have_count(2)
         page.locator(".tile", has_text="pattern").first.click()
         page.locator(".timeline .lane[data-holds=true]").first.wait_for()
         expect(page.locator(".scene .timeline .label").first).to_contain_text("events in this")
@@ -359,9 +364,7 @@ def test_a_report_plays_from_a_file_without_a_network(
     page = visit((tmp_path / "r.html").as_uri(), offline=True)
     open_first(page)
     expect(page.locator(".timeline .lane[data-holds=true]")).to_have_count(2)
-    was = time_shown(page).inner_text()
-    page.keyboard.press(" ")
-    expect(time_shown(page)).not_to_have_text(was)
+    expect_to_play(page)
     page.keyboard.press(" ")
     expect(page.locator(".camera .none")).to_have_count(0)
     seen(page, "report")

@@ -95,7 +95,7 @@ function Tile({ match, at, x, y, wide, high, flies, turn, many }) {
       ${offline.value || match.go ? null : html`<button class="quiet small tagger" tabindex=${turn ? 0 : -1}
         title="tag this match" aria-label=${`Tag ${match.trace} ${start} s`}
         onClick=${(/** @type {Event} */ event) => { event.stopPropagation(); tagged.value = { trace: match.trace,
-          first: match.first, last: match.last }; dialog.value = "tag"; }}>＋tag</button>`}
+          first: match.first, last: match.last }; dialog.value = "tag"; }}>+ tag</button>`}
       ${order.value ? html`<span class="faint">${match.trace}</span>` : null}<span class="who" title=${who}>
         ${who}</span>
     </div></div>`;
@@ -125,6 +125,11 @@ export function Gallery({ found: all, none, word = ["match", "matches"] }) {
     const seen = place.current;
     if (seen) setBox({ width: seen.clientWidth, height: seen.clientHeight, top: seen.scrollTop });
   };
+  // The rows there are drawn at once, not after the scroll event: the focus has its tile before the next key.
+  const scrollTo = (/** @type {number} */ top) => {
+    if (place.current) place.current.scrollTop = top;
+    measure();
+  };
   useEffect(() => {
     const watch = new ResizeObserver(measure);
     if (place.current) watch.observe(place.current);
@@ -152,13 +157,13 @@ export function Gallery({ found: all, none, word = ["match", "matches"] }) {
   const drawn = seen.map((row, at) => ({ row, slot: (low + at) % most.current }));
   if (jumps) drawn.sort((a, b) => a.slot - b.slot);
   const now = open.value?.match;
-  useEffect(() => { // what is open comes into sight
+  useEffect(() => { // what is open comes into sight, and stays there when the rows get another width
     if (!now || !place.current) return;
     const row = rows.find((one) => !one.group && found.slice(one.first,
       one.last).some((m) => keyOf(m) === keyOf(now)));
     if (row && (row.top < box.top
-      || row.top + row.height > box.top + box.height)) place.current.scrollTop = row.top - box.height / 3;
-  }, [now]);
+      || row.top + row.height > box.top + box.height)) scrollTo(row.top - box.height / 3);
+  }, [now, box.width]);
   // One tile is in the order of the Tab key. It keeps the focus, though its elements show other matches after scrolling.
   const [active, setActive] = useState(0), held = useRef("");
   const turn = Math.min(active, found.length - 1), visible = drawn.some(({ row }) => !row.group && row.first <= turn
@@ -190,7 +195,7 @@ export function Gallery({ found: all, none, word = ["match", "matches"] }) {
   };
   const onKey = (/** @type {KeyboardEvent} */ event) => {
     const to = moved(rows, turn, event.key, Math.max(1, Math.floor(box.height / (high + GAP)))), match = found[turn];
-    const opens = event.key === "Enter" && held.current !== "button",
+    const opens = event.key === "Enter" && !/** @type {HTMLElement} */ (event.target).closest("button"),
       ticks = event.key === "x" && !match?.go && !offline.value;
     if (to === null && !opens && !ticks) return;
     event.preventDefault();
@@ -200,9 +205,8 @@ export function Gallery({ found: all, none, word = ["match", "matches"] }) {
     setActive(to);
     const row = rows.find((one) => !one.group && to < one.last), seen = place.current;
     if (!row || !seen) return;
-    if (row.top - HEAD < seen.scrollTop) seen.scrollTop = row.top - HEAD;
     const below = row.top + row.height - seen.clientHeight;
-    if (below > seen.scrollTop) seen.scrollTop = below;
+    scrollTo(Math.max(Math.min(seen.scrollTop, row.top - HEAD), below));
   };
   return html`<section class="gallery" ref=${place} onScroll=${measure} aria-label="Matches"
     tabindex=${visible ? -1 : 0} onKeyDown=${onKey}

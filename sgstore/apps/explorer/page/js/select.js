@@ -38,16 +38,35 @@ function Clips({ all }) {
     return () => removeEventListener("resize", measure);
   }, []);
   arrived.value;
-  const first = Math.max(Math.floor(box.top / ROW) - SPARE, 0);
-  const rows = all.slice(first, first + Math.ceil(box.height / ROW) + 2 * SPARE);
-  return html`<div class="clips" ref=${place} onScroll=${measure} tabindex="0" role="list" aria-label="Clips">
-    <div style=${{ height: `${all.length * ROW}px` }}>${rows.map((match, i) => {
-      const [start, end] = timesOf(match);
-      return html`<div class="clip" role="listitem" key=${keyOf(match)} style=${{ top: `${(first + i) * ROW}px` }}
-          aria-posinset=${first + i + 1} aria-setsize=${all.length}><span class="cut">${match.trace}</span>
+  // The row with the focus stays, wherever the list is scrolled. The row after a removed one has it next.
+  const held = useRef(-1), gone = useRef(false), first = Math.max(Math.floor(box.top / ROW) - SPARE, 0),
+    end = Math.min(first + Math.ceil(box.height / ROW) + 2 * SPARE, all.length), rows = [];
+  held.current = Math.min(held.current, all.length - 1);
+  if (held.current >= 0 && held.current < first) rows.push(held.current);
+  for (let at = first; at < end; at++) rows.push(at);
+  if (held.current >= end) rows.push(held.current);
+  useLayoutEffect(() => {
+    if (!gone.current) return;
+    gone.current = false;
+    /** @type {HTMLElement | null | undefined} */ (place.current?.querySelector(
+      `[aria-posinset="${held.current + 1}"] button:last-child`))?.focus();
+  });
+  const onFocus = (/** @type {FocusEvent} */ event) => {
+    const row = /** @type {HTMLElement} */ (event.target).closest("[aria-posinset]");
+    held.current = Number(row?.getAttribute("aria-posinset") || 0) - 1;
+  };
+  return html`<div class="clips" ref=${place} onScroll=${measure} onFocusIn=${onFocus} tabindex="0" role="list"
+      aria-label="Clips">
+    <div style=${{ height: `${all.length * ROW}px` }}>${rows.map((at) => {
+      const match = /** @type {Match} */ (all[at]), [start, end] = timesOf(match);
+      return html`<div class="clip" role="listitem" key=${keyOf(match)} style=${{ top: `${at * ROW}px` }}
+          aria-posinset=${at + 1} aria-setsize=${all.length}><span class="cut">${match.trace}</span>
         <span class="number">${seconds(start)} s</span><span class="number">${seconds(end)} s</span>
         <button class="small" onClick=${() => { view.value = "find"; openMatch(match); }}>open</button>
-        <button class="small" onClick=${() => tick(match)}>remove</button></div>`;
+        <button class="small" onClick=${(/** @type {MouseEvent} */ event) => {
+          gone.current = event.detail === 0; // by a key
+          tick(match);
+        }}>remove</button></div>`;
     })}</div></div>`;
 }
 
