@@ -1190,6 +1190,8 @@ class BoundCheck:
         True if the robustness of the formula is computed: the margin by which it is true or false.
     returns : tuple of ReturnColumn
         Values to return for each violation.
+    having : Bound or None
+        Condition of the listed violations, on their values. The verdict does not depend on it.
     world : bool
         As in :class:`Query`.
     range : float or None
@@ -1213,6 +1215,7 @@ class BoundCheck:
     gaps: str = "break"
     robustness: bool = False
     returns: tuple[ReturnColumn, ...] = ()
+    having: Bound | None = None
     world: bool = True
     range: float | None = None
     limit: float | None = None

@@ -462,11 +462,11 @@ class CheckMonitor:
         self._domains = {key: questions.met(node.kinds) for key, node in nodes}
         self._kinds = {node.kinds for _, node in nodes}
         self._margins = RobustnessMonitor(check, questions, pulse) if check.robustness else None
-        self._returned = ReturnedValues(check.returns, "first")
+        self._returned = ReturnedValues(check.returns, "first", check.having)
         about, bridge = (questions, pulse), check.gaps == "bridge"
         plan = partial(plan_of_returned, check)
         self._values = MatchValues(self._returned.parts, plan, *about, bridge=bridge)
-        self._ended: dict[tuple[Partial, Span], dict[str, Any]] = {}
+        self._ended: dict[tuple[Partial, Span], dict[str, Any] | None] = {}
         self._told: dict[Key, tuple[int, int]] = {}
         self._full = 0
         self._immediate = all(q.word == "FORALL" for q in check.quantifiers)
@@ -575,8 +575,8 @@ class CheckMonitor:
         since = (entry.since.seq for entry in held if entry.since is not None)
         self._values.forget((self._pulse.tick.number, *since))
 
-    def _values_of(self, key: Partial, span: Span) -> dict[str, Any]:
-        """Return the ``RETURN`` values of one violation of a check: column name → value."""
+    def _values_of(self, key: Partial, span: Span) -> dict[str, Any] | None:
+        """Return the ``RETURN`` values of one violation, or None for one that ``HAVING`` rejects."""
         binding = dict(zip(self._variables, key, strict=True))
         start, end = (one.seq for one in span)
 
@@ -586,7 +586,7 @@ class CheckMonitor:
 
         return self._returned.told(part)
 
-    def _violation(self, key: Partial, span: Span) -> dict[str, Any]:
+    def _violation(self, key: Partial, span: Span) -> dict[str, Any] | None:
         """Return the ``RETURN`` values of one violation. Values of an ended violation are stored already."""
         if not self._check.returns or span not in self._known.of(key).over:
             return self._values_of(key, span)
@@ -618,7 +618,7 @@ class CheckMonitor:
     def _events(self, here: FrameTime, changed: list[Partial]) -> Iterator[MonitorEvent]:
         """Yield events for combinations of entities whose status changed in this frame.
 
-        A new entity produces events for all its combinations.
+        A new entity produces events for all its combinations. ``HAVING`` chooses ended violations.
         """
         rows = list(self._known.held) if self._kinds & self._questions.fresh else changed
         for row in rows:
@@ -627,17 +627,20 @@ class CheckMonitor:
                 continue
             for key in self._covered(row, entry):
                 begun, ended = self._told.get(key, (0, 0))
-                spans = entry.over if entry.since is None else (*entry.over, (entry.since, None))
+                begins = entry.since is not None and self._check.having is None
+                spans = (*entry.over, (entry.since, None)) if begins else entry.over
                 if (begun, ended) == (len(spans), len(entry.over)) or not self._counts(key, entry):
                     continue
                 self._told[key] = len(spans), len(entry.over)
                 for number in range(ended, len(spans)):
                     start, end = spans[number]
+                    values = {} if end is None else self._violation(key, (start, end))
+                    if values is None:
+                        continue
                     if number >= begun:
                         yield self._event("violated", here, key, start, start)
                     if end is not None:
                         event = self._event("kept again", here, key, start, end)
-                        values = self._violation(key, (start, end))
                         yield replace(event, values=values)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
@@ -775,8 +778,9 @@ class CheckMonitor:
         def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
             key = tuple(bindings[row].tolist())
             return tuple(
-                _interval(trace, span, {**names, **self._violation(key, span)})
+                _interval(trace, span, {**names, **values})
                 for span in spans[row]
+                if (values := self._violation(key, span)) is not None
             )
 
         found = verdict_of(
@@ -823,12 +827,15 @@ class CheckMonitor:
         if holds:
             return
         if not self._immediate:
-            yield MonitorEvent("violated", self.name, last, last, last, {}, {}, at_end=True)
+            if self._check.having is None:
+                yield MonitorEvent("violated", self.name, last, last, last, {}, {}, at_end=True)
             return
         for key, found in zip(bindings.tolist(), spans, strict=True):
             begun, _ = self._told.get(tuple(key), (0, 0))
-            for start, _ in found[begun:]:
-                yield self._event("violated", last, tuple(key), start, start, at_end=True)
+            for start, end in found[begun:]:
+                every = self._check.having is None
+                if every or self._violation(tuple(key), (start, end)) is not None:
+                    yield self._event("violated", last, tuple(key), start, start, at_end=True)
 
 
 def _stepped(

@@ -322,5 +322,7 @@ def verdict_of(
     told: tuple[Interval, ...] = ()
     if folded[0][0] == VIOLATED:
         every = {(i.start_seq, i.end_seq): i for w in found for i in w.violations}
-        told = tuple(every[key] for key in sorted(every)) or (last,)
+        told = tuple(every[key] for key in sorted(every))
+        if not told and check.having is None:
+            told = (last,)
     return replace(verdict, violations=told, witnesses=tuple(found))

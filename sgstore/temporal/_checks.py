@@ -369,7 +369,7 @@ class StoreCheck:
         self._compat, self._want_status = compat, status
         self._plan, self._formula, self._reset, self._guards = plan_of_check(check)
         self._whole, self._variables = self._plan.whole, self._plan.bound
-        self._returned = ReturnedValues(check.returns, "first")
+        self._returned = ReturnedValues(check.returns, "first", check.having)
         self._values = plan_of_returned(check)
         for part in self._returned.parts:
             self._values.test(part.operand)
@@ -817,6 +817,7 @@ class StoreCheck:
             return tuple(
                 _interval(trace, one, {**names, **more})
                 for one, more in zip(spans, values, strict=True)
+                if more is not None
             )
 
         names = self._people.get(trace.trace_id, {})
@@ -826,8 +827,11 @@ class StoreCheck:
 
     def _values_of(
         self, trace: TraceReader, binding: Keys, spans: Sequence[Violation]
-    ) -> list[dict[str, Any]]:
-        """Return the ``RETURN`` values of each violation, for one combination of entities."""
+    ) -> list[dict[str, Any] | None]:
+        """Return the ``RETURN`` values of each violation, for one combination of entities.
+
+        ``None`` means a violation that ``HAVING`` rejects.
+        """
         if not self._returned.parts:
             return [self._returned.told(lambda _: None) for _ in spans]
         values = PlanValues(self._values, trace, self._variables, binding)

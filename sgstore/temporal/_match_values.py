@@ -38,6 +38,8 @@ class ReturnedValues:
     columns : sequence of ReturnColumn
     word : str
         Default aggregate of a single-frame value: ``first`` or ``last``.
+    having : Bound, optional
+        ``HAVING`` condition on these values.
 
     Attributes
     ----------
@@ -45,11 +47,15 @@ class ReturnedValues:
         Distinct parts of the values. Single-frame parts have the steps :data:`AT_FRAME`.
     """
 
-    def __init__(self, columns: Sequence[b.ReturnColumn], word: str) -> None:
+    def __init__(
+        self, columns: Sequence[b.ReturnColumn], word: str, having: b.Bound | None = None
+    ) -> None:
         self._word = word
         self._columns = [(column.name, self._of_match(column.value)) for column in columns]
+        self._having = None if having is None else self._of_match(having)
         self._single = frozenset(column.name for column in columns if column.single)
-        found = (part for _, value in self._columns for part in b.walk(value))
+        values = [*(value for _, value in self._columns), *filter(None, [self._having])]
+        found = (part for value in values for part in b.walk(value))
         self.parts = tuple(dict.fromkeys(part for part in found if isinstance(part, b.OverMatch)))
 
     def _of_match(self, value: b.Bound) -> b.Bound:
@@ -63,8 +69,8 @@ class ReturnedValues:
         self,
         part: Callable[[b.OverMatch], Any],
         seconds: Callable[[int], float | None] | None = None,
-    ) -> dict[str, Any]:
-        """Return the ``RETURN`` values of one match: column name → value.
+    ) -> dict[str, Any] | None:
+        """Return the ``RETURN`` values of one match: column name → value. None: ``HAVING`` rejects the match.
 
         Parameters
         ----------
@@ -82,10 +88,13 @@ class ReturnedValues:
             return b.with_operands(value, known)
 
         nothing: Any = None  # constants need no query
-        told = {
-            name: expression(known(value), injective=False)(nothing)
-            for name, value in self._columns
-        }
+
+        def result(value: b.Bound) -> Any:
+            return expression(known(value), injective=False)(nothing)
+
+        if self._having is not None and not result(self._having):
+            return None
+        told = {name: result(value) for name, value in self._columns}
         return {n: shortest(v) if n in self._single else v for n, v in told.items()}
 
 

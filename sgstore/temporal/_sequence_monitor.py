@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.errors import TextSpan
+from sgstore.errors import QueryError, TextSpan
 from sgstore.lang.ir import (
+    Bound,
     BoundStep,
+    GroupKey,
     OverMatch,
     Query,
     ReturnColumn,
@@ -17,6 +19,7 @@ from sgstore.lang.ir import (
     StepTime,
     StepWay,
     walk,
+    with_operands,
 )
 from sgstore.model.world import seconds_of
 from sgstore.temporal._binding_truth import Valuation
@@ -325,7 +328,7 @@ class SequenceMonitor:
         self._names: dict[int, str] = {}
         self._ended = False
         self._happen = {way: way.happen for way in self._asked}
-        self._returned = ReturnedValues(_returned(query), "last")
+        self._returned = ReturnedValues(_returned(query), "last", _having(query))
         plan, bridge = partial(plan_of_steps, query, self._steps), query.gaps == "bridge"
         parts = self._returned.parts
         self._values = MatchValues(parts, plan, questions, pulse, bridge=bridge)
@@ -388,7 +391,7 @@ class SequenceMonitor:
             way, _, places = one
             if self._ended or all(places[n].run.over for n in self._lasting[way]):
                 self._pending.remove(one)
-                found.append(self._event(one, here))
+                found += self._events(one, here)
         self._forget()
         if self._returned.parts:
             self._values.forget(self._frames())
@@ -556,7 +559,8 @@ class SequenceMonitor:
             return FAILED
         return (place,) if self._closed(place, plain, absent, NEVER) else OPEN
 
-    def _event(self, found: FoundMatch, here: FrameTime) -> MonitorEvent:
+    def _events(self, found: FoundMatch, here: FrameTime) -> Iterator[MonitorEvent]:
+        """Yield the event of a match, if ``HAVING`` keeps it."""
         way, binding, places = found
         happen = self._happen[way]
         steps = tuple(self._moment(place) for place in places)
@@ -574,11 +578,13 @@ class SequenceMonitor:
             return steps[happen.index(step)].t if step in happen else None
 
         values = self._returned.told(part, seconds)
+        if values is None:
+            return
         if self.query.stages:
             question, keys = self._asks[0]
             values = self._questions.answers[question][tuple(binding[name] for name in keys)]
         about = here, steps[0], steps[-1], nodes, names, steps
-        return MonitorEvent("found", self.name, *about, values=values)
+        yield MonitorEvent("found", self.name, *about, values=values)
 
     def _span(
         self, part: OverMatch, happen: tuple[int, ...], ways: tuple[StepFrame, ...]
@@ -697,6 +703,35 @@ def _returned(query: Query) -> list[ReturnColumn]:
         for column in query.result.columns
         if any(isinstance(part, OverMatch | StepTime) for part in walk(column.value))
     ]
+
+
+def _having(query: Query) -> Bound | None:
+    """Return the ``HAVING`` condition on the values of one match, without references to result columns.
+
+    Raises
+    ------
+    QueryError
+        The condition is about groups of matches, or about the ends of intervals.
+    """
+    result = query.result
+    if result.having is None:
+        return None
+    hint = "write a value of the match: HAVING MIN(x) OVER match < 1 or HAVING LAST(frame.t) OVER match > 5"
+    if result.aggregated:
+        raise QueryError("a monitor reports single matches, so HAVING has no groups", hint=hint)
+    columns = {column.name: column.value for column in result.columns}
+
+    def resolved(part: Bound) -> Bound:
+        if not isinstance(part, GroupKey):
+            return with_operands(part, resolved)
+        if part.name not in columns:
+            reason = (
+                f"a monitor reports single matches, so '{part.name}' of {result.form} is unknown"
+            )
+            raise QueryError(reason, hint=hint)
+        return columns[part.name]
+
+    return resolved(result.having)
 
 
 def _named(query: Query) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from sgstore.errors import QueryError
+from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
     from sgstore.query import Store
@@ -66,3 +67,53 @@ def test_steps_have_times_after_having(open_town: Store) -> None:
 def test_a_value_of_one_frame_is_still_refused(form: str, open_town: Store) -> None:
     with pytest.raises(QueryError):
         open_town.find(f"{NEAR} RETURN v.name{form} HAVING v.speed > 2")
+
+
+APART = (
+    "CHECK apart: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 8 RESET WHEN dist(ego, v) > 9"
+    " RETURN MIN(dist(ego, v)) OVER match AS least, v.speed AS speed"
+)
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        "least < 5",
+        "MIN(dist(ego, v)) OVER match < 5",
+        "least < 5 AND speed > -1",
+        "5 > least AND v.speed >= 0",
+    ],
+)
+def test_having_chooses_the_listed_violations_of_a_check(condition: str, open_town: Store) -> None:
+    (every,) = open_town.check(APART)
+    (chosen,) = open_town.check(f"{APART} HAVING {condition}")
+    wanted = [
+        (witness.names, [one for one in witness.violations if one.values["least"] < 5])
+        for witness in every.witnesses
+    ]
+
+    assert [(witness.names, [*witness.violations]) for witness in chosen.witnesses] == wanted
+    assert 0 < len(chosen.violations) < len(every.violations)
+    assert chosen.verdict == every.verdict == "false"
+
+
+def test_a_check_stays_violated_if_having_keeps_no_violation(open_town: Store) -> None:
+    (found,) = open_town.check(f"{APART} HAVING least < 0")
+
+    assert found.violated
+    assert found.violations == ()
+    assert found.first_violation is None
+
+
+@pytest.mark.parametrize(
+    ("returned", "wrong"),
+    [
+        ("v.name, COUNT(*) AS n HAVING n > 1", "HAVING has no groups"),
+        ("v.name, INTERVALS HAVING frames > 3", "'frames' of intervals"),
+    ],
+)
+def test_a_monitor_rejects_having_of_groups_and_of_intervals(returned: str, wrong: str) -> None:
+    with pytest.raises(QueryError, match=wrong) as error:
+        Monitor(f"MATCH (v:Vehicle) RETURN {returned}")
+
+    assert "HAVING MIN(x) OVER match" in str(error.value)

@@ -49,7 +49,11 @@ CHECK fast: FORALL (v:Vehicle) EVENTUALLY v.speed > 10;
 CHECK lately: FORALL (v:Vehicle ABSENT AS TRUE) ALWAYS ONCE[0s, 5s] v.speed > 1;
 CHECK stops: ALWAYS (ego.speed > 1 IMPLIES EVENTUALLY[0s, 3s] ego.speed < 1) AND ALWAYS ego.speed < 9;
 USING END pending CHECK due: EVENTUALLY ego.speed > 40;
-USING END weak CHECK forgiven: EVENTUALLY ego.speed > 40
+USING END weak CHECK forgiven: EVENTUALLY ego.speed > 40;
+CHECK touches: FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 8 RESET WHEN dist(ego, v) > 9
+  RETURN MIN(dist(ego, v)) OVER match AS least, v.speed AS speed HAVING least < 5 AND speed < 6;
+CHECK bursts: ALWAYS ego.speed < 5 RESET WHEN ego.speed < 4.5
+  RETURN ego.speed AS speed HAVING LAST(frame.t) OVER match - FIRST(frame.t) OVER match > 2
 """
 
 LANE_RULES = """
@@ -93,6 +97,11 @@ VALUES = (
     " RETURN MIN(dist(e, p)) OVER match, FIRST(dist(e, p)) OVER a..b, AVG(coalesce(prev(p.speed), 0)) OVER b",
     "USING MATCHES longest MATCH (e:Ego) WHERE e.speed < 3 AS a UNTIL MATCH (e) WHERE e.speed > 2 AS b"
     " RETURN MAX(run_length(e.speed < 3)) OVER a, t(a) + MIN(e.speed) OVER b",
+    "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 12"
+    " RETURN INTERVALS, MIN(dist(e, v)) OVER match AS least HAVING least < 7",
+    "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 15 FOR >= 1s AS a"
+    " THEN WITHIN 3s MATCH (v) WHERE v.speed < 3 AS b RETURN t(b) - t(a) AS took, MIN(ttc(e, v)) OVER match AS ttc"
+    " HAVING MAX(v.speed) OVER match < 4 AND took < 1",
 )
 
 MARGINS = """

@@ -102,7 +102,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
             written.span,
             "remove USING END weak or ROBUSTNESS, or bound the formula: EVENTUALLY[0s, 5s] …",
         )
-    returns = _returned(written, names)
+    returns, having = _returned(written, names)
     refuse_strange(session, catalog)
     found = b.BoundCheck(
         name,
@@ -118,6 +118,7 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
         settings.gaps or "break",
         written.robustness,
         returns,
+        having,
         world=settings.scope != "graph",
         range=settings.range,
         doubts=tuple(dict.fromkeys(session.doubts)),
@@ -133,8 +134,10 @@ def _knows_no_more(traces: Iterable[TraceFacts], limit: float) -> bool:
     return all(one.reach is not None and one.reach.farthest <= limit for one in traces)
 
 
-def _returned(written: WrittenCheck, names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
-    """Return the bound columns of a check's ``RETURN``: the values reported for each violation."""
+def _returned(
+    written: WrittenCheck, names: SymbolTable
+) -> tuple[tuple[b.ReturnColumn, ...], b.Bound | None]:
+    """Return the bound columns of a check's ``RETURN``, the values of each violation, and its ``HAVING``."""
     inner = replace(names, over=True)
     found = tuple(bind_column(item, inner) for item in written.returns)
     taken = [node.name for one in written.quantifiers for node in one.nodes]
@@ -146,7 +149,10 @@ def _returned(written: WrittenCheck, names: SymbolTable) -> tuple[b.ReturnColumn
         if column.value.type is Type.node:
             hint = "return its name, v.name, or a number: v.speed"
             names.session.refuse("a violation has values, not nodes", item.span, hint)
-    return found
+    if written.having is None:
+        return found, None
+    named = replace(inner, aliases={column.name: column.value for column in found})
+    return found, settled(named.condition(written.having), names.session)
 
 
 def _quantifier(

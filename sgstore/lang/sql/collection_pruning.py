@@ -132,6 +132,7 @@ def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
         values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
         values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]
         values += [column.value for column in asked.returns]
+        values += [] if asked.having is None else [asked.having]
     else:
         values = [*asked.scope.where, *asked.result.values]
         for stage in asked.stages:

@@ -591,14 +591,14 @@ def rule_check(span: TextSpan, children: Children) -> s.CheckClause:
     settings, name, *quantifiers, formula, reset, robustness, returns = children
     called, quantified = name and name.text, tuple(quantifiers)
     distinct, items, having, at = returns or (False, (), None, span)
-    if distinct or having:
-        word = "DISTINCT" if distinct else "HAVING"
-        raise BuildError(f"violations are listed one by one; remove {word}", at)
+    if distinct:
+        raise BuildError("violations are listed one by one; remove DISTINCT", at)
     if any(item.form != "value" for item in items):
         reason = "a CHECK returns values of its violations"
         raise BuildError(reason, at, "RETURN MIN(gap(ego, v)) OVER match AS closest")
     asked = robustness is not None
-    return s.CheckClause(settings or (), called, quantified, formula, reset, asked, items, span)
+    about = settings or (), called, quantified, formula, reset, asked, items, span
+    return s.CheckClause(*about, having)
 
 
 def rule_quantifier(span: TextSpan, children: Children) -> s.QuantifierClause:

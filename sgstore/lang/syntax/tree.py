@@ -605,7 +605,7 @@ class QuantifierClause:
 class CheckClause:
     """Check statement, a rule for whole traces.
 
-    ``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items``.
+    ``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items HAVING condition``.
     """
 
     settings: tuple[Setting, ...]
@@ -616,6 +616,7 @@ class CheckClause:
     robustness: bool
     returns: tuple[Item, ...]
     span: TextSpan
+    having: Expression | None = None
 
 
 Statement = MatchClause | UnionClause | Define | CheckClause
