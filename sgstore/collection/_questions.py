@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from sgstore.collection._catalogue import Snapshot
     from sgstore.collection._engines import Engine
     from sgstore.lang.catalog import Catalog, Triple
+    from sgstore.lang.ir import Scope
     from sgstore.lang.sql import Compiled
     from sgstore.lang.sql.collection_pruning import ClassQuestion
     from sgstore.lang.syntax import Pattern
@@ -601,6 +602,14 @@ class CollectionMatches(TemporalMatches):
     def _compiled(self) -> Generator[Compiled]:
         yield self._ready
 
+    def _exists(self, compiled: Compiled, scope: Scope) -> bool:
+        """Return True if some frame of the collection matches a pattern. Each store gets it as text."""
+        from sgstore.lang.help import pattern_text
+
+        using, values = self._settings()
+        text = f"{using}MATCH {pattern_text(scope)} LIMIT 1"
+        return next(iter(CollectionMatches(self._whole, text, values)), None) is not None
+
     def _table(self) -> None:
         return None
 
@@ -617,11 +626,6 @@ class CollectionMatches(TemporalMatches):
         """Return the traces that cannot answer the query, each with the reason."""
         found = {**self._ready.reasons, **self._reasons}
         return {name: found[name] for name in sorted(found, key=natural)}
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return the parts of the query that never hold, or always, without a search."""
-        return self._ready.bound.doubts
 
     @property
     def scope(self) -> dict[str, Any]:
@@ -653,6 +657,7 @@ class CollectionMatches(TemporalMatches):
             for result in self._whole.ask(self._question("count", folder), bundles):
                 self._reasons |= result["reasons"]
                 total += sum(row[0] for row in _rows(_parts_of(result), {}))
+            self._some = total > 0
             return total
 
     def explain(self) -> str:
@@ -693,7 +698,9 @@ class CollectionMatches(TemporalMatches):
             asked = parted(self._ready, form, *offsets).statement(self._ready.catalog)
             with PartFile.merged_rows(tables, self.snapshot.words, *asked) as batches:
                 rows = (row for batch in batches for row in batch.values)
-                yield from islice(rows, result.limit if cut else None)
+                for row in islice(rows, result.limit if cut else None):
+                    self._some = True
+                    yield row
 
     def written_apart(self, to: Path) -> PartFile:
         """Write the rows of one part of a ``UNION`` to a file, with columns that distinguish equal node ids."""
@@ -788,11 +795,6 @@ class CollectionChecks(CheckRun):
         """Yield frame ids with the robustness margins of the only check."""
         question = {"text": self._text, "parameters": self._parameters}
         return self._whole.file.margins(question)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return an empty tuple: a collection does not search checks for likely mistakes."""
-        return ()
 
     @property
     def scope(self) -> dict[str, Any]:

@@ -177,6 +177,39 @@ def close(one: Any, other: Any) -> bool:
     return type(one) is type(other) and one == other
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "MATCH (a:Car) WHERE a.name = 'carr 1'",
+        "MATCH (a:Car)-[:near]->(b) WHERE a.speed > 4000",
+        "MATCH (a:Car)-[:near]->(b:Bus)-[:near]->(a) WHERE a.width > 90 AND b.x > 0",
+        "MATCH (a:Car) WHERE EXISTS {(a)-[:near]->(b:Bus WHERE b.speed > 9000)}",
+        "USING DATASET 'trace[45]' MATCH (a:Car {name: $name}) WHERE a.speed > 4000",
+        "MATCH (a:Car)-[:near]->(b)",
+        "MATCH (a:Car) WHERE a.speed > 4000 UNION MATCH (a:Car) WHERE a.name = 'no car'",
+        "MATCH (a:Car) WHERE a.speed > 1 THEN WITHIN 1s MATCH (a) WHERE a.speed > 4000",
+    ],
+)
+def test_a_collection_has_the_notes_of_one_store(
+    text: str, whole: Collection, store: Store
+) -> None:
+    values = {"name": "nobody"} if "$name" in text else {}
+    one, many = store.find(text, **values), whole.find(text, **values)
+
+    assert many.notes == one.notes
+    assert bool(one.notes) == (text != "MATCH (a:Car)-[:near]->(b)")
+    assert many.count() == one.count()
+    assert many.notes == one.notes
+
+
+def test_checks_of_a_collection_have_the_notes_of_one_store(
+    whole: Collection, store: Store
+) -> None:
+    text = "CHECK none: FORALL (v:Car) ALWAYS NOT v.name = 'carr 1'"
+
+    assert whole.check(text).notes == store.check(text).notes != ()
+
+
 def nested(values: Any) -> Any:
     """An array as a list; so is what it holds, as the steps of a path."""
     return [*map(nested, values)] if getattr(values, "ndim", 0) else values

@@ -100,7 +100,8 @@ VALUES = (
     "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 12"
     " RETURN INTERVALS, MIN(dist(e, v)) OVER match AS least HAVING least < 7",
     "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 15 FOR >= 1s AS a"
-    " THEN WITHIN 3s MATCH (v) WHERE v.speed < 3 AS b RETURN t(b) - t(a) AS took, MIN(ttc(e, v)) OVER match AS ttc"
+    " THEN WITHIN 3s MATCH (v) WHERE v.speed < 3 AS b"
+    " RETURN t(b) - t(a) AS took, MIN(ttc(e, v)) OVER match AS ttc"
     " HAVING MAX(v.speed) OVER match < 4 AND took < 1",
 )
 

@@ -11,7 +11,7 @@ from sgstore.lang.help._notes import (
     unknown_in_or,
 )
 from sgstore.lang.help._pattern_parts import PatternPart, has_nodes, parts_of, separable
-from sgstore.lang.help._pattern_text import in_words
+from sgstore.lang.help._pattern_text import in_words, pattern_text
 from sgstore.lang.help._why_not import WhyNot, WhyNotSteps, events_in, looked_up, why_not
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "nearest_query",
     "notes_on",
     "parts_of",
+    "pattern_text",
     "separable",
     "unknown_in_or",
     "why_not",

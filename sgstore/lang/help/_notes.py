@@ -143,9 +143,9 @@ def _note(name: str, text: str, ask: Ask) -> str:
             return f"{said}; it is a value of {other}"
     # A difference in case is the smallest mistake.
     near = 'levenshtein(lower("v"."value"), lower($1)), levenshtein("v"."value", $1), "v"."value"'
-    nearest = Select(['"v"."value"'], [nested(_all_values(name), "v")], order=[near], limit=1)
-    rows = ask(nearest.text(), [text])
-    return f"{said}; the nearest is {rows[0][0]!r}" if rows else f"{said}, nor any {name}"
+    nearest = Select([near], [nested(_all_values(name), "v")], order=[near], limit=1)
+    rows = ask(nearest.text(), [text])  # a row of each store of a collection
+    return f"{said}; the nearest is {min(rows)[-1]!r}" if rows else f"{said}, nor any {name}"
 
 
 def _all_values(name: str) -> str:

@@ -217,6 +217,11 @@ class Writer:
         return f"({text})" if inner else text
 
 
+def pattern_text(scope: b.Scope) -> str:
+    """Return the query text of a pattern, as after ``MATCH``."""
+    return Writer(scope).block(scope)
+
+
 def in_words(value: b.Bound) -> b.Bound:
     """Return an expression with the text of the query in place of each pattern in braces.
 
