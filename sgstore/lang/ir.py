@@ -466,6 +466,9 @@ Bound = (
     | OverMatch
 )
 
+Calls = dict[Bound, str]
+"""Texts of conditions: meaning of a predicate's call → its text in the query."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scope:
@@ -822,6 +825,8 @@ class Query:
         Parts of a query with ``OPTIONAL MATCH``, ``WITH`` or a named path. The first is a pattern.
     world : bool
         True in scope ``world``: the query also covers data outside the graphs.
+    calls : mapping of Bound to str
+        Calls of predicates in the query: meaning → text.
     doubts : tuple of str
         Notes on parts that never hold in recordings, or always.
     """
@@ -840,6 +845,7 @@ class Query:
     stages: tuple[Stage, ...] = ()
     world: bool = False
     doubts: tuple[str, ...] = ()
+    calls: Calls = field(default_factory=dict["Bound", str], compare=False, repr=False)
 
     @property
     def ways(self) -> tuple[StepWay, ...]:

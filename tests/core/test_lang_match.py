@@ -199,6 +199,45 @@ def test_failed_case_is_shown_as_written(town: Store) -> None:
     assert answer.failed == case
 
 
+@pytest.mark.parametrize(
+    ("define", "condition", "held", "failed", "found"),
+    [
+        ("", "e.speed < 99 AND hard_brake(e)", "e.speed < 99", "hard_brake(e)", "e.accel = "),
+        ("", "NOT  hard_brake( e )  AND e.speed > 99", "NOT hard_brake( e )", "e.speed > 99", ""),
+        (
+            "DEFINE PREDICATE both(x) AS x.speed > -1 AND x.speed > 99; ",
+            "both(e)",
+            "(e:Ego)",
+            "both(e)",
+            "e.speed = ",
+        ),
+        (
+            "DEFINE PREDICATE fast(x) AS x.speed > 99; ",
+            "fast(e) OR hard_brake(e)",
+            "(e:Ego)",
+            "fast(e) OR hard_brake(e)",
+            "e.accel = ",
+        ),
+    ],
+)
+def test_predicates_are_shown_as_written(
+    town: Store, define: str, condition: str, held: str, failed: str, found: str
+) -> None:
+    answer = town.why_not("town@20s", f"{define}MATCH (e:Ego) WHERE {condition}")
+
+    assert answer.held[-1] == held
+    assert answer.failed == failed
+    assert found in answer.found
+
+
+def test_notes_show_predicates_as_written(town: Store) -> None:
+    define = "DEFINE PREDICATE both(x) AS x.speed > 1 AND x.speed > 99; "
+
+    (note,) = town.find(f"{define}MATCH (e:Ego) WHERE both(e)").notes
+
+    assert note == "no frame of the store has both(e)"
+
+
 def test_nearest_match_has_smallest_shortfall(town: Store) -> None:
     answer = town.why_not("town@20s", "MATCH (e:Ego), (v:Vehicle) WHERE dist(e, v) < 1")
     distances = town.sql(

@@ -387,13 +387,16 @@ def _predicate(e: s.Call, names: SymbolTable) -> b.Bound:
     }
     session.calls.append(definition.name)
     try:
-        return names.body(meanings).bind(definition.body)
+        found = names.body(meanings).bind(definition.body)
     except QueryError as error:
         reason = f"in {definition.name}(): {error.reason}"
         hint = error.hint or _signature(normalize_name(definition.name))
         raise type(error)(reason, text=session.text, span=e.span, hint=hint) from None
     finally:
         session.calls.pop()
+    if not session.calls and not session.shipped:
+        session.written[found] = " ".join(session.text[e.span.start : e.span.end].split())
+    return found
 
 
 def _meaning(argument: s.Expression, names: SymbolTable) -> Symbol:

@@ -100,6 +100,7 @@ def bind_query(
         gaps=settings.gaps or "break",
         world=settings.scope == "world",
         doubts=tuple(dict.fromkeys(session.doubts)),
+        calls=session.written,
     )
 
 

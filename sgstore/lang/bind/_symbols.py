@@ -131,6 +131,7 @@ class Session:
     relations: set[str] = field(default_factory=set[str])
     keys: set[str] = field(default_factory=set[str])
     calls: list[str] = field(default_factory=list[str])
+    written: dict[b.Bound, str] = field(default_factory=dict["b.Bound", str])
     classed: tuple[str, ...] = ()
     tables: Mapping[str, TableFacts] = field(default_factory=dict[str, "TableFacts"])
     traces: tuple[TraceFacts, ...] = ()

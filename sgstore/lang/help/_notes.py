@@ -166,7 +166,7 @@ def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str,
     exists : function
         Function that returns True if some frame of the store matches a pattern.
     """
-    for part, scope, writer, held in _first_absent(query, exists):
+    for part, scope, writer, held in _first_absent(query, exists, query.calls):
         text = part_text(part, scope, writer)
         if isinstance(part, b.Edge):
             text = writer.labelled_edge(part, scope)
@@ -177,17 +177,20 @@ def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str,
 
 
 def _first_absent(
-    query: b.Query, exists: Callable[[b.Scope], bool]
+    query: b.Query, exists: Callable[[b.Scope], bool], calls: b.Calls
 ) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope, Writer, list[str]]]:
-    """Yield the first part that no frame has, the pattern up to it, its writer, and the parts before."""
+    """Yield the first part that no frame has, the pattern up to it, its writer, and the parts before.
+
+    The calls of predicates in ``calls`` are one part each.
+    """
     steps = [query.steps[number].scope for number in sorted(query.certain)] if query.steps else []
     for step in steps or [query.first]:
         where = [part for part in step.where if not any(map(b.is_passed_on, b.walk(part)))]
         whole = replace(step, where=tuple(where))
         if not whole.nodes or exists(whole):
             continue
-        writer, held = Writer(whole), list[str]()
-        for part, scope in growing(whole):
+        writer, held = Writer(whole, calls), list[str]()
+        for part, scope in growing(whole, calls):
             if not exists(scope):
                 yield part, scope, writer, held
                 return
@@ -216,7 +219,7 @@ def nearest_query(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[st
     text : str
         The query; empty without such a value. Its columns are trace, frame and value.
     """
-    for part, scope, writer, _ in _first_absent(query, exists):
+    for part, scope, writer, _ in _first_absent(query, exists, {}):
         failed, others = part_text(part, scope, writer), scope
         match part:
             case b.Operation(word="<" | "<=" | ">" | ">=" | "=", operands=(left, right)):
@@ -239,6 +242,8 @@ def _is_scene(condition: b.Bound) -> bool:
     match condition:
         case b.Operation(operands=(b.NodeAttribute(attribute=one), _)) if one.name == "id":
             return False
+        case b.Operation(word="AND", operands=parts):
+            return any(map(_is_scene, parts))
         case b.Operation(word=word):
             return word in {"<", "<=", ">", ">=", "=", "OR"}
         case b.BlockValue() | b.NodeAttribute() | b.EdgeAttribute():

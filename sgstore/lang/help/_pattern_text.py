@@ -5,6 +5,7 @@ Nodes and edges without a name get one if the text needs it: ``lane`` for a lane
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import TextSpan
@@ -80,9 +81,12 @@ class Writer:
     ----------
     scope : Scope
         Scope of the whole pattern.
+    calls : mapping of Bound to str, optional
+        Texts of conditions, for the calls of predicates.
     """
 
-    def __init__(self, scope: b.Scope) -> None:
+    def __init__(self, scope: b.Scope, calls: b.Calls | None = None) -> None:
+        self.calls: b.Calls = calls or {}
         self._names: dict[str, str] = {}
         self._spoken_of: set[str] = set()
         named: list[str] = []
@@ -93,6 +97,12 @@ class Writer:
         self._taken = {*named, "ego", "env", "frame", "trace"}
         for key in named:  # different blocks may use the same name
             self._names[key] = key if "~" not in key else self._free(key.split("~")[0])
+
+    def expanded(self) -> Writer:
+        """Return a writer with the same names that writes the meaning of predicates."""
+        other = copy(self)
+        other.calls = {}
+        return other
 
     def _free(self, base: str) -> str:
         name, number = base, 2
@@ -157,6 +167,8 @@ class Writer:
 
         ``inner`` adds brackets where neighbouring operators need them.
         """
+        if self.calls and value in self.calls:
+            return self.calls[value]
         match value:
             case b.Value():
                 return _constant(value, inner=inner)
@@ -167,8 +179,6 @@ class Writer:
             case b.BlockValue(word=word, scope=scope, value=told):
                 told_text = "" if told is None else f" | {self.expression(told)}"
                 return f"{word} {{{self.block(scope)}{told_text}}}"
-            case b.LabelTest(node=node, kinds=kinds):
-                return f"EXISTS {{{self.node(node, kinds)}}}"
             case _:
                 return self._leaf(value)
 
@@ -176,6 +186,8 @@ class Writer:
         match value:
             case b.NodeValue(node=node):
                 text = self.name(node)
+            case b.LabelTest(node=node, kinds=kinds):
+                text = f"EXISTS {{{self.node(node, kinds)}}}"
             case b.NodeAttribute(node=node, attribute=attribute):
                 text = f"{self.name(node)}.{attribute.name}"
             case b.EdgeAttribute(edge=edge, attribute=attribute):

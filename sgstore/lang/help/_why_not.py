@@ -168,9 +168,9 @@ def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotS
 
 
 def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
-    scope, writer = _nothing(asked), Writer(asked)
+    scope, writer = _nothing(asked), Writer(asked, query.calls)
     held: list[str] = []
-    for part, wider in growing(asked):
+    for part, wider in growing(asked, query.calls):
         if not _first(wider, query, view):
             return _failure(part, scope, query, view, writer, tuple(held))
         scope = wider
@@ -250,7 +250,7 @@ def _nothing(scope: b.Scope) -> b.Scope:
     return b.Scope({}, scope.outer, (), (), frozenset())
 
 
-def _parts(scope: b.Scope) -> list[_Part]:
+def _parts(scope: b.Scope, calls: b.Calls) -> list[_Part]:
     parts: list[_Part] = []
     seen: set[str] = set()
     edges = list(scope.edges)
@@ -260,13 +260,24 @@ def _parts(scope: b.Scope) -> list[_Part]:
         complete = [edge for edge in edges if {edge.src, edge.dst} <= seen]
         edges = [edge for edge in edges if edge not in complete]
         parts += complete
-    return [*parts, *edges, *scope.where]
+    return [*parts, *edges, *_together(scope.where, calls)]
 
 
-def growing(whole: b.Scope) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope]]:
+def _together(where: Sequence[b.Bound], calls: b.Calls) -> Iterator[b.Bound]:
+    """Yield the conditions of a pattern. Those of one predicate are joined again."""
+    joined = {parts: call for call in calls if len(parts := tuple(b.conjuncts(call))) > 1}
+    at = 0
+    while at < len(where):
+        fits = (parts for parts in joined if tuple(where[at : at + len(parts)]) == parts)
+        parts = next(fits, None)
+        yield where[at] if parts is None else joined[parts]
+        at += 1 if parts is None else len(parts)
+
+
+def growing(whole: b.Scope, calls: b.Calls) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope]]:
     """Yield each part of a pattern (node, edge or condition), with the pattern up to and including it."""
     scope = _nothing(whole)
-    for part in _parts(whole):
+    for part in _parts(whole, calls):
         if isinstance(part, b.Node):
             scope = replace(scope, nodes={**scope.nodes, part.key: part})
             distinct = frozenset(p for p in whole.distinct if set(p) <= set(scope.nodes))
@@ -310,7 +321,8 @@ def _failure(
         if short < best or not found:
             best, nearest = short, _named(at, scope)
             between = isinstance(part, b.Edge)
-            found = _between(part, at, writer) if between else _values(part, at, query, writer)
+            plain = writer.expanded()
+            found = _between(part, at, writer) if between else _values(part, at, query, plain)
             gaps = () if between else tuple(_gaps(part, at, query))
     return WhyNot(held, part_text(part, scope, writer), nearest, found, gaps)
 
