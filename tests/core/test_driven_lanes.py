@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import oracle_turned
 import pytest
+import shapely
 from builders import Recording, Thing, frame_of, thing
 from oracle_watched import LANE_RULES, Drive, worldwide
 from scenes import Scene, actor, crossroads, ego, store_of, through
@@ -150,6 +151,42 @@ def test_primary_lanes_stay_when_the_world_is_turned_and_mirrored(way: str, mirr
 
     for turn in TURNS:
         assert lanes_of(way, turn=turn, mirrored=mirrored) == wanted
+
+
+@pytest.mark.data
+def test_a_passage_begins_in_the_same_frame_in_a_turned_world(data: Path) -> None:
+    # One vehicle of Town10HD changed its lane two frames later where squares on fixed axes bound passages.
+    road_map, blocks = oracle_turned.recorded(data / "traces/sumo/Town10HD_sumo_osi.mcap")
+    blocks = [block for block in blocks if block.seq[0] <= 330]
+
+    (differences,) = oracle_turned.compare(
+        road_map, blocks, [oracle_turned.World(math.atan2(4, 3), mirrored=True)]
+    ).values()
+
+    assert differences == []
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("turn", TURNS)
+def test_points_are_near_a_surface_by_their_distance(turn: float, mirrored: bool) -> None:
+    lanes = np.array([1, 2, 3, 4])
+    points = np.random.default_rng(7).uniform(-50, 60, (4000, 2))
+    shape = shapely.union_all(town().outlines()[1 + lanes])
+    distance = np.array([shape.distance(shapely.Point(point)) for point in points])
+
+    for far in (0.5, 3.0, 20.0):
+        surface = town(turn, mirrored).surface_of(lanes, far)
+        near = surface.near(*placed(points, turn, mirrored).T)
+        sure = abs(distance - far) > 1e-9
+        assert (near[sure] == (distance <= far)[sure]).all()
+        assert 0 < near.sum() < len(near)
+
+
+def test_points_without_a_finite_place_are_near_no_surface() -> None:
+    x, y = np.array([np.nan, np.inf, 1e300, 10.0]), np.array([0.0, 0.0, 1e300, 0.0])
+
+    assert town().surface_of(np.array([2]), 3.0).near(x, y).tolist() == [False] * 3 + [True]
+    assert not town().surface_of(np.zeros(0, np.int64), 3.0).near(x, y).any()
 
 
 @pytest.mark.parametrize("size", [7, 50])

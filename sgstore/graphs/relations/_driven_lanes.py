@@ -46,11 +46,8 @@ MOST_STATES: Final = 1 << 17
 APART: Final = 3
 """Frames without a vehicle near junctions that end its passage."""
 
-CELL: Final = 2.0
-"""Edge of a square of the grid of junctions; m."""
-
-FAR: Final = 1e9
-"""Greatest number of a row or column of the grid."""
+NEAR: Final = 3.0
+"""Greatest distance of a vehicle's centre from lanes of junctions in a passage; m."""
 
 HOPS: Final = 3
 """Links between lanes of successive frames: short lanes have no frame."""
@@ -122,7 +119,7 @@ _NONE: Final = _Candidates(
 
 
 class _Junctions:
-    """Grid of the junctions of a map, and the links of its lanes."""
+    """Surface of the junctions of a map, and the links of its lanes."""
 
     def __init__(self, road_map: RoadMap) -> None:
         self.road_map = road_map
@@ -143,31 +140,7 @@ class _Junctions:
             first = first[owner]
             linked.append(first * count + lane)
         self._linked = np.unique(np.concatenate(linked)).astype(np.int64)
-        self._cells = self._grid()
-
-    def _grid(self) -> Ints:
-        """Return the squares near lanes of junctions."""
-        of, lanes = self.road_map.ribbons, np.flatnonzero(self.lanes)
-        owner, number = spread(
-            np.zeros(len(lanes), np.int64), 2 + (of.lengths[lanes] / CELL).astype(np.int64)
-        )
-        lane, along = lanes[owner], (number * CELL).astype(np.float64)
-        borders = (of.left_x, of.left_y, of.right_x, of.right_y)
-        left_x, left_y, right_x, right_y = of.between(lane, along, np.stack(borders))
-        found = [
-            np.floor(
-                np.stack([a * left_x + (1 - a) * right_x, a * left_y + (1 - a) * right_y]) / CELL
-            )
-            for a in (0.0, 0.5, 1.0)
-        ]
-        x, y = np.concatenate(found, axis=1)
-        _, once = np.unique(_square(x, y), return_index=True)
-        x, y = x[once], y[once]
-        return np.unique([_square(x + dx, y + dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)])
-
-    def near(self, x: Floats, y: Floats) -> Bools:
-        """Return a mask of the places near lanes of junctions."""
-        return _among(self._cells, _square(np.floor(x / CELL), np.floor(y / CELL)))
+        self.surface = road_map.surface_of(np.flatnonzero(self.lanes), NEAR)
 
     def toll(self, src: Ints, dst: Ints) -> Floats:
         """Return the cost of driving from lane to lane between two frames."""
@@ -177,12 +150,6 @@ class _Junctions:
 
 
 _BESIDE: Final = ("toLeftOf", "toRightOf", "opposes")
-
-
-def _square(column: Floats, line: Floats) -> Ints:
-    """Return a number for each square of the grid. Few distant squares share a number."""
-    places = np.clip(np.nan_to_num(np.stack([column, line])), -FAR, FAR).astype(np.int64)
-    return places[0] << 32 ^ places[1]
 
 
 def _among(keys: Ints, wanted: Ints) -> Bools:
@@ -303,7 +270,7 @@ class DrivenLanes:
         self._kinds = np.concatenate([self._kinds[: entities.first], entities.kind])
         start, self._states = self._states, self._states + len(states)
         rows = np.flatnonzero(IS_VEHICLE[self._kinds[states.node]])
-        rows = rows[junctions.near(states.x[rows], states.y[rows])]
+        rows = rows[junctions.surface.near(states.x[rows], states.y[rows])]
         rows = rows[np.argsort(node[rows], kind="stable")]
         of = states.take(rows)
         box = np.stack([of.x, of.y, of.heading, of.length, of.width], axis=1)

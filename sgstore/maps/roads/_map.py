@@ -23,7 +23,7 @@ from sgstore.maps.roads._places import (
     signal_places,
     whole_lanes,
 )
-from sgstore.maps.roads._ribbons import LanePoints, Ribbons, lane_polygons, waypoints
+from sgstore.maps.roads._ribbons import LanePoints, LaneSurface, Ribbons, lane_polygons, waypoints
 from sgstore.maps.roads._zones import zones
 from sgstore.model.vocabulary import DRIVING, KIND_CODE, KINDS, RELATION_CODE
 
@@ -346,6 +346,11 @@ class RoadMap:
         Roads, junctions and ``off_road`` have no shape: a road consists of its lanes.
         """
         return self._outlines.copy()
+
+    def surface_of(self, lanes: Ints, distance: float) -> LaneSurface:
+        """Return the surroundings of some lanes, counted from 0, up to a distance; m."""
+        with _PREPARED:
+            return LaneSurface(self._outlines[1 + lanes], distance)
 
     def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
         """Return the lanes that footprints (ground rectangles of objects) touch at their height.

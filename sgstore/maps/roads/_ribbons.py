@@ -263,3 +263,30 @@ def lane_polygons(ribbons: Ribbons) -> NDArray[Any]:
     ring = np.repeat(np.arange(len(counts)), 2 * counts + 1)
     polygons: Any = shapely.polygons(shapely.linearrings(points, indices=ring))
     return polygons
+
+
+class LaneSurface:
+    """Surroundings of some lanes: the points within a distance of their surfaces.
+
+    Parameters
+    ----------
+    polygons : (L,) object
+        Valid shapely polygons of the lanes.
+    distance : float
+        m.
+    """
+
+    def __init__(self, polygons: NDArray[Any], distance: float) -> None:
+        self._distance = distance
+        self._parts: Any = shapely.get_parts(shapely.union_all(polygons))
+        shapely.prepare(self._parts)
+        around = np.array([-distance, -distance, distance, distance])
+        self._boxes = shapely.STRtree(shapely.box(*(shapely.bounds(self._parts) + around).T))
+
+    def near(self, x: Floats, y: Floats) -> Bools:
+        """Return a mask of the points within the distance."""
+        points: Any = shapely.points(x, y)
+        row, part = self._boxes.query(points)
+        near = np.zeros(len(x), np.bool_)
+        near[row[shapely.dwithin(self._parts[part], points[row], self._distance)]] = True
+        return near
