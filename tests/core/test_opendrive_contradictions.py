@@ -83,6 +83,42 @@ def test_links_of_lanes_that_do_not_touch_are_warnings(links: tuple[str, str], s
     assert said in "\n".join(read(*chain(*links, x=70.0)).warnings)
 
 
+def merge(*, back: int = -2, joined: int = -2) -> RoadMap:
+    """Lane -3 tapers and is linked to lane -2 of the next section, whose link names lane ``back``."""
+    before = section(
+        lane(0),
+        lane(-1, after=-1),
+        lane(-2, after=-2),
+        lane(-3, width(3.5, -0.07), after=joined),
+    )
+    return read(
+        a_road(
+            "1",
+            line(90.0),
+            sections=before
+            + section(lane(0), lane(-1, before=-1), lane(-2, before=back), lane(-3), s=50),
+        )
+    )
+
+
+def test_a_link_to_a_lane_that_is_linked_elsewhere_is_a_warning() -> None:
+    road_map = merge()
+
+    said = "lane 1/0/-3 is linked to lane 1/1/-2, which is linked to lane 1/0/-2 instead"
+    assert [w for w in road_map.warnings if said in w]
+    assert ("1/0/-3", "1/1/-2") in travels(road_map)
+    for agreed in (merge(back=-3), merge(joined=-3)):
+        assert not [w for w in agreed.warnings if "1/0/-3 is linked to" in w]
+
+
+@pytest.mark.data
+def test_the_tapering_lane_of_soderleden_is_a_warning(data: Path) -> None:
+    text = (data / "maps/soderleden.xodr").read_text(encoding="utf-8")
+
+    (warning,) = parse_map(text, "soderleden").warnings
+    assert warning.startswith("lane 0/0/-3 is linked to lane 0/1/-2, which is linked to")
+
+
 def test_a_road_link_without_lane_links_joins_touching_lanes_and_is_else_a_warning() -> None:
     plain = section(lane(0), lane(-1))
 

@@ -235,6 +235,20 @@ class _Links:
                 self._say(f"{both} are linked, but {gap[row]:.1f} m apart")
             if head_on[row]:
                 self._say(f"{both} are linked, but their traffic meets head on")
+        for row in np.flatnonzero((gap > TOUCH) & (gap <= FAR)).tolist():
+            one, next_one = ((rows[row][i], END if rows[row][i + 1] else START) for i in (0, 2))
+            named_back = named.get(next_one, [])
+            if named_back and one not in named_back and not self._at_junction(*next_one):
+                self._say(
+                    f"{self._lane(one[0])} is linked to {self._lane(next_one[0])}, which is linked"
+                    f" to {' and '.join(self._lane(back) for back, _ in named_back)} instead:"
+                    " the link counts"
+                )
+
+    def _at_junction(self, lane: int, contact: str) -> bool:
+        """Return True if a lane end is at a junction, which lists the ways into it alone."""
+        link = self._road_links[contact].get(self._road[lane], {})
+        return self._inner(lane, contact) is None and link.get("elementType") == "junction"
 
     def _lane(self, lane: int) -> str:
         inner = self._section[lane] - self._network.first[self._road[lane]]
