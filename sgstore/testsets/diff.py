@@ -72,7 +72,7 @@ def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any
 
 
 def _listed(values: set[str]) -> str:
-    return first_of(sorted(values, key=natural), 3)
+    return first_of(sorted((value or "none" for value in values), key=natural), 3)
 
 
 def scenes(a: Classed, b: Classed) -> ReportTable:

@@ -25,6 +25,7 @@ from sgstore.exporters import Export, labelled, whole_clips, write_export
 from sgstore.exporters._geojson import _projection
 from sgstore.ingest import ingest
 from sgstore.model.world import Clip
+from sgstore.testsets.coverage import phrases
 
 if TYPE_CHECKING:
     from sgstore.query import Store
@@ -344,6 +345,41 @@ def test_a_class_has_a_phrase_in_a_table_and_none_in_json(folder: Path, capsys: 
     assert table.splitlines()[0].split()[-1] == "scene"
     assert phrase.startswith("ego")
     assert (f"{cars} car{'s' * (cars > 1)} near" in phrase) == (cars > 0)
+
+
+def test_scenes_are_told_by_one_function_in_each_table(folder: Path, capsys: Any) -> None:
+    store = str(folder / "town.sgstore")
+    select = ["select", store, "--unit", "clip", "--rarest", "--budget", "2units"]
+    early, late = (f"{store}:MATCH (e:Ego) WHERE frame.seq {of} 20" for of in ("<", ">="))
+    opened = sgstore.open(store)
+    for words in (select, ["diff", early, late], ["coverage", "novel", late, "--by", early]):
+        rows = json.loads(printed(capsys, *words, "--json")[0])
+        table = printed(capsys, *words)[0].splitlines()
+        frames = [row.get("frame", row.get("unit")) for row in rows[: len(table) - 2]]
+        told = [line.rpartition("  ")[2] for line in table[2:]]
+        assert "scene" not in rows[0]
+        assert table[0].split()[-1] == "scene"
+        assert told == phrases(opened, frames)
+        assert all(one.startswith("ego, ") for one in told)
+
+
+def test_a_vanished_scene_has_the_phrase_of_its_own_store(
+    folder: Path, tmp_path: Path, capsys: Any
+) -> None:
+    drive(tmp_path / "town.mcap", frames=9)
+    ingest(tmp_path / "other.sgstore", [tmp_path / "town.mcap"])
+    stores = [str(folder / "town.sgstore"), str(tmp_path / "other.sgstore")]
+    rows = json.loads(printed(capsys, "diff", *stores, "--json")[0])
+    table = printed(capsys, "diff", *stores)[0].splitlines()[2:]
+    of = {"vanished": sgstore.open(stores[0]), "appeared": sgstore.open(stores[1])}
+    told = {line.rpartition("  ")[2] for line in table if line.startswith("vanished")}
+
+    assert {row["change"] for row in rows} == {*of}
+    frames = {row["frame"] for row in rows if row["change"] == "vanished"}
+    assert told <= {*phrases(of["vanished"], [*frames])}
+    assert "town#0" in frames
+    assert phrases(of["appeared"], ["town#0"]) != phrases(of["vanished"], ["town#0"])
+    assert phrases(of["appeared"], ["nowhere#0"]) == ["no ego"]
 
 
 def test_a_shard_names_its_traces(tmp_path: Path, capsys: Any) -> None:

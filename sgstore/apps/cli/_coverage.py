@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -97,40 +97,13 @@ class SceneOptions(WindowOptions):
     slots: Path | None = None
 
 
-_SCENES: Final = """
-SELECT f.trace || '#' || f.seq AS frame, e.dst_kind::VARCHAR AS kind, e.relation = 'isIn' AS inside,
-       count(DISTINCT e.dst) AS number
-FROM (SELECT unnest($trace::VARCHAR[]) AS trace, unnest($seq::BIGINT[]) AS seq) w
-     JOIN frames f USING (trace, seq) JOIN edges e ON e.frame_id = f.frame_id AND e.src = f.ego
-WHERE e.src_is_ego AND (e.relation IN ('near_coll', 'super_near', 'very_near', 'near')
-      AND e.dst_kind NOT IN ('prop', 'building', 'pole', 'barrier', 'vegetation') OR e.relation = 'isIn')
-GROUP BY ALL ORDER BY inside, number DESC, kind
-"""
+def _report_scenes(
+    table: ReportTable, frames: Classed, ask: FrameAskOptions, limit: int | None
+) -> None:
+    """Print a table of frames; for people with a phrase for each scene."""
+    from sgstore.testsets.coverage import with_scenes
 
-
-def _with_scenes(table: ReportTable, frames: Classed, ask: FrameAskOptions) -> ReportTable:
-    """Return a table of classes with a phrase for the frame of each, such as ``ego, 2 cars near, 1 lane``."""
-    from sgstore.query import Store
-
-    store = frames.chosen.store
-    if not (ask.for_people and isinstance(store, Store) and {"class", "frame"} < {*table.columns}):
-        return table
-    names = table.column("frame")[:_MOST_SCENES]
-    parts = [name.rpartition("#") for name in names]
-    values = {"trace": [one[0] for one in parts], "seq": [int(one[2]) for one in parts]}
-    phrases: dict[str, list[str]] = {name: ["ego"] for name in names}
-    for frame, kind, inside, number in store.file.rows(_SCENES, values):
-        plural = "es" if kind.endswith("s") else "s"
-        noun = kind.replace("_", " ") + (plural if number > 1 else "")
-        phrases[frame].append(f"{number} {noun}{'' if inside else ' near'}")
-    columns = (*table.columns, "scene")
-    every = zip(table.rows, table.column("frame"), strict=True)
-    rows = [(*row, ", ".join(phrases.get(name, ()))) for row, name in every]
-    return replace(table, columns=columns, rows=rows)
-
-
-_MOST_SCENES: Final = 200
-"""Largest number of classes with a phrase."""
+    ask.report(with_scenes(table, frames.chosen.store) if ask.for_people else table, limit)
 
 
 @coverage.command("classes")
@@ -147,7 +120,7 @@ def classes_(
     from sgstore.testsets.coverage import classes, rank_sizes
 
     (frames,) = scenes.of(ask, a, slots=scenes.slots)
-    ask.report(_with_scenes(classes(frames, unit), frames, ask), limit)
+    _report_scenes(classes(frames, unit), frames, ask, limit)
     if picture is not None:
         from sgstore.draw import draw_rank_sizes
 
@@ -187,7 +160,7 @@ def novel_(
 
     listed = {"classes": novel, "frames": novel_frames, "clips": novel_clips}[items]
     frames, than = scenes.of(ask, a, by, slots=scenes.slots)
-    ask.report(_with_scenes(listed(frames, than), frames, ask), limit)
+    _report_scenes(listed(frames, than), frames, ask, limit)
 
 
 @coverage.command("venn")
@@ -346,7 +319,7 @@ def windows_(
     from sgstore.testsets.coverage import classes
 
     (frames,) = WindowOptions(abstraction, window, incomplete).of(ask, a)
-    ask.report(_with_scenes(classes(frames), frames, ask), limit)
+    _report_scenes(classes(frames), frames, ask, limit)
 
 
 @coverage.command("explain")
@@ -402,7 +375,12 @@ def failures_(
     told = read_outcomes(outcomes, limits)
     known, tested = windows.of(ask, train, test)
     shares, listed = failures(known, tested, told)
-    _report_below(shares, listed if novel else shares, ask, limit)
+    if novel:
+        for text in shares.said:
+            say(text)
+        _report_scenes(listed, tested, ask, limit)
+    else:
+        ask.report(shares, limit)
 
 
 def _fraction(text: str) -> float:

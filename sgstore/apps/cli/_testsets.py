@@ -131,7 +131,9 @@ def select(
     if curve or picture is not None:
         _curve(found, picture, out, printed=curve)
     else:
-        out.report(table)
+        from sgstore.testsets.coverage import with_scenes
+
+        out.report(with_scenes(table, found.units.chosen.store) if out.for_people else table)
 
 
 def check_lock_name(to: Path | None) -> None:
@@ -288,7 +290,7 @@ def diff(
     """
     from sgstore.apps.verbs import compared
     from sgstore.testsets import diff as differences
-    from sgstore.testsets.coverage import ChosenFrames
+    from sgstore.testsets.coverage import ChosenFrames, with_scenes
 
     if sum(one is not None for one in (name, query, file)) + by_frame > 1:
         raise typer.BadParameter("expected one of -p NAME, -q TEXT, -f FILE, --by-frame")
@@ -301,7 +303,10 @@ def diff(
     for difference in differences.sources(before.store, after.store):
         say(difference)
     table = compared(before, after, text, values, by_frame, abstraction)
-    # In a table the reasons are below it, each once.
-    ask.report(table.without(*differences.REASONS) if ask.for_people else table)
+    if ask.for_people:  # in a table the reasons are below it, each once
+        shown = table.without(*differences.REASONS)
+        ask.report(with_scenes(shown, after.store, before.store))
+    else:
+        ask.report(table)
     different = any(row[0] != differences.SAME for row in table.rows)
     return NO_MATCH if require and different else 0

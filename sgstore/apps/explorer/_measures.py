@@ -5,7 +5,6 @@ Each function implements the task of its name, with the fields as parameters.
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -27,14 +26,15 @@ from sgstore.testsets.coverage import (
     covered,
     features,
     growth,
+    phrases,
 )
 from sgstore.testsets.diff import by_frame, scenes
 from sgstore.testsets.locks import lock_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
-    from sgstore.testsets.coverage import Classed, ReportTable
+    from sgstore.testsets.coverage import ReportTable
 
     Clips = Sequence[tuple[str, int, int]]
 
@@ -46,9 +46,6 @@ MOST_PAIRED: Final = 48
 
 MOST_IN_WORDS: Final = 60
 """Classes that are described in words."""
-
-MOST_FEATURES: Final = 4
-"""Features of a class in words."""
 
 
 def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
@@ -68,48 +65,12 @@ def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
         return features(of, abstraction, of_ego=True).matrix(MOST_PAIRED)
     if what == "classes":
         table = classes(of)
-        shown = table.column("class")[:MOST_IN_WORDS]
-        return {**_table(table), "words": _words(of, abstraction, shown)}
+        shown = table.column("frame")[:MOST_IN_WORDS]
+        return {**_table(table), "words": phrases(store, shown)}
     found = combos(of, abstraction, 2)
     return {"shares": _table(found.shares), "missing": _table(found.missing)} | {
         "covered": _table(found.covered())
     }
-
-
-def _words(of: Classed, abstraction: str, shown: Sequence[str]) -> list[str]:
-    """Return the features of some classes as texts."""
-    place = {name: i for i, name in enumerate(of.names)}
-    first = of.first()[[place[name] for name in shown]]
-    order = np.argsort(first)
-    counts: list[dict[tuple[str, ...], int]] = [{} for _ in shown]
-    for rows, some in of.chosen.abstracted.features(abstraction, first[order]):
-        every = zip(
-            rows[some.frame].tolist(), some.feature.tolist(), some.often.tolist(), strict=True
-        )
-        for row, feature, often in every:
-            counts[int(order[row])][tuple(some.names[feature])] = often
-    edges = any(len(name) == 3 for one in counts for name in one)
-    share = Counter(name for one in counts for name in one if len(name) == 3 or not edges)
-    return [_in_words(one, share) for one in counts]
-
-
-def _in_words(counts: Mapping[tuple[str, ...], int], share: Mapping[tuple[str, ...], int]) -> str:
-    """Return features as a text: relations of each kind to the ego first, and rare ones before common ones."""
-    ranked = sorted(
-        (name for name in counts if name in share), key=lambda name: (share[name], name)
-    )
-    to_ego: dict[str, list[str]] = {}
-    for name in ranked:
-        if len(name) == 3 and name[2] == "ego":
-            many = f"{counts[name]} \N{MULTIPLICATION SIGN} " if counts[name] > 1 else ""
-            to_ego.setdefault(name[0], []).append(many + name[1])
-    told = [f"{kind} {', '.join(relations)} ego" for kind, relations in to_ego.items()]
-    told += [" ".join(name) for name in ranked if "ego" not in name and "Root Road" not in name]
-    lanes = [name[0].replace(" of Ego Lane", "") for name in ranked if name[-1] == "Root Road"]
-    told += [f"lanes: {', '.join(sorted(lanes))}"] if lanes and not told else []
-    told = told or [" ".join(name) for name in ranked]
-    more = len(told) - MOST_FEATURES
-    return "; ".join(told[:MOST_FEATURES]) + (f"; and {more} more" if more > 0 else "")
 
 
 def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:

@@ -39,6 +39,7 @@ from sgstore.testsets.coverage._failures import (
 )
 from sgstore.testsets.coverage._features import Combinations, combos, features
 from sgstore.testsets.coverage._frames import ReportTable, of_unknown
+from sgstore.testsets.coverage._scenes import phrases, with_scenes
 from sgstore.testsets.coverage._sequences import (
     WITHIN_S,
     check_sequences,
@@ -77,6 +78,7 @@ __all__ = [
     "novel_frames",
     "of_unknown",
     "periods_of",
+    "phrases",
     "rank_sizes",
     "read_outcomes",
     "recordings_of",
@@ -90,4 +92,5 @@ __all__ = [
     "told_outcomes",
     "traces_of",
     "venn",
+    "with_scenes",
 ]
