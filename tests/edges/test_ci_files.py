@@ -15,6 +15,7 @@ import pytest
 
 from sgstore.apps.cli import run
 from sgstore.apps.demo import RECORDING
+from sgstore.lang.library import patterns
 
 ROOT = Path(__file__).parents[2]
 ACTION = (ROOT / "action.yml").read_text(encoding="utf-8")
@@ -89,6 +90,41 @@ def test_the_action_writes_its_results_and_counts_new_violations(folder: Path) -
     assert f"{len(sarif)} new violations" in first
     assert "0 new violations" in second
     assert first.count("sgstore show drives.sgstore") == len(sarif)
+
+
+@pytest.mark.parametrize("verb", ["ingest", "check", "report"])
+def test_a_failure_of_a_command_fails_the_step(verb: str, tmp_path: Path) -> None:
+    program = tmp_path / "bin" / "sgstore"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\necho "$1" >> asked\n[ "$1" != {verb} ] || exit 3\n')
+    program.chmod(0o755)
+    (tmp_path / "sgstore-results").mkdir()
+    (tmp_path / "sgstore-results" / "violations.sarif").write_text('{"runs": [{"results": []}]}')
+    names = env_of("Ingest and check")
+    inputs = dict.fromkeys(names, "x") | {"BASELINE": "", "ACTION": str(ROOT)}
+    env = environment(tmp_path, **inputs)
+    env["PATH"] = f"{program.parent}{os.pathsep}{env['PATH']}"
+    lines = ["bash", "-euo", "pipefail", "-c", script("Ingest and check")]
+
+    done = subprocess.run(lines, cwd=tmp_path, env=env, capture_output=True, check=False)
+
+    assert done.returncode == 3
+    assert (tmp_path / "asked").read_text().split()[-1] == verb
+    assert (tmp_path / "sgstore-results" / "comment.md").exists() == (verb == "report")
+
+
+def test_results_are_uploaded_although_a_step_failed() -> None:
+    upload = ACTION.split("    - name: Upload the results\n")[1].splitlines()[0]
+    assert upload.strip() == "if: ${{ always() }}"
+
+
+def test_the_report_takes_a_file_and_a_rule_of_the_library(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    named = next(one.name for one in patterns().values() if one.is_check)
+    for rules in ("rules.sgql", named):
+        assert run(["report", "drives.sgstore", rules, "-o", str(tmp_path / "page.html")]) == 0
 
 
 def test_each_violation_has_a_clip_a_picture_and_a_command_that_runs(
