@@ -271,8 +271,9 @@ def draw_matrix(
     least = max(480 if groups else 420, 7.4 * len(title))  # for the texts above and below
     high, wide = image.shape[:2]
     cell = min(max((least - label - 30) / max(wide, 1), _CELL), _LARGEST_CELL)
-    wider = 2 if groups else 1  # few values, with a long legend below
-    high, wide = high * cell, wide * cell * wider
+    high, wide = high * cell, wide * cell
+    if groups:  # few values, with a long legend below
+        wide = max(2 * wide, least - label - 30)
     with _page(to, title, below, max(label + wide + 30, least), high + label + 80) as page:
         axes = page.plot(label, 30.0 + label, label + wide, 30.0 + label + high)
         axes.imshow(image, interpolation="nearest", aspect="auto")

@@ -448,6 +448,21 @@ def test_the_picture_of_gaps_has_each_pair_once_and_the_features_that_surprise_m
     assert {name for name in names if f">{name}<" in drawn} == {*names} - {"car near ego"}
 
 
+def test_matrix_of_few_slot_values_is_as_wide_as_its_picture(tmp_path: Path) -> None:
+    from matplotlib.image import imread
+
+    from sgstore.draw import draw_matrix
+
+    names, groups = ["a: x", "a: y", "b: x", "b: y"], ["a", "a", "b", "b"]
+    wanted = np.array([[one != other for one in groups] for other in groups])
+    frames = np.full((4, 4), 7)
+    draw_matrix(names, frames, wanted, tmp_path / "m.png", title="slots", groups=groups)
+    picture = imread(tmp_path / "m.png")[..., :3]
+    high, wide, _ = picture.shape
+    middle = picture[round(0.2 * high) : round(0.5 * high)]
+    assert (middle[:, round(0.85 * wide) : round(0.9 * wide)] < 0.9).any()
+
+
 def test_features_count_how_often_they_occur_and_nodes_count_where_there_are_no_edges(
     worlds: Worlds,
 ) -> None:
