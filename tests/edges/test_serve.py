@@ -8,6 +8,8 @@ import hashlib
 import itertools
 import json
 import socket
+import subprocess
+import sys
 import time
 import zlib
 from pathlib import Path
@@ -119,6 +121,22 @@ def test_an_address_that_is_told_can_be_connected_to(town_store: Path) -> None:
 
     with pytest.raises(InterruptedError):
         serve(town_store, link="http://127.0.0.1:1/#at=town%237", on_start=told)
+
+
+def test_a_running_query_ends_with_its_server_without_a_traceback(town_store: Path) -> None:
+    command = [sys.executable, "-m", "sgstore", "serve", str(town_store)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as child:
+        assert child.stdout is not None
+        address = child.stdout.readline().strip()
+        with httpx.Client(base_url=address.partition("?")[0], timeout=60) as client:
+            client.get(address)
+            with client.stream("POST", "/api/find", json={"text": RUNAWAY}) as answer:
+                child.terminate()
+                last = json.loads(answer.read().splitlines()[-1])
+        _, told = child.communicate(timeout=60)
+    assert last["error"]["reason"] == "stopped"
+    assert "Traceback" not in told
 
 
 def test_the_token_in_the_address_becomes_a_cookie(page: Page) -> None:

@@ -187,11 +187,15 @@ class Explorer:
         for reads in self.reads.values():
             self._threads.submit(reads.warm, self._ended)
 
+    def stop(self) -> None:
+        """Cancel all running queries. Their responses end with an error."""
+        for answer in tuple(self.busy):
+            answer.end()
+
     def close(self) -> None:
         """Stop the sandboxes, wait for running reads, and close the stores."""
         self._ended.set()
-        for answer in tuple(self.busy):
-            answer.end()
+        self.stop()
         for pool in self._pools.values():
             pool.close()
         # The process must not end while a thread is in the database.

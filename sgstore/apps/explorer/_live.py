@@ -102,6 +102,7 @@ class LiveRun:
         self._still: dict[int, list[Any]] = {}
         self._events: list[dict[str, Any]] = []
         self._origin: tuple[float, float] | None = None
+        self._stopped = False
 
     def follow(self, monitor: Monitor) -> None:
         """Set the monitor whose data the page shows; required before the first frame."""
@@ -137,6 +138,10 @@ class LiveRun:
             listed = [[one.check, one.verdict, len(one.violations), one.reason] for one in verdicts]
             told = {"verdicts": listed, "events": self._events}
             self._put("end", as_json(told))
+
+    def stop(self) -> None:
+        """End the messages to all pages."""
+        self._stopped = True
 
     def _put(self, event: str, data: bytes) -> None:
         message = b"event: " + event.encode() + b"\ndata: " + data + b"\n\n"
@@ -271,7 +276,7 @@ class LiveRun:
         """Yield server-sent events for the page: all stored messages, then each frame on arrival."""
         number, hello = self._hello()
         yield hello
-        while True:
+        while not self._stopped:
             number, found = self._since(number)
             if found:
                 yield b"".join(found)

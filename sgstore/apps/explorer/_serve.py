@@ -33,6 +33,26 @@ EVERYWHERE: Final = {"0.0.0.0", "::", ""}  # noqa: S104 - only where somebody as
 """Addresses for all interfaces of this machine; then its names are permitted hosts, too."""
 
 
+class _Server(uvicorn.Server):
+    """Web server that ends its running responses before it closes the connections.
+
+    Parameters
+    ----------
+    config : uvicorn.Config
+    stop : function
+        Function that ends the running responses.
+    """
+
+    def __init__(self, config: uvicorn.Config, stop: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._stop = stop
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the running responses, then close the connections."""
+        self._stop()
+        await super().shutdown(sockets)
+
+
 def serve(  # noqa: PLR0913  one argument per option
     store: Path,
     *,
@@ -76,7 +96,9 @@ def serve(  # noqa: PLR0913  one argument per option
         explorer.warm()
         make = partial(application, explorer)
         with (
-            _begun(make, host, port, (on_start, webbrowser.open)[: 1 + browse], link) as (
+            _begun(
+                make, explorer.stop, host, port, (on_start, webbrowser.open)[: 1 + browse], link
+            ) as (
                 server,
                 listening,
             ),
@@ -103,7 +125,8 @@ def serve_live(
         The server cannot listen on the address.
     """
     make = partial(live_application, run)
-    with _begun(make, HOST, port, (on_start, webbrowser.open)[: 1 + browse]) as (server, listening):
+    told = (on_start, webbrowser.open)[: 1 + browse]
+    with _begun(make, run.stop, HOST, port, told) as (server, listening):
         thread = threading.Thread(target=server.run, args=([listening],), daemon=True)
         thread.start()
         try:
@@ -116,6 +139,7 @@ def serve_live(
 @contextmanager
 def _begun(
     make: Callable[[str, tuple[str, ...], str], Guard],
+    stop: Callable[[], None],
     host: str,
     port: int,
     told: Iterable[Callable[[str], object]],
@@ -139,7 +163,7 @@ def _begun(
         address = f"http://{hosts[0]}/?token={token}" + f"#{view}" * bool(view)
         for tell in told:
             tell(address)
-        yield uvicorn.Server(config), listening
+        yield _Server(config, stop), listening
 
 
 def _listening(host: str, port: int) -> socket.socket:
