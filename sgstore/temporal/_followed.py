@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 MOST_EDGES: Final = 100_000
 """Largest number of edges of stored graphs; about 30 MB."""
 
-MOST_FOLLOWED: Final = 8
-"""Number of followed matches and curves, the latest requests."""
+MOST_FOLLOWED: Final = 36
+"""Number of followed matches and curves, the latest requests. A page asks for a match and eight curves."""
 
 LONGEST_CURVE: Final = 3000
 """Largest number of frames of a curve."""
 
 OF_NODE: Final = (*POSE, *INPUTS, "speed", "accel")
-OF_PAIR: Final = tuple(PAIR_FUNCTIONS)
-"""Pair values that can be followed as a curve."""
+OF_PAIR: Final = {one.column or name: name for name, one in PAIR_FUNCTIONS.items()}
+"""Pair values that can be followed as a curve, by their columns in the view ``pairs``."""
 
 W = TypeVar("W", "FollowedMatch", "FollowedCurve")
 
@@ -145,7 +145,7 @@ class FollowedCurve:
             if self._other is None:
                 value = about.get(self._attribute)
             else:
-                value = view.pair(self._attribute, self._node, self._other)
+                value = view.pair(OF_PAIR[self._attribute], self._node, self._other)
             self._told.append((seq, view.frame["t"], math.nan if value is None else float(value)))
 
     def columns(self) -> dict[str, Any]:

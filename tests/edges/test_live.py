@@ -138,7 +138,9 @@ def test_curves_are_those_of_a_store(watched: Any, open_town: Store) -> None:
     e, v = nodes["e"], nodes["v"]
     (trace,) = open_town.traces()
     asked = [(name, v, None) for name in ("speed", "heading", "accel", "steer")]
-    asked += [(name, e, v) for name in ("gap", "ttc", "bearing", "closing_speed")]
+    asked += [
+        (name, e, v) for name in ("distance", "gap", "ttc", "headway", "bearing", "closing_speed")
+    ]
     for attribute, node, other in asked:
         _, mine = unpacked(run.series(attribute, node, other))
         of = StateColumns(open_town.file).series(trace.trace_id, attribute, node, other)
@@ -188,6 +190,34 @@ def moving(i: int, speed: float) -> Frame:
     frame.add("e", "car", 0.0, 0.0, heading=0.0, length=4.0, width=2.0, vx=0.0, vy=0.0)
     frame.add("v", "car", 9.0 + i, 0.0, heading=0.0, length=4.0, width=2.0, vx=speed, vy=0.0)
     return frame
+
+
+def test_a_page_with_all_its_curves_keeps_their_history(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two pages follow a match and eight curves each; they ask for all of them again and again."""
+    import sgstore.temporal._followed as followed
+
+    monkeypatch.setattr(followed, "MOST_EDGES", 12)  # of the first frames only the curves know
+    run = LiveRun("x", None)
+    monitor = Monitor("MATCH (v:Vehicle) WHERE v.speed > 1", on_event=run.event, on_step=run.step)
+    run.follow(monitor)
+    names = ("x", "y", "z", "vx", "vy", "speed", "length", "width")
+    for i in range(40):
+        monitor.step(moving(i, 3.0))
+        curves = [
+            len(unpacked(run.series(name, node))[1]["seq"]) for node in (0, 1) for name in names
+        ]
+        for node in (0, 1):
+            run.parts("pattern", {"v": node})
+        assert curves == [i + 1] * 16
+
+
+def test_messages_end_with_the_server() -> None:
+    async def end() -> int:
+        run = LiveRun("x", None)
+        run.stop()
+        return len([one async for one in run.messages()])
+
+    assert asyncio.run(asyncio.wait_for(end(), 20)) == 1
 
 
 def test_what_is_kept_does_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
