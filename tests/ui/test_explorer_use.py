@@ -52,8 +52,13 @@ def test_narrow_window_has_one_column(
         page.get_by_role("button", name=view, exact=True).click()
         page.locator(sign).first.wait_for()
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert page.locator(sign).first.bounding_box()["width"] <= 390
     search(page, f"{NEAR} WHERE e.speed > 3")
     open_first(page)
+    page.get_by_role("button", name="legend").click()
+    legend, view = (page.locator(f".above {one}").bounding_box() for one in (".legend", "canvas"))
+    scale = 32  # px at the lower edge of the view
+    assert legend["y"] + legend["height"] <= view["y"] + view["height"] - scale
     assert_one_column(page)
     report(Store(town_store), f"{NEAR} WHERE e.speed > 3", tmp_path / "r.html", most=3)
     page = visit((tmp_path / "r.html").as_uri(), offline=True)

@@ -4,6 +4,7 @@ import { about, asked, match, server, settled, TIMES } from "./page.mjs";
 
 const state = await import("../../../sgstore/apps/explorer/page/js/state.js");
 const data = await import("../../../sgstore/apps/explorer/page/js/data.js");
+const api = await import("../../../sgstore/apps/explorer/page/js/api.js");
 const clock = await import("../../../sgstore/apps/explorer/page/js/clock.js");
 
 test("each frame has its own time, which is asked for once", async () => {
@@ -53,4 +54,17 @@ test("what failed for a time is asked again", async () => {
   data.stillOf("run");
   await settled();
   assert.equal(data.timeAt("run", 4), 5.1);
+});
+
+test("a busy server is no trouble, and is asked again", async () => {
+  await api.look();
+  const before = api.returns.value;
+  server.busy = true;
+  await assert.rejects(api.json("api/x"), (error) => state.isLost(error) && /are under way/.test(error.message));
+  assert.equal(api.trouble.value, "");
+  assert.equal(await api.look(), null);
+  server.busy = false;
+  await api.look();
+  await api.look();
+  assert.equal(api.returns.value, before + 1);
 });

@@ -14,6 +14,7 @@ test("tiles stand in rows below the name of their trace", () => {
   rows.slice(1).forEach((row, i) => assert.ok(row.top >= rows[i].top + rows[i].height));
   assert.ok(height >= rows.at(-1).top + rows.at(-1).height);
   assert.equal(layout(found, 100).across, 1);
+  assert.ok(layout(found, 2560).wide > 300);
   assert.equal(layout([], 700).rows.length, 0);
 });
 

@@ -22,11 +22,13 @@ function packed(header, columns) {
 /** Times of the frames of the trace `run`: a pause before frame 3. */
 export const TIMES = [0, 0.1, 0.2, 5, 5.1];
 export const asked = [];
-export const server = { fails: false };
+export const server = { fails: false, busy: false };
 
 globalThis.fetch = async (path) => {
   asked.push(path);
   if (server.fails) throw new TypeError("no network");
+  if (server.busy) return new Response('{"reason": "8 questions are under way"}', { status: 503 });
+  if (path === "api/stamp") return new Response("{}");
   const names = { 7: ["car", "17", ""] };
   return new Response(packed({ names }, { t: TIMES, node: [], kind: [], x: [], y: [] }));
 };

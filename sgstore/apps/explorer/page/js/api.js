@@ -7,16 +7,19 @@ import { unpacked } from "./wire.js";
 
 /** Why the server does not answer; empty: it does. */
 export const trouble = signal("");
-/** Counts how often it answered again after that. */
+/** Counts how often it answered again after that, or after it was busy. */
 export const returns = signal(0);
 
-/** A request that failed; `lost`: for a time only. */
+let missed = false;
+
+/** A request that failed; `lost`: for a time only; `down`: the server does not answer at all. */
 class Failed extends Error {
-  /** @param {string} reason @param {boolean} lost */
-  constructor(reason, lost) {
+  /** @param {string} reason @param {boolean} lost @param {boolean} [down] */
+  constructor(reason, lost, down = lost) {
     super(reason);
     this.lost = lost;
-    if (lost) trouble.value = reason;
+    missed ||= lost;
+    if (down) trouble.value = reason;
   }
 }
 
@@ -24,7 +27,7 @@ class Failed extends Error {
 export async function look() {
   let found = null;
   try { found = await json("api/stamp"); } catch { return null; }
-  if (trouble.value) { trouble.value = ""; returns.value++; }
+  if (missed) { missed = false; trouble.value = ""; returns.value++; }
   return found;
 }
 
@@ -49,7 +52,7 @@ async function send(path, body, how = {}) {
   /** @type {Plain} */
   let about = {};
   try { about = JSON.parse(told); } catch { /* no JSON */ }
-  throw new Failed(about.reason || `the server answered ${status}: ${told.slice(0, 200)}`, status === 503);
+  throw new Failed(about.reason || `the server answered ${status}: ${told.slice(0, 200)}`, status === 503, false);
 }
 
 /** @param {string} path @param {Plain} values */

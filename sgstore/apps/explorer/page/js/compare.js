@@ -63,9 +63,11 @@ function onlyIn(a, b, of, word, query) {
       if (last && last[1] === at - 1) last[1] = at; else runs.push([at, at]);
     }
     for (const [first, last] of runs) {
-      const found = matches.find((m) => m.first <= first && first <= m.last);
+      const found = matches.find((m) => m.first <= first && first <= m.last), whole = found?.first === first
+        && found.last === last; // a whole match has the times of the answer, part of one those of its frames
       tiles.push({
-        trace: of === "b" ? inOther(name) : name, first, last, start: NaN, end: NaN, binding: found?.binding || {},
+        trace: of === "b" ? inOther(name) : name, first, last,
+        start: whole ? found.start : NaN, end: whole ? found.end : NaN, binding: found?.binding || {},
         names: found?.names || {}, values: {}, index: `${word} ${name} ${first}`, group: `${name} · only in ${word}`,
         go: () => go(name, first, query),
       });

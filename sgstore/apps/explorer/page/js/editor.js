@@ -139,7 +139,7 @@ export function Editor() {
           autocompletion({ override: [complete], icons: false, maxRenderedOptions: 60 }), language,
             syntaxHighlighting(colours),
           EditorView.lineWrapping,
-            placeholder("MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 5     · or SELECT …"
+            placeholder("MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed > 5 · or SELECT …"
             + " · or choose a pattern below"),
           EditorView.contentAttributes.of({ "aria-label": "Query" }),
           keymap.of([

@@ -17,7 +17,7 @@ const groupOf = (match) => match?.group ?? (order.value ? ORDERS[order.value] : 
 /** Where everything stands: groups and rows, by their heights.
  * @param {import("./state.js").Match[]} found @param {number} width */
 export function layout(found, width) {
-  const across = Math.max(1, Math.floor((width - GAP) / 214)), wide = (width - GAP) / across - GAP,
+  const across = Math.max(1, Math.floor((width - GAP) / Math.max(214, width / 8))), wide = (width - GAP) / across - GAP,
     high = Math.round(wide * 0.62) + 27;
   const rows = [];
   let top = 4, at = 0;

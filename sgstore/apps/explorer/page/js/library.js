@@ -6,6 +6,7 @@ import { answer, ask, idle, isLost, library, matchesIn, open, reasonOf, store, t
 
 const html = htm.bind(h);
 const MOST_CARDS = 24, MOST_WORDS = 12;
+const PAUSE = 400; // ms between looks whether the library may be counted
 
 /** @typedef {{name: string, kind: string, text: string, sentence: string, library: string, drawing: string}} Entry */
 /** @typedef {{name: string, meaning: string, text: string}} Word */
@@ -29,7 +30,7 @@ export async function countLibrary() {
     && !tally.value[p.name]);
   for (let one = next(); one; one = next()) {
     const busy = () => answer.value.state !== "idle" || view.value !== "find" || open.value || api.trouble.value;
-    while (busy()) await new Promise((done) => setTimeout(done, 400));
+    while (busy()) await new Promise((done) => setTimeout(done, PAUSE));
     const spots = new Set(), place = placed(), mine = new AbortController(), { stamp } = store.value;
     let count = 0, more = "", reason = "";
     idle.stop = () => mine.abort();
@@ -40,7 +41,10 @@ export async function countLibrary() {
         for (let at = Math.floor(place(trace, first)); at < place(trace, last + 1); at++) spots.add(at);
       }
     } catch (error) {
-      if (isLost(error)) continue; // again later
+      if (isLost(error)) { // again later
+        await new Promise((done) => setTimeout(done, PAUSE));
+        continue;
+      }
       count = -1;
       reason = reasonOf(error);
     }
@@ -142,7 +146,7 @@ export function Near({ text, most = MOST_CARDS }) {
 /** The field of the search in words. */
 export const WordSearch = () => html`<input type="search" class="words-field"
   aria-label="Search the library and the words of the language"
-  placeholder="search in words: pedestrian crosses" value=${sought.value}
+  placeholder="words: pedestrian crosses" value=${sought.value}
     onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { sought.value = e.target.value; }}
   onKeyDown=${(/** @type {KeyboardEvent} */ e) => { if (e.key === "Escape") sought.value = ""; }} />`;
 

@@ -95,7 +95,7 @@ function Head() {
       : ""}</h1>
     <span class="grow"></span>
     <button class=${following.value ? "main" : ""} aria-pressed=${following.value} onClick=${follow}>
-      ${following.value ? "● Live" : "Back to live"}</button>
+      ${following.value ? "Live" : "Back to live"}</button>
     <button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>`;
 }
 

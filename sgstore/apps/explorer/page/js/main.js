@@ -26,6 +26,9 @@ import { Verdicts } from "./verdicts.js";
 const html = htm.bind(h);
 const VIEWS = [["find", "Find"], ["coverage", "Coverage"], ["selection", "Selection"], ["compare", "Compare"]];
 
+/** What is filled of the disc on the button of the colours. @type {Record<string, string>} */
+const DISC = { "": "M7 1.5v11a5.5 5.5 0 0 0 0-11z", light: "", dark: "M7 1.5a5.5 5.5 0 0 0 0 11a5.5 5.5 0 0 0 0-11z" };
+
 function Head() {
   const about = store.value, frames = about.traces.reduce((/** @type {number} */ n,
     /** @type {any} */ t) => n + t.frames, 0);
@@ -41,7 +44,8 @@ function Head() {
         ? html` <span class="badge">${ticked.value.size}</span>` : null}</button>`)}</nav>
     <button class="quiet" title="light, dark, or as the system has it"
       aria-label=${`Colours: ${theme.value || "of the system"}`} onClick=${() => { theme.value = next; }}>
-      ${theme.value === "dark" ? "☾" : theme.value === "light" ? "☀" : "◐"}</button>
+      <svg class="icon" viewBox="0 0 14 14" aria-hidden="true"><circle cx="7" cy="7" r="5.5" fill="none"
+        stroke="currentColor" stroke-width="1.5" /><path d=${DISC[theme.value]} fill="currentColor" /></svg></button>
     <button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>`;
 }
 
@@ -75,7 +79,7 @@ function Search() {
       <${NumberSlider} /><span class="grow"></span>
       ${answer.value.state === "busy" ? html`<button onClick=${cancel}>Stop</button>` : null}
       <button class="main" onClick=${() => find()}>Find <kbd>
-        ${navigator.platform.startsWith("Mac") ? "⌘" : "Ctrl "}⏎</kbd></button>
+        ${navigator.platform.startsWith("Mac") ? "Cmd" : "Ctrl"} Enter</kbd></button>
     </div></section>`;
 }
 
@@ -201,7 +205,7 @@ function App() {
       : html`<${Compare} />`}<${Above}><${TagForm} /></${Above}>`;
 }
 
-keys.unshift(["/", "editor", { "/": focusEditor }], ["Ctrl ⏎", "find", {}]);
+keys.unshift(["/", "editor", { "/": focusEditor }], ["Ctrl Enter", "find", {}]);
 keys.push(["t", "tag this frame", { t: () => { tagged.value = null; if (open.value) dialog.value = "tag"; } }],
   ["y", "copy a link", { y: copyLink }],
   ["Y", "copy the command that opens this view", { Y: copyCommand }]);
@@ -256,8 +260,8 @@ async function begin() {
   store.value = await firstRead(place);
   place.textContent = "";
   render(html`<${App} />`, place);
+  followPlace(); // the address may change while it is read
   await readAddress();
-  followPlace();
   let stamp = "";
   effect(() => { // another state of the store
     const { stamp: now, store: name, other } = store.value;

@@ -334,7 +334,7 @@ function Transport() {
     ${offline.value ? null : html`<button title="copy a link (y)" onClick=${copyLink}>Link</button>
       <button title="copy the command that opens this view (Y)" onClick=${copyCommand}>Command</button>`}
     ${live.value ? null : html`<button aria-label="Close" title="close (Esc)"
-      onClick=${() => { playing.value = false; open.value = null; }}>✕</button>`}
+      onClick=${() => { playing.value = false; open.value = null; }}>×</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed
       ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>`
       : null}</span>`

@@ -61,7 +61,7 @@ function Clips({ all }) {
       const match = /** @type {Match} */ (all[at]), [start, end] = timesOf(match);
       return html`<div class="clip" role="listitem" key=${keyOf(match)} style=${{ top: `${at * ROW}px` }}
           aria-posinset=${at + 1} aria-setsize=${all.length}><span class="cut">${match.trace}</span>
-        <span class="number">${seconds(start)} s</span><span class="number">${seconds(end)} s</span>
+        <span class="number">${seconds(start)} s</span><span class="number">– ${seconds(end)} s</span>
         <button class="small" onClick=${() => { view.value = "find"; openMatch(match); }}>open</button>
         <button class="small" onClick=${(/** @type {MouseEvent} */ event) => {
           gone.current = event.detail === 0; // by a key

@@ -43,7 +43,7 @@ function extendBrush(by) {
 export const timelineKeys = [
   ["+ −", "less or more of the timeline", { "+": () => zoomBy(0.5), "-": () => zoomBy(2) }],
   ["0", "the whole trace", { 0: zoomOut }],
-  ["⇧← ⇧→", "mark frames, to zoom in or to tag them", {
+  ["Shift ← →", "mark frames, to zoom in or to tag them", {
     ArrowLeft: (e) => { if (e.shiftKey) extendBrush(-1); else goTo(frame.value - 1); },
     ArrowRight: (e) => { if (e.shiftKey) extendBrush(1); else goTo(frame.value + 1); },
   }],
@@ -140,7 +140,7 @@ function Series({ attribute, curves }) {
     <i style=${{ background: CURVES[k % 6] }}></i>
         <b>${Number.isFinite(now) ? `${now.toFixed(2)} ${unit}` : "–"}</b> ${label}
         <button class="quiet small" aria-label=${`Remove ${label}`}
-          onClick=${() => { series.value = series.value.filter((one) => one.label !== label); }}>✕</button></div>`)}
+          onClick=${() => { series.value = series.value.filter((one) => one.label !== label); }}>×</button></div>`)}
       <label>limit <input size="5" inputmode="decimal" aria-label=${`Limit of ${attribute}`}
         value=${Number.isFinite(limit) ? limit : ""}
         onInput=${(/** @type {InputEvent} */ e) => { limits.value = { ...limits.value,
@@ -172,7 +172,7 @@ function Marked() {
       onClick=${() => { zoomed.value = [marked[0], Math.max(marked[1],
       marked[0] + 10)]; brush.value = null; }}>zoom in</button>
       ${offline.value ? null : html`<button class="small" onClick=${tagThem}>tag</button>`} <button class="small"
-        aria-label="Unmark" onClick=${() => { brush.value = null; }}>✕</button>` : null}</div>`;
+        aria-label="Unmark" onClick=${() => { brush.value = null; }}>×</button>` : null}</div>`;
 }
 
 /** Tags of a trace as runs of frames. @param {any[][]} all @param {string} trace */
