@@ -10,13 +10,13 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
 
 def chromium() -> str | None:
@@ -40,12 +40,18 @@ def browser() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
+def town_store(town_of_the_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of the bundled recording; all pages of the run share it, and its server."""
+    return Path(shutil.copy(town_of_the_run, tmp_path_factory.mktemp("town") / "town.sgstore"))
+
+
+@pytest.fixture(scope="session")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("written")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def served(written: Path) -> Iterator[Callable[[Path], str]]:
     """Serves stores; each address has its token."""
     children: dict[Path, tuple[subprocess.Popen[str], str]] = {}

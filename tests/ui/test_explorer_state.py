@@ -63,6 +63,12 @@ class Served:
 
 
 @pytest.fixture(scope="module")
+def town_store(town_of_the_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store of its own, because the tests change it."""
+    return Path(shutil.copy(town_of_the_run, tmp_path_factory.mktemp("town") / "town.sgstore"))
+
+
+@pytest.fixture(scope="module")
 def served(town_store: Path) -> Iterator[Served]:
     with duckdb.connect(str(town_store)) as connection:
         connection.execute(
