@@ -28,6 +28,7 @@ from thorough import LONG
 
 import sgstore.apps.explorer
 from sgstore.apps.explorer import Explorer, application, serve
+from sgstore.errors import SgstoreError
 from sgstore.maps.opendrive import read_map
 from sgstore.query import Store
 from sgstore.store import StateColumns
@@ -137,6 +138,17 @@ def test_a_running_query_ends_with_its_server_without_a_traceback(town_store: Pa
         _, told = child.communicate(timeout=60)
     assert last["error"]["reason"] == "stopped"
     assert "Traceback" not in told
+
+
+def test_a_slow_read_ends_with_its_server_without_a_traceback(page: Page) -> None:
+    async def cancelled() -> None:
+        reading = asyncio.create_task(page.explorer.threaded(time.sleep, 0.5))
+        await asyncio.sleep(0.1)
+        reading.cancel()
+        await reading
+
+    with pytest.raises(SgstoreError, match="the server ends"):
+        asyncio.run(cancelled())
 
 
 def test_the_token_in_the_address_becomes_a_cookie(page: Page) -> None:

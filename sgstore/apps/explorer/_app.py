@@ -283,8 +283,18 @@ class Explorer:
         return self._answer(pool, question, uuid.uuid4().hex, _last, "application/json")
 
     async def threaded(self, ask: Callable[..., T], *arguments: Any) -> T:
-        """Run a slow function in a thread, and return its result."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads, ask, *arguments)
+        """Run a slow function in a thread, and return its result.
+
+        Raises
+        ------
+        RequestError
+            The server ends.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            return await loop.run_in_executor(self._threads, ask, *arguments)
+        except asyncio.CancelledError:
+            raise RequestError("the server ends", 503) from None
 
     async def read(self, request: Request, name: str) -> Response:
         """Endpoint that reads data of a store: binary columns, a picture, or JSON values."""
