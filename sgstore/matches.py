@@ -17,6 +17,7 @@ from heapq import merge
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
+from weakref import ref
 
 from sgstore.base.display import IN_NOTEBOOK
 from sgstore.base.quoting import quoted
@@ -194,6 +195,7 @@ class Matches(Tabular):
 
     of_match = False
     _kept: tuple[Catalog, list[Row]] | None = None
+    _unread: ref[_LazyRows] | None = None
 
     def __init__(
         self,
@@ -274,7 +276,7 @@ class Matches(Tabular):
         if most < 0:
             raise ValueError(f"limit is {most}, expected 0 or more")
         fewer = copy.copy(self)
-        fewer._kept = None  # noqa: SLF001
+        fewer._kept = fewer._unread = None  # noqa: SLF001
         fewer._limit = most if self._limit is None else min(self._limit, most)  # noqa: SLF001
         fewer._ready = self._ready.limited(most)  # noqa: SLF001
         return fewer
@@ -430,6 +432,11 @@ class Matches(Tabular):
             return scope_of((one.report for one in traces), world=compiled.bound.world)
 
     def __iter__(self) -> Iterator[Row]:
+        rows = _LazyRows(self._kept_or_searched)
+        self._unread = ref(rows)
+        return rows
+
+    def _kept_or_searched(self) -> Iterator[Row]:
         with self._file.snapshot():
             kept = self._kept_rows()
         return self._rows(whole=False) if kept is None else iter(kept)
@@ -443,7 +450,8 @@ class Matches(Tabular):
     def __len__(self) -> int:
         """Return the number of rows, each match in each frame; see :meth:`count` for frames.
 
-        Rows of a small result are kept until the store changes, so that they are not searched twice.
+        Rows of a small result are kept until the store changes, so that they are not searched twice. ``list``
+        asks for the number after it has created its iterator, which then takes the rows of any result.
         """
         with self._file.snapshot():
             if (kept := self._kept_rows()) is not None:
@@ -452,7 +460,10 @@ class Matches(Tabular):
             some = list(islice(rows, KEPT + 1))
             if len(some) <= KEPT:
                 self._kept = self._catalog(), some
-            return len(some) + sum(1 for _ in rows)
+                return len(some)
+            unread = self._unread and self._unread()
+            taken = None if unread is None else unread.take(chain(some, rows))
+            return len(some) + sum(1 for _ in rows) if taken is None else taken
 
     def __bool__(self) -> bool:
         """True if there is a match."""
@@ -947,7 +958,7 @@ class UnionMatches(Matches):
         if most < 0:
             raise ValueError(f"limit is {most}, expected 0 or more")
         fewer = copy.copy(self)
-        fewer._kept = None  # noqa: SLF001
+        fewer._kept = fewer._unread = None  # noqa: SLF001
         fewer._limit = most if self._limit is None else min(self._limit, most)  # noqa: SLF001
         return fewer
 
@@ -1119,6 +1130,36 @@ class UnionMatches(Matches):
 
 def _begin(interval: Interval) -> tuple[Any, int]:
     return natural(interval.trace), interval.start_seq
+
+
+class _LazyRows:
+    """Iterator of the rows of matches. The search begins with the first row.
+
+    Parameters
+    ----------
+    search : function
+        Function that returns the rows.
+    """
+
+    def __init__(self, search: Callable[[], Iterator[Row]]) -> None:
+        self._search = search
+        self._rows: Iterator[Row] | None = None
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Row:
+        if self._rows is None:
+            self._rows = self._search()
+        return next(self._rows)
+
+    def take(self, rows: Iterable[Row]) -> int | None:
+        """Take the rows of another search before the own search begins; return their number, or None."""
+        if self._rows is not None:
+            return None
+        found = list(rows)
+        self._rows = iter(found)
+        return len(found)
 
 
 class TooMuchError(QueryError):

@@ -22,7 +22,7 @@ from sgstore.model.world import Clip
 from sgstore.store import FrameRef, StoreFile
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from sgstore.query import Store
@@ -499,3 +499,28 @@ def test_arrays_hold_enumerations_as_texts(store: Store, world: World) -> None:
         row[0] for row in store.find("MATCH (e:Ego)-->(x) RETURN x.kind")
     }
     assert {type(kind) for kind in arrays["kind"]} == {str}
+
+
+@pytest.mark.parametrize("kept", [10_000, 3])
+def test_a_list_of_matches_searches_once(
+    kept: int, store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sgstore.matches, "KEPT", kept)
+    searches: list[bool] = []
+    search = Matches._rows
+
+    def counted(self: Matches, *, whole: bool) -> Iterator[Any]:
+        searches.append(whole)
+        return search(self, whole=whole)
+
+    monkeypatch.setattr(Matches, "_rows", counted)
+    matches = store.find(PATTERN)
+    begun = iter(matches)
+    first = next(begun)
+
+    assert len(searches) == 1
+    rows = list(matches)
+    assert len(searches) == 2
+    assert [first, *begun] == rows == matches.rows()
+    assert len(rows) == len(matches) > 3
+    assert [*iter(matches)] == rows
