@@ -38,6 +38,7 @@ from sgstore.lang.sql import (
 from sgstore.lang.sql.collection_parts import PARTS, parted
 from sgstore.lang.sql.collection_pruning import Pruning, class_questions
 from sgstore.lang.syntax import pattern_tables
+from sgstore.lang.topics import unknown_topic
 from sgstore.matches import UnionMatches
 from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.vocabulary import natural
@@ -856,12 +857,18 @@ class CollectionRows(Tabular):
                 self.reasons |= found.reasons
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
+        missing = ""
         for result in self._whole.ask({"kind": "sql", "text": self._text}, self._whole.bundles()):
-            self._columns = ("bundle", *result["columns"])
             self.reasons |= result["reasons"]
+            if (lacking := result.get("no_topic")) is not None:
+                missing = lacking
+                continue
+            self._columns = ("bundle", *result["columns"])
             with Path(result["lines"]).open(encoding="utf-8") as lines:
                 for line in lines:
                     yield result["bundle"], *json.loads(line)
+        if missing and not self._columns:
+            raise unknown_topic(missing, self._whole.catalog.topics)
 
     @property
     def columns(self) -> tuple[str, ...]:

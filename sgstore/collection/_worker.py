@@ -24,7 +24,7 @@ from sgstore.errors import StoreError
 from sgstore.lang.catalog import Type
 from sgstore.lang.sql import Compiled
 from sgstore.lang.sql.collection_parts import parted
-from sgstore.lang.topics import topics_of_parts
+from sgstore.lang.topics import NoTopicError, topics_of_parts
 from sgstore.matches import Interval, UnionMatches
 from sgstore.query import Store, UserStatement, matches_of
 from sgstore.store import Example, PartFile, StoreFile, UserTables
@@ -308,12 +308,19 @@ class BundleTask:
             return matches_of(make, UnionMatches, text, values)
 
         asked = UserStatement(find, self.catalog().tables, self.task["text"])
-        with path.open("w", encoding="utf-8") as lines, asked.on(self.file).batches() as batches:
-            columns, types = batches.columns, batches.types
-            for batch in batches:
-                for row in batch.values:
-                    lines.write(json.dumps(row, default=str))
-                    lines.write("\n")
+        try:
+            with (
+                path.open("w", encoding="utf-8") as lines,
+                asked.on(self.file).batches() as batches,
+            ):
+                columns, types = batches.columns, batches.types
+                for batch in batches:
+                    for row in batch.values:
+                        lines.write(json.dumps(row, default=str))
+                        lines.write("\n")
+        except NoTopicError as error:  # other bundles may have the topic
+            reasons = {trace.name: error.reason for trace in self.file.traces()}
+            return {"lines": str(path), "columns": [], "reasons": reasons, "no_topic": error.name}
         about = {"columns": list(columns), "types": list(types), "reasons": dict(asked.reasons)}
         return {"lines": str(path), **about}
 

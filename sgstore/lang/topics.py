@@ -36,6 +36,22 @@ class TopicError(SgstoreError):
         self.reason, self.hint = reason, hint
 
 
+class NoTopicError(TopicError):
+    """A topic does not exist.
+
+    Parameters
+    ----------
+    name : str
+        Name of the topic.
+    hint : str
+        Remedy.
+    """
+
+    def __init__(self, name: str, hint: str) -> None:
+        super().__init__(f"no topic {excerpt(name)!r}", hint)
+        self.name = name
+
+
 def fields_of(facts: TopicFacts) -> Mapping[str, TopicField]:
     """Return the fields of a topic, by name.
 
@@ -76,12 +92,12 @@ def topic_of(topics: Mapping[str, TopicFacts], name: str) -> TopicFacts:
     return found
 
 
-def unknown_topic(name: str, known: Iterable[str]) -> TopicError:
+def unknown_topic(name: str, known: Iterable[str]) -> NoTopicError:
     """Return the error for a topic that does not exist, with the most similar topic or all topics."""
     names = sorted(known)
     like = suggestion(name, names)
     listed = f"the topics are {excerpts([*map(repr, names)])}" if names else "no topic has a name"
-    return TopicError(f"no topic {excerpt(name)!r}", f"did you mean {like!r}?" if like else listed)
+    return NoTopicError(name, f"did you mean {like!r}?" if like else listed)
 
 
 def field_list(names: Iterable[tuple[str, str]]) -> dict[str, TopicField]:

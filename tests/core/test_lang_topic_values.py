@@ -240,6 +240,12 @@ def test_a_collection_has_topics_of_some_stores(tmp_path: Path) -> None:
         assert {one.trace: one.verdict for one in verdicts} == {"one": "true", "two": "unknown"}
         with pytest.raises(sgstore.QueryError, match="no topic '/planer'"):
             fleet.find("MATCH (e:Ego) WHERE topic('/planer').z > 1").rows()
+        listed = fleet.sql("SELECT trace, max(z) FROM topic('/planner') GROUP BY 1", each=True)
+        assert [row[1:] for row in listed] == [("one", 6)]
+        assert listed.columns == ("bundle", "trace", "max(z)")
+        assert listed.reasons == {"two": "no topic '/planner'"}
+        with pytest.raises(sgstore.SgstoreError, match="no topic '/planer'; did you mean"):
+            list(fleet.sql("SELECT z FROM topic('/planer')", each=True))
         with pytest.raises(sgstore.SgstoreError, match="topic '/planner' has no field 'zz'"):
             fleet.find("MATCH (e:Ego) WHERE topic('/planner').zz > 1").rows()
 
