@@ -22,6 +22,8 @@ FIELDS: Mapping[str, Mapping[str, str]] = {
         "state": "VARCHAR",
         "active": "BOOLEAN",
         "values": "DOUBLE[]",
+        "raw": "BLOB",
+        "more.any": "JSON",
         "odd-name": "INTEGER",
     },
     "/imu": {f"linear_acceleration.{axis}": "DOUBLE" for axis in "xyz"},
@@ -137,6 +139,18 @@ def test_using_tolerance_is_the_default_of_a_statement() -> None:
             "field values of /planner has several values",
             "values",
             "one of them: values[0]",
+        ),
+        (
+            "topic('/planner').raw IS KNOWN",
+            "field raw of /planner has bytes, not one value",
+            "raw",
+            "in SQL, \"raw\" is a column of topic('/planner')",
+        ),
+        (
+            "topic('/planner').more.any = 'A'",
+            "field more.any of /planner has JSON values, not one value",
+            "more.any",
+            "in SQL, \"more.any\" is a column of topic('/planner')",
         ),
         (
             "topic('/planner', linear).state = 'A'",

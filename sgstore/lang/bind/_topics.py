@@ -6,6 +6,7 @@ import math
 import re
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.quoting import quoted
 from sgstore.errors import QueryNameError, TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang.bind._expressions import parameter
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from sgstore.lang.bind._symbols import Session, SymbolTable
     from sgstore.lang.topics import TopicError
 
+_WHOLE: Final = {"BLOB": "bytes", "JSON": "JSON values"}
 _TIME: Final = re.compile(r"(\d+(?:\.\d+)?)(ms|s|min)?", re.IGNORECASE)
 
 
@@ -37,10 +39,6 @@ def topic_field(e: s.TopicExpression, names: SymbolTable) -> b.FrameAttribute:
     if not isinstance(topic, str):
         session.refuse("topic() takes the name of a topic, a text", e.topic.span)
     topic, path, kind = _of_recordings(topic, _dotted(e.path), e, session)
-    if kind is Type.list:
-        session.refuse(
-            f"field {path} of {topic} has several values", e.path_span, f"one of them: {path}[0]"
-        )
     if e.rule == "linear" and kind not in {Type.number, Type.open}:
         session.refuse(
             f"only numbers can be interpolated, and {path} is a {kind.value}",
@@ -81,6 +79,15 @@ def _of_recordings(
         if facts.refused:
             session.refuse(f"{error.reason}: {error.hint}", e.topic.span)
         _refuse(error, e.path_span, session)
+    if field.type is Type.list:
+        reason = f"field {field.name} of {facts.name} has several values"
+        hint = f"one of them: {field.name}[0]"
+        if not field.declared.endswith("]"):
+            reason = (
+                f"field {field.name} of {facts.name} has {_WHOLE[field.declared]}, not one value"
+            )
+            hint = f"in SQL, {quoted(field.name)} is a column of topic('{facts.name}')"
+        session.refuse(reason, e.path_span, hint)
     return facts.name, field.name, field.type
 
 
