@@ -289,7 +289,8 @@ class _RowStatement:
             _from_frames(select, relation)
         else:
             select.join(nested(relation, ":rows"), [])
-        select.distinct = self.result.distinct or self.result.framed
+        once = self.result.framed and not (wanted or self.query.stages or self.query.steps)
+        select.distinct = not once and (self.result.distinct or self.result.framed)
         if self.result.having is not None and not self.result.aggregated:
             select.where.append(self._text(self.result.having))
         if self.result.aggregated:
