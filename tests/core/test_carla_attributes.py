@@ -15,6 +15,8 @@ from sgstore.model.config import configured
 from sgstore.sgg import SceneGraphGenerator, map_of_graphs
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from sgstore.query import Store
 
 SIGN = element(
@@ -78,6 +80,40 @@ def test_markings_of_each_side_are_those_of_its_traffic(store: Store) -> None:
     assert marking(store, -2, "right") == (None, None, None, None)
     assert marking(store, 1, "left") == ("broken", "standard", None, True)
     assert marking(store, 1, "right") == ("solid", "yellow", 0.2, False)
+
+
+def test_waypoints_have_the_markings_beside_them(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "drive.mcap") as recorder:
+        recorder.map(TOWN)
+        recorder.ground_truth(0.0, [car(1, 40, -1.75)], host=1)
+    config = configured(lanes={"granularity": "waypoint", "spacing": 10.0})
+    ingest(tmp_path / "s.sgstore", [tmp_path / "drive.mcap"], config=config)
+    marked = sgstore.open(tmp_path / "s.sgstore")
+
+    def markings(side: str) -> dict[tuple[int, float], tuple[object, ...]]:
+        items = ", ".join(f"w.{side}_marking_{name}" for name in ASKED)
+        rows = marked.find(f"MATCH (w:Waypoint) RETURN DISTINCT w.x, w.y, {items}").rows()
+        lanes = {1.75: 1, -1.75: -1, -5.25: -2}
+        return {(lanes[round(y, 3)], round(x, 3)): tuple(of) for x, y, *of in rows}
+
+    left, right = markings("left"), markings("right")
+    # The middle line is solid up to 30 m, and broken from there.
+    solid, broken = ("solid", "standard", None, False), ("broken", "standard", None, True)
+    for number in (-1, 1):
+        own = {x: of for (lane, x), of in left.items() if lane == number}
+        assert own.items() >= {(x, solid if x < 30 else broken) for x in range(0, 90, 10)}
+    white = ("broken", "white", 0.12)
+    assert {of for (lane, _), of in right.items() if lane == -1} == {(*white, False)}
+    assert {of for (lane, _), of in left.items() if lane == -2} == {(*white, True)}
+    assert {of for (lane, _), of in right.items() if lane == -2} == {(None,) * 4}
+    graph = marked.file.graph("drive#0")
+    frame = sgstore.Frame(0, ego="1")
+    frame.add("1", "car", 40, -1.75, heading=0, length=4, width=2)
+    online = SceneGraphGenerator(read_map(TOWN, "town.xodr"), config).step(frame)
+    for one in (graph, online):
+        told = [a for a in one.nodes.values() if a["kind"] == "waypoint" and "@30" in a["name"]]
+        assert len(told) == 3
+        assert sum("left_marking_type" in about for about in told) == 3
 
 
 def test_signs_have_text_unit_and_size(store: Store) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -25,6 +25,10 @@ FIRST_LANE: Final = 1
 
 MOST: Final = 500_000
 """Greatest number of waypoints of a map: each frame stores the presence of each."""
+
+
+ROUNDING: Final = 1e-6
+"""Error of places along roads; m."""
 
 
 class Waypoints:
@@ -90,6 +94,7 @@ class Waypoints:
             stop_lines=no_signals,
             courses=LaneCourses.none(),
             broad_lines=MapPlaces.none(),
+            own={**road_map.own, **_markings(road_map, points)},
             variant=f" {road_map.digest} waypoints {self._spacing} {sorted(set(points.lane.tolist()))}",
         )
 
@@ -155,6 +160,20 @@ class Waypoints:
         count = np.where(last < 0, 0, high - low + 1).astype(np.int64)
         hit, column = spread((self._first[lane] + low).astype(np.int64), count)
         return row[hit], -1 - column
+
+
+def _markings(road_map: RoadMap, points: LanePoints) -> dict[int, dict[str, Any]]:
+    """Return the attributes of the markings beside waypoints, by node row."""
+    found: dict[int, dict[str, Any]] = {}
+    for row, sides in road_map.marking_parts.items():
+        low, high = np.searchsorted(points.lane, (row - FIRST_LANE, row - FIRST_LANE + 1)).tolist()
+        for parts in sides:
+            starts = [start for start, _ in parts]
+            last = np.searchsorted(starts, points.s[low:high] + ROUNDING, side="right") - 1
+            for point, part in enumerate(last.tolist(), start=low):
+                if part >= 0:
+                    found.setdefault(len(road_map.nodes) + point, {}).update(parts[part][1])
+    return found
 
 
 _KNOWN: WeakKeyDictionary[RoadMap, tuple[LaneSettings, Waypoints]] = WeakKeyDictionary()

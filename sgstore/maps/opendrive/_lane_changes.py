@@ -12,7 +12,7 @@ import math
 from collections import Counter
 from itertools import pairwise
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -126,10 +126,18 @@ def _records(document: Document, name: str) -> dict[int, list[tuple[float, str, 
     return records
 
 
-def read_markings(document: Document, lanes: LaneTable) -> dict[int, dict[str, Any]]:
+Attributes: TypeAlias = dict[str, Any]
+MarkingParts: TypeAlias = dict[int, list[list[tuple[float, Attributes]]]]
+"""Row of a lane → for each marked side, the markings in order: start along the road (m), and attributes."""
+
+
+def read_markings(
+    document: Document, lanes: LaneTable
+) -> tuple[dict[int, Attributes], MarkingParts]:
     """Return the markings of lanes as attributes of their nodes: type, colour, width, permitted lane change.
 
-    Left and right are those of traffic on the lane. Of several markings along a border, the longest one counts.
+    Left and right are those of traffic on the lane. Of several markings along a border, the longest one counts
+    for the lane. The second result has all of them.
     """
     element = "road/laneSection/lane/roadMark"
     table = document[element]
@@ -154,27 +162,43 @@ def read_markings(document: Document, lanes: LaneTable) -> dict[int, dict[str, A
         if math.isfinite(offset):
             told = (offset, (kind, color, change, width if 0 <= width <= _WIDEST else -1.0))
             marks.setdefault((section, ident), []).append(told)
-    found: dict[int, dict[str, Any]] = {}
+    found: dict[int, Attributes] = {}
+    parts: MarkingParts = {}
     for (section, ident), records in marks.items():
-        length = float(lanes.sections.end[section] - lanes.sections.start[section])
+        first, last = float(lanes.sections.start[section]), float(lanes.sections.end[section])
         records.sort(key=itemgetter(0))
-        cuts = [min(max(offset, 0.0), length) for offset, _ in records] + [length]
+        cuts = [min(max(first + offset, first), last) for offset, _ in records] + [last]
         totals: Counter[tuple[str, str, str, float]] = Counter()
         for (_, told), (start, end) in zip(records, pairwise(cuts), strict=True):
             totals[told] += end - start  # pyright: ignore[reportArgumentType]
-        kind, color, change, width = totals.most_common(1)[0][0]
+        longest = totals.most_common(1)[0][0]
         outer = (1, -1) if ident == 0 else (ident, ident + (1 if ident > 0 else -1))
         for row in (row_of[section, one] for one in outer if (section, one) in row_of):
-            # Outside is right for a lane on the right of its road's direction.
-            forward = bool(lanes.forward[row])
-            is_left = (lanes.ident[row] == ident) == ((lanes.ident[row] < 0) != forward)
-            side = "left" if is_left else "right"
-            allowed = permitted(kind, change, ident)[bool(is_left != forward)]
-            about = {"type": kind, "color": color, "change": allowed, "width": width}
-            found.setdefault(FIRST_LANE + row, {}).update(
-                {f"{side}_marking_{n}": v for n, v in about.items() if v != -1.0}
+            side = _beside(lanes, row, ident)
+            found.setdefault(FIRST_LANE + row, {}).update(side(longest))
+            starts = zip(cuts, records, strict=False)
+            parts.setdefault(FIRST_LANE + row, []).append(
+                [(start, side(told)) for start, (_, told) in starts if start < last]
             )
-    return found
+    return found, parts
+
+
+def _beside(
+    lanes: LaneTable, row: int, ident: int
+) -> Callable[[tuple[str, str, str, float]], Attributes]:
+    """Return the attributes of a lane by a marking at the border outside lane ``ident``."""
+    # Outside is right for a lane on the right of its road's direction.
+    forward = bool(lanes.forward[row])
+    is_left = (lanes.ident[row] == ident) == ((lanes.ident[row] < 0) != forward)
+    side = "left" if is_left else "right"
+
+    def attributes(marking: tuple[str, str, str, float]) -> Attributes:
+        kind, color, change, width = marking
+        allowed = permitted(kind, change, ident)[bool(is_left != forward)]
+        about = {"type": kind, "color": color, "change": allowed, "width": width}
+        return {f"{side}_marking_{n}": v for n, v in about.items() if v != -1.0}
+
+    return attributes
 
 
 _WIDEST: Final = 10.0

@@ -165,6 +165,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
     signal, lane, s = signals.places(first_signal)
     header_name = next(iter(document["header"].texts("name")), "").strip()
     every = ribbons.followed_by(spaces)
+    markings, marking_parts = read_markings(document, lanes)
     return RoadMap(
         name=name or header_name or _short_digest(text),
         text=text,
@@ -181,7 +182,8 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         stop_lines=signals.stop_lines(first_signal),
         courses=LaneCourses.of(every, heights(document, lanes, every)),
         broad_lines=read_broad_lines(document, lanes, ribbons),
-        own=read_markings(document, lanes) | dict(enumerate(signals.about, first_signal)),
+        own=markings | dict(enumerate(signals.about, first_signal)),
+        marking_parts=marking_parts,
         variant=signals.told,
     )
 

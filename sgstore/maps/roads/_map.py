@@ -306,6 +306,8 @@ class RoadMap:
         Broad markings at the sides of lanes.
     own : mapping of int to mapping
         Row of a lane or signal → its attributes without a column: markings, and text and size of a sign.
+    marking_parts : mapping of int to sequence of sequence of tuple
+        Row of a lane → for each marked side, the markings in order: start along the road (m), and attributes.
     variant : str
         Difference from the map that the text describes.
     """
@@ -330,6 +332,9 @@ class RoadMap:
     courses: LaneCourses = field(default_factory=LaneCourses.none)
     broad_lines: MapPlaces = field(default_factory=MapPlaces.none)
     own: Mapping[int, Mapping[str, Any]] = field(default_factory=dict[int, "Mapping[str, Any]"])
+    marking_parts: Mapping[int, Sequence[Sequence[tuple[float, Mapping[str, Any]]]]] = field(
+        default_factory=dict[int, "Sequence[Sequence[tuple[float, Mapping[str, Any]]]]"]
+    )
     variant: str = ""
 
     def __post_init__(self) -> None:
@@ -599,12 +604,19 @@ class RoadMap:
         signals = signal_places(self.ribbons, names["junction"], what, applies, self.stops)
         crossed = crosswalk_places(self.ribbons, crosswalks, shapes, z, STOREY)
         table = chained([*wholes, crossed, signals])
-        # Attributes are JSON texts, each at the first place of its part.
+        # Attributes are JSON texts, each at the first place of its part; of a waypoint, at that of its lane.
         first = dict(zip(table.part[::-1].tolist(), range(len(table))[::-1], strict=True))
+        inside = self.edges.relation == RELATION_CODE["isIn"]
+        ends = zip(self.edges.src[inside].tolist(), self.edges.dst[inside].tolist(), strict=True)
+        first |= {
+            -1 - point: first[-1 - lane]
+            for point, lane in ends
+            if what[-1 - point] == "waypoint" and -1 - point in self.own
+        }
         parts = [part for part, told in self.own.items() if told and part in first]
         about = taken(table, np.array([first[part] for part in parts], np.int64))
         texts = (json.dumps(self.own[part], ensure_ascii=False, sort_keys=True) for part in parts)
-        about = replace(about, what=tuple(texts))
+        about = replace(about, part=np.array(parts, np.int64), what=tuple(texts))
         table = about if is_merged else chained([table, about])
         return MapPlaces.of(table.part, table.what, table.lane, table.start, table.end)
 
