@@ -187,7 +187,7 @@ oracle: $(VENV)/.dev
 	$(TOOL) tests/reference/oracle_constructs.py 5000
 	$(TOOL) tests/reference/oracle_over_time.py 1000
 	$(TOOL) tests/reference/oracle_steps.py 10000
-	$(TOOL) tests/reference/oracle_watched.py $${SGSTORE_DATA:-../shared/data}/traces
+	$(TOOL) tests/reference/oracle_watched.py $(addprefix $${SGSTORE_DATA:-../shared/data}/,traces real)
 	$(TOOL) tests/reference/oracle_turned.py $(addprefix $${SGSTORE_DATA:-../shared/data}/traces/,carla/Town01.carla.mcap esmini/swarm_Town04.mcap sumo/Town10HD_sumo_osi.mcap)
 	SGSTORE_LONG=1 $(BIN)/python -m pytest -m long tests/core tests/edges
 	SGSTORE_LONG=1 $(BIN)/python -m pytest tests/core/test_geometry.py
