@@ -4,7 +4,7 @@
 
     python tools/json_shapes.py
 
-Raise ``VERSION`` if a key vanishes or changes its type. New keys need no new version.
+Raise ``JSON_VERSION`` if a key vanishes or changes its type. New keys need no new version.
 """
 
 from __future__ import annotations
@@ -19,15 +19,13 @@ from pathlib import Path
 
 PAGE = Path(__file__).parents[1] / "docs" / "json_shapes.json"
 
-VERSION = 1
-"""Version of the shapes."""
-
 TYPES = {bool: "boolean", int: "number", float: "number", str: "text", list: "list", dict: "object"}
 
 
 def shape_of(text: str) -> dict[str, str]:
     """Keys and types of a JSON document, or of the objects of a list; ``null`` only if always."""
     told = json.loads(text)
+    assert isinstance(told, list) or "json_version" in told
     found: dict[str, set[str]] = {}
     for row in told if isinstance(told, list) else [told]:
         for key, value in row.items():
@@ -54,10 +52,12 @@ def main() -> int:
     sys.path[:0] = [str(PAGE.parents[1] / "tests" / part) for part in ("edges", "worlds")]
     from test_cli_shapes import JSON_LINES, small_files
 
+    from sgstore.apps.cli._output import JSON_VERSION
+
     with tempfile.TemporaryDirectory() as folder:
         found = shapes(JSON_LINES, small_files(Path(folder)))
         shutil.rmtree(folder, ignore_errors=True)
-    text = json.dumps({"version": VERSION, "verbs": found}, indent=1, ensure_ascii=False)
+    text = json.dumps({"version": JSON_VERSION, "verbs": found}, indent=1, ensure_ascii=False)
     PAGE.write_text(f"{text}\n", encoding="utf-8")
     return 0
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 import typer
-from json_shapes import PAGE, VERSION, shapes
+from json_shapes import PAGE, shape_of, shapes
 from verb_lines import LINES, verbs
 
 from sgstore.apps.cli import _application, app, run
+from sgstore.apps.cli._output import JSON_VERSION, Format, write_document
 from sgstore.collection import pack
 
 if TYPE_CHECKING:
@@ -89,7 +90,19 @@ def test_the_json_of_each_verb_has_its_shape(
 
     found = shapes(lines, small_files(tmp_path))
 
-    assert known["version"] == VERSION
+    assert known["version"] == JSON_VERSION
     expected = {verb: one for verb, one in known["verbs"].items() if verb in lines}
     assert found == expected, "run 'python tools/json_shapes.py'"
     assert len(found) >= 30
+    objects = {verb for verb, keys in found.items() if "json_version" in keys}
+    assert objects == {"why-not", "patterns show"}
+
+
+def test_a_document_has_the_version_of_its_shape(capsys: pytest.CaptureFixture[str]) -> None:
+    write_document({"version": "0.2"}, Format.json)
+    text = capsys.readouterr().out
+
+    assert json.loads(text) == {"json_version": JSON_VERSION, "version": "0.2"}
+    assert shape_of(text) == {"json_version": "number", "version": "text"}
+    with pytest.raises(AssertionError):
+        shape_of('{"version": "0.2"}')

@@ -178,6 +178,10 @@ def write_rows(
         return _write_text(columns, rows, form, stream)
 
 
+JSON_VERSION: Final = 1
+"""Version of the keys and types of the JSON of all verbs, as in ``docs/json_shapes.json``."""
+
+
 def write_document(values: dict[str, Any], form: Format) -> None:
     """Print one object on stdout: one value per line as text, or one JSON document."""
     if form is Format.table:
@@ -185,7 +189,7 @@ def write_document(values: dict[str, Any], form: Format) -> None:
         width = max(len(name) for name, _ in lines)
         sys.stdout.writelines(f"{name.ljust(width)}{GAP}{value}\n" for name, value in lines)
         return
-    sys.stdout.write(f"{json_text(_json_object(values), 2)}\n")
+    sys.stdout.write(f"{json_text({'json_version': JSON_VERSION} | _json_object(values), 2)}\n")
 
 
 @dataclass(slots=True)
