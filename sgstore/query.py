@@ -1481,7 +1481,7 @@ class Store(StoreVerbs):
     def why_not(
         self, frame: int | str | FrameRef, text: str, /, **parameters: object
     ) -> WhyNot | WhyNotSteps:
-        """Explain why a pattern does not match a frame: the first failing part, and the nearest binding.
+        """Explain why a pattern does not match a frame: the first condition that fails, and by how much.
 
         Parameters
         ----------

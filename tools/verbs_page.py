@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 from sgstore.base.docstrings import split_docstring
-from sgstore.query import StoreVerbs
+from sgstore.query import Store, StoreVerbs
 
 PAGE = Path(__file__).parents[1] / "docs" / "commands.md"
 
@@ -17,25 +17,36 @@ WORDS = {"form": "as", "labels": "label", "mounts": "mount", "channels": "channe
     "manoeuvres": "manoeuvre",
     "traces": "trace",
     "parameters": "param",
+    "timeout_s": "timeout",
+    "max_rows": "limit",
 }
 """Names in Python → words of the command line: a list is a repeated option, and ``as`` is a keyword."""
+
+
+def plain(text: str) -> str:
+    """Return a sentence of a docstring with the quotes of Markdown."""
+    return re.sub(r":\w+:`~?", "`", text).replace("``", "`")
 
 
 def table() -> str:
     """The section with one table for each verb: option, name in Python, default and meaning."""
     lines = [f"{TITLE}\n", "`store.VERB(…)` takes the options of `sgstore VERB`.\n"]
-    for verb, method in vars(StoreVerbs).items():
+    others = {verb: getattr(Store, verb) for verb in ("find", "why_not", "sql", "check")}
+    for verb, method in {**others, **vars(StoreVerbs)}.items():
         if verb.startswith("_"):
             continue
         about = split_docstring(method)[1]
-        lines += [f"**{verb}**: {(method.__doc__ or '').partition(chr(10))[0]}\n"]
+        first = plain((method.__doc__ or "").partition("\n")[0])
+        lines += [f"**{verb.replace('_', '-')}**: {first}\n"]
         lines += ["| Option | Python | Default | Meaning |", "|---|---|---|---|"]
         for one in inspect.signature(method).parameters.values():
-            if one.kind is one.KEYWORD_ONLY:
+            if one.name in about and (one.kind is one.KEYWORD_ONLY or method in others.values()):
                 word = WORDS.get(one.name, one.name).replace("_", "-")
-                default = "" if one.default in (None, (), "", False) else f"`{one.default}`"
-                text = about[one.name][1].replace("|", "\\|")
-                lines.append(f"| `--{word}` | `{one.name}` | {default} | {text} |")
+                option = word.upper() if one.kind is one.POSITIONAL_ONLY else f"--{word}"
+                free = one.default in (None, (), "", False, one.empty)
+                default = "" if free else f"`{one.default}`"
+                text = plain(about[one.name][1]).replace("|", "\\|")
+                lines.append(f"| `{option}` | `{one.name}` | {default} | {text} |")
         lines.append("")
     return "\n".join(lines).rstrip() + "\n"
 

@@ -61,6 +61,9 @@ START_S: Final = 120.0
 READ_S: Final = 60.0
 """Additional time for each table that it reads first; s."""
 
+REDUCE: Final = "reduce the query: fewer variables, a narrower WHERE, one trace"
+"""Remedy for a query that needs too much time or memory."""
+
 _TABLE_BYTES: Final = 4 << 30
 """Largest file that it may write, only while it reads tables, in its own folder; bytes."""
 
@@ -320,7 +323,7 @@ class Sandbox:
         except queue.Empty:
             self._abandon()
             told = self._timeout_s if question is None else timeout_s  # later parts have less time
-            raise SqlError(f"stopped after {told:g} s") from None
+            raise SqlError(f"stopped after {told:g} s; {REDUCE}, or raise --timeout") from None
         except BaseException:
             self._kill()
             raise
@@ -332,7 +335,7 @@ class Sandbox:
             raise SqlError("stopped")
         if len(line) > self._max_bytes:
             raise SqlError(f"stopped: the answer is longer than {self._max_bytes} bytes")
-        raise SqlError("stopped: it took more memory than is allowed")
+        raise SqlError(f"stopped: it took more memory than is allowed; {REDUCE}")
 
     def _abandon(self) -> None:
         """Kill the sandbox process, and remove its folder in the background."""
@@ -624,7 +627,7 @@ def plain(value: Any) -> Any:
 
 def _refusal(error: SgstoreError) -> dict[str, Any]:
     if not isinstance(error, QueryError) and _spilled(error):
-        error = SqlError("stopped: it took more memory than is allowed")
+        error = SqlError(f"stopped: it took more memory than is allowed; {REDUCE}")
     return plain_error(error)
 
 

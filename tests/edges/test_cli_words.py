@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import re
 from collections import defaultdict
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
 from verb_lines import verbs
 from verbs_page import PAGE, table
 
-from sgstore.apps.assistant import StoreTools
+from sgstore.apps.assistant import StoreTools, server_of
 from sgstore.apps.cli import app, run
 from sgstore.apps.cli._options import OLD_WORDS, library_help
 from sgstore.base.docstrings import split_docstring
-from sgstore.query import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from sgstore.query import Store, StoreVerbs
 
 COMMANDS = verbs(typer.main.get_command(app))
 PATHS = [
@@ -132,6 +131,39 @@ def test_tools_of_assistants_have_the_same_words() -> None:
             if one.name in known and one.name != "self" and (name, one.name) not in differing:
                 free = inspect.Parameter.empty in (one.default, known[one.name].default)
                 assert free or seconds(one.default) == seconds(known[one.name].default), name
+
+
+def test_tools_of_assistants_have_the_same_sentences() -> None:
+    """The first sentence is that of the command or method, and arguments with one name have one sentence."""
+    of = {"export_clips": "export", "coverage_missing": "coverage"}
+    same = 0
+    own = {("coverage_missing", "by"), ("coverage_missing", "query"), ("export_clips", "query")}
+    own |= {("export_clips", "parameters")}  # a query of one store, and values as an object
+    with_server = {tool.name: tool for tool in asyncio.run(_tools())}
+    for name in ("find", "why_not", "sql", "check", "timeline", "show", *of):
+        word = of.get(name, name)
+        method, tool = getattr(Store, word), with_server[name]
+        sentences = {split_docstring(method)[0].partition(". ")[0].strip(".") + "."}
+        sentences |= {
+            (one.help or "").splitlines()[0]
+            for path, one in COMMANDS.items()
+            if path.split()[0] == word.replace("_", "-")
+        }
+        first = tool.description.splitlines()[0]
+        assert first in sentences or name == "coverage_missing", (first, sentences)
+        about = split_docstring(method)[1] if hasattr(StoreVerbs, word) else {}
+        for argument, schema in tool.input_schema["properties"].items():
+            if argument in about and (name, argument) not in own:
+                assert schema["description"] == about[argument][1], (name, argument)
+                same += 1
+    assert same >= 8
+
+
+async def _tools() -> Any:
+    with StoreTools.__new__(StoreTools) as tools:
+        tools.close = lambda: None  # type: ignore[method-assign]
+        vars(tools)["_write_to"] = Path()
+        return await server_of(tools).list_tools()
 
 
 def test_the_page_of_commands_has_the_table() -> None:

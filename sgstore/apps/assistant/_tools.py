@@ -24,6 +24,7 @@ from pydantic import Field
 
 from sgstore.apps.assistant._vocabulary import Topic, topic_text
 from sgstore.apps.sandbox import TIMEOUT_S, Sandbox
+from sgstore.apps.verbs import seconds
 from sgstore.base.display import cell
 from sgstore.base.json_text import finite
 from sgstore.errors import ExportError, StoreError
@@ -61,7 +62,7 @@ Pattern = Annotated[
 Values = Annotated[
     dict[str, Any] | None, Field(description="values of $name in it, or of the named pattern")
 ]
-Limit = Annotated[int, Field(ge=1, description="rows at most")]
+Limit = Annotated[int, Field(ge=1, description="Maximum number of results.")]
 
 
 @dataclass(frozen=True)
@@ -245,7 +246,7 @@ class StoreTools:
         limit: Limit = ROWS,
         parameters: Values = None,
     ) -> ToolAnswer:
-        """Find scenes by a pattern of their scene graphs.
+        """Find frames whose scene graphs match a pattern.
 
         Parameters
         ----------
@@ -256,7 +257,7 @@ class StoreTools:
         return self._rows("find", query=query, form=form, limit=limit, parameters=parameters or {})
 
     def why_not(self, frame: FrameName, query: Pattern, parameters: Values = None) -> ToolAnswer:
-        """Explain why a pattern does not match a frame: the first failing condition, and its margin."""
+        """Explain why a pattern does not match a frame: the first condition that fails, and by how much."""
         reply = self._ask("why_not", frame=frame, query=query, parameters=parameters or {})
         return ToolAnswer(reply["text"], finite(reply))
 
@@ -265,7 +266,9 @@ class StoreTools:
         statement: str,
         limit: Limit = ROWS,
     ) -> ToolAnswer:
-        """Run a read-only SQL statement of DuckDB; vocabulary 'views' lists tables and columns.
+        """Run a read-only SQL statement on the views of the store.
+
+        The dialect is DuckDB's; vocabulary 'views' lists the views with their columns.
 
         Parameters
         ----------
@@ -280,7 +283,10 @@ class StoreTools:
         limit: Limit = ROWS,
         parameters: Values = None,
     ) -> ToolAnswer:
-        """Check a rule over time: for each trace true, false or unknown, and each violation.
+        """Check properties that must be true in every trace.
+
+        A trace has the verdict true, false or unknown. After the first violation, ALWAYS p is violated up to
+        the end of the trace: find NOT p with form intervals lists the times.
 
         Parameters
         ----------
@@ -297,14 +303,12 @@ class StoreTools:
         traces: list[str] | None = None,
         picture: bool = False,
     ) -> ToolAnswer:
-        """Show over time when patterns match and rules are violated: one lane per entity.
+        """Plot matches and rule violations over time, one lane per entity, for each trace that has any.
 
         Parameters
         ----------
         queries
             each MATCH …, CHECK …, or a name of the library
-        traces
-            only these
         picture
             as a picture, too
         """
@@ -332,7 +336,7 @@ class StoreTools:
         graph: bool = False,
         radius: Annotated[float | None, Field(gt=0)] = None,
     ) -> ToolAnswer:
-        """Draw a frame from above, the ego in the middle.
+        """Draw a frame as a bird's-eye view, next to the camera picture.
 
         Parameters
         ----------
@@ -424,12 +428,6 @@ class StoreTools:
             MATCH … of the frames to compare with; empty: all frames
         spec
             MATCH … RETURN a, b: each combination of values is a cell
-        abstraction
-            without spec: of features
-        k
-            features in a combination
-        of_ego
-            only features of the ego
         """
         reply = self._ask(
             "missing",
@@ -449,27 +447,21 @@ class StoreTools:
         self,
         query: Pattern,
         name: str,
-        before: Annotated[float, Field(ge=0, le=600)] = 2.0,
-        after: Annotated[float, Field(ge=0, le=600)] = 2.0,
+        before: str | float = "2s",
+        after: str | float = "2s",
         form: str = "mcap",
         with_graph: bool = False,
         limit: Annotated[int, Field(ge=1)] = ROWS,
         parameters: Values = None,
     ) -> ToolAnswer:
-        """Export the matches of a pattern as clips, into the folder of the user.
+        """Cut matches out of their recordings, as clips with the original messages.
+
+        The files are in a new folder inside the folder of the user.
 
         Parameters
         ----------
         name
             of a new folder for them: letters, digits, - _ .
-        before
-            before each match; s
-        after
-            after each match; s
-        form
-            mcap, parquet, frames, nx, pyg, s3c, xosc, rrd
-        with_graph
-            mcap: with the scene graphs
         limit
             clips at most
         """
@@ -481,11 +473,14 @@ class StoreTools:
         if not _NAME.fullmatch(name):
             raise ExportError(f"{name!r} is not a folder name; expected such as 'cut-ins_1'")
         exporter_named(form)  # before the search starts
+        around = seconds(before, "before"), seconds(after, "after")
+        if not all(0 <= one <= MOST_AROUND_S for one in around):
+            raise ExportError(f"before and after are 0 to {MOST_AROUND_S} s")
         reply = self._ask(
             "clips",
             query=query,
-            before=before,
-            after=after,
+            before=around[0],
+            after=around[1],
             limit=limit,
             parameters=parameters or {},
         )
@@ -505,6 +500,9 @@ class StoreTools:
 
 TRACES_DRAWN: Final = 12
 """Greatest number of traces in one timeline."""
+
+MOST_AROUND_S: Final = 600
+"""Longest time before and after a match in a clip; s."""
 
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 
