@@ -134,6 +134,11 @@ class Maps:
     signs : Signs
         Interpretation of their signals.
 
+    Attributes
+    ----------
+    folder : Path or None
+        The folder of maps, if one is given.
+
     Raises
     ------
     MapError
@@ -145,9 +150,14 @@ class Maps:
         self._read: dict[str, RoadMap | MapError] = {}
         if given is not None and (given / AUTOWARE_MAP).is_file():
             given = given / AUTOWARE_MAP
-        self._folder = given if given is not None and given.is_dir() else None
-        one_file = given is not None and not self._folder
+        self.folder = given if given is not None and given.is_dir() else None
+        one_file = given is not None and not self.folder
         self._given = read_map_file(given, signs) if given is not None and one_file else None
+
+    @property
+    def digest(self) -> str:
+        """Digest of the map file of the caller; empty without a file."""
+        return self._given.digest if self._given is not None else ""
 
     def of(self, info: TraceInfo) -> tuple[RoadMap | None, list[str]]:
         """Return the road map for a recording, and warnings about the choice.
@@ -184,16 +194,16 @@ class Maps:
 
     def _named(self, name: str, warnings: list[str]) -> RoadMap | None:
         """Find the map file for a map name in a folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
-        if self._folder is None:
+        if self.folder is None:
             return None
         stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)
         stem = stem.removesuffix(".xodr").removesuffix(".osm")
-        path = self._folder / f"{stem}.xodr"
+        path = self.folder / f"{stem}.xodr"
         if not path.is_file():
             path = path.with_suffix(".osm")
         if not stem or not path.is_file():
             wanted = (
-                f"no map {stem!r} in {self._folder}" if stem else "it does not name its road map"
+                f"no map {stem!r} in {self.folder}" if stem else "it does not name its road map"
             )
             warnings.append(wanted)
             return None

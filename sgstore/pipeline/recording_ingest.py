@@ -8,12 +8,14 @@ the job, each further one a recording. Its replies are progress and outcomes.
 
 from __future__ import annotations
 
+import json
 import time
 import traceback
 from array import array
 from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -350,26 +352,56 @@ class SegmentReader:
         start = time.perf_counter()
         views: list[_EgoView] = []
         failed: SgstoreError | None = None
+        present: TraceOutcome | None = None
         try:
             check_name(path)
             with near(path, folder / "copy"):
-                self._read(path, folder, views)
+                present = self._present(path)
+                if present is None:
+                    self._read(path, folder, views)
         except Exception as error:  # noqa: BLE001  the other recordings must still be read
             failed = failure(error, path)
             if failed is not error:
                 _log.debug("%s: %s", path, traceback.format_exc())
-        found = [(view.outcome, view.sealed) for view in views] or [(TraceOutcome(path), None)]
+        found = [(view.outcome, view.sealed) for view in views]
+        found = found or [(present or TraceOutcome(path), None)]
         for outcome, _ in found:
             if outcome.status == "failed" and outcome.error is None:
                 outcome.error = failed
             outcome.seconds = time.perf_counter() - start
         return found
 
+    def _store(self) -> StoreFile | None:
+        """Return the store that can have the traces already; ``None`` means that all are read."""
+        if self._file is None and self._job.store.exists():
+            self._file = StoreFile(self._job.store)
+        return None if self._job.force else self._file
+
+    def _request(self) -> str:
+        """Return all that decides which trace a recording gives, as JSON; empty if more than that decides.
+
+        A list of egos gives several traces. A folder of maps and a file of a mapping can change.
+        """
+        part, config, maps = self._job.part, self._job.config, self._maps
+        if config.egos or config.mapping or maps.folder is not None:
+            return ""
+        parts = [part.since, part.until, part.rate]
+        return json.dumps([version("sgstore"), config.as_dict(), maps.digest, parts])
+
+    def _present(self, path: Path) -> TraceOutcome | None:
+        """Return the result for a recording whose trace the store has, without opening the recording.
+
+        ``None`` means not known: the file has changed, or the trace was read by another request.
+        """
+        store, request = self._store(), self._request()
+        stored = store.requested(path, request) if store and request else None
+        if stored is None:
+            return None
+        scope = stored.report.get("scope", {})
+        return TraceOutcome(path, "present", stored.name, stored.ego, stored.frames, scope=scope)
+
     def _read(self, path: Path, folder: Path, views: list[_EgoView]) -> None:
-        job, config = self._job, self._job.config
-        if self._file is None and job.store.exists():
-            self._file = StoreFile(job.store)
-        store = None if job.force else self._file
+        job, config, store = self._job, self._job.config, self._store()
         digest = store.known_digest(path) if store else ""  # A known digest saves the hashing.
         with open_trace(path, ego=config.ego, digest=digest, mapping=config.mapping) as trace:
             trace.noise = config.noise
@@ -561,7 +593,8 @@ class SegmentReader:
             outcome.losses += [*report.losses, *one.crowds.losses(self._job.config)]
             kept = replace(report, warnings=outcome.warnings, losses=outcome.losses, about_ego=[])
             outcome.scope = segment.scope.get("scope", {})
-            segment.seal(kept, told, parked)
+            request = segment.identity.request(self._request())
+            segment.seal(kept, told | {"request": request} if request else told, parked)
             outcome.status = "sealed"
 
     def _keep_topics(self, trace: MessageTrace, segments: Sequence[Segment]) -> list[Loss]:

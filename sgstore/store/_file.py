@@ -30,6 +30,7 @@ from sgstore.store._traces import (
     already_stored,
     frame_named,
     located,
+    name_of_request,
     place_below,
     stored_name,
     stored_traces,
@@ -673,6 +674,13 @@ class StoreFile:
         with self.access.reading() as connection:
             found = connection.execute(sql, [*places, *mark]).fetchone()
         return str(found[0]) if found and found[0] else ""
+
+    def requested(self, path: Path, request: str) -> StoredTrace | None:
+        """Return the trace of a recording whose file looks unchanged, if an equal request gave the trace."""
+        digest = self.known_digest(path)
+        with self.access.reading() as connection:
+            name = name_of_request(connection, digest, request) if digest else None
+        return None if name is None else self.trace(name)
 
     def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:
         """Delete traces in one transaction, with the settings and maps that no other trace uses.

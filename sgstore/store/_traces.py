@@ -100,6 +100,13 @@ class Identity:
         """Ids of the recording, settings and map of a trace: column name → id."""
         return {f"{table}_id": id_of(digest) for table, digest in self.shared.items()}
 
+    def request(self, text: str) -> str:
+        """Return a digest of the request that the trace answers, with its settings and map.
+
+        The report of the trace keeps it. Without a text, it is empty.
+        """
+        return _request_digest(text, self.settings_digest, self.map_digest)
+
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Identity:
         """Restore the identity of a trace from a dict of plain values."""
@@ -394,6 +401,27 @@ def stored_name(
             " store of its own"
         )
     return name
+
+
+def _request_digest(text: str, settings_digest: str, map_digest: str) -> str:
+    parts = "\0".join((text, settings_digest, map_digest))
+    return hashlib.sha256(parts.encode()).hexdigest() if text else ""
+
+
+def name_of_request(connection: DuckDBPyConnection, digest: str, text: str) -> str | None:
+    """Return the name of the trace of a recording that was read by an equal request.
+
+    A trace whose settings or map have changed since then does not count. ``None`` means no such trace.
+    """
+    sql = """
+        SELECT t.name, json_extract_string(t.report, '$.request'), c.digest, coalesce(m.digest, '')
+        FROM recording r JOIN trace t ON t.recording_id = r.recording_id
+             JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map_id = t.map_id
+        WHERE r.digest = ?"""
+    for name, request, *digests in connection.execute(sql, [digest]).fetchall():
+        if request is not None and request == _request_digest(text, *digests):
+            return str(name)
+    return None
 
 
 def already_stored(

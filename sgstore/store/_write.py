@@ -107,7 +107,7 @@ class Segment:
     ) -> None:
         self._store = store
         self._info = info
-        self._identity = identity
+        self.identity = identity
         self._answers = answers
         self._road_map = road_map = on_map.road_map
         self._channel_ids = np.array([c.id for c in info.channels], np.int64)
@@ -180,7 +180,7 @@ class Segment:
         self._uneven |= graph.uneven
         self._kinds.learn(frames.entities)
         self._origin = self._origin or origin_of(frames)
-        self._insert_graph(graph, self._identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
+        self._insert_graph(graph, self.identity.trace_id, self._origin or Origin(0.0, 0.0, 0.0))
 
     def name_frames(self, seq: Ints, graphs: list[str], places: Ints, images: Ints) -> None:
         """Store the graph names from an imported file for the frames of the trace.
@@ -193,7 +193,7 @@ class Segment:
             Row or line of each graph in the file, and number of source frames that it covers.
         """
         columns = {
-            "bucket": frame_ids.trace_bucket(self._identity.trace_id, seq),
+            "bucket": frame_ids.trace_bucket(self.identity.trace_id, seq),
             "bit": seq % BUCKET_FRAMES,
             "graph": texts(graphs),
             "place": places,
@@ -216,7 +216,7 @@ class Segment:
             frame, src, relation, dst, name, value = zip(*own, strict=True)
             of_node = np.array(relation) < 0
             columns: Columns = {
-                "frame_id": frame_ids.frame_ids(self._identity.trace_id, seq)[list(frame)],
+                "frame_id": frame_ids.frame_ids(self.identity.trace_id, seq)[list(frame)],
                 "node_id": np.array(src, np.int64),
                 "relation": packing.unless(np.array(relation, np.int64), of_node),
                 "dst": packing.unless(np.array(dst, np.int64), of_node),
@@ -229,7 +229,7 @@ class Segment:
     def topics(self, reading: TopicReading) -> Generator[TopicWriter]:
         """Context manager with a writer of the messages of topics. All frames must have been added."""
         time_ns, log_time_ns = np.concatenate(self._times, axis=1)
-        identity = self._identity
+        identity = self.identity
         clock = FrameClock.of_trace(identity.trace_id, time_ns, log_time_ns)
         bounded = (identity.since, identity.until) != (None, None)
         with topic_scratch(spill_folder()) as connection:
@@ -262,7 +262,7 @@ class Segment:
         """
         if not self._next_seq:
             raise ValueError("a trace without frames")
-        staging, identity = self._staging, self._identity
+        staging, identity = self._staging, self.identity
         time_ns, log_time_ns = np.concatenate(self._times, axis=1)
         staging.insert("event", self._owned(self._happenings.rest()))
         for name, known in zip(("parked", "world_parked"), parked, strict=False):
@@ -309,7 +309,7 @@ class Segment:
 
         An import excludes none.
         """
-        counts, settings = self._left_out, json.loads(self._identity.settings)
+        counts, settings = self._left_out, json.loads(self.identity.settings)
         if not counts.states:
             return {}
         around = settings["range"]
@@ -331,7 +331,7 @@ class Segment:
 
     def _insert_payloads(self, columns: Columns) -> None:
         seq = columns.pop("seq")
-        bucket = frame_ids.trace_bucket(self._identity.trace_id, seq)
+        bucket = frame_ids.trace_bucket(self.identity.trace_id, seq)
         places = {"bucket": bucket, "bit": seq % BUCKET_FRAMES, **columns}
         self._staging.insert("payload", self._owned(places))
         self._staging.write("payload")
@@ -344,16 +344,16 @@ class Segment:
         joined = (seq > 0) & (step >= 0) & (step <= longest_step_ns(period_ns))
         starts = seq[::BUCKET_FRAMES]
         columns = {
-            "bucket": frame_ids.trace_bucket(self._identity.trace_id, starts),
+            "bucket": frame_ids.trace_bucket(self.identity.trace_id, starts),
             "valid": np.bitwise_or.reduceat(one, starts),
             "joined": np.bitwise_or.reduceat(np.where(joined, one, 0), starts),
         }
-        number = self._identity.numbers.get("map_id")
+        number = self.identity.numbers.get("map_id")
         return columns if number is None else columns | {"map_id": np.full(len(starts), number)}
 
     def _insert_about(self) -> None:
         """Insert the table rows known before the first frame: recording, settings, channels and map."""
-        insert, info, identity = self._staging.insert, self._info, self._identity
+        insert, info, identity = self._staging.insert, self._info, self.identity
         self._on_map.insert_into(self._staging, identity.numbers.get("map_id", 0))
         recording = {
             "recording_id": np.array([identity.numbers["recording_id"]]),
@@ -383,7 +383,7 @@ class Segment:
         abstracted = self._on_map.classes.tables(graph, trace_id, kinds.entities)
         of_frames = packing.frame_columns(graph, trace_id)
         if self._road_map is not None:
-            of_frames["map_id"] = np.full(len(graph.frames), self._identity.numbers["map_id"])
+            of_frames["map_id"] = np.full(len(graph.frames), self.identity.numbers["map_id"])
         insert("frame", self._owned(of_frames))
         entities = packing.entity_columns(graph, origin)
         insert("entity", self._owned(entities))
@@ -428,7 +428,7 @@ class Segment:
 
     def _owned(self, columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
-        return columns | {"trace_id": np.full(count, self._identity.trace_id)}
+        return columns | {"trace_id": np.full(count, self.identity.trace_id)}
 
 
 def _period_ns(time_ns: Ints) -> int:

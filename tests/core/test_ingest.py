@@ -10,6 +10,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import duckdb
 import pytest
 from children import FOLDERS
 from opendrive_maps import a_map, a_road, line
@@ -23,6 +24,7 @@ from sgstore.maps.map_files import read_map_file
 from sgstore.maps.opendrive import read_map
 from sgstore.model.config import Config, RangeSettings
 from sgstore.model.vocabulary import RELATIONS
+from sgstore.pipeline import recording_ingest
 from sgstore.readers import open_trace
 from sgstore.sgg import SceneGraphGenerator
 from sgstore.store import StoreFile
@@ -101,6 +103,87 @@ def test_the_same_recording_again_is_present(tmp_path: Path) -> None:
 
     assert [(o.status, o.name, o.frames) for o in again] == [("present", "drive", 12)] * 2
     assert (tmp_path / "s.db").read_bytes() == before
+
+
+def not_opened(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Let the opening of recordings fail. The list receives their paths."""
+    paths: list[Path] = []
+
+    def opened(path: Path, **_: object) -> None:
+        paths.append(path)
+        raise TraceError("opened", path=path)
+
+    monkeypatch.setattr(recording_ingest, "open_trace", opened)
+    return paths
+
+
+@pytest.mark.parametrize("config", [Config(), Config(ego="3")])
+def test_a_recording_that_is_present_is_not_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, config: Config
+) -> None:
+    path = recorded(tmp_path / "drive.mcap")
+    ingest(tmp_path / "s.db", [path], config=config)
+    expected = ingest(tmp_path / "s.db", [copy_of(path)], config=config)[0].as_dict()
+    opened = not_opened(monkeypatch)
+
+    (outcome,) = ingest(tmp_path / "s.db", [path], config=config)
+
+    assert outcome.as_dict() | {"path": "", "seconds": 0} == expected | {"path": "", "seconds": 0}
+    assert (outcome.status, outcome.ego, opened) == ("present", config.ego or "7", [])
+
+
+def copy_of(path: Path) -> Path:
+    """Return another file with the same content, which the store does not know."""
+    found = path.with_stem(f"{path.stem}-copy")
+    found.write_bytes(path.read_bytes())
+    return found
+
+
+def test_a_recording_is_opened_if_anything_of_its_request_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, store = recorded(tmp_path / "drive.mcap", text=""), tmp_path / "s.db"
+    street = tmp_path / "street.xodr"
+    street.write_text(STREET)
+    ingest(store, [path], road_map=street)
+    opened = not_opened(monkeypatch)
+    ingest(store, [path], road_map=street)
+    assert not opened
+    others: list[dict[str, Any]] = [
+        {"road_map": None},
+        {"config": Config(ego="3")},
+        {"config": Config(egos=("7",))},
+        {"config": Config(range=RangeSettings(20.0))},
+        {"since": 0.5},
+        {"rate": 5.0},
+        {"force": True},
+    ]
+
+    for number, other in enumerate(others, 1):
+        ingest(store, [path], **{"road_map": street, **other})
+        assert len(opened) == number, other
+
+    street.write_text(STREET.replace('x="-20.0"', 'x="-21.0"'))
+    ingest(store, [path], road_map=street)
+    assert len(opened) == len(others) + 1
+    path.touch()
+    street.write_text(STREET)
+    ingest(store, [path], road_map=street)
+    assert len(opened) == len(others) + 2
+
+
+def test_a_trace_with_other_settings_than_its_request_is_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, store = recorded(tmp_path / "drive.mcap"), tmp_path / "s.db"
+    ingest(store, [path])
+    with duckdb.connect(store) as connection:
+        connection.execute("UPDATE inside.config SET digest = 'other'")
+    opened = not_opened(monkeypatch)
+
+    ingest(store, [path])
+
+    assert opened == [path]
 
 
 def test_the_same_recording_with_other_settings_is_refused(tmp_path: Path) -> None:
