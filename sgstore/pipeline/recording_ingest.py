@@ -15,6 +15,7 @@ from array import array
 from collections import Counter
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -377,8 +378,9 @@ class SegmentReader:
             self._file = StoreFile(self._job.store)
         return None if self._job.force else self._file
 
+    @cached_property
     def _request(self) -> str:
-        """Return all that decides which trace a recording gives, as JSON; empty if more than that decides.
+        """All that decides which trace a recording gives, as JSON; empty if more than that decides.
 
         A list of egos gives several traces. A folder of maps and a file of a mapping can change.
         """
@@ -393,12 +395,12 @@ class SegmentReader:
 
         ``None`` means not known: the file has changed, or the trace was read by another request.
         """
-        store, request = self._store(), self._request()
-        stored = store.requested(path, request) if store and request else None
-        if stored is None:
+        store = self._store()
+        found = store.requested(path, self._request) if store and self._request else None
+        if found is None:
             return None
-        scope = stored.report.get("scope", {})
-        return TraceOutcome(path, "present", stored.name, stored.ego, stored.frames, scope=scope)
+        *stored, report = found
+        return TraceOutcome(path, "present", *stored, scope=report.get("scope", {}))
 
     def _read(self, path: Path, folder: Path, views: list[_EgoView]) -> None:
         job, config, store = self._job, self._job.config, self._store()
@@ -593,7 +595,7 @@ class SegmentReader:
             outcome.losses += [*report.losses, *one.crowds.losses(self._job.config)]
             kept = replace(report, warnings=outcome.warnings, losses=outcome.losses, about_ego=[])
             outcome.scope = segment.scope.get("scope", {})
-            request = segment.identity.request(self._request())
+            request = segment.identity.request(self._request)
             segment.seal(kept, told | {"request": request} if request else told, parked)
             outcome.status = "sealed"
 

@@ -30,11 +30,11 @@ from sgstore.store._traces import (
     already_stored,
     frame_named,
     located,
-    name_of_request,
     place_below,
     stored_name,
     stored_traces,
     trace_named,
+    trace_of_request,
     unchanged,
     uri_of,
 )
@@ -675,12 +675,14 @@ class StoreFile:
             found = connection.execute(sql, [*places, *mark]).fetchone()
         return str(found[0]) if found and found[0] else ""
 
-    def requested(self, path: Path, request: str) -> StoredTrace | None:
-        """Return the trace of a recording whose file looks unchanged, if an equal request gave the trace."""
-        digest = self.known_digest(path)
+    def requested(self, path: Path, request: str) -> tuple[str, str, int, dict[str, Any]] | None:
+        """Return name, ego, frames and report of the trace that an equal request of a recording gave.
+
+        ``None`` means no such trace, or a file that has changed.
+        """
         with self.access.reading() as connection:
-            name = name_of_request(connection, digest, request) if digest else None
-        return None if name is None else self.trace(name)
+            digest = self.known_digest(path)
+            return trace_of_request(connection, digest, request) if digest else None
 
     def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:
         """Delete traces in one transaction, with the settings and maps that no other trace uses.

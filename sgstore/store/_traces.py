@@ -408,19 +408,22 @@ def _request_digest(text: str, settings_digest: str, map_digest: str) -> str:
     return hashlib.sha256(parts.encode()).hexdigest() if text else ""
 
 
-def name_of_request(connection: DuckDBPyConnection, digest: str, text: str) -> str | None:
-    """Return the name of the trace of a recording that was read by an equal request.
+def trace_of_request(
+    connection: DuckDBPyConnection, digest: str, text: str
+) -> tuple[str, str, int, dict[str, Any]] | None:
+    """Return name, ego, frames and report of the trace of a recording that was read by an equal request.
 
     A trace whose settings or map have changed since then does not count. ``None`` means no such trace.
     """
     sql = """
-        SELECT t.name, json_extract_string(t.report, '$.request'), c.digest, coalesce(m.digest, '')
+        SELECT t.name, coalesce(t.ego, ''), t.frames, t.report, c.digest, coalesce(m.digest, '')
         FROM recording r JOIN trace t ON t.recording_id = r.recording_id
              JOIN config c ON c.config_id = t.config_id LEFT JOIN map m ON m.map_id = t.map_id
         WHERE r.digest = ?"""
-    for name, request, *digests in connection.execute(sql, [digest]).fetchall():
-        if request is not None and request == _request_digest(text, *digests):
-            return str(name)
+    for name, ego, frames, text_of_report, *digests in connection.execute(sql, [digest]).fetchall():
+        report = _object(text_of_report)
+        if report.get("request") == _request_digest(text, *digests):
+            return name, ego, frames, report
     return None
 
 
