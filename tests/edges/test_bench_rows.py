@@ -72,3 +72,22 @@ def test_each_verb_ends_well(
     assert len(said) == len(bench.verbs.VERBS) + 1
     assert [line for line in lines if "exit code" in line.note or "ended" in line.note] == []
     assert sum(map(bool, said.values())) > len(said) // 2
+
+
+def test_each_row_above_its_limit_is_counted(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fast, slow = "info STORE", f"{bench.verbs.CHECK} ROBUSTNESS"
+    monkeypatch.setattr(bench.verbs, "VERBS", [bench.verbs.Verb(fast), bench.verbs.Verb(slow)])
+    monkeypatch.setattr(bench.verbs, "RATIOS", [bench.verbs.Ratio(slow, fast, 2.0)])
+    monkeypatch.setattr("os.sched_setaffinity", lambda *_: None)
+    monkeypatch.setenv("SGSTORE_BENCH_REAL", str(small))
+
+    def rows(seconds: dict[str, float]) -> list[float]:
+        def ran(words: list[str], _most: int, _folder: Path) -> bench.verbs.Run:
+            return bench.verbs.Run(seconds[words[0]], 100, 0, "")
+
+        monkeypatch.setattr(bench.verbs, "ran", ran)
+        return [line.value for line in bench.verbs.run(quick=True)]
+
+    assert rows({"--version": 0.5, "info": 2.0, "check": 4.0}) == [0.5, 2.0, 4.0, 2.0, 0]
+    assert rows({"--version": 0.5, "info": 1.0, "check": 4.0}) == [0.5, 1.0, 4.0, 4.0, 1]
+    assert rows({"--version": 1.5, "info": 1.0, "check": 6.0}) == [1.5, 1.0, 6.0, 6.0, 3]
