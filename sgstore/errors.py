@@ -21,6 +21,7 @@ library raises ``ValueError`` or ``TypeError``. Any other exception is a bug.
 
 from __future__ import annotations
 
+import errno
 import re
 import unicodedata
 from dataclasses import dataclass
@@ -126,6 +127,40 @@ class TraceError(SgstoreError):
 
 INTERRUPTIONS: Final = ("Query interrupted", "KeyboardInterrupt", "INTERRUPT Error")
 """Words in the error messages of DuckDB after an interruption."""
+
+
+_DISK_FULL: Final = "the disk is full; free space, and run it again"
+FULL: Final = {
+    errno.ENOSPC: _DISK_FULL,
+    errno.EDQUOT: _DISK_FULL,
+    errno.EFBIG: "stopped at the limit of the file size (ulimit -f); raise it, or ask for less",
+}
+"""Error codes of a write without room, with their messages."""
+
+_REMEDIES: Final = {
+    errno.EBUSY: "close the programs that use it, and run it again",
+    errno.EINTR: "run it again",
+    errno.EIO: "check the disk and its connection, and run it again",
+    errno.ENOLCK: "use a file system that has locks",
+    errno.ENOSYS: "use a file system that supports it",
+    errno.EOPNOTSUPP: "use a file system that supports it",
+    errno.EXDEV: "use a folder on one file system",
+}
+
+
+def reason_of(error: OSError) -> str:
+    """Return the reason of an operating system error, with the remedy if one is known.
+
+    Examples
+    --------
+    >>> reason_of(OSError(errno.EIO, "Input/output error"))
+    'Input/output error; check the disk and its connection, and run it again'
+    """
+    code = error.errno or 0
+    if code in FULL:
+        return FULL[code]
+    said = error.strerror or str(error)
+    return f"{said}; {_REMEDIES[code]}" if code in _REMEDIES else said
 
 
 def is_interruption(error: BaseException | None) -> bool:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.temporary_folders import HeldFolder, working_folder
-from sgstore.errors import ExportError
+from sgstore.errors import ExportError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -138,7 +138,7 @@ class Stream(io.RawIOBase):
         if isinstance(error, BrokenPipeError):
             raise ReaderGoneError(f"{self._name}: the reader closed the pipe") from error
         if not self._quiet:
-            raise ExportError(f"{self._name}: {error.strerror or error}") from error
+            raise ExportError(f"{self._name}: {reason_of(error)}") from error
 
 
 class OutputFile:
@@ -303,7 +303,7 @@ def _export_errors(to: Path) -> Generator[None]:
     try:
         yield
     except OSError as error:
-        raise ExportError(f"{to}: {error.strerror or error}") from error
+        raise ExportError(f"{to}: {reason_of(error)}") from error
     except ValueError as error:  # a name with a null character
         raise ExportError(f"{str(to)!r}: {error}") from error
 
@@ -347,12 +347,32 @@ def _descriptor(to: Path) -> int:
 
 
 def _copy(content: Path, to: Path, name: str) -> None:
-    """Copy a file into an existing file or stream that cannot be replaced."""
+    """Copy a file into an existing file or stream that cannot be replaced.
+
+    The space is reserved first, so that a full disk does not damage an existing file.
+    """
     about = to.stat()
     plain = stat.S_ISREG(about.st_mode) and _open_here(to, about) is None
-    descriptor = os.open(to, os.O_WRONLY | os.O_TRUNC) if plain else _descriptor(to)
+    descriptor = os.open(to, os.O_WRONLY) if plain else _descriptor(to)
     with content.open("rb") as source, io.BufferedWriter(Stream(descriptor, name)) as sink:
+        if plain:
+            _reserve(descriptor, about.st_size, content.stat().st_size)
         shutil.copyfileobj(source, sink)
+        if plain:
+            sink.flush()
+            os.ftruncate(descriptor, content.stat().st_size)
+
+
+def _reserve(descriptor: int, before: int, size: int) -> None:
+    """Reserve the space of a longer content; without room, the file keeps its size and raises an error."""
+    if size <= before or not hasattr(os, "posix_fallocate"):
+        return
+    try:
+        os.posix_fallocate(descriptor, before, size - before)
+    except OSError as error:
+        os.ftruncate(descriptor, before)
+        if error.errno not in {errno.EOPNOTSUPP, errno.EINVAL}:  # not supported: write at once
+            raise
 
 
 def _keep_owner_and_mode(content: Path, target: Path) -> None:

@@ -1,8 +1,8 @@
 """Temporary folders that are removed when their process ends.
 
 Each folder is locked while its process lives, and is removed at exit. The next process that needs a folder in
-the same place removes the folders of killed processes. It removes a folder only if its lock is free. On a file
-system without locks, it removes nothing.
+the same place removes the folders of killed processes. It removes a folder only if its lock is free. A folder
+without a lock has a mark; no other process removes it.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ except ImportError:  # not on Windows: a folder in use cannot be removed there
 
 PREFIX: Final = "sgstore-held-"
 """Prefix of process folders in the folder for temporary files."""
+
+_UNLOCKED: Final = ".unlocked"
+"""File in a folder that its process could not lock."""
 
 _FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
 
@@ -83,15 +86,23 @@ class HeldFolder:
             return False
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
-        except OSError:  # a file system without locks: no process removes the folder
+        except OSError:  # a file system without locks, or without free ones
             os.close(lock)
-            return True
+            return self._marked()
         with suppress(FileNotFoundError):
             if os.path.samestat(self.path.stat(), os.fstat(lock)):
                 self._lock = lock
                 return True
         os.close(lock)
         return False
+
+    def _marked(self) -> bool:
+        """Mark the folder, so that no process removes it. Return False if a process has removed it."""
+        try:
+            (self.path / _UNLOCKED).touch()
+        except FileNotFoundError:
+            return False
+        return True
 
     def __enter__(self) -> Self:
         return self
@@ -130,6 +141,8 @@ def _remove_dead(folder: Path, undo: Callable[[Path], None] | None) -> None:
     try:
         if fcntl is not None and os.fstat(lock).st_uid == os.geteuid():
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if (folder / _UNLOCKED).exists():
+                return  # its process may still run
             if undo is not None:
                 undo(folder)
             shutil.rmtree(folder, ignore_errors=True)

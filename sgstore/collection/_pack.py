@@ -17,7 +17,7 @@ from sgstore.collection import _catalogue as catalogue
 from sgstore.collection._catalogue import BUNDLE_TRACES
 from sgstore.collection._landing import DESCRIPTION
 from sgstore.collection._storage import bundle_path, digest_of_file, place_at
-from sgstore.errors import StoreError
+from sgstore.errors import StoreError, reason_of
 from sgstore.model.vocabulary import natural
 from sgstore.store import (
     CATALOGUE,
@@ -246,7 +246,10 @@ def unpack(url: str | Path, store: str | Path) -> list[str]:
             BundleSource.join(paths, fresh, names, maps)
         else:
             StoreFile.create(fresh).close()
-        fresh.rename(to)
+        try:
+            fresh.rename(to)
+        except OSError as error:
+            raise StoreError(f"{to}: cannot be made: {reason_of(error)}") from error
     return [row["name"] for row in snapshot.traces]
 
 

@@ -28,7 +28,7 @@ from sgstore.collection import _worker as worker
 from sgstore.collection._engines import engine_named, fault_of_question
 from sgstore.collection._pack import refuse_others
 from sgstore.collection._storage import place_at
-from sgstore.errors import QueryError, SqlError, StoreError, one_store_needed
+from sgstore.errors import QueryError, SqlError, StoreError, one_store_needed, reason_of
 from sgstore.lang.bind import CLASSES_GIVEN
 from sgstore.lang.catalog import TableFacts, Type
 from sgstore.lang.sql import (
@@ -824,7 +824,11 @@ class CollectionChecks(CheckRun):
             files: list[Path] = []
             for result in self._whole.ask(question, self._whole.bundles()):
                 path = Path(result["lines"])
-                files.append(path.replace(folder / path.name))
+                try:
+                    files.append(path.replace(folder / path.name))
+                except OSError as error:
+                    reason = reason_of(error)
+                    raise StoreError(f"{folder}: cannot be written: {reason}") from error
             ordered = merge(
                 *map(_verdicts, files), key=lambda one: (places[one.check], natural(one.trace))
             )

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sgstore.errors import StoreError, url_named
+from sgstore.errors import StoreError, reason_of, url_named
 from sgstore.mcap import (
     fetch_object,
     object_store_at,
@@ -68,7 +68,7 @@ def digest_of_file(path: Path) -> str:
             while piece := file.read(PIECE):
                 digest.update(piece)
     except OSError as error:
-        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
+        raise StoreError(f"{path}: cannot be read: {reason_of(error)}") from error
     return digest.hexdigest()
 
 
@@ -94,7 +94,7 @@ class _Folder:
         except OSError as error:
             if self.root.is_file():
                 raise StoreError(f"{self.root}: a file, and a collection is a folder") from error
-            raise StoreError(f"{self.root / name}: {error.strerror or error}") from error
+            raise StoreError(f"{self.root / name}: {reason_of(error)}") from error
 
     def read(self, name: str) -> bytes:
         """Return the content of a file."""
@@ -110,14 +110,21 @@ class _Folder:
                 os.fsync(file.fileno())
             try:
                 os.link(fresh, path)
-            except FileExistsError:
-                return False
+            except OSError as error:
+                # A network drive may report an error after it has made the link.
+                if path.exists() and path.samefile(fresh):
+                    return True
+                if isinstance(error, FileExistsError):
+                    return False
+                raise
             return True
 
     def upload(self, path: Path, name: str) -> None:
         """Copy a local file to a name in the storage."""
         with self._told(name), self._beside(name) as (fresh, to):
             shutil.copyfile(path, fresh)
+            with fresh.open("rb") as file:
+                os.fsync(file.fileno())  # a snapshot names the file: both survive a power failure
             fresh.replace(to)
 
     @contextmanager
@@ -231,7 +238,7 @@ def cache_folder() -> Path:
         (folder / "seen").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(
-            f"{folder}: cannot be written: {error.strerror}; {CACHE} names another folder for bundles"
+            f"{folder}: cannot be written: {reason_of(error)}; {CACHE} names another folder for bundles"
         ) from error
     return folder
 
@@ -278,7 +285,7 @@ def _fetch(place: Place, name: str, sha: str, path: Path) -> None:
             )
         fresh.replace(path)
     except OSError as error:
-        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise StoreError(f"{path}: cannot be written: {reason_of(error)}") from error
     finally:
         with suppress(OSError):
             fresh.unlink(missing_ok=True)

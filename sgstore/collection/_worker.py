@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection._storage import bundle_path, place_at
-from sgstore.errors import StoreError
+from sgstore.errors import StoreError, reason_of
 from sgstore.lang.catalog import Type
 from sgstore.lang.sql import Compiled
 from sgstore.lang.sql.collection_parts import parted
@@ -421,5 +421,5 @@ def brought(result: dict[str, Any], folder: Path) -> dict[str, Any]:
             to.write_text(result.pop("data"), encoding="utf-8")
             result["lines"] = str(to)
     except OSError as error:
-        raise StoreError(f"{folder}: cannot be written: {error.strerror}") from error
+        raise StoreError(f"{folder}: cannot be written: {reason_of(error)}") from error
     return result

@@ -19,7 +19,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.temporary_folders import HeldFolder, sweep, sweep_temporary
-from sgstore.errors import ExportError
+from sgstore.errors import ExportError, reason_of
 from sgstore.mcap import digest_of
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def export_folder(to: Path) -> Generator[Path]:
             (held.path / _MOVING).write_text(json.dumps(marks), encoding="utf-8")
             _move(things, to)
     except OSError as error:
-        raise ExportError(f"{to}: cannot be written: {error.strerror or error}") from error
+        raise ExportError(f"{to}: cannot be written: {reason_of(error)}") from error
     finally:
         for folder in made:
             with suppress(OSError):  # folders with content stay
@@ -332,4 +332,8 @@ def _move_file(file: Path, target: Path) -> None:
     except OSError:  # a file system without hard links
         with target.open("xb"):
             pass
-        file.replace(target)
+        try:
+            file.replace(target)
+        except OSError:
+            target.unlink()
+            raise

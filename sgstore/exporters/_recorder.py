@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Self
 from mcap.writer import Writer
 
 import sgstore.exporters._foxglove as foxglove
-from sgstore.errors import ExportError
+from sgstore.errors import ExportError, reason_of
 from sgstore.exporters._clips import tool
 from sgstore.exporters._osi_messages import (
     ROAD_MAP,
@@ -108,7 +108,7 @@ class Recorder:
             reason = "another recording is being written there, or was left behind"
             raise ExportError(f"{self._aside}: {reason}") from error
         except OSError as error:
-            raise ExportError(f"{self._aside}: {error.strerror or error}") from error
+            raise ExportError(f"{self._aside}: {reason_of(error)}") from error
         self._writer = Writer(self._stream, enable_data_crcs=True)
         self._writer.start("", tool())
         self._describe(sensors or {})
@@ -187,7 +187,7 @@ class Recorder:
             else:
                 self._aside.unlink()
         except OSError as error:
-            raise ExportError(f"{self._aside}: {error.strerror or error}") from error
+            raise ExportError(f"{self._aside}: {reason_of(error)}") from error
         start, end = self._times or (0, 0)
         self.written = Written(self._to, self._frames, dict(self._counts), start, end)
 
@@ -215,7 +215,7 @@ class Recorder:
             self._writer.add_message(number, time_ns, data, time_ns, self._counts[topic])
             self._counts[topic] += 1
         except OSError as error:
-            raise ExportError(f"{self._aside}: {error.strerror or error}") from error
+            raise ExportError(f"{self._aside}: {reason_of(error)}") from error
 
     def _define(self, topic: str, schema: tuple[str, str, bytes], encoding: str) -> int:
         name, schema_encoding, data = schema

@@ -16,7 +16,7 @@ from dataclasses import astuple, dataclass, fields
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from sgstore.errors import StoreError
+from sgstore.errors import StoreError, reason_of
 
 try:
     import fcntl
@@ -103,7 +103,7 @@ class NotesFile:
         try:
             self._append(lines.getvalue().encode())
         except OSError as error:
-            raise StoreError(f"{self.path}: {error.strerror}") from error
+            raise StoreError(f"{self.path}: {reason_of(error)}") from error
 
     def _append(self, lines: bytes) -> None:
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
@@ -111,9 +111,16 @@ class NotesFile:
         try:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX)
-            if os.fstat(file).st_size == 0:
+            size = os.fstat(file).st_size
+            if size == 0:
                 lines = ",".join(COLUMNS).encode() + b"\n" + lines
-            os.write(file, lines)
+            left = memoryview(lines)
+            try:
+                while left:  # a full disk takes a part of the lines first
+                    left = left[os.write(file, left) :]
+            except OSError:
+                os.ftruncate(file, size)
+                raise
         finally:
             os.close(file)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.display import excerpts
 from sgstore.base.temporary_folders import working_folder
-from sgstore.errors import ConfigError, SgstoreError, StoreError, TraceError, url_named
+from sgstore.errors import ConfigError, SgstoreError, StoreError, TraceError, reason_of, url_named
 from sgstore.ingest import ingest, recordings
 from sgstore.mcap import digest_of, mark_of
 from sgstore.model.config import Config, from_dict
@@ -167,13 +167,15 @@ def _alone(fresh: Path) -> Generator[None]:
     try:
         held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
     except OSError as error:
-        raise StoreError(f"{fresh.parent}: cannot be written: {error.strerror}") from error
+        raise StoreError(f"{fresh.parent}: cannot be written: {reason_of(error)}") from error
     try:
         if fcntl is not None:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise StoreError(f"{fresh}: another process is at work on it") from error
+            except OSError as error:
+                raise StoreError(f"{lock}: cannot be locked: {reason_of(error)}") from error
         yield
         with suppress(OSError):
             lock.unlink()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import duckdb
 
-from sgstore.errors import SqlError, StoreError
+from sgstore.errors import FULL, SqlError, StoreError, reason_of
 
 if TYPE_CHECKING:
     from collections.abc import Generator
@@ -93,28 +93,32 @@ def translated(path: Path) -> Generator[None]:
         raise StoreError(f"{path}: {_reason(message)}") from error
 
 
-_DISK_FULL: Final = "the disk is full; free space, and run it again"
-_FULL: Final = {
-    errno.ENOSPC: _DISK_FULL,
-    errno.EDQUOT: _DISK_FULL,
-    errno.EFBIG: "stopped at the limit of the file size (ulimit -f); raise it, or ask for less",
-}
-"""Error codes of a write without room, with their messages."""
-
-
 def _without_room(message: str) -> str | None:
     """Return the words for a DuckDB error at a write without room; ``None`` for other errors."""
     if os.strerror(errno.EFBIG) in message and "duckdb_temp" in message:
         return None  # temporary data of a sandbox: its memory is too small, not the disk
-    found = (words for code, words in _FULL.items() if os.strerror(code) in message)
+    found = (words for code, words in FULL.items() if os.strerror(code) in message)
     return next(found, None)
+
+
+def move(path: Path, to: Path, fault: str) -> Path:
+    """Move a file, replacing another one, and return its new path.
+
+    Raises
+    ------
+    StoreError
+        The file cannot be moved; the message begins with ``fault``.
+    """
+    try:
+        return path.replace(to)
+    except OSError as error:
+        raise os_fault(fault, error) from error
 
 
 def os_fault(message: str, error: OSError) -> StoreError:
     """Return a store error for an operating system error. A full disk has its own class and words."""
-    if error.errno in _FULL:
-        return DiskFullError(f"{message}: {_FULL[error.errno]}")
-    return StoreError(f"{message}: {error.strerror}")
+    kind = DiskFullError if error.errno in FULL else StoreError
+    return kind(f"{message}: {reason_of(error)}")
 
 
 def _reason(message: str) -> str:

@@ -98,12 +98,12 @@ class _Gate:
         while True:
             try:
                 self._lock = os.open(gate_of(self._path), os.O_RDWR | os.O_CREAT, 0o666)
+                if fcntl is not None:
+                    _lock(self._lock, fcntl.LOCK_EX, self._path, deadline)
+                if self._is_there():
+                    return
             except OSError as error:
                 raise os_fault(f"{self._path}: cannot be written", error) from error
-            if fcntl is not None:
-                _lock(self._lock, fcntl.LOCK_EX, self._path, deadline)
-            if self._is_there():
-                return
             # The previous owner has deleted the file, so other processes would not see this lock.
             os.close(self._lock)
             self._lock = -1
@@ -141,7 +141,4 @@ def _lock(gate: int, how: int, path: Path, deadline: Deadline) -> None:
         except OSError as error:
             if how == fcntl.LOCK_SH:
                 return  # a file system without locks: DuckDB decides alone
-            raise StoreError(
-                f"{path}: cannot be locked for writing: {error.strerror}; keep the store on a file"
-                " system that has locks"
-            ) from error
+            raise os_fault(f"{path}: cannot be locked for writing", error) from error

@@ -19,7 +19,7 @@ from sgstore.base.quoting import literal, quoted
 from sgstore.errors import StoreError
 from sgstore.model.frame_ids import SEQ_BITS
 from sgstore.model.vocabulary import NAMES
-from sgstore.store._engine_errors import translated
+from sgstore.store._engine_errors import move, translated
 from sgstore.store._interrupts import interruptible
 from sgstore.store._joins import tables_folder
 from sgstore.store._lease import shared_instance
@@ -100,7 +100,8 @@ class PartFile:
         """Move the file of a partial query result into another folder, and return the moved result."""
         if not self.written:
             return self
-        return replace(self, path=self.path.replace(folder / self.path.name))
+        to = folder / self.path.name
+        return replace(self, path=move(self.path, to, f"{folder}: cannot be written"))
 
     @staticmethod
     def of_statement(

@@ -20,7 +20,7 @@ from sgstore.base.display import excerpts
 from sgstore.base.quoting import quoted
 from sgstore.errors import StoreError
 from sgstore.store._creation import attach_empty
-from sgstore.store._engine_errors import BusyError, DiskFullError
+from sgstore.store._engine_errors import BusyError, DiskFullError, move
 from sgstore.store._locking import Access, spill_folder
 from sgstore.store._publish import copy_sorted
 from sgstore.store._staging import scratch
@@ -378,4 +378,4 @@ def _replace(path: Path, fresh: Path) -> None:
     for one in (path, fresh):
         if one.with_name(f"{one.name}.wal").exists():
             raise StoreError(f"{path}: left as it is: the log {one.name}.wal of {one} stays")
-    fresh.replace(path)
+    move(fresh, path, f"{path}: left as it is: cannot be replaced")

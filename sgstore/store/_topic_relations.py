@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.base.quoting import literal, quoted
 from sgstore.lang.catalog import TOPIC, TopicValue
 from sgstore.lang.topics import find_field
+from sgstore.store._engine_errors import move
 from sgstore.store._interrupts import interruptible
 from sgstore.store._lease import stamp_of
 
@@ -57,4 +58,4 @@ def _write(connection: DuckDBPyConnection, access: Access, relation: str, place:
     part = place.with_suffix(f".{id(connection)}")
     copy = f"COPY (FROM ({made}) ORDER BY frame_id) TO {literal(str(part))} (FORMAT parquet)"
     interruptible(connection, lambda: connection.execute(copy))
-    part.replace(place)
+    move(part, place, f"{place}: cannot be written")

@@ -154,7 +154,7 @@ def test_no_verb_ends_in_a_traceback_whatever_its_streams_are(verb: str, ended) 
     assert not [text for text in told.values() if "Traceback" in text or "Exception" in text]
     assert usual in {"record": {1}, "serve": {2}}.get(verb, {0, 4}), told
     assert (size == 0) == (verb in WITHOUT_OUTPUT)
-    for condition, said in (("stdout full", "No space left"), ("stdout closed", "Bad file")):
+    for condition, said in (("stdout full", "the disk is full"), ("stdout closed", "Bad file")):
         if not is_tried(verb, condition):
             continue
         code, _, err = found[condition]

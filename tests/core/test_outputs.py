@@ -98,7 +98,7 @@ def test_what_was_there_survives_a_full_disk_and_a_pipe_gets_what_a_file_gets(
         code = run(command(name, named, to))
 
     assert code == 1
-    assert "File too large" in capsys.readouterr().err
+    assert "limit of the file size" in capsys.readouterr().err
     assert to.read_bytes() == b"of yesterday"
     assert names(tmp_path) == [name]
     assert run(command(name, named, to)) == 0
@@ -158,7 +158,7 @@ def test_a_device_is_written_into(named: dict[str, str]) -> None:
 
 def test_a_device_that_is_full_says_so(named: dict[str, str], capsys) -> None:
     assert run([*command("rows.csv", named, Path("/dev/full")), "--format", "csv"]) == 1
-    assert "/dev/full: No space left on device" in capsys.readouterr().err
+    assert "/dev/full: the disk is full; free space" in capsys.readouterr().err
 
 
 def test_a_link_stays_one_and_a_new_file_has_the_usual_rights(tmp_path: Path) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from probes import PROBES
 
-from sgstore.apps.sandbox import Sandbox
+from sgstore.apps.sandbox import Sandbox, _limit
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
 from sgstore.query import Store
 
@@ -126,6 +128,31 @@ def test_memory_is_bounded_and_nothing_is_spilled(path: Path, sql: str, reason: 
             box.sql(sql)
 
         assert box.sql("SELECT 1").rows == [(1,)]
+
+
+@pytest.mark.parametrize("memory", [64 << 20, 1 << 30])
+def test_a_worker_process_has_limits_of_memory_and_files(memory: int) -> None:
+    resource = pytest.importorskip("resource")
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:  # the limits hold until the process ends
+        with suppress(BaseException):
+            _limit(memory, files=1000)
+            kinds = resource.RLIMIT_AS, resource.RLIMIT_FSIZE, resource.RLIMIT_CORE
+            limits = json.dumps([resource.getrlimit(kind) for kind in kinds])
+            with suppress(MemoryError):
+                bytearray(5 * (1 << 30) + 2 * memory)
+                limits = "more memory than the limit"
+            os.write(writer, limits.encode())
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as pipe:
+        said = pipe.read()
+    os.waitpid(child, 0)
+
+    (soft, hard), files, core = json.loads(said)
+    assert 2 * memory < soft == hard <= 2 * memory + (5 << 30)
+    assert (files, core) == ([1000, 1000], [0, 0])
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from sgstore.model.frame_ids import frame_ids
 from sgstore.model.vocabulary import MOST_RELATIONS
 from sgstore.model.world import BUCKET_FRAMES, Origin, origin_of
 from sgstore.store._columns import marked, parted
-from sgstore.store._packing import NodeKinds, edge_columns, masks_of, state_columns
+from sgstore.store._packing import NodeKinds, edge_columns, masks_of, node_columns, state_columns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -179,3 +179,42 @@ def test_states_that_repeat_lie_together_behind_the_others() -> None:
     assert found["repeated"].tolist() == [False, True, True, False, False, True, True]
     assert found["is_ego"].tolist() == [1, 1, 1, 0, 0, 0, 0]
     assert found["frame_id"].tolist() == [0, 1, 2, 2, 64, 0, 1]
+
+
+@pytest.mark.parametrize("size", [7, 50])
+def test_blocks_that_begin_off_an_edge_of_a_bucket_and_cross_one_have_the_right_rows(
+    size: int,
+) -> None:
+    trace = RandomTrace(seed=4, frames=130, size=size, road_map=map_stub())
+    kinds = NodeKinds(np.zeros(0, np.int8), trace.road_map.nodes.kind)
+    kinds.learn(trace.blocks[0].frames.entities)
+    crossing = 0
+    for block in trace.blocks:
+        seq = block.frames.seq.tolist()
+        crossing += seq[0] % BUCKET_FRAMES > seq[-1] % BUCKET_FRAMES > 0
+        expected: dict[str, dict[tuple[int, ...], int]] = {
+            name: defaultdict(int) for name in ("edge", "node")
+        }
+        edges, presence = block.edges, block.presence
+        for row, frame in enumerate(edges.frame.tolist()):
+            bucket, bit = divmod(seq[frame], BUCKET_FRAMES)
+            key = int(edges.relation[row]), int(edges.src[row]), int(edges.dst[row]), bucket
+            expected["edge"][key] |= 1 << bit
+        for frame, node in zip(presence.frame.tolist(), presence.node.tolist(), strict=True):
+            bucket, bit = divmod(seq[frame], BUCKET_FRAMES)
+            expected["node"][node, bucket] |= 1 << bit
+
+        found: dict[str, dict[tuple[int, ...], int]] = {
+            name: defaultdict(int) for name in ("edge", "node")
+        }
+        for columns in edge_columns(block, 5, kinds):
+            for *key, bucket, mask in _rows(columns, "relation", "src", "dst", "bucket", "mask"):
+                found["edge"][*key, bucket - (5 << 18)] |= mask
+        for node, bucket, mask in _rows(node_columns(block, 5, kinds), "node_id", "bucket", "mask"):
+            found["node"][node, bucket - (5 << 18)] |= mask
+        assert found == expected
+    assert crossing == 2
+
+
+def _rows(columns: dict[str, Any], *names: str) -> Iterable[tuple[int, ...]]:
+    return zip(*(columns[name].tolist() for name in names), strict=True)
