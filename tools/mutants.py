@@ -34,7 +34,7 @@ from functools import cache
 from itertools import zip_longest
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mutants_coverage import REPOSITORY, copy_of_the_tree, coverage_of, digest, environment
 
@@ -68,7 +68,23 @@ ROOMS: Final[dict[str, tuple[str, ...]]] = {
         *("test_relations*.py", "test_extent.py", "test_lane_*.py", "test_sgg*.py"),
         *("test_crowds.py", "test_plugins.py", "test_compiled.py"),
     ),
-    "temporal": ("test_temporal.py", "test_over_time.py", "test_monitor.py"),
+    "temporal": (
+        *("test_temporal.py", "test_over_time.py", "test_monitor.py", "test_check_verdicts.py"),
+        *("test_robustness.py", "test_step_expressions.py", "test_windows.py", "test_union.py"),
+        *("test_tolerance.py", "test_happens.py", "test_sequences.py", "test_shrink.py"),
+        *("test_lang_topic_values.py", "test_noise.py", "test_clock.py"),
+    ),
+    "mcap": (
+        *(
+            "test_mcap*.py",
+            "test_ahead.py",
+            "test_order.py",
+            "test_damaged.py",
+            "test_carla_cut.py",
+        ),
+        *("test_carla_bags.py", "test_flavours.py"),
+    ),
+    "collection": ("test_collection*.py", "test_system_calls.py"),
     "lang": ("test_lang_*.py", "test_query.py", "test_like.py", "test_notes.py"),
     "readers": (
         *("test_mcap_file.py", "test_osi*.py", "test_cdr.py", "test_carla*.py", "test_foxglove.py"),
@@ -82,10 +98,11 @@ AT_MOST: Final = 3
 """How many mutants there are, and how many may survive."""
 
 TOGETHER: Final = 2
-LIMIT_S: Final = 600.0
+LIMIT_S: Final = 120.0
+AT_LEAST_S: Final = 20.0
 SLOWER: Final = 4.0
-"""Mutants that are tried at a time; after how long no further tests of a mutant are begun; and how much slower
-tests may be than they were, beside that, before it is said that they have no end."""
+"""Mutants that are tried at a time; longest total of the tests of a mutant; and the processor time after
+which a mutant has no end: so many seconds, and a multiple of what the tests take without it."""
 
 
 @dataclass(frozen=True)
@@ -345,96 +362,83 @@ def files_of(room: str) -> list[str]:
 # Trying them ----------------------------------------------------------------------------------------------
 
 
-_SERVER: Final = """
-import json, os, sys
-import duckdb, google.protobuf.message, lz4.frame, mcap, networkx, numpy
-import pytest, shapely, typer, zstandard
-
-class Noted:
-    def pytest_runtest_logreport(self, report):
-        if report.failed:
-            with open(noted, "w") as file:
-                file.write(report.nodeid)
-
-for line in sys.stdin:
-    noted, options = json.loads(line)
-    child = os.fork()
-    if not child:
-        os.setsid()
-        nowhere = os.open(os.devnull, os.O_RDWR)
-        for stream in range(3):
-            os.dup2(nowhere, stream)
-        code = 70
-        try:
-            code = int(pytest.main(options, plugins=[Noted()]))
-        finally:
-            os._exit(code)
-    print(child, flush=True)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
-"""Runs tests in processes that have imported what is large already."""
-
-
 class Tree:
     """A copy of the tree, in which one mutant after another is tried.
 
     Parameters
     ----------
     folder : Path
+    files : sequence of str
+        Files of tests, which are collected once.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, files: Sequence[str]) -> None:
         self.folder = copy_of_the_tree(folder)
-        self._server = subprocess.Popen(
-            [sys.executable, "-c", _SERVER],
-            cwd=self.folder,
-            env=environment(self.folder),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        self._sound: set[str] = set()
+        self._ready = False
+        orders, replies = os.pipe(), os.pipe()
+        command = [sys.executable, "tools/mutants_server.py", str(orders[0]), str(replies[1])]
+        with (folder / "server.log").open("wb") as log:
+            self._server = subprocess.Popen(
+                [*command, *files],
+                cwd=self.folder,
+                env=environment(self.folder),
+                pass_fds=(orders[0], replies[1]),
+                stdout=log,
+                stderr=log,
+            )
+        os.close(orders[0])
+        os.close(replies[1])
+        self._orders, self._replies = os.fdopen(orders[1], "w"), os.fdopen(replies[0])
 
     def close(self) -> None:
-        """End what runs the tests."""
-        self._server.communicate()
+        """End the process that runs the tests."""
+        self._orders.close()
+        self._server.wait()
+        self._replies.close()
 
-    def outcome(self, mutant: Mutant, files: list[list[str]], takes: Takes) -> Outcome:
-        """Whether tests find a mutant; those of a file run together, up to the first that fails.
+    def outcome(
+        self, mutant: Mutant, tests: Sequence[str], takes: Takes, limit: float = LIMIT_S
+    ) -> Outcome:
+        """Whether tests find a mutant.
 
         Parameters
         ----------
         mutant : Mutant
-        files : list of list of str
-            Tests that run what is changed, by their files, the quickest first.
+        tests : sequence of str
+            Tests that run what is changed, in the order in which they are tried.
         takes : callable
             How long tests take without a mutant.
+        limit : float
+            Tests are left out when those before them take longer in total; s.
 
         """
-        begun, ran, broken = time.monotonic(), 0, 0
-        waiting = [list(tests) for tests in files]
-        while waiting:
-            if ran and time.monotonic() - begun > LIMIT_S:
-                left = sum(map(len, waiting))
-                why = f"the {ran} quickest tests that run it pass, {left} were not run"
-                return Outcome(found=False, why=why)
-            tests = waiting.pop(0)
-            with self._changed(mutant):
-                failed = self._failed(tests, SLOWER * takes(tests))
-            if failed is None:
-                ran += len(tests)
-                continue
-            blamed = failed or tests
-            if self._failed(blamed, SLOWER * takes(blamed)) is None:
-                found = failed[0] if failed else f"{tests[0]} and others: no end"
-                return Outcome(found=True, why=found)
-            # A test that fails without the mutant finds nothing.
-            print(f"{blamed} fail without any mutant", flush=True)
-            broken += len(blamed)
-            others = [test for test in tests if test not in blamed]
-            waiting[:0] = [others] if others else []
+        if not tests:
+            return Outcome(found=False, why="no test of the room runs its file")
+        if not self._ready:
+            self._ready = bool(self._reply())
+        waiting = list(tests)
+        while len(waiting) > 1 and takes(waiting) > limit:
+            waiting.pop()
+        left, broken = len(tests) - len(waiting), 0
+        # The second trial imports the changed file: some functions run only at the import.
+        for anew in (False, True):
+            while waiting:
+                with self._changed(mutant):
+                    failed = self._failed(waiting, takes, mutant, anew=anew)
+                if failed is None:
+                    break
+                blamed = [failed] if failed in waiting else waiting
+                if self._passes(blamed, takes):
+                    why = failed if failed in waiting else f"{waiting[0]} and others: {failed}"
+                    return Outcome(found=True, why=why)
+                # A test that fails without the mutant finds nothing.
+                print(f"{blamed} fail without any mutant", flush=True)
+                broken += len(blamed)
+                waiting = [test for test in waiting if test not in blamed]
         unused = f", {broken} fail without it" if broken else ""
-        why = f"all {ran} tests that run it pass{unused}"
-        return Outcome(found=False, why=why if files else "no test of the room runs its file")
+        unused += f", {left} were not run" if left else ""
+        return Outcome(found=False, why=f"all {len(waiting)} tests that run it pass{unused}")
 
     @contextmanager
     def _changed(self, mutant: Mutant) -> Generator[None]:
@@ -447,32 +451,69 @@ class Tree:
             file.write_text(mutant.old, encoding="utf-8")
             _forget(file)
 
-    def _failed(self, tests: list[str], seconds: float) -> list[str] | None:
-        """The test that fails, empty if that is not known (all took too long, say); ``None``: they pass."""
-        stdin, stdout = self._server.stdin, self._server.stdout
-        assert stdin is not None
-        assert stdout is not None
-        with tempfile.TemporaryDirectory() as base:
-            options = [
-                "-x",
-                "-q",
-                "-p",
-                "no:cacheprovider",
-                "-p",
-                "no:xdist",
-                f"--basetemp={base}/t",
-            ]
-            noted = Path(base) / "failed"
-            stdin.write(json.dumps([str(noted), [*options, *tests]]) + "\n")
-            stdin.flush()
-            child = int(stdout.readline())
-            timer = threading.Timer(LIMIT_S + seconds, _kill, (child,))
+    def _passes(self, tests: Sequence[str], takes: Takes) -> bool:
+        unknown = [test for test in tests if test not in self._sound]
+        if unknown and self._failed(unknown, takes) is not None:
+            return False
+        self._sound.update(unknown)
+        return True
+
+    def _failed(
+        self,
+        tests: Sequence[str],
+        takes: Takes,
+        mutant: Mutant | None = None,
+        *,
+        anew: bool = False,
+    ) -> str | None:
+        """The test that fails, or the reason why that is not known; ``None``: they pass."""
+        seconds = AT_LEAST_S + SLOWER * takes(tests)
+        with tempfile.TemporaryDirectory() as folder:
+            if anew:
+                return self._failed_anew(tests, folder, seconds)
+            about = (
+                {"path": str(self.folder / mutant.path), "old": mutant.old, "new": mutant.new}
+                if mutant
+                else {"old": "", "new": ""}
+            )
+            told = {"folder": folder, "tests": tests, "seconds": seconds, **about}
+            self._orders.write(json.dumps(told) + "\n")
+            self._orders.flush()
+            child = self._reply()["child"]
+            timer = threading.Timer(SLOWER * seconds, _kill, (child,))
             timer.start()
-            code = int(stdout.readline())
+            reply = self._reply()
             timer.cancel()
-            if code == 0:
-                return None
-            return [noted.read_text(encoding="utf-8")] if noted.exists() else []
+        if reply["code"] == 0:
+            return None
+        return reply["failed"] or f"ended with code {reply['code']}"
+
+    def _reply(self) -> dict[str, Any]:
+        line = self._replies.readline()
+        assert line, (self.folder / "server.log").read_text(encoding="utf-8")
+        return json.loads(line)
+
+    def _failed_anew(self, tests: Sequence[str], folder: str, seconds: float) -> str | None:
+        options = ["-x", "-q", "-rf", "-p", "no:cacheprovider", "-p", "no:xdist"]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pytest", *options, f"--basetemp={folder}/t", *tests],
+            cwd=self.folder,
+            env=environment(self.folder),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            said = process.communicate(timeout=SLOWER * seconds)[0]
+        except subprocess.TimeoutExpired:
+            _kill(process.pid)
+            process.communicate()
+            return "no end"
+        if process.returncode == 0:
+            return None
+        named = [test for test in tests if f"FAILED {test}" in said or f"ERROR {test}" in said]
+        return max(named, key=len, default=f"ended with code {process.returncode}")
 
 
 def _kill(group: int) -> None:
@@ -539,7 +580,7 @@ class Results:
         return digest(self._package, tests)
 
 
-def try_all(rooms: list[str], number: int, seed: int, kept: Path) -> int:
+def try_all(rooms: list[str], number: int, seed: int, kept: Path, limit: float = LIMIT_S) -> int:
     """Make mutants, try them, print what survives; how many do.
 
     Parameters
@@ -550,19 +591,22 @@ def try_all(rooms: list[str], number: int, seed: int, kept: Path) -> int:
     seed : int
     kept : Path
         Folder of what tests run which lines, and of results.
+    limit : float
+        Longest total of the tests of a mutant; s.
     """
     equal = equivalent()
     every = [(room, mutant) for room in rooms for mutant in chosen(room, number, seed)]
     every += [("store", mutant) for mutant in named() if "store" in rooms]
     begun = time.monotonic()
     coverages = coverage_of({room: files_of(room) for room in rooms}, kept, TOGETHER)
+    files = sorted({f"tests/{file}" for room in rooms for file in files_of(room)})
     results = Results(kept / "results.ndjson")
     survivors: list[Mutant] = []
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(TOGETHER) as pool:
         trees: SimpleQueue[Tree] = SimpleQueue()
         for i in range(TOGETHER):
             (Path(name) / str(i)).mkdir()
-            trees.put(Tree(Path(name) / str(i)))
+            trees.put(Tree(Path(name) / str(i), files))
 
         def one(room: str, mutant: Mutant) -> Outcome:
             if mutant.key in equal:
@@ -572,7 +616,8 @@ def try_all(rooms: list[str], number: int, seed: int, kept: Path) -> int:
             coverage, tree = coverages[room], trees.get()
             try:
                 tests = coverage.of(mutant.path, mutant.line, mutant.old)
-                outcome = tree.outcome(mutant, tests, coverage.takes)
+                flat = [test for of_file in tests for test in of_file]
+                outcome = tree.outcome(mutant, flat, coverage.takes, limit)
             finally:
                 trees.put(tree)
             results.keep(mutant, outcome)
@@ -609,8 +654,9 @@ if __name__ == "__main__":
         default=REPOSITORY / "build" / "mutants",
         help="Folder that keeps what tests run which lines, and what became of mutants.",
     )
+    parser.add_argument("--limit", type=float, default=LIMIT_S, help="Longest total of tests; s.")
     given = parser.parse_args()
     os.nice(10)
     given.coverage.mkdir(parents=True, exist_ok=True)
-    survive = try_all(given.rooms, given.each, given.seed, given.coverage)
+    survive = try_all(given.rooms, given.each, given.seed, given.coverage, given.limit)
     sys.exit(survive > AT_MOST)

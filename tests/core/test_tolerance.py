@@ -150,14 +150,51 @@ def test_jitter_changes_nothing_that_a_monitor_tells() -> None:
     assert found > 200
 
 
+MARGINS = """
+CHECK far: ALWAYS (ego.speed > 5 IMPLIES EVENTUALLY[0s, 0.2s] ego.speed < 2) ROBUSTNESS;
+CHECK near: ALWAYS (ego.speed < 2 IMPLIES EVENTUALLY[0.3s, 0.5s] ego.speed > 5) ROBUSTNESS;
+CHECK back: ALWAYS (ego.speed < 2 IMPLIES ONCE[0.1s, 0.3s] ego.speed > 5) ROBUSTNESS;
+CHECK kept: ALWAYS (ego.speed > 5 IMPLIES (ego.speed > 2 UNTIL[0.1s, 0.3s] ego.speed < 2)) ROBUSTNESS;
+CHECK past: ALWAYS (ego.speed < 2 IMPLIES (ego.speed < 5 SINCE[0.1s, 0.3s] ego.speed > 5)) ROBUSTNESS
+"""
+
+
+def test_jitter_changes_no_margin_of_a_monitor() -> None:
+    found: set[tuple[Any, ...]] = set()
+    for seed in range(3):
+        rng = random.Random(seed)
+        speeds = [rng.choice((0.0, 3.0, 8.0)) for _ in range(14)]
+        times = [100_000_000 * n for n in range(14)]
+        off = [rng.randint(-JITTER_NS, JITTER_NS) for _ in speeds]
+        even, odd = (
+            margins(speeds, [t + o * on for t, o in zip(times, off, strict=True)]) for on in (0, 1)
+        )
+        assert even == odd, seed
+        found.update(even)
+
+    assert len(found) > 7
+
+
+def margins(speeds: list[float], times: list[int]) -> list[tuple[Any, ...]]:
+    monitor = Monitor(MARGINS, period_s=0.1)
+    for speed, time_ns in zip(speeds, times, strict=True):
+        monitor.step(driven(speed, time_ns))
+    found = ((v.check, v.verdict, v.robustness) for v in monitor.finish())
+    return [(name, verdict, of and (of.value, of.condition, of.seq)) for name, verdict, of in found]
+
+
+def driven(speed: float, time_ns: int) -> Frame:
+    frame = Frame(time_ns=time_ns, ego="ego")
+    size = {"heading": 0.0, "length": 4.0, "width": 2.0}
+    frame.add("ego", "car", 0.0, 0.0, 0.0, **size, vx=speed, vy=0.0)
+    return frame
+
+
 def watched(speeds: list[float], times: list[int]) -> list[tuple[Any, ...]]:
     monitor = Monitor(ONLINE, period_s=0.1)
     told: list[Any] = []
     for speed, time_ns in zip(speeds, times, strict=True):
-        frame = Frame(time_ns=time_ns, ego="ego")
-        size = {"heading": 0.0, "length": 4.0, "width": 2.0}
-        frame.add("ego", "car", 0.0, 0.0, 0.0, **size, vx=speed, vy=0.0)
-        told += monitor.step(frame)
+        told += monitor.step(driven(speed, time_ns))
     verdicts = monitor.finish()
     events = [(e.kind, e.name, e.told.seq, e.start.seq, e.end.seq) for e in told]
     return events + [(v.check, v.verdict, len(v.violations)) for v in verdicts]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import mutants
 import mutants_coverage
+import mutants_server
 import pytest
 
 if TYPE_CHECKING:
@@ -73,29 +74,55 @@ def test_mutants_that_are_listed_as_equivalent_can_be_made_and_have_a_reason() -
     assert mutants.equivalent().keys() <= known
 
 
-def test_what_a_test_finds_is_told_from_what_it_does_not(
+def test_a_test_finds_a_mutant_or_passes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     committed = next(m for m in mutants.named() if "committed" in m.kind)
     file = "tests/core/test_store_transactions.py"
     finds = f"{file}::test_what_fails_in_a_transaction_is_undone_and_the_store_is_free"
-    tree = mutants.Tree(tmp_path)
+    other = "tests/edges/test_mutants.py::test_lines_that_moved_are_found_again_by_their_text"
+    tree = mutants.Tree(tmp_path, [file, "tests/edges/test_mutants.py"])
 
-    def found(*files: str) -> str:
-        outcome = tree.outcome(committed, [[file] for file in files], lambda _: 10.0)
+    def found(*tests: str, limit: float = 100.0) -> str:
+        outcome = tree.outcome(committed, tests, lambda tests: 10.0 * len(tests), limit)
         return "found" if outcome.found and outcome.why == finds else outcome.why
 
     try:
         assert found() == "no test of the room runs its file"
-        assert found("tests/core/test_graph.py") == "all 1 tests that run it pass"
-        assert found("tests/core/test_graph.py", finds) == "found"
+        assert found(other) == "all 1 tests that run it pass"
+        assert found(other, finds) == "found"
+        assert found(other, finds, limit=10.0) == "all 1 tests that run it pass, 1 were not run"
         assert capsys.readouterr().out == ""
-        gone = "tests/core/test_graph.py::test_that_is_not_there"
+        gone = "tests/edges/test_mutants.py::test_that_is_not_there"
         assert found(gone) == "all 0 tests that run it pass, 1 fail without it"
         assert gone in capsys.readouterr().out
     finally:
         tree.close()
     assert (tmp_path / committed.path).read_text(encoding="utf-8") == committed.old
+
+
+def test_imported_functions_get_the_code_of_a_mutant(tmp_path: Path) -> None:
+    path = tmp_path / "changed.py"
+    old = (
+        "class A:\n    def f(self):\n        return [\n            1\n        ]\n\n"
+        "    @property\n    def g(self):\n        return (lambda: 2)()\n"
+    )
+    names: dict = {}
+    exec(compile(old, str(path), "exec"), names)
+    a = names["A"]()
+
+    assert mutants_server.exchange(str(path), old, old.replace("2", "3")) == 2
+    assert (a.f(), a.g) == ([1], 3)
+    assert (
+        mutants_server.exchange(
+            str(path),
+            old.replace("2", "3"),
+            "class A:\n    def f(self):\n"
+            "        return [4]\n    @property\n    def g(self):\n        return 5\n",
+        )
+        == 2
+    )
+    assert (a.f(), a.g) == ([4], 5)
 
 
 def test_lines_that_moved_are_found_again_by_their_text() -> None:
