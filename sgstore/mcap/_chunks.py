@@ -561,11 +561,14 @@ def parse_records(
         )
         raise TraceError(reason, offset=chunk_offset)
     view = memoryview(records)
-    heads = _message_heads(view, offsets)
-    messages = message_columns(
-        heads, offsets, chunk_offset, lambda at, length: view[at : at + length]
-    )
+    messages = message_columns(_message_heads(view, offsets), offsets, chunk_offset, data_of(view))
     return messages, [(opcode, view[start:stop]) for opcode, start, stop in definitions]
+
+
+def data_of(records: Records) -> Callable[[int, int], memoryview]:
+    """Return the function that reads the bytes of a decompressed chunk, for :class:`Messages`."""
+    view = memoryview(records)
+    return lambda at, length: view[at : at + length]
 
 
 def message_columns(

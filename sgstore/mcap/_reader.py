@@ -42,6 +42,7 @@ from sgstore.mcap._chunks import (
     Messages,
     RecordPlace,
     StrictStream,
+    data_of,
     decompress_head,
     head_of_cut_chunk,
     loss_of_chunk,
@@ -488,14 +489,10 @@ class McapFile:
         self, walk: _FileWalk, head: ChunkHead
     ) -> tuple[Messages, list[tuple[int, memoryview]]]:
         """Return the messages of a chunk and its schemas and channels, from the cache or the file."""
-
-        def read() -> tuple[Messages, list[tuple[int, memoryview]]]:
-            return parse_records(walk.ahead.records(head), head.offset)
-
-        kept = self._spool.get(self.path, head.offset, lambda: read()[0].read)
+        kept = self._spool.get(self.path, head.offset, lambda: data_of(walk.ahead.records(head)))
         if kept is not None:
             return kept, []
-        found = read()
+        found = parse_records(walk.ahead.records(head), head.offset)
         self._verified.add(head.offset)
         return found
 

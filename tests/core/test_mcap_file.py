@@ -21,6 +21,7 @@ from mcap.stream_reader import StreamReader
 from recordings import OSI, Recorder, bulb, car, drive, ground_truth, house, person, sign
 from thorough import LONG, some
 
+import sgstore.mcap._reader as mcap_reader
 from sgstore.errors import TraceError
 from sgstore.mcap import McapFile
 from sgstore.model.world import TraceReport
@@ -183,6 +184,39 @@ def test_messages_of_a_real_recording_are_read_back_by_their_place(data: Path) -
     ]
 
     assert read == [message[-1] for message in officially(path)]
+
+
+def test_a_second_walk_parses_no_chunk_again_for_data_that_the_first_did_not_keep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parsed: list[int] = []
+    real = mcap_reader.parse_records
+
+    def counted(records: Any, offset: int) -> Any:
+        parsed.append(offset)
+        return real(records, offset)
+
+    monkeypatch.setattr(mcap_reader, "parse_records", counted)
+    path, topics = tmp_path / "two.mcap", ("/kept", "/other")
+    with Recorder(path, chunk_size=1000) as recorder:
+        schema = recorder.writer.register_schema("Plan", "", b"")
+        for topic in topics:
+            recorder.channels[topic] = recorder.writer.register_channel(topic, "json", schema)
+        for i in range(100):
+            for topic in topics:
+                recorder.write(recorder.channels[topic], i / 10, f'["{topic}", {i}]'.encode())
+    with McapFile(path) as file:
+        kept = recorder.channels["/kept"]
+
+        def data() -> list[bytes]:
+            runs = file.walk(TraceReport(), keep=lambda channel: channel == kept)
+            return [bytes(run.data(row)) for run in runs for row in range(len(run))]
+
+        first, chunks = data(), len(parsed)
+        assert len(first) == 200
+        assert data() == first
+    assert chunks > 5
+    assert len(parsed) - chunks <= 2  # only chunks with definitions
 
 
 def test_a_file_that_was_replaced_gives_no_other_message_in_its_place(tmp_path: Path) -> None:
