@@ -10,6 +10,7 @@ from bench.measure import show
 TITLES = {
     "ingest": "Ingest: a recording into a store",
     "traces": "Recordings: objects decoded, large files skimmed",
+    "topics": "Topics: a million messages stored and filtered",
     "sgg": "The scene graph generator",
     "classes": "Classes: isomorphic or not, beside networkx",
     "roads": "Road maps: reading, and asking which lanes footprints touch",
