@@ -255,11 +255,9 @@ def draw_matrix(
                 f"; {len(names) - len(shown)} features are in the same frames as one of the others"
             )
     if len(shown) > most:
-        often = np.diagonal(frames) + 1.0
-        surprise = (gaps[np.ix_(shown, shown)] * often[shown]).sum(axis=1) * often[shown]
         what = "values" if groups else "features"
         below += f"; of {len(shown)} {what} the {most} with the most gaps"
-        shown = np.sort(shown[np.argsort(-surprise, kind="stable")[:most]])
+        shown = _most_surprising(shown, frames, gaps, most)
     square = np.ix_(shown, shown)
     groups = [groups[i] for i in shown.tolist()] if groups else []
     image = _cells(frames[square], gaps[square], wanted[square], groups)
@@ -288,6 +286,15 @@ def draw_matrix(
                     draw(place - 0.5, color=INK, linewidth=0.6)
         cannot = bool((image == to_rgb(_CANNOT)).all(axis=2).any())
         _explain_colours(page, gaps, cannot=cannot)
+
+
+def _most_surprising(
+    shown: NDArray[np.int64], frames: NDArray[np.int64], gaps: NDArray[np.bool_], most: int
+) -> NDArray[np.int64]:
+    """Return the features with the most gaps, weighted by frame counts, in the given order."""
+    often = np.diagonal(frames) + 1.0
+    surprise = (gaps[np.ix_(shown, shown)] * often[shown]).sum(axis=1) * often[shown]
+    return np.sort(shown[np.argsort(-surprise, kind="stable")[:most]])
 
 
 def _cells(

@@ -399,8 +399,8 @@ class SegmentReader:
         found = store.requested(path, self._request) if store and self._request else None
         if found is None:
             return None
-        *stored, report = found
-        return TraceOutcome(path, "present", *stored, scope=report.get("scope", {}))
+        name, ego, frames, report = found
+        return TraceOutcome(path, "present", name, ego, frames, scope=report.get("scope", {}))
 
     def _read(self, path: Path, folder: Path, views: list[_EgoView]) -> None:
         job, config, store = self._job, self._job.config, self._store()

@@ -628,20 +628,20 @@ class CheckMonitor:
             for key in self._covered(row, entry):
                 begun, ended = self._told.get(key, (0, 0))
                 begins = entry.since is not None and self._check.having is None
-                spans = (*entry.over, (entry.since, None)) if begins else entry.over
-                if (begun, ended) == (len(spans), len(entry.over)) or not self._counts(key, entry):
+                told = len(entry.over) + begins, len(entry.over)
+                if (begun, ended) == told or not self._counts(key, entry):
                     continue
-                self._told[key] = len(spans), len(entry.over)
-                for number in range(ended, len(spans)):
-                    start, end = spans[number]
-                    values = {} if end is None else self._violation(key, (start, end))
+                self._told[key] = told
+                for number, (start, end) in enumerate(entry.over[ended:], ended):
+                    values = self._violation(key, (start, end))
                     if values is None:
                         continue
                     if number >= begun:
                         yield self._event("violated", here, key, start, start)
-                    if end is not None:
-                        event = self._event("kept again", here, key, start, end)
-                        yield replace(event, values=values)
+                    event = self._event("kept again", here, key, start, end)
+                    yield replace(event, values=values)
+                if begins and entry.since is not None and begun < told[0]:
+                    yield self._event("violated", here, key, entry.since, entry.since)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
         """Yield the combinations of known entities that share one monitoring state."""

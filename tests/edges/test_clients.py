@@ -25,7 +25,7 @@ from sgstore.exporters import Export, labelled, whole_clips, write_export
 from sgstore.exporters._geojson import _projection
 from sgstore.ingest import ingest
 from sgstore.model.world import Clip
-from sgstore.testsets.coverage import phrases
+from sgstore.testsets.scenes import phrases
 
 if TYPE_CHECKING:
     from sgstore.query import Store

@@ -101,7 +101,7 @@ def _report_scenes(
     table: ReportTable, frames: Classed, ask: FrameAskOptions, limit: int | None
 ) -> None:
     """Print a table of frames; for people with a phrase for each scene."""
-    from sgstore.testsets.coverage import with_scenes
+    from sgstore.testsets.scenes import with_scenes
 
     ask.report(with_scenes(table, frames.chosen.store) if ask.for_people else table, limit)
 

@@ -131,7 +131,7 @@ def select(
     if curve or picture is not None:
         _curve(found, picture, out, printed=curve)
     else:
-        from sgstore.testsets.coverage import with_scenes
+        from sgstore.testsets.scenes import with_scenes
 
         out.report(with_scenes(table, found.units.chosen.store) if out.for_people else table)
 
@@ -290,7 +290,8 @@ def diff(
     """
     from sgstore.apps.verbs import compared
     from sgstore.testsets import diff as differences
-    from sgstore.testsets.coverage import ChosenFrames, with_scenes
+    from sgstore.testsets.coverage import ChosenFrames
+    from sgstore.testsets.scenes import with_scenes
 
     if sum(one is not None for one in (name, query, file)) + by_frame > 1:
         raise typer.BadParameter("expected one of -p NAME, -q TEXT, -f FILE, --by-frame")

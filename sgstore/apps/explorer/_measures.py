@@ -26,10 +26,10 @@ from sgstore.testsets.coverage import (
     covered,
     features,
     growth,
-    phrases,
 )
 from sgstore.testsets.diff import by_frame, scenes
 from sgstore.testsets.locks import lock_of
+from sgstore.testsets.scenes import phrases
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -163,7 +163,7 @@ class Waypoints:
 
 
 def _markings(road_map: RoadMap, points: LanePoints) -> dict[int, dict[str, Any]]:
-    """Return the attributes of the markings beside waypoints, by node row."""
+    """Return the attributes of the markings at waypoints, by node row."""
     found: dict[int, dict[str, Any]] = {}
     for row, sides in road_map.marking_parts.items():
         low, high = np.searchsorted(points.lane, (row - FIRST_LANE, row - FIRST_LANE + 1)).tolist()

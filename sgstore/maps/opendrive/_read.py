@@ -52,6 +52,8 @@ from sgstore.model.config import Signs
 if TYPE_CHECKING:
     from collections.abc import Container, Mapping
 
+    from numpy.typing import NDArray
+
 
 SIGNS: Final = Signs()
 """Default interpretation of signals."""
@@ -157,10 +159,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         ("laneChange", FIRST_LANE + lane_changes.lane, FIRST_LANE + lane_changes.to),
         signals.edges(first_signal),
     ]
-    shapes = np.full(len(nodes), None, object)
     poles: Any = shapely.points(signals.nodes.x, signals.nodes.y)
-    beside = [*crosswalks.shapes, *poles, *scenery.shapes]
-    shapes[len(nodes) - len(beside) :] = beside
     document.settle()
     signal, lane, s = signals.places(first_signal)
     header_name = next(iter(document["header"].texts("name")), "").strip()
@@ -172,7 +171,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         nodes=nodes,
         edges=edges_of(edges),
         ribbons=every,
-        shapes=shapes,
+        shapes=_at_the_end([*crosswalks.shapes, *poles, *scenery.shapes], len(nodes)),
         lane_changes=lane_changes,
         road_types=road_types(document),
         junction_types=junction_types(document),
@@ -186,6 +185,13 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
         marking_parts=marking_parts,
         variant=signals.told,
     )
+
+
+def _at_the_end(shapes: list[Any], number: int) -> NDArray[Any]:
+    """Return the shapes of all nodes; only the last nodes have one."""
+    found = np.full(number, None, object)
+    found[number - len(shapes) :] = shapes
+    return found
 
 
 def _short_digest(text: str) -> str:

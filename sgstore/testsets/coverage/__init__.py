@@ -39,7 +39,6 @@ from sgstore.testsets.coverage._failures import (
 )
 from sgstore.testsets.coverage._features import Combinations, combos, features
 from sgstore.testsets.coverage._frames import ReportTable, of_unknown
-from sgstore.testsets.coverage._scenes import phrases, with_scenes
 from sgstore.testsets.coverage._sequences import (
     WITHIN_S,
     check_sequences,
@@ -78,7 +77,6 @@ __all__ = [
     "novel_frames",
     "of_unknown",
     "periods_of",
-    "phrases",
     "rank_sizes",
     "read_outcomes",
     "recordings_of",
@@ -92,5 +90,4 @@ __all__ = [
     "told_outcomes",
     "traces_of",
     "venn",
-    "with_scenes",
 ]

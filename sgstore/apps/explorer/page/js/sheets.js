@@ -184,7 +184,8 @@ function Classes({ found }) {
 /** How often two features are in the same frame; a gap is its query.
  * @param {{found: {names: string[], frames: number[][], queries: Record<string, string>}}} props */
 function Matrix({ found: { names, frames, queries } }) {
-  const size = 17, left = 12 + 6.2 * Math.min(42, Math.max(...names.map((name) => name.length))), most = Math.max(...frames.flat(), 1), gaps = Object.keys(queries).length;
+  const size = 17, left = 12 + 6.2 * Math.min(42, Math.max(...names.map((name) => name.length)));
+  const most = Math.max(...frames.flat(), 1), gaps = Object.keys(queries).length;
   const [at, point] = useState(/** @type {[number, number] | null} */ (null));
   const cells = names.flatMap((_, i) => names.slice(0, i + 1).map((_, j) => {
     const many = frames[i]?.[j] || 0, query = queries[`${j} ${i}`],

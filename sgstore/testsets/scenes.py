@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from sgstore.collection import Collection
-    from sgstore.testsets.coverage._frames import ReportTable
+    from sgstore.testsets.coverage import ReportTable
 
 MOST: Final = 200
 """Largest number of rows of a table with a phrase."""
