@@ -69,7 +69,7 @@ def served(written: Path) -> Iterator[Callable[[Path], str]]:
     for child, _ in children.values():
         child.terminate()
     for child, _ in children.values():
-        child.communicate(timeout=20)
+        child.communicate(timeout=120)
 
 
 @pytest.fixture

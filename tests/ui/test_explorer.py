@@ -325,7 +325,7 @@ def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
         page.context.close()  # before what it listens to is gone
     finally:
         child.terminate()
-        child.communicate(timeout=20)
+        child.communicate(timeout=120)
 
 
 def test_coverage_is_shown_and_a_gap_is_a_query(page: Any) -> None:

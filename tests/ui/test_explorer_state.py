@@ -55,7 +55,7 @@ class Served:
     def stop(self) -> None:
         assert self.child is not None
         self.child.terminate()
-        self.child.communicate(timeout=20)
+        self.child.communicate(timeout=120)  # a busy machine
 
     def link(self, **parts: str) -> str:
         told = "&".join(f"{name}={quote(value)}" for name, value in parts.items())
