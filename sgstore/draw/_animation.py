@@ -158,7 +158,7 @@ class Gif(Animation):
         self.frames += 1
 
     def _indexed(self, picture: Image.Image, box: tuple[int, int, int, int]) -> Image.Image:
-        """Return a part in the palette of an earlier picture, or of this one if colours are new."""
+        """Return a part of the picture in the palette of an earlier one, or with new colours in its own."""
         if self._palette is not None:
             part = picture.crop(box)
             made = part.quantize(palette=self._palette, dither=Image.Dither.NONE)

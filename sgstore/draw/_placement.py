@@ -126,7 +126,7 @@ class Placer:
 def _spots(
     x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
 ) -> list[tuple[float, float]]:
-    """Return possible places (middles) of a text around an object, nearest first."""
+    """Return possible centres of a label next to an object, nearest first."""
     half_w, half_h = size[0] / 2, size[1] / 2
     return [
         (

@@ -188,7 +188,7 @@ _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
 
 def within_range(found: Verdict, short: ShortRange) -> Verdict:
-    """Return a verdict that holds for the whole world.
+    """Return the verdict about the whole world, not only about the entities in range.
 
     It becomes unknown if the trace stores too small a range around the ego.
     """

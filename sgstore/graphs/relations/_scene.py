@@ -361,7 +361,7 @@ def carried_by(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def levels(bodies: Bodies, between: str) -> Floats:
-    """Return the heights of objects that are used for distances; m."""
+    """Return the height of each object, which distances use; m."""
     if between != "origins":
         return bodies.z
     on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]

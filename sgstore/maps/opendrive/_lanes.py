@@ -386,7 +386,7 @@ def _pieces(
     plan: PlanView,
     parts: tuple[_LaneIntervals, _LaneBorders, Floats],
 ) -> tuple[Ints, Ints]:
-    """Return the number of straight pieces for each interval of a road, and its reference line record."""
+    """Return the number of straight pieces of each interval of a road, and its reference line record."""
     intervals, borders, heights = parts
     length = intervals.end - intervals.start
     road = lanes.sections.road[intervals.section]

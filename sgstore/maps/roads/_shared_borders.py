@@ -43,7 +43,7 @@ class _Stretch:
 
 
 def with_shared_borders(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Return lanes with more neighbours: lanes that share a border are neighbours.
+    """Add missing neighbours: lanes that share a border become neighbours. Return the changed lanes.
 
     Two lanes share a border if they are on its two sides, along the same part of it. A side with a
     neighbour from the source stays unchanged.

@@ -80,7 +80,7 @@ class Classed:
         return len(np.unique(trace_of(self.frame_id))) if unit == "trace" else 0
 
     def _units(self, unit: CountedUnit) -> Ints:
-        """Return the indices of the counted frames: all frames, or one per run or trace for each class."""
+        """Return the indices of the frames to count: all, or for each class one per run or trace."""
         rows = np.flatnonzero(self.known)
         if unit == "frame" or not len(rows):
             return rows
