@@ -103,6 +103,7 @@ WHOLE = {
         "mutants",
         "packaging",
         "public_paths",
+        "system_calls",
     ),
 }
 """Tests of no room: of all of them together, and of programs beside the package."""

@@ -349,13 +349,12 @@ def test_a_class_has_a_phrase_in_a_table_and_none_in_json(folder: Path, capsys: 
 
 def test_scenes_are_told_by_one_function_in_each_table(folder: Path, capsys: Any) -> None:
     store = str(folder / "town.sgstore")
-    select = ["select", store, "--unit", "clip", "--rarest", "--budget", "2units"]
     early, late = (f"{store}:MATCH (e:Ego) WHERE frame.seq {of} 20" for of in ("<", ">="))
     opened = sgstore.open(store)
-    for words in (select, ["diff", early, late], ["coverage", "novel", late, "--by", early]):
+    for words in (["diff", early, late], ["coverage", "novel", late, "--by", early]):
         rows = json.loads(printed(capsys, *words, "--json")[0])
         table = printed(capsys, *words)[0].splitlines()
-        frames = [row.get("frame", row.get("unit")) for row in rows[: len(table) - 2]]
+        frames = [row["frame"] for row in rows[: len(table) - 2]]
         told = [line.rpartition("  ")[2] for line in table[2:]]
         assert "scene" not in rows[0]
         assert table[0].split()[-1] == "scene"

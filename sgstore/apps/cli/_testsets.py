@@ -113,7 +113,6 @@ def select(
     picture : FILE
         Draw the curve: .png or .svg.
     """
-    from sgstore.testsets.scenes import with_scenes
     from sgstore.testsets.selection import parse_split, split_table
     from sgstore.testsets.selection import split as split_up
 
@@ -124,15 +123,12 @@ def select(
     found = opened.select(question.typed(), **given(choice), parameters=values)
     say_chosen(found.units.chosen, out, world=False)
     table = split_table(found, split_up(found, shares), shares) if shares else found.table()
-    draws = curve or picture is not None
-    if out.for_people and not draws:  # before the lock is written: the deadline may stop the query
-        table = with_scenes(table, found.units.chosen.store)
     for text in found.said:
         say(text)
     if to is not None:
         write_lock(found, to, split=split, payloads=payloads)
     # Last, so that the lock exists even if the reader stops after the first rows.
-    if draws:
+    if curve or picture is not None:
         _curve(found, picture, out, printed=curve)
     else:
         out.report(table)
