@@ -62,6 +62,7 @@ TESTS = {
     "rebuild": "rebuilding",
     "relations": "relations relations_* motion bodies bounds driven_lanes",
     "roads": "roads roads_* lane_dist lane_places lane_courses roundabouts",
+    "scenes": "clients coverage",
     "schema": "schema views views_page open_names",
     "recording_ingest": "ingest ingest_many",
     "coverage": "coverage coverage_* sequences",
