@@ -133,6 +133,7 @@ CHECKS = [
     "CHECK slow: FORALL (a:Car) ALWAYS a.speed < 8 ROBUSTNESS;"
     " CHECK ever: FORSOME (a:Car) EVENTUALLY a.x > 100 AND EXISTS {(a)-[:near]->(b)} ROBUSTNESS",
     "CHECK told: FORALL (a:Car) ALWAYS a.speed < 5 RETURN MAX(a.speed) OVER match AS most, a.name",
+    "CHECK some: FORALL (a:Car) ALWAYS a.speed < 5 RETURN MAX(a.speed) OVER match AS most HAVING most > 6",
     "CHECK seen: FORSOME (a:Car) EVENTUALLY EXISTS {(a)-[:near]->(b)}; CHECK still: ALWAYS ego.speed < 3",
     "USING RANGE 5 CHECK close: FORALL (a:Car) ALWAYS NOT EXISTS {(a)-[:near]->(b)}",
 ]
@@ -484,7 +485,7 @@ RULES = {
     "BoundCheck": {
         *("name", "scope", "quantifiers", "formula", "reset", "relations", "injective", "ego"),
         *("unknown_is_false", "end", "gaps", "robustness", "returns", "world", "range", "limit"),
-        "doubts",
+        *("doubts", "having"),
     },
     "Scope": {"nodes", "outer", "edges", "where", "distinct"},
     "Aggregate": {"word", "operand", "distinct", "type", "share"},
