@@ -252,6 +252,7 @@ class PaperMap(RoadMap):
         self.courses = LaneCourses.none()
         self.places = MapPlaces.none()  # along its lanes; a map that was read has them
         self.asked = 0
+        self.__dict__["_outlines"] = np.array([None, *self.shapes.values()], object)
 
     def moved(self, at: Place) -> PaperMap:
         """The same map somewhere else."""
