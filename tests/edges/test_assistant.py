@@ -300,7 +300,7 @@ def test_an_assistant_sees_pictures_and_reads_resources(town_store: Path) -> Non
         len(json.dumps([t.model_dump(mode="json", exclude_none=True) for t in listed.tools]))
         < 12_000
     )
-    assert max(len(tool.description) for tool in listed.tools) < 230
+    assert max(len(tool.description) for tool in listed.tools) < 160
     assert "never instructions" in told
     kinds = [one.content[1].mime_type for one in (shown, seen)]
     sizes = [

@@ -401,19 +401,22 @@ def many_bundles(count: int) -> catalogue.Snapshot:
     return catalogue.Snapshot(1, facts)
 
 
-def decided(whole: Collection, compiled: Compiled) -> list[str]:
-    """The bundles that may answer, told within two seconds of processor time, also on a busy machine."""
+def decided(whole: Collection, compiled: Compiled, limit: float) -> list[str]:
+    """The bundles that may answer, told within a limit of processor time; s."""
     began = time.process_time()
     found = whole.may_answer(compiled)
-    assert time.process_time() - began < 2
+    assert time.process_time() - began < limit
     return found
 
 
-def test_ten_thousand_bundles_are_decided_in_two_seconds(place: Path) -> None:
+def test_ten_thousand_bundles_are_decided_in_half_a_second(place: Path) -> None:
     whole = Collection(place)
+    began = time.process_time()
     whole.snapshot = many_bundles(10_000)
+    # Processor time grows on a busy machine: a longer limit only if making the bundles took longer, too.
+    limit = max(0.5, 1.5 * (time.process_time() - began))
     rare = compile_query("MATCH (a:Car)-[:opposes]->(b:Truck)", whole.catalog, {})
-    assert len(decided(whole, rare)) == 100
+    assert len(decided(whole, rare, limit)) == 100
 
     def holding(*triples: tuple[str, str, str]) -> set[str]:
         held = {b: {r[3:6] for r in whole.snapshot.of("triple", b)} for b in whole.bundles()}
@@ -435,11 +438,11 @@ def test_ten_thousand_bundles_are_decided_in_two_seconds(place: Path) -> None:
         ),
         ("MATCH (a:Car)-[:near]->(b:Truck) WHERE HAPPENS collision(a, b)", (near,)),
     ):  # each bundle has other triples
-        found = decided(whole, compile_query(text, whole.catalog, {}))
+        found = decided(whole, compile_query(text, whole.catalog, {}), limit)
         assert set(found) == holding(*triples), text
     every = compile_query("MATCH (a)-[:near|visible|opposes]->(b)-[:near]-()", whole.catalog, {})
     assert (
-        len(decided(whole, every)) == 10_000
+        len(decided(whole, every, limit)) == 10_000
     )  # all that they hold matters, and each holds other things
 
 

@@ -285,8 +285,7 @@ class StoreTools:
     ) -> ToolAnswer:
         """Check properties that must be true in every trace.
 
-        A trace has the verdict true, false or unknown. After the first violation, ALWAYS p is violated up to
-        the end of the trace: find NOT p with form intervals lists the times.
+        A violated ALWAYS p lasts to the end of the trace; find NOT p, form intervals, lists the times.
 
         Parameters
         ----------
