@@ -36,11 +36,11 @@ def phrases(store: Store, frames: Sequence[str]) -> list[str]:
     ----------
     store : Store
     frames : sequence of str
-        Names of frames (``town#120``) or of test cases (``town#120-139``, which means the first frame).
+        Names of frames, such as ``town#120``.
     """
     parts = [name.rpartition("#") for name in frames]
     values = {"place": [*range(len(frames))], "trace": [one[0] for one in parts]}
-    values["seq"] = [one[2].partition("-")[0] for one in parts]
+    values["seq"] = [one[2] for one in parts]
     found: dict[int, list[str]] = {}
     for place, kind, inside, number in store.file.rows(_SCENES, values):
         phrase = found.setdefault(place, ["ego"])
@@ -55,22 +55,21 @@ def phrases(store: Store, frames: Sequence[str]) -> list[str]:
 def with_scenes(
     table: ReportTable, store: Store | Collection, vanished_from: Store | Collection | None = None
 ) -> ReportTable:
-    """Return a table with a column ``scene``: the phrase of the frame or test case of each row.
+    """Return a table with a column ``scene``: the phrase of the frame of each row.
 
     Parameters
     ----------
     table : ReportTable
-        A table with a column ``frame`` or ``unit``; others are returned unchanged.
+        A table with a column ``frame``; others are returned unchanged.
     store : Store or Collection
         Store of the frames. A collection has no phrases.
     vanished_from : Store or Collection, optional
         Store of the frames of rows with the change ``vanished``.
     """
-    name = next((one for one in ("frame", "unit") if one in table.columns), None)
     stores = [store] if vanished_from is None else [store, vanished_from]
-    if name is None or not all(isinstance(one, Store) for one in stores):
+    if "frame" not in table.columns or not all(isinstance(one, Store) for one in stores):
         return table
-    frames = table.column(name)[:MOST]
+    frames = table.column("frame")[:MOST]
     gone = [bool(vanished_from) and row[0] == "vanished" for row in table.rows[:MOST]]
     told = dict[int, str]()
     for number, one in enumerate(stores):

@@ -399,7 +399,7 @@ EDGES: Final[dict[str, tuple[Edge, ...]]] = {
             lambda x: SIREN.with_actor("ego", route=aside(x, RIGHT, LEFT, 15)), 65.98, 65.96, None
         ),
     ),
-    "turn_lanes_846": (edge(turns_right_into, 0.43, 0.44),),
+    "turn_lanes_846": (edge(turns_right_into, 0.42, 0.43),),
     # From side to side 0.90 m and 0.92 m
     "bicycle_839": (edge(across(BESIDE_BICYCLE), -0.95, -0.93),),
     "pass_843": (
