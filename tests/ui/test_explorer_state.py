@@ -216,10 +216,12 @@ def test_many_matches_are_ticked_at_once_and_survive_a_reload(page: Any, served:
     expect(last).to_be_visible()
     assert rows.count() < 60
     expect(rows.first.locator(":focus")).to_have_text("open")  # it stays, out of sight
+    page.wait_for_function("location.hash.includes('tick=')")
+    was = page.evaluate("location.hash")
     last.get_by_role("button", name="remove").press("Enter")
     expect(page.get_by_role("heading", name=f"{MANY - 1:,} clips")).to_be_visible()
     expect(page.locator(f".clip[aria-posinset='{MANY - 1}'] :focus")).to_have_text("remove")
-    page.wait_for_function("location.hash.includes('tick=')")
+    page.wait_for_function("was => location.hash !== was", arg=was)
     page.reload()
     expect(page.get_by_role("heading", name=f"{MANY - 1:,} clips")).to_be_visible()
     expect(page.locator(".clip").first).to_contain_text("0.00 s")
