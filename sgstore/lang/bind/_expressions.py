@@ -139,7 +139,8 @@ def _attribute(e: s.AttributeOf, names: SymbolTable) -> b.Bound:
             known_names = [attribute.name.removeprefix("env.") for attribute in known.values()]
             if owner == "frame":
                 known_names += [f"class_{name}" for name in names.session.classed]
-            names.session.unknown(f"attribute of {owner}", e.name, _tail(e), known_names)
+            hint = _hint_elsewhere(e.name, known_names)
+            names.session.unknown(f"attribute of {owner}", e.name, _tail(e), known_names, hint)
         return make(found, found.type)
     meaning = names.meaning(owner)
     if meaning is None and owner in names.session.tables:
@@ -147,6 +148,15 @@ def _attribute(e: s.AttributeOf, names: SymbolTable) -> b.Bound:
     if meaning is not None and meaning.edge is not None:
         return edge_attribute(meaning.edge, e.name, _tail(e), names)
     return node_attribute(names.node(owner, e.owner.span), e.name, _tail(e), names)
+
+
+def _hint_elsewhere(name: str, known: Sequence[str]) -> str | None:
+    """Return a hint for an attribute that another owner has; None if a known name is similar."""
+    if (hint_at(name, known) or "").startswith("did"):
+        return None
+    if normalize_name(name) in NODE_ATTRIBUTES:
+        return f"it is an attribute of nodes, such as ego.{name}"
+    return said_of("attributes", name)
 
 
 def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
