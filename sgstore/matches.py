@@ -132,7 +132,7 @@ class Interval:
     start_ns, end_ns : int
         Simulation times of these frames; ns.
     start, end : float
-        Times since the trace start; s.
+        Times of the first and of the last frame since the trace start; s.
     frames : int
         Number of frames.
     values : dict

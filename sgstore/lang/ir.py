@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeGuard
 
+from sgstore.errors import QueryError
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Attribute, DisplayUnit, RelationScope, Type
 from sgstore.model.vocabulary import KINDS, RELATIONS, entity_kinds
 
@@ -633,6 +634,50 @@ class Result:
         """True if ``SKIP``, ``LIMIT``, or ``HAVING`` without groups, chooses among the rows of the query."""
         chosen = self.limit is not None or self.top is not None or self.skip > 0
         return chosen or (self.having is not None and not self.aggregated)
+
+    @property
+    def among_rows(self) -> list[str]:
+        """Words of the clauses that need all rows: sorted, chosen, or counted together."""
+        clauses = {
+            "aggregates such as COUNT(*)": self.aggregated,
+            "DISTINCT": self.distinct,
+            "ORDER BY": bool(self.order),
+            "SAMPLE": self.sample is not None,
+            "LIMIT … PER": self.top is not None,
+            "SKIP": self.skip > 0,
+            "LIMIT": self.limit is not None,
+        }
+        return [word for word, used in clauses.items() if used]
+
+    def having_of_match(self, reason: str) -> Bound | None:
+        """Return the ``HAVING`` condition on the values of one match, without references to columns.
+
+        Parameters
+        ----------
+        reason : str
+            The reason for an error: "a monitor reports single matches".
+
+        Raises
+        ------
+        QueryError
+            The condition is about groups of matches, or about the ends of intervals.
+        """
+        if self.having is None:
+            return None
+        hint = "write a value of the match: HAVING MIN(x) OVER match < 1 or HAVING LAST(frame.t) OVER match > 5"
+        if self.aggregated:
+            raise QueryError(f"{reason}, so HAVING has no groups", hint=hint)
+        columns = {column.name: column.value for column in self.columns}
+
+        def resolved(part: Bound) -> Bound:
+            if not isinstance(part, GroupKey):
+                return with_operands(part, resolved)
+            if part.name not in columns:
+                told = f"{reason}, so '{part.name}' of {self.form} is unknown"
+                raise QueryError(told, hint=hint)
+            return columns[part.name]
+
+        return resolved(self.having)
 
     def changed(self, change: Callable[[Bound], Bound]) -> Result:
         """Return a copy of the result clause with a function applied to every expression."""

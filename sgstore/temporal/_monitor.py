@@ -453,6 +453,22 @@ class Monitor:
         return {follow.name: follow.query for _, follow, _ in self._follows}
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on the clauses of patterns that have no effect in a monitor.
+
+        Examples
+        --------
+        >>> sgstore.Monitor("MATCH (v:Vehicle) RETURN v.name ORDER BY v.name LIMIT 3").notes
+        ('pattern: a monitor reports each match; ORDER BY, LIMIT have no effect',)
+        """
+        ignored = {name: query.result.among_rows for name, query in self.patterns.items()}
+        return tuple(
+            f"{name}: a monitor reports each match; {', '.join(words)} have no effect"
+            for name, words in ignored.items()
+            if words
+        )
+
+    @property
     def status(self) -> dict[str, str]:
         """Return the status of each check: ``true``, ``false``, ``presumably_true`` or ``presumably_false``.
 

@@ -7,11 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.errors import QueryError, TextSpan
+from sgstore.errors import TextSpan
 from sgstore.lang.ir import (
-    Bound,
     BoundStep,
-    GroupKey,
     OverMatch,
     Query,
     ReturnColumn,
@@ -19,7 +17,6 @@ from sgstore.lang.ir import (
     StepTime,
     StepWay,
     walk,
-    with_operands,
 )
 from sgstore.model.world import seconds_of
 from sgstore.temporal._binding_truth import Valuation
@@ -328,7 +325,8 @@ class SequenceMonitor:
         self._names: dict[int, str] = {}
         self._ended = False
         self._happen = {way: way.happen for way in self._asked}
-        self._returned = ReturnedValues(_returned(query), "last", _having(query))
+        having = query.result.having_of_match("a monitor reports single matches")
+        self._returned = ReturnedValues(_returned(query), "last", having)
         plan, bridge = partial(plan_of_steps, query, self._steps), query.gaps == "bridge"
         parts = self._returned.parts
         self._values = MatchValues(parts, plan, questions, pulse, bridge=bridge)
@@ -703,35 +701,6 @@ def _returned(query: Query) -> list[ReturnColumn]:
         for column in query.result.columns
         if any(isinstance(part, OverMatch | StepTime) for part in walk(column.value))
     ]
-
-
-def _having(query: Query) -> Bound | None:
-    """Return the ``HAVING`` condition on the values of one match, without references to result columns.
-
-    Raises
-    ------
-    QueryError
-        The condition is about groups of matches, or about the ends of intervals.
-    """
-    result = query.result
-    if result.having is None:
-        return None
-    hint = "write a value of the match: HAVING MIN(x) OVER match < 1 or HAVING LAST(frame.t) OVER match > 5"
-    if result.aggregated:
-        raise QueryError("a monitor reports single matches, so HAVING has no groups", hint=hint)
-    columns = {column.name: column.value for column in result.columns}
-
-    def resolved(part: Bound) -> Bound:
-        if not isinstance(part, GroupKey):
-            return with_operands(part, resolved)
-        if part.name not in columns:
-            reason = (
-                f"a monitor reports single matches, so '{part.name}' of {result.form} is unknown"
-            )
-            raise QueryError(reason, hint=hint)
-        return columns[part.name]
-
-    return resolved(result.having)
 
 
 def _named(query: Query) -> tuple[str, ...]:

@@ -117,3 +117,34 @@ def test_a_monitor_rejects_having_of_groups_and_of_intervals(returned: str, wron
         Monitor(f"MATCH (v:Vehicle) RETURN {returned}")
 
     assert "HAVING MIN(x) OVER match" in str(error.value)
+
+
+@pytest.mark.parametrize("form", ["v.name, ", "*, "])
+def test_intervals_are_those_that_having_chooses(form: str, open_town: Store) -> None:
+    text = f"{NEAR} RETURN {form}{LEAST} AS least"
+    named = f"{NEAR} RETURN v.name, INTERVALS, {LEAST} AS least"
+    chosen = [row for row in rows(named, open_town) if row[-1] < 1]
+    matches = open_town.find(f"{text} HAVING least < 1")
+
+    assert 0 < len(chosen) < len(rows(named, open_town))
+    for bound in (False, True):
+        found = [*matches.intervals(bound=bound)]
+        assert [(i.trace, i.start_seq, i.values["v.name"]) for i in found] == [
+            (row[0], row[1], row[8]) for row in chosen
+        ]
+
+
+@pytest.mark.parametrize(
+    ("returned", "bound", "wrong"),
+    [
+        ("v.name, COUNT(*) AS n HAVING n > 20", False, "HAVING has no groups"),
+        ("v.name, COUNT(*) AS n HAVING n > 20", True, "HAVING has no groups"),
+        ("v.name, CLIPS(-1s, 1s) HAVING start_ns > 3", False, "'start_ns' of clips"),
+        ("v.name, INTERVALS HAVING frames > 3", True, "'frames' of intervals"),
+    ],
+)
+def test_intervals_do_not_ignore_having(
+    returned: str, bound: bool, wrong: str, open_town: Store
+) -> None:
+    with pytest.raises(QueryError, match=wrong):
+        next(open_town.find(f"{NEAR} RETURN {returned}").intervals(bound=bound))

@@ -395,3 +395,19 @@ def test_a_frame_without_an_ego_has_off_road_too(text: str) -> None:
     scene = SceneGraph(1, "town", 0, 0, None, nodes, [(3, "isIn", -1, {})])
     found = {event.nodes["a"] for event in Monitor(text).look([scene])}
     assert found == ({-1, 3} if text == "MATCH (a)" else {-1})
+
+
+@pytest.mark.parametrize(
+    ("clause", "words"),
+    [
+        ("ORDER BY v.name LIMIT 3", "ORDER BY, LIMIT"),
+        ("SAMPLE 2 PER v.kind SKIP 1", "SAMPLE, SKIP"),
+        ("LIMIT 2 PER v.kind", "LIMIT … PER"),
+    ],
+)
+def test_a_monitor_notes_clauses_without_effect(clause: str, words: str) -> None:
+    watched = Monitor(f"MATCH (v:Vehicle) RETURN v.name, v.kind {clause}", called="cars")
+
+    assert watched.notes == (f"cars: a monitor reports each match; {words} have no effect",)
+    assert Monitor("MATCH (v:Vehicle) RETURN v.name; CHECK ALWAYS ego.speed < 3").notes == ()
+    assert Monitor("MATCH (v:Vehicle) RETURN COUNT(*)").notes[0].count("COUNT(*)") == 1

@@ -21,6 +21,7 @@ from sgstore.apps.cli._options import (
     ReadingOptions,
     Statements,
     Verbs,
+    say_notes,
     seconds_of,
 )
 from sgstore.apps.cli._output import json_text, say
@@ -104,6 +105,7 @@ def monitor(
             watched, verdicts = _run_with_page(watch, source, write, longest, port)
         else:
             watched = watch(on_event=write)
+            say_notes(watched.notes)
             verdicts = watched.run(source.frames, duration_s=longest)
     losses = [*source.losses, *(loss.reason for loss in watched.generator.losses)]
     found = checked.findings()
@@ -146,6 +148,7 @@ def _run_with_page(
         page.event(event)
 
     watched = watch(on_event=on_event, on_step=page.step)
+    say_notes(watched.notes)
     page.follow(watched)
     with serve_live(page, port=port, on_start=say):
         frames = source.frames if source.live else paced(source.frames)

@@ -150,7 +150,8 @@ class Compiled:
         if result.whole or result.aggregated or self.layout is not None:
             query = results.with_bindings(query)
         elif result.form != "intervals":
-            result = Result(form="intervals", columns=result.columns, whole=False)
+            having = result.having_of_match(results.OF_NODES)
+            result = Result(form="intervals", columns=result.columns, whole=False, having=having)
             query = replace(query, result=result)
         return self.rows(window, query)
 
@@ -298,5 +299,6 @@ def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[st
                 seen = replace(catalog.under(name) or catalog, only=seen.only)
             elif normalize_name(setting.name) == "dataset":
                 only = traces_in(name, catalog.traces, catalog.tables, part=catalog.part)
-                seen = replace(seen, only=only)
+                both = only if None in {only, seen.only} else only & seen.only
+                seen = replace(seen, only=both)
     return seen.in_world() if world else seen

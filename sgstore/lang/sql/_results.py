@@ -44,7 +44,7 @@ from sgstore.lang.sql._frames import in_masks, masks, phases
 from sgstore.lang.sql._masks import SqlBuilder, number_of_frames
 from sgstore.lang.sql._node_owners import counted_apart, owners_of
 from sgstore.lang.sql._runs import runs
-from sgstore.lang.sql._select import Select, nested
+from sgstore.lang.sql._select import BoundValues, Select, nested
 from sgstore.lang.sql._windows import frame_key, name_key
 
 if TYPE_CHECKING:
@@ -64,6 +64,9 @@ FIRST, OWNER_KEY, TOP_OWNER = ":first frame", ":owner", ":top owner"
 sampling keys."""
 
 LOG_TIME: Final = "log_time_ns"
+
+OF_NODES: Final = "intervals are those of single matches"
+"""Reason for an error about ``HAVING``."""
 
 _NAME: Final = NODE_ATTRIBUTES["name"]
 _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
@@ -205,6 +208,21 @@ def about_frame(attributes: Sequence[FrameAttribute]) -> str:
     return select.text()
 
 
+def named_traces(conditions: Sequence[Bound]) -> tuple[str, list[Any]]:
+    """Return SQL for the names of the traces that meet conditions on their attributes, and its values."""
+    values = BoundValues()
+    select = Select([f'{_TRACE}."name"'])
+    select.join(f'"trace" AS {_TRACE}', [])
+    select.join('"map" AS ":map"', [f'":map"."map_id" = {_TRACE}."map_id"'], "LEFT JOIN")
+
+    def leaf(found: Leaf) -> str:
+        assert isinstance(found, TraceAttribute)  # noqa: S101 - chosen by the caller
+        return frame_text(found, _FRAME, _TRACE, '":map"')
+
+    select.where = [expression_text(one, leaf, values) for one in conditions]
+    return select.text(), values.items
+
+
 def with_bindings(query: Query) -> Query:
     """Return a query for intervals of frames in which the same nodes match.
 
@@ -218,7 +236,9 @@ def with_bindings(query: Query) -> Query:
                 ReturnColumn(f"{node.key}.name", NodeAttribute(node.key, _NAME, Type.text))
             )
     columns += [ReturnColumn(e.key, EdgeRelation(e.key)) for e in query.scope.edges if e.named]
-    return replace(query, result=Result(form="intervals", columns=tuple(columns), whole=False))
+    having = query.result.having_of_match(OF_NODES)
+    result = Result(form="intervals", columns=tuple(columns), whole=False, having=having)
+    return replace(query, result=result)
 
 
 def told_apart_by(query: Query) -> list[FrameAttribute]:
