@@ -278,13 +278,17 @@ def _rules(look: FirstLook, each: Each) -> list[FirstLookEntry]:
             look.unanswered.setdefault(verdicts[0].reason, []).append(one.name)
         if not violated:
             continue
-        span = violated[0].violations[0]
-        frame = f"{span.trace}#{span.start_seq}"
-        place = f"the first in {span.trace} at {span.start:.1f} s"
-        text = f"Violated in {len(violated)} of {len(verdicts)} traces, {place}."
+        # HAVING can leave a violated trace without listed violations
+        span = next((span for verdict in violated for span in verdict.violations), None)
+        trace = violated[0].trace if span is None else span.trace
+        frame = "" if span is None else f"{span.trace}#{span.start_seq}"
+        place = f" at {span.start:.1f} s" if span else ""
+        text = (
+            f"Violated in {len(violated)} of {len(verdicts)} traces, the first in {trace}{place}."
+        )
         lines = {
             "CLI": f"sgstore check {STORE} {one.name}",
-            "SQL": _sql_of(look.store, frame),
+            "SQL": _sql_of(look.store, frame or f"{trace}#0"),
             "Python": f'for verdict in store.check("{one.name}"): print(verdict)',
             "CI": f"sgstore check {STORE} {one.name} --require --junit rules.xml",
         }

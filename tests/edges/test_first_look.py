@@ -10,7 +10,7 @@ import recordings
 
 from sgstore.apps import first_look
 from sgstore.apps.cli import run
-from sgstore.lang.library import patterns
+from sgstore.lang.library import entries, patterns
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -49,6 +49,24 @@ def test_every_line_of_the_page_runs(folder: Path) -> None:
         _, *arguments = shlex.split(one.lines["CLI"])
         assert run([*arguments, *(["-o", "a.png"] if arguments[0] == "show" else [])]) == 0
         assert one.title in look.html()
+
+
+def test_a_violated_rule_without_listed_violations_is_an_entry(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = """-- property nowhere: Never met.
+-- source: own
+CHECK nowhere: FORALL (v:Vehicle) ALWAYS v.speed < 0.1
+  RETURN MIN(v.speed) OVER match AS least HAVING least > 900"""
+    (rule,) = entries(text, "mine")
+    monkeypatch.setattr(first_look, "patterns", lambda: {rule.name: rule})
+    look = first_look.sampled([folder / "in" / "a.mcap"], folder / "drives.sgstore")
+    first_look.evaluate(look)
+
+    (entry,) = look.sections["Violated rules"]
+    assert entry.text == "Never met. Violated in 1 of 1 traces, the first in a."
+    assert Store(folder / "drives.sgstore").sql(entry.lines["SQL"]).values
+    assert entry.title in look.html()
 
 
 def test_try_prints_a_page_or_writes_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
