@@ -307,6 +307,8 @@ EDGES: Final[dict[str, tuple[Edge, ...]]] = {
         edge(person_aside, 1.19, 1.21),
         edge(both_at(WALKED_INTO.with_actor("ego", speed=8.0), "p"), 1.38, 1.40, None),
     ),
+    # Their boxes meet where they are 0 m apart: 0.9 m and half of the width of the person
+    "no_collision": (edge(person_aside, 1.19, 1.21, None),),
     "r157_emergency_braking": (
         edge(lambda decel: ABRUPT.with_actor("ego", speed=braking(15, 2, decel)), 5.01, 4.99),
         edge(lambda x: stands_ahead(x, braking(15, 2, 6)), 54.27, 54.26, None),

@@ -164,6 +164,9 @@ NEAR = Scene(
     seconds=6,
     drawn=(3.6, 6.0),
 )
+RUN_OVER = Scene(
+    WAYS, ego(along(RIGHT), braking(12, 4, 9)), actor("v", (55, RIGHT)), seconds=6, drawn=(5.0,)
+)
 THROUGH_STOP = Scene(STOPS, ego(through("s", "n"), 8, start=92), seconds=8, drawn=(2.0, 6.0))
 AT_STOP = THROUGH_STOP.with_actor("ego", speed=[(0, 8), (3, 8), (5, 0), (6, 0), (8, 8)])
 STANDING = Scene(
@@ -311,6 +314,7 @@ SCENES: dict[str, tuple[Scene, Scene | None]] = {
         on(OVERTAKING.with_actor("ego", route=past(RIGHT, LEFT, 20, 105)), WAYS),
     ),
     "near_miss": (NEAR, NEAR.with_actor("ego", speed=12.0)),
+    "collision": (RUN_OVER, NEAR),
     "lane_change_without_indicator": (
         Scene(WAYS, ego(aside(40, RIGHT, LEFT), 12, lights=OFF), drawn=(0.0, 5.0)),
         Scene(WAYS, ego(aside(40, RIGHT, LEFT), 12, lights=("light_right",))),
@@ -774,6 +778,7 @@ SCENES |= {
     "r157_cut_out": (REVEALED, REVEALED.with_actor("ego", speed=braking(10, 8, 3))),
     "r157_pedestrian": (WALKED_INTO, WALKED_INTO.with_actor("ego", speed=braking(7, 2, 2.5))),
     "r157_emergency_braking": (HARD, NEAR),
+    "no_collision": (RUN_OVER, NEAR),
     "r157_lane_change": (
         MERGED_BEFORE,
         MERGED_BEFORE.with_actor("ego", route=aside(120, RIGHT, LEFT, 20), start=100.0),

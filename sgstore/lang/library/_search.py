@@ -15,6 +15,11 @@ if TYPE_CHECKING:
 
 _WORD: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
 
+_SYNONYMS: Final = {
+    **LABEL_ALIASES,
+    **dict.fromkeys(("crash", "crashes", "crashed", "contact", "overlaps", "overlap"), "collision"),
+}
+
 _STEM: Final = 4
 """Smallest number of letters that words of one stem share: ``brakes``, ``braking``."""
 
@@ -59,8 +64,8 @@ def _places(name: str) -> tuple[tuple[int, frozenset[str]], ...]:
 
 
 def _words(text: str) -> list[str]:
-    """Split a text into lower-case words, such as ``cut`` and ``in``. Synonyms of node kinds are replaced."""
-    return [LABEL_ALIASES.get(word, word) for word in map(str.lower, _WORD.findall(text))]
+    """Split a text into lower-case words, such as ``cut`` and ``in``. Synonyms are replaced."""
+    return [_SYNONYMS.get(word, word) for word in map(str.lower, _WORD.findall(text))]
 
 
 def _weight(word: str, place: tuple[int, frozenset[str]]) -> int:
