@@ -8,7 +8,7 @@ import pytest
 from test_lang_golden import CATALOG
 
 from sgstore.errors import QueryError, TextSpan
-from sgstore.lang.sql import compile_query, for_people
+from sgstore.lang.sql import compile_checks, compile_query, for_people
 
 
 def refused(text: str, **parameters: object) -> QueryError:
@@ -209,3 +209,17 @@ def test_parameter_with_invalid_duration_is_refused(value: object) -> None:
     assert "this duration is longer than any trace" in str(
         refused("MATCH (e:Ego) FOR >= $p", p=value)
     )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "CHECK FORALL (v:Vehicle) ALWAYS NOT (ego)-[:near]->(v)",
+        "CHECK FORALL (v:Vehicle) ALWAYS ((v)-[:near]->(ego) IMPLIES v.speed < 3)",
+    ],
+)
+def test_an_edge_without_braces_after_forall_needs_exists(text: str) -> None:
+    with pytest.raises(QueryError) as error:
+        compile_checks(text, CATALOG)
+
+    assert "in braces: EXISTS {(a)-[:near]->(b)}" in str(error.value)
