@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -809,6 +810,9 @@ class Store(StoreVerbs):
     >>> store.close()
     """
 
+    _only: frozenset[int] | None = None
+    _narrow: tuple[Catalog, Catalog] | None = None
+
     def __init__(
         self,
         path: str | Path,
@@ -923,9 +927,38 @@ class Store(StoreVerbs):
                 raise StoreError(f"{file}: file not found; expected a recording or a folder")
         return ingest(self.file.path, files, **options)
 
+    def only(self, *traces: str) -> Self:
+        """Return the store with some of its traces: :meth:`find` and :meth:`check` search no others.
+
+        Parameters
+        ----------
+        *traces : str
+            Names of traces. Without names, the result is the whole store.
+
+        Raises
+        ------
+        StoreError
+            A trace does not exist.
+
+        Examples
+        --------
+        >>> store.only("town").find("MATCH (e:Ego)-[:near_coll]->(v:Vehicle)").count()
+        108
+        """
+        fewer = copy.copy(self)
+        fewer._only = (  # noqa: SLF001
+            frozenset(map(self.file.trace_id, traces)) if traces else None
+        )
+        return fewer
+
     def catalog(self) -> Catalog:
         """Return the catalog of the store for queries. It is cached until the file changes."""
-        return self.file.catalog()
+        whole = self.file.catalog()
+        if self._only is None:
+            return whole
+        if self._narrow is None or self._narrow[0] is not whole:
+            self._narrow = whole, replace(whole, only=self._only)
+        return self._narrow[1]
 
     def find(
         self,
@@ -961,7 +994,7 @@ class Store(StoreVerbs):
         """
         from sgstore.temporal import TemporalMatches
 
-        make = partial(TemporalMatches, self.file, self.file.catalog)
+        make = partial(TemporalMatches, self.file, self.catalog)
         return matches_of(make, UnionMatches, query, parameters)
 
     def check(
@@ -1000,7 +1033,7 @@ class Store(StoreVerbs):
         from sgstore.temporal import CheckRun  # imports numpy: only on demand
 
         return CheckRun(
-            self.file, self.file.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status
+            self.file, self.catalog, text, parameters, sgsm_compat=sgsm_compat, status=status
         )
 
     def shrink(
@@ -1017,7 +1050,7 @@ class Store(StoreVerbs):
         """
         from sgstore.temporal import shortest_clips
 
-        return shortest_clips(self.file, self.file.catalog, text, parameters, clip)
+        return shortest_clips(self.file, self.catalog, text, parameters, clip)
 
     def sql(
         self, text: str, *, timeout_s: float | None = None, max_rows: int | None = None

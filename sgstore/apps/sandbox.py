@@ -61,7 +61,9 @@ START_S: Final = 120.0
 READ_S: Final = 60.0
 """Additional time for each table that it reads first; s."""
 
-REDUCE: Final = "reduce the query: fewer variables, a narrower WHERE, one trace"
+REDUCE: Final = (
+    "reduce the query: a label for each node, such as (v:Vehicle), fewer variables, one trace"
+)
 """Remedy for a query that needs too much time or memory."""
 
 _TABLE_BYTES: Final = 4 << 30

@@ -30,7 +30,8 @@ def spill_fault(message: str) -> str | None:
         return None
     return (
         "stopped: it needs more memory, and disk beside it, than it may take; allow it more (--max-spill 50GB;"
-        " memory and max_spill of Store), or ask for less: fewer variables, a narrower WHERE, no ORDER BY"
+        " memory and max_spill of Store), or ask for less: a label for each node, such as (v:Vehicle), fewer"
+        " variables, a narrower WHERE, no ORDER BY"
     )
 
 

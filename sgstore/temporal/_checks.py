@@ -477,7 +477,8 @@ class StoreCheck:
         """Yield the unknown verdicts of the traces in ``lacks``, with the reasons."""
         _, left = traces_of(self._whole, catalog)
         for facts in catalog.traces:
-            if facts.trace_id in left and self._check.ego in {None, facts.ego}:
+            chosen = catalog.only is None or facts.trace_id in catalog.only
+            if chosen and facts.trace_id in left and self._check.ego in {None, facts.ego}:
                 reason = lacks.get(facts.trace_id, "")
                 yield Verdict(self._check.name, facts.name, "unknown", reason=reason)
 

@@ -7,8 +7,24 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sgstore.lang.bind import MOTION, of_query
-from sgstore.lang.ir import BlockValue, OverMatch, walk
-from sgstore.lang.sql import TOLD_WEATHER, told_events, told_lanes, traces_with, with_places
+from sgstore.lang.ir import (
+    BlockValue,
+    Choices,
+    Operation,
+    OverMatch,
+    TraceAttribute,
+    Value,
+    conjuncts,
+    walk,
+)
+from sgstore.lang.sql import (
+    TOLD_WEATHER,
+    named_traces,
+    told_events,
+    told_lanes,
+    traces_with,
+    with_places,
+)
 from sgstore.matches import Matches
 
 if TYPE_CHECKING:
@@ -16,7 +32,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang.bind import Need
     from sgstore.lang.catalog import Attribute, Catalog
-    from sgstore.lang.ir import Query
+    from sgstore.lang.ir import Bound, Query
     from sgstore.lang.sql import Compiled
     from sgstore.store import StoreFile
     from sgstore.temporal._sequences import Finder
@@ -71,6 +87,19 @@ def _knowing(
     return known | ((every - known) - having(None, moving=need.attribute.name in MOTION))
 
 
+def _about_trace(query: Query) -> list[Bound]:
+    """Return the conditions on the trace alone that every match of a query meets."""
+    certain = [query.steps[number].scope for number in sorted(query.certain)]
+    each = (c for scope in certain or query.required for w in scope.where for c in conjuncts(w))
+    plain = (Operation, Value, Choices, TraceAttribute)
+    return [
+        one
+        for one in each
+        if all(isinstance(part, plain) for part in walk(one))
+        and any(isinstance(part, TraceAttribute) for part in walk(one))
+    ]
+
+
 def _has_braces(query: Query) -> bool:
     spoken = (part for scope in query.required for part in scope.where)
     return any(isinstance(part, BlockValue) for one in spoken for part in walk(one))
@@ -121,6 +150,10 @@ class TemporalMatches(Matches):
                 if trace.trace_id in lacks:
                     told = [found[trace.name]] if trace.name in found else []
                     found[trace.name] = "; ".join([*told, lacks[trace.trace_id]])
+            conditions = _about_trace(compiled.bound) if found else []
+            if conditions:
+                names = {name for (name,) in self._file.rows(*named_traces(conditions)).values}
+                found = {name: reason for name, reason in found.items() if name in names}
         return found
 
     def _lacking(self, compiled: Compiled) -> dict[int, str]:

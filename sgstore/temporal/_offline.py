@@ -52,6 +52,12 @@ if TYPE_CHECKING:
     Keys = NDArray[np.int64]
 
 
+REMEDY: Final = (
+    "give each node a label, such as (v:Vehicle), an edge to another node, or a condition"
+)
+"""Remedy for a query with too many combinations of nodes."""
+
+
 def refuse_many(bindings: int, told: str) -> None:
     """Raise an error if a query has too many combinations of nodes in one trace.
 
@@ -63,7 +69,7 @@ def refuse_many(bindings: int, told: str) -> None:
     if bindings > MOST_BINDINGS:
         raise QueryError(
             f"{told}: {bindings:,} combinations of nodes in one trace, expected at most {MOST_BINDINGS:,}",
-            hint="restrict these nodes: add a label, an edge between them, or a condition",
+            hint=REMEDY,
         )
 
 
@@ -555,7 +561,7 @@ def _too_many(catalog: Catalog, ask: Ask, window: Window | None, most: int) -> T
     return TooMuchError(
         f"{ask_text(ask)} holds for more than {most:,} combinations of nodes and frames of"
         f" {', '.join(held)}, more than memory may take",
-        hint="restrict its nodes: add a label, an edge between them, or a condition; or allow more memory",
+        hint=f"{REMEDY}; or allow more memory",
     )
 
 

@@ -17,7 +17,7 @@ from sgstore.model.world import JUMP_NS, seconds_of
 from sgstore.temporal._formula import formula_text
 from sgstore.temporal._joint_bindings import JoinedBindings, joined
 from sgstore.temporal._match_values import Stretches, picked
-from sgstore.temporal._offline import PlanValues, groups, traces, words
+from sgstore.temporal._offline import REMEDY, PlanValues, groups, traces, words
 from sgstore.temporal._plan import (
     Test,
     asks_of_steps,
@@ -333,7 +333,7 @@ class Finder:
             if sum(len(one[0]) for one in parts) > MOST_MATCHES:
                 raise TooMuchError(
                     f"{name} has more than {MOST_MATCHES:,} matches, more than memory may take",
-                    hint="restrict its nodes: add a label, an edge between them, or a condition",
+                    hint=REMEDY,
                 )
         first = [frame for part in parts for frame in part[0].tolist()]
         last = [frame for part in parts for frame in part[1].tolist()]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+import recordings
 from mcp import Client, StdioServerParameters
 from PIL import Image
 from test_docs_queries import queries_of
@@ -21,7 +22,8 @@ from test_sandbox import RUNAWAY
 from thorough import some
 
 from sgstore.apps.assistant import StoreTools, server_of
-from sgstore.errors import ExportError, QueryError, StoreError
+from sgstore.errors import ExportError, QueryError, SgstoreError, StoreError
+from sgstore.ingest import ingest
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -484,6 +486,8 @@ def test_clips_are_cut_into_the_folder_and_nowhere_else(
 
     assert file.is_file()
     assert file.parent.name == "fast_1"
+    (first, *_) = Store(town_store).find(query).frames()
+    assert dict(zip(made.data["columns"], made.data["rows"][0], strict=True))["start"] == first.t
     assert (
         json.loads((file.parent / "manifest.json").read_text())["clips"][0]["provenance"]["query"]
         == query
@@ -535,6 +539,100 @@ def test_topics_of_the_vocabulary_say_what_there_is(topic: Any, tools: StoreTool
     }
 
     assert words[topic] in tools.vocabulary(topic).text
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StoreTools]:
+    """Tools for two recordings without a map."""
+    folder = tmp_path_factory.mktemp("two")
+    for name, frames in (("a", 20), ("b", 25)):
+        recordings.drive(folder / f"{name}.mcap", frames=frames)
+    ingest(folder / "two.sgstore", [folder / "a.mcap", folder / "b.mcap"])
+    with StoreTools(folder / "two.sgstore", timeout_s=60) as tools:
+        yield tools
+
+
+LANES = "MATCH (e:Ego)-[:isIn]->(:Lane)"
+
+
+def test_find_and_check_take_names_of_traces(two: StoreTools) -> None:
+    for form, rows in {"frames": 25, "rows": 25, "count": 1}.items():
+        found = two.find("MATCH (e:Ego)", form=form, traces=["b"], limit=100).data["rows"]
+        assert len(found) == rows
+        assert form == "count" or {row[0].partition("#")[0] for row in found} == {"b"}
+    assert two.find("MATCH (e:Ego)", form="count", traces=["b"]).data["rows"] == [[25]]
+    assert two.find("MATCH (e:Ego) RETURN COUNT(*)", traces=["a"]).data["rows"] == [[20]]
+    assert two.find("MATCH (e:Ego)", form="count").data["rows"] == [[45]]
+    assert two.find("USING DATASET 'a' MATCH (e:Ego)", traces=["b"]).data["rows"] == []
+    assert two.check("ALWAYS ego.speed < 99", traces=["b"]).data["verdicts"] == {"true": 1}
+    assert [*two.check("ALWAYS HAPPENS collision(ego)", traces=["b"]).data["left_out"]] == ["b"]
+    with pytest.raises(StoreError, match="nowhere"):
+        two.find("MATCH (e:Ego)", traces=["nowhere"])
+
+
+@pytest.mark.parametrize(
+    ("query", "names"),
+    [
+        (LANES, ["a", "b"]),
+        (f"{LANES} WHERE trace.name = 'b'", ["b"]),
+        (f"{LANES} WHERE e.speed > 1 AND (trace.name = 'a' OR trace.frames < 3)", ["a"]),
+        (f"{LANES} WHERE trace.name = 'b' OR e.speed > 1", ["a", "b"]),
+        (f"MATCH (e:Ego) WHERE trace.name = 'a' THEN {LANES}", ["a"]),
+        (f"MATCH (e:Ego) THEN NOT MATCH (e) WHERE trace.name = 'a' THEN {LANES}", ["a", "b"]),
+        (f"USING DATASET 'b' {LANES}", ["b"]),
+    ],
+)
+def test_traces_that_where_excludes_are_not_reported(
+    query: str, names: list[str], two: StoreTools
+) -> None:
+    assert [*two.find(query, form="count").data["left_out"]] == names
+
+
+def test_a_check_of_a_dataset_has_no_verdicts_of_other_traces(two: StoreTools) -> None:
+    found = two.check("USING DATASET 'a' CHECK c: ALWAYS HAPPENS collision(ego)")
+
+    assert [row[1] for row in found.data["rows"]] == ["a"]
+
+
+def test_a_query_beyond_the_memory_names_a_label(tools: StoreTools) -> None:
+    every = "(a:Entity, b:Entity, c:Entity, d:Entity)"
+    with pytest.raises(SgstoreError, match=r"label.* such as \(v:Vehicle\)"):
+        tools.check(f"FORALL {every} ALWAYS dist(a, b) > 0")
+    with pytest.raises(SgstoreError, match=r"label.* such as \(v:Vehicle\)"):
+        tools.find("MATCH (a), (b), (c), (d), (e), (f) RETURN COUNT(*)")
+
+
+def test_a_long_vocabulary_is_cut_and_a_word_finds_the_rest(
+    tools: StoreTools, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fields = {f"/topic{n}": [f"field{m} (metres)" for m in range(60)] for n in range(90)}
+    known = tools._ask("vocabulary") | {"topics": fields}
+    monkeypatch.setattr(tools, "_ask", lambda _: known)
+
+    here, topics = tools.vocabulary("here").text, tools.vocabulary("topics").text
+    assert "/topic3 (60)" in here
+    assert "and 60 more" in here
+    assert max(len(here), len(topics)) < 31_000
+    assert re.search(r"\n\(\d+ more lines: add word", topics)
+    some = tools.vocabulary("topics", word="/topic77 ").text.splitlines()
+    assert len(some) == 60
+    assert some[-1] == "/topic77 field59 (metres)"
+    assert tools.vocabulary("topics", word="nothing").text == "no line has 'nothing'"
+
+
+def test_a_collision_is_found_by_its_words(tools: StoreTools) -> None:
+    for word in ("collision", "crash", "contact"):
+        names = [one["name"] for one in tools.patterns_search(word).data["patterns"]]
+        assert {"collision", "no_collision"} <= {*names[:3]}, (word, names)
+    assert tools.check("no_collision").data["verdicts"] == {"true": 1}
+
+
+def test_descriptions_name_units_and_ends(tools: StoreTools) -> None:
+    about = {tool.name: tool for tool in asyncio.run(server_of(tools).list_tools())}
+    form = about["find"].input_schema["properties"]["form"]["description"]
+
+    assert "end (last frame" in form
+    assert "seconds" in about["export_clips"].description
 
 
 def called(tools: StoreTools, tool: str, arguments: dict[str, Any]) -> Any:

@@ -16,6 +16,7 @@ import threading
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import resources
+from itertools import accumulate
 from pathlib import Path
 from textwrap import indent
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
@@ -62,6 +63,7 @@ Pattern = Annotated[
 Values = Annotated[
     dict[str, Any] | None, Field(description="values of $name in it, or of the named pattern")
 ]
+Traces = Annotated[list[str] | None, Field(description="names of traces; empty: all")]
 Limit = Annotated[int, Field(ge=1, description="Maximum number of results.")]
 
 
@@ -175,6 +177,7 @@ class StoreTools:
     def vocabulary(
         self,
         about: Topic = "here",
+        word: str = "",
     ) -> ToolAnswer:
         """Describe the words of queries. Read 'language' once before your first query.
 
@@ -182,9 +185,12 @@ class StoreTools:
         ----------
         about
             here: kinds and relations in this store; language: how to write a query, in one page;
-            others: what a query may name
+            topics: recorded topics and their fields; others: what a query may name
+        word
+            only lines with this word
         """
-        text = self.topic(about)
+        lines = [one for one in self.topic(about).splitlines() if word.lower() in one.lower()]
+        text = _first_lines(lines) if lines else f"no line has {word!r}"
         return ToolAnswer(text, {"about": about, "text": text})
 
     def topic(self, about: Topic) -> str:
@@ -245,16 +251,24 @@ class StoreTools:
         form: Literal["intervals", "rows", "frames", "count"] = "rows",
         limit: Limit = ROWS,
         parameters: Values = None,
+        traces: Traces = None,
     ) -> ToolAnswer:
         """Find frames whose scene graphs match a pattern.
 
         Parameters
         ----------
         form
-            intervals: when it holds, and who; rows: one a match and frame, or what RETURN says;
-            frames: each once; count: number of frames
+            intervals: who, and from start (first frame) to end (last frame; s);
+            rows: one a match and frame, or what RETURN says; frames: each once; count: number of frames
         """
-        return self._rows("find", query=query, form=form, limit=limit, parameters=parameters or {})
+        return self._rows(
+            "find",
+            query=query,
+            form=form,
+            limit=limit,
+            parameters=parameters or {},
+            traces=traces or [],
+        )
 
     def why_not(self, frame: FrameName, query: Pattern, parameters: Values = None) -> ToolAnswer:
         """Explain why a pattern does not match a frame: the first condition that fails, and by how much."""
@@ -282,6 +296,7 @@ class StoreTools:
         rule: str,
         limit: Limit = ROWS,
         parameters: Values = None,
+        traces: Traces = None,
     ) -> ToolAnswer:
         """Check properties that must be true in every trace.
 
@@ -292,14 +307,16 @@ class StoreTools:
         rule
             'CHECK name: ALWAYS …', or the name of a property of the library
         """
-        reply = self._ask("check", text=rule, limit=limit, parameters=parameters or {})
+        reply = self._ask(
+            "check", text=rule, limit=limit, parameters=parameters or {}, traces=traces or []
+        )
         tally = ", ".join(f"{number} {word}" for word, number in reply["verdicts"].items())
         return ToolAnswer(f"{_rows_text(reply)}\n({tally or 'no trace'})", finite(reply))
 
     def timeline(
         self,
         queries: Annotated[list[str], Field(min_length=1)],
-        traces: list[str] | None = None,
+        traces: Traces = None,
         picture: bool = False,
     ) -> ToolAnswer:
         """Plot matches and rule violations over time, one lane per entity, for each trace that has any.
@@ -400,6 +417,14 @@ class StoreTools:
         image = _encoded(image.convert("RGB"), "JPEG")
         return ToolAnswer(f"{about['frame']}, {topic}: {size}", about, image, "image/jpeg")
 
+    def _from_start(self, row: dict[str, Any]) -> dict[str, Any]:
+        """Return the row of a clip with its start in seconds since the trace began, as other tools have it."""
+        if "start_ns" not in row:
+            return row
+        began = self._store.file.frame(f"{row['trace']}@0s").log_time_ns
+        times = {"start_ns": ("start", round((row["start_ns"] - began) / 1e9, 3))}
+        return dict(times.get(name, (name, value)) for name, value in row.items())
+
     def _drawn(self, draw: Callable[[Path], None]) -> bytes:
         """Return the PNG picture that a function draws into a temporary file."""
         with self._turn, tempfile.TemporaryDirectory() as folder:
@@ -455,7 +480,7 @@ class StoreTools:
     ) -> ToolAnswer:
         """Cut matches out of their recordings, as clips with the original messages.
 
-        The files are in a new folder inside the folder of the user.
+        The files are in a new folder inside the folder of the user. Times are in seconds.
 
         Parameters
         ----------
@@ -489,7 +514,7 @@ class StoreTools:
         with self._turn:
             order = Export(self._store, clips, with_graph=with_graph, provenance={"query": query})
             written = write_export(order, self._write_to / name, form)
-        rows = [one.as_row() for one in written]
+        rows = [self._from_start(one.as_row()) for one in written]
         losses = [f"{one.file.name}: lost: {loss.reason}" for one in written for loss in one.losses]
         listed = {"columns": [*rows[0]], "rows": [[*row.values()] for row in rows]}
         about = {**listed, "truncated": reply["truncated"], "left_out": reply["left_out"]}
@@ -508,6 +533,15 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}")
 
 def _one_line(text: str) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() else " " for c in text)
+
+
+def _first_lines(lines: Sequence[str]) -> str:
+    """Return the first lines of a long text, with a note on the others."""
+    sizes = accumulate(len(one) + 1 for one in lines)
+    shown = max(sum(size <= MOST_TEXT for size in sizes), 1)
+    rest = len(lines) - shown
+    note = [f"({rest} more lines: add word='…' to list those with a word)"] if rest else []
+    return "\n".join([*(one[:MOST_TEXT] for one in lines[:shown]), *note])
 
 
 def _encoded(image: Image, form: str) -> bytes:

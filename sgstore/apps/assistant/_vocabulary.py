@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
+from sgstore.base.display import first_of
 from sgstore.lang.bind import FUNCTIONS
 from sgstore.lang.catalog import (
     EDGE_ATTRIBUTES,
@@ -21,12 +22,11 @@ from sgstore.model.vocabulary import LABEL_ALIASES, LIGHT_STATES, SUPER_KINDS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-Topic = Literal["here", "language", "relations", "attributes", "functions", "predicates", "views"]
+Topic = Literal[
+    "here", "language", "relations", "attributes", "functions", "predicates", "views", "topics"
+]
 
-TOPICS: Final[tuple[Topic, ...]] = (
-    *("here", "language", "relations"),
-    *("attributes", "functions", "predicates", "views"),
-)
+TOPICS: Final[tuple[Topic, ...]] = get_args(Topic)
 
 _SIGNATURE: Final = re.compile(r"PREDICATE\s+(\w+\s*\([^)]*\))")
 
@@ -41,19 +41,9 @@ def topic_text(about: Topic, known: Mapping[str, Any]) -> str:
     known : mapping
         Facts about the store from the sandbox; see :mod:`sgstore.apps.assistant._worker`.
     """
-    match about:
-        case "relations":
-            return _relations()
-        case "attributes":
-            return _attributes(known)
-        case "functions":
-            return _functions()
-        case "predicates":
-            return _predicates()
-        case "views":
-            return _views(known)
-        case _:
-            return _here(known)
+    always = {"relations": _relations, "functions": _functions, "predicates": _predicates}
+    here = {"attributes": _attributes, "views": _views, "topics": _topics}
+    return always[about]() if about in always else here.get(about, _here)(known)
 
 
 def _here(known: Mapping[str, Any]) -> str:
@@ -71,8 +61,15 @@ def _here(known: Mapping[str, Any]) -> str:
     ]
     lines += [f"Unknown of {trace}: {', '.join(of)}" for trace, of in known["unknown"].items()]
     lines += [f"Table {name}: {', '.join(columns)}" for name, columns in known["tables"].items()]
-    lines += [f"Topic {name}: {', '.join(fields)}" for name, fields in known["topics"].items()]
+    if known["topics"]:
+        named = first_of([f"{name} ({len(of)})" for name, of in known["topics"].items()], 30)
+        lines.append(f"Recorded topics (number of fields; about='topics' lists them): {named}")
     return "\n".join(lines)
+
+
+def _topics(known: Mapping[str, Any]) -> str:
+    fields = (f"{name} {one}" for name, of in known["topics"].items() for one in of)
+    return "\n".join(fields) or "no recorded topics"
 
 
 def _ends(relations: Mapping[str, tuple[list[str], list[str]]]) -> list[str]:

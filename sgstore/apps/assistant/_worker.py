@@ -33,7 +33,13 @@ def answer(store: Store, question: Mapping[str, Any], most: int) -> Reply:
     """Return the reply of the sandbox process to a query of an assistant."""
     about = dict(question["with"])
     about["limit"] = min(about.get("limit", most), most)
+    if question["ask"] in _OF_TRACES:
+        store = store.only(*about.pop("traces"))
     return plain(ANSWERS[question["ask"]](store, **about))
+
+
+_OF_TRACES: Final = {"find", "check"}
+"""Queries that search only the traces of a list."""
 
 
 def _listed(
@@ -254,10 +260,6 @@ def _views(store: Store, limit: int) -> Reply:
     return {"views": views}
 
 
-_FIELDS: Final = 40
-"""Largest number of fields of a topic in a vocabulary."""
-
-
 def _vocabulary(store: Store, limit: int) -> Reply:
     """Return the kinds and relations that occur in a store, with their counts."""
     del limit
@@ -285,7 +287,7 @@ def _vocabulary(store: Store, limit: int) -> Reply:
         "own": {name: str(kind) for name, kind in catalog.own.items()},
         "tables": {name: list(table.columns) for name, table in catalog.tables.items()},
         "topics": {
-            name: [f"{one['name']} ({one['meaning']})" for one in fields[:_FIELDS]]
+            name: [f"{one['name']} ({one['meaning']})" for one in fields]
             for name, fields in words(catalog)["topics"].items()
         },
     }

@@ -22,7 +22,7 @@ from sgstore.lang.sql._known_matches import ExternalRelation, with_places
 from sgstore.lang.sql._lookups import told_lanes
 from sgstore.lang.sql._plan import Gathered, traces_of
 from sgstore.lang.sql._recorded_events import happened_in_frame, recorded_events, told_events
-from sgstore.lang.sql._results import CONSTANTS, SqlStatement, about_frame
+from sgstore.lang.sql._results import CONSTANTS, SqlStatement, about_frame, named_traces
 from sgstore.lang.sql._rewrite import path_ways, rewritten
 from sgstore.lang.sql._select import Select, nested
 from sgstore.lang.sql._subgraphs import Layout
@@ -56,6 +56,7 @@ __all__ = [
     "happened_in_frame",
     "joined_rows",
     "leaves",
+    "named_traces",
     "nested",
     "path_ways",
     "recorded_events",

@@ -145,7 +145,9 @@ def specification(
         of = int(np.prod([len(column) for column in values])) if values else 0
         listed = product(*values) if of <= _LISTED else ()
         missing = [cell for cell in listed if cell not in found]
-        denominator = f"combinations of the values that occur in {chosen.text} (product)"
+        denominator = (
+            f"combinations of the values that the query returns for {chosen.text} (product)"
+        )
     shares = ReportTable(
         SHARES, [share("cells", len(found), of, denominator)], [f"frames of {chosen.text}"]
     )
