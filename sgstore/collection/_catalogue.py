@@ -207,6 +207,17 @@ class Snapshot:
                 known[field] = common_type(last, reason_or_type) if field else same
         return found
 
+    def fields_of_some(self, topic: str) -> dict[str, int]:
+        """Return the fields of a topic that some bundles (store files) lack, with their number."""
+        with_field: dict[str, set[str]] = {}
+        for bundle, what, word, _, _ in self.facts["word"]:
+            if what == "topic" and json.loads(word)[0] == topic:
+                with_field.setdefault(json.loads(word)[1], set()).add(bundle)
+        with_field.pop("", None)  # the topic itself
+        every = set[str]().union(*with_field.values())
+        lack = {field: len(every - bundles) for field, bundles in with_field.items()}
+        return {field: number for field, number in lack.items() if number}
+
     @cached_property
     def classed(self) -> tuple[str, ...]:
         """Return the abstractions whose frame classes are stored in at least one bundle (store file)."""

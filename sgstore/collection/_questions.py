@@ -37,8 +37,8 @@ from sgstore.lang.sql import (
 )
 from sgstore.lang.sql.collection_parts import PARTS, parted
 from sgstore.lang.sql.collection_pruning import Pruning, class_questions
-from sgstore.lang.syntax import pattern_tables
-from sgstore.lang.topics import unknown_topic
+from sgstore.lang.syntax import pattern_tables, topic_tables, topics_in_sql
+from sgstore.lang.topics import topic_of, unknown_topic
 from sgstore.matches import UnionMatches
 from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.vocabulary import natural
@@ -849,6 +849,8 @@ class CollectionRows(Tabular):
         self._columns: tuple[str, ...] = ()
         self.reasons: dict[str, str] = {}
         self.notes: tuple[str, ...] = ()
+        if "topic" in text.lower():
+            self.notes = tuple(_null_fields(whole, text))
         if "sgql" in text.lower():
             _, calls = pattern_tables(text, whole.catalog.tables)
             for one in calls:
@@ -883,6 +885,18 @@ class CollectionRows(Tabular):
 
     def _described(self) -> tuple[tuple[str, ...], None]:
         return self.columns, None
+
+
+def _null_fields(whole: Collection, text: str) -> Iterator[str]:
+    """Yield a note for each field of a topic in an SQL statement that some bundles lack."""
+    known = whole.catalog.topics
+    selects_all = re.search(r"(?<!\()\*", text)
+    for name in topics_in_sql(topic_tables(text)):
+        if name in known or f"/{name}" in known:  # an unknown topic is an error of the answer
+            topic = topic_of(known, name).name
+            for field, number in whole.snapshot.fields_of_some(topic).items():
+                if selects_all or field.lower() in text.lower():
+                    yield f"field {field!r} of topic {topic!r} is NULL in the bundles without it ({number})"
 
 
 @overload

@@ -307,6 +307,8 @@ class BundleTask:
             make = partial(TemporalMatches, self.file, self.catalog)
             return matches_of(make, UnionMatches, text, values)
 
+        for topic, told in self.task["whole"]["topics"].items():
+            self.file.access.topic_fields[topic] = {name: told[name] for name in told if name}
         asked = UserStatement(find, self.catalog().tables, self.task["text"])
         try:
             with (

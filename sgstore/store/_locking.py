@@ -38,7 +38,7 @@ from sgstore.store._store_paths import refuse_odd_name, refuse_special, remove_l
 _log = logger("store")
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Callable, Generator, Mapping
     from pathlib import Path
 
     from duckdb import DuckDBPyConnection
@@ -182,6 +182,8 @@ class Access:
         faster. Only for trusted statements: a user's statement could read the other files.
     root : str, Path or None
         New folder of the recordings; see :func:`sgstore.store._traces.located`.
+    topic_fields : dict
+        Topic → fields with database types that topics of other stores of a collection have.
     """
 
     def __init__(
@@ -198,6 +200,7 @@ class Access:
         self.path = path
         self.together = False
         self.root: str | Path | None = None
+        self.topic_fields: dict[str, Mapping[str, str]] = {}
         self._checked = checked
         self._diagnose = diagnose
         self._tables = tables

@@ -21,7 +21,7 @@ import numpy as np
 from sgstore.base.quoting import literal, quoted
 from sgstore.errors import SqlError, StoreError, TraceError
 from sgstore.lang.catalog import TopicFacts, TopicField, Type
-from sgstore.lang.syntax import TOPIC
+from sgstore.lang.syntax import TOPIC, topics_in_sql
 from sgstore.lang.topics import (
     TopicError,
     common_fields,
@@ -61,8 +61,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_NAMED: Final = re.compile(rf'"{TOPIC} ((?:[^"]|"")+)"')
-
 
 def show_topics(connection: DuckDBPyConnection, access: Access, sql: str) -> None:
     """Create the views of topics that an SQL statement names, on its connection.
@@ -74,13 +72,8 @@ def show_topics(connection: DuckDBPyConnection, access: Access, sql: str) -> Non
     """
     with access.reading() as reading:
         known = topic_facts(reading, access)
-    for topic in _topics_in(sql):
+    for topic in topics_in_sql(sql):
         _show(connection, access, topic_of(known, topic), topic)
-
-
-def _topics_in(sql: str) -> list[str]:
-    """Return the topics whose views an SQL statement names, each once."""
-    return [name.replace('""', '"') for name in dict.fromkeys(_NAMED.findall(sql))]
 
 
 def _show(connection: DuckDBPyConnection, access: Access, facts: TopicFacts, topic: str) -> None:
@@ -89,7 +82,9 @@ def _show(connection: DuckDBPyConnection, access: Access, facts: TopicFacts, top
         fields_of(facts)
     with access.reading() as reading:
         sources = [*_sources(reading, access, facts)]
-    fields = common_fields(one.fields for one in sources)
+    # Other stores of a collection can have more fields. They are NULL here.
+    more = access.topic_fields.get(facts.name, {})
+    fields = common_fields([more, *(one.fields for one in sources)])
     rows = " UNION ALL ".join(one.rows(fields) for one in sources)
     view = quoted(f":messages {topic}")
     connection.execute(f"CREATE OR REPLACE TEMP VIEW {view} AS {rows}")
@@ -247,7 +242,7 @@ class RecordingSql:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         memory, threads = default_memory(), os.cpu_count() or 1
         with ExitStack() as stack, scratch(folder, memory=memory, threads=threads) as connection:
-            for topic in _topics_in(sql):
+            for topic in topics_in_sql(sql):
                 self._show(connection, topic)
             connection.execute(f"CREATE SCHEMA {INSIDE}")
             connection.execute(f"CREATE TABLE {INSIDE}.store_info (key VARCHAR, value VARCHAR)")
@@ -353,7 +348,7 @@ def field_fault(connection: DuckDBPyConnection, sql: str, message: str) -> str:
     ``message``: error of the database.
     """
     found = _UNKNOWN.search(message)
-    topics = _topics_in(sql)
+    topics = topics_in_sql(sql)
     if found is None or not topics:
         return ""
     name = found["name"]

@@ -260,6 +260,16 @@ def test_a_stored_field_of_some_parts_of_a_collection_is_unknown_in_the_others(
     text = "MATCH (e:Ego) WHERE topic('/words').only = 4 AND topic('/words').words[0] = 'a' RETURN FRAMES"
     with Collection(tmp_path / "fleet") as fleet:
         assert [row.trace for row in fleet.find(text).rows()] == ["two"] * 20
+        asked = "SELECT DISTINCT trace, words, \"only\" FROM topic('/words')"
+        listed = fleet.sql(asked, each=True)
+        assert sorted(row[1:] for row in listed) == [("one", ["a", "b"], None), ("two", ["a"], 4)]
+        assert listed.notes == (
+            "field 'only' of topic '/words' is NULL in the bundles without it (1)",
+        )
+        every = fleet.sql("SELECT * FROM topic('words')", each=True)
+        of = {row[every.columns.index("trace")]: row[every.columns.index("only")] for row in every}
+        assert of == {"one": None, "two": 4}
+        assert fleet.sql("SELECT words FROM topic('words')", each=True).notes == ()
 
 
 def test_online_frames_carry_messages() -> None:

@@ -10,7 +10,7 @@ from sgstore.lang.syntax._hints import (
 )
 from sgstore.lang.syntax._parse import joined, parse
 from sgstore.lang.syntax._pattern_builder import Pattern
-from sgstore.lang.syntax._table_function import TOPIC, pattern_tables, topic_tables
+from sgstore.lang.syntax._table_function import TOPIC, pattern_tables, topic_tables, topics_in_sql
 from sgstore.lang.syntax._tables import keywords
 
 __all__ = [
@@ -27,5 +27,6 @@ __all__ = [
     "pattern_tables",
     "said_of",
     "topic_tables",
+    "topics_in_sql",
     "variable_hint",
 ]

@@ -110,6 +110,20 @@ def topic_tables(sql: str) -> str:
     return "".join([*parts, sql[end:]])
 
 
+def topics_in_sql(sql: str) -> list[str]:
+    """Return the topics whose views an SQL statement names, each once.
+
+    Examples
+    --------
+    >>> topics_in_sql(topic_tables("SELECT x FROM topic('/imu')"))
+    ['/imu']
+    """
+    return [name.replace('""', '"') for name in dict.fromkeys(_VIEW.findall(sql))]
+
+
+_VIEW: Final = re.compile(rf'"{TOPIC} ((?:[^"]|"")+)"')
+
+
 def _free(taken: Collection[str], number: int) -> str:
     """Return an unused table name for a call of ``sgql`` in SQL. The first table is named ``sgql``."""
     name = f"sgql {number + 1}" if number else "sgql"
