@@ -48,8 +48,9 @@ if TYPE_CHECKING:
     from mcap.records import Schema
     from numpy.typing import NDArray
 
-    from sgstore.lang.catalog import Catalog, TopicFacts, TopicValue
+    from sgstore.lang.catalog import Catalog
     from sgstore.maps.roads import RoadMap
+    from sgstore.mcap import Recording
     from sgstore.model.config import Config
     from sgstore.model.criticality import Meetings
     from sgstore.model.graph import SceneGraph
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
     from sgstore.store._graphs import Graphs
     from sgstore.store._joins import JoinedTable, UserTables
     from sgstore.store._locking import Stamp
+    from sgstore.store._replayed_topics import ReplayedTopics
     from sgstore.store._rows import Parameters
     from sgstore.store._staging import Sealed
     from sgstore.store._user_sql import UserSql, UserTablesGiven
@@ -169,23 +171,11 @@ class StoreFile:
         return cls(path, memory=memory, wait_s=wait_s, made=made)
 
     @staticmethod
-    def recorded_topics(path: Path) -> dict[str, TopicFacts]:
-        """Return the topics of a recording that is replayed without a store, by name."""
-        from sgstore.store._replayed_topics import recorded_topics
+    def replayed_topics(recording: Recording) -> AbstractContextManager[ReplayedTopics]:
+        """Context manager with the topics of an open recording that is replayed without a store."""
+        from sgstore.store._replayed_topics import replayed_topics
 
-        return recorded_topics(path)
-
-    @staticmethod
-    def recorded_values(
-        path: Path,
-        asked: Iterable[TopicValue],
-        time_ns: NDArray[np.int64],
-        log_time_ns: NDArray[np.int64],
-    ) -> dict[TopicValue, list[Any]]:
-        """Return the values of topics at all frames of a recording that is replayed without a store."""
-        from sgstore.store._replayed_topics import recorded_values
-
-        return recorded_values(path, asked, time_ns, log_time_ns)
+        return replayed_topics(recording)
 
     def snapshot(self) -> AbstractContextManager[object]:
         """Keep the store open for several queries. The queries see the same state and run faster."""

@@ -12,7 +12,7 @@ import os
 import re
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 from weakref import ref
 
@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 
     from duckdb import DuckDBPyConnection
 
+    from sgstore.mcap import Recording
     from sgstore.readers import TopicReading
     from sgstore.store._locking import Access
     from sgstore.store._traces import StoredTrace
@@ -197,11 +198,17 @@ def _recording(trace: StoredTrace, topic: str) -> Path:
 
 
 def converted(
-    path: Path, topic: str, folder: Path, clock: FrameClock, *, bounded: bool = False
+    path: Path, topic: str, folder: Path, clock: FrameClock | None = None, *, bounded: bool = False
 ) -> TopicFile:
-    """Write the messages of a topic of a recording to Parquet files in a folder."""
+    """Write the messages of a topic of a recording to Parquet files in a folder.
+
+    Without a clock of frames, times begin with the first message of the recording.
+    """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     with _reading(path, [topic]) as reading, topic_scratch(folder) as connection:
+        if clock is None:
+            first = np.array([_first_ns(reading.recording)])
+            clock = FrameClock(np.zeros(1, np.int64), np.zeros(1, np.int64), first)
         writer = TopicWriter(connection, folder, clock, bounded=bounded)
         for batch in reading.batches(Findings()):
             writer.add(batch)
@@ -258,12 +265,8 @@ class RecordingSql:
                 raise SqlError(f"{reason}: {example}; ingest it for scene graphs") from error
 
     def _show(self, connection: DuckDBPyConnection, topic: str) -> None:
-        def convert(folder: Path) -> TopicFile:
-            first = np.array([_first_ns(self._path)])
-            clock = FrameClock(np.zeros(1, np.int64), np.zeros(1, np.int64), first)
-            return converted(self._path, topic, folder, clock)
-
-        source = _once((str(self._path), *mark_of(self._path), topic), convert)
+        key = str(self._path), *mark_of(self._path), topic
+        source = _once(key, partial(converted, self._path, topic))
         listed = "".join(f", {quoted(name)}" for name in source.fields)
         connection.execute(
             f"CREATE TEMP VIEW {quoted(f'{TOPIC} {topic}')} AS SELECT {literal(self._path.stem)} AS trace,"
@@ -275,12 +278,11 @@ class RecordingSql:
 _NO_TABLE: Final = re.compile(r"Table with name (\S+) does not exist")
 
 
-def _first_ns(path: Path) -> int:
+def _first_ns(recording: Recording) -> int:
     """Return the log time at which a recording begins, as far as its first messages show; ns."""
-    with _reading(path, ()) as reading:
-        for run in reading.recording.walk(Findings()):
-            if len(run):
-                return int(run.log_time_ns.min())
+    for run in recording.walk(Findings()):
+        if len(run):
+            return int(run.log_time_ns.min())
     return 0
 
 
@@ -334,6 +336,11 @@ def topics_in(path: Path) -> dict[str, TopicFacts]:
 
 def fields_in(path: Path, topic: str) -> dict[str, str] | None:
     """Return the fields of a topic of a recording, with database types. ``None`` means JSON: read it first."""
+    return _fields_at(path, mark_of(path), topic)
+
+
+@lru_cache(maxsize=256)
+def _fields_at(path: Path, _mark: tuple[int, int], topic: str) -> dict[str, str] | None:
     with _reading(path, [topic]) as reading:
         found = reading.fields(topic)
     return None if found is None else {name: one.declared for name, one in found.items()}

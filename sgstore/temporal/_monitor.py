@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     from sgstore.lang.syntax.tree import Statement
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import SceneGraph
-    from sgstore.model.world import FrameBlock
     from sgstore.readers import Cameras, Sensor
     from sgstore.temporal._robustness import Robustness
 
@@ -134,7 +133,7 @@ def opened(
     from sgstore.readers import RecordedCameras, on_map, open_trace
 
     path = Path(source)
-    with open_trace(path, ego=ego or config.ego) as trace:
+    with ExitStack() as until, open_trace(path, ego=ego or config.ego) as trace:
         found, warnings = Maps(road_map, config.signs).of(trace.info)
         on_map(trace, found)
         trace.noise, trace.causal = config.noise, True
@@ -142,12 +141,7 @@ def opened(
         told = FrameSource(path.stem, found, iter(()), warnings, cameras=cameras)
         told.losses += [loss.reason for loss in lost_lanes(trace.info, found)]
 
-        def again() -> Iterator[FrameBlock]:
-            with open_trace(path, ego=ego or config.ego) as same:
-                on_map(same, found)
-                yield from same.blocks()
-
-        told.topics = topics = RecordedTopics(trace.info.path, again)
+        told.topics = topics = RecordedTopics(trace.recording, trace.blocks, until)
 
         def frames() -> Iterator[Frame]:
             blocks = topics.followed(cameras.followed(trace.blocks()))

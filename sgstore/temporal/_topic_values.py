@@ -14,10 +14,11 @@ from sgstore.lang.ir import FrameAttribute
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
-    from pathlib import Path
+    from contextlib import ExitStack
 
     from sgstore.graphs.online import Frame
     from sgstore.lang.catalog import TopicFacts, TopicValue
+    from sgstore.mcap import Recording
     from sgstore.model.world import FrameBlock
 
 
@@ -41,9 +42,11 @@ class RecordedTopics:
 
     Parameters
     ----------
-    path : Path
+    recording : Recording
     again : callable
-        Opens the recording again, and returns its blocks of frames.
+        Returns the blocks of frames from the start.
+    until : ExitStack
+        Ends with the replay.
 
     Attributes
     ----------
@@ -51,28 +54,30 @@ class RecordedTopics:
         Values that the monitor needs. They are decoded with the first frame.
     """
 
-    def __init__(self, path: Path, again: Callable[[], Iterator[FrameBlock]]) -> None:
-        self._path, self._again = path, again
+    def __init__(
+        self, recording: Recording, again: Callable[[], Iterator[FrameBlock]], until: ExitStack
+    ) -> None:
+        self._recording, self._again, self._until = recording, again, until
         self.asked: list[TopicValue] = []
         self._waiting: Iterator[dict[str, Any]] = iter(())
 
     @cached_property
-    def facts(self) -> Mapping[str, TopicFacts]:
-        """Topics by name, with the types of their fields."""
+    def _decoded(self) -> Any:
         from sgstore.store import StoreFile  # online, no database is needed
 
-        return StoreFile.recorded_topics(self._path)
+        return self._until.enter_context(StoreFile.replayed_topics(self._recording))
+
+    @property
+    def facts(self) -> Mapping[str, TopicFacts]:
+        """Topics by name, with the types of their fields."""
+        return self._decoded.facts
 
     def followed(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
         """Yield blocks of frames unchanged, after reading the values of all frames."""
         if self.asked:
-            from sgstore.store import StoreFile
-
             asked = [*dict.fromkeys(self.asked)]
             times = [np.stack([block.time_ns, block.log_time_ns]) for block in self._again()]
-            found = StoreFile.recorded_values(
-                self._path, asked, *np.hstack([np.zeros((2, 0), np.int64), *times])
-            )
+            found = self._decoded.values(asked, *np.hstack([np.zeros((2, 0), np.int64), *times]))
             there: dict[str, Any] = dict.fromkeys((one.topic for one in asked), True)
             rows = zip(*found.values(), strict=True)
             names = [one.written for one in found]

@@ -13,8 +13,10 @@ import pytest
 import rosbag_files
 import zstandard
 
+import sgstore
 from sgstore.errors import TraceError
 from sgstore.ingest import recordings
+from sgstore.mcap import McapFile
 from sgstore.model.world import States, TraceReport
 from sgstore.readers import (
     decode,
@@ -23,7 +25,10 @@ from sgstore.readers import (
     parse_definition,
     read_message,
 )
+from sgstore.readers.rosbags._file import RosbagFile
 from sgstore.readers.rosbags._sqlite import SqliteBag
+from sgstore.store import StoreFile
+from sgstore.temporal import Monitor, opened
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -234,3 +239,79 @@ def test_a_bag_of_ros_1_equals_an_independent_decoder(tmp_path: Path) -> None:
     apart = block.states.x[ego] - [x for x, _, _ in want]
     assert apart == pytest.approx(apart[0])
     assert block.states.y[ego] == pytest.approx([y for _, y, _ in want])
+
+
+FIX = """builtin_interfaces/Time timestamp
+string frame_id
+float64 latitude
+float64[9] position_covariance
+uint8 position_covariance_type
+"""
+"""``foxglove_msgs/LocationFix``, in part."""
+
+
+def located(path: Path) -> Path:
+    """A drive with a topic of foxglove_msgs, whose messages lie between the frames."""
+    with autoware_recordings.Stack(path) as stack:
+        stack.other = {**stack.other, "foxglove_msgs/LocationFix": FIX}
+        for i in range(8):
+            t = 1 + i / 10
+            stack.pose(t, 8 * t, 0.0, v=(8.0, 0.0, 0.0))
+            stack.objects(t, [autoware_recordings.thing("car", 8 * t + 20, 0)])
+            told = {
+                "timestamp": {"sec": 1, "nanosec": i},
+                "frame_id": "gps",
+                "latitude": 48 + i / 8,
+                "position_covariance": [i / 3] * 9,
+                "position_covariance_type": 2,
+            }
+            stack.send("/gps", "foxglove_msgs/LocationFix", told, t + 0.11)
+    return path
+
+
+@pytest.mark.parametrize("container", ["mcap", "sqlite", "packed", "ros1"])
+def test_topics_of_bags_have_the_values_of_their_messages(tmp_path: Path, container: str) -> None:
+    mcap = located(tmp_path / "a.mcap")
+    path = mcap if container == "mcap" else CONTAINERS[container](tmp_path, mcap)
+    listed = 'latitude, position_covariance[9], frame_id, "timestamp.nanosec", log_time_ns'
+    sql = f"SELECT {listed} FROM topic('/gps') ORDER BY log_time_ns"
+    times = [1_000_000_000 + i * 100_000_000 + 110_000_000 for i in range(8)]
+    want = [(48 + i / 8, i / 3, "gps", i, time) for i, time in enumerate(times)]
+    assert StoreFile.recording_sql(path, sql).rows().values == want
+    for topics in ((), ("/gps",)):
+        with sgstore.open(tmp_path / f"{len(topics)}.sgstore", create=True) as store:
+            store.ingest(path, topics=topics)
+            assert store.sql(sql).values == want
+            rows = store.find("MATCH (e:Ego) RETURN frame.seq AS s, topic('/gps').latitude AS l")
+            assert [tuple(row) for row in rows.rows()][2:5] == [
+                (2, 48.125),
+                (3, 48.25),
+                (4, 48.375),
+            ]
+
+
+@pytest.mark.parametrize("container", ["mcap", "sqlite", "ros1"])
+def test_a_monitor_opens_a_recording_with_topics_once(
+    tmp_path: Path, container: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mcap = autoware_recordings.drive(tmp_path / "a.mcap", 8)
+    path = mcap if container == "mcap" else CONTAINERS[container](tmp_path, mcap)
+    kind = McapFile if container == "mcap" else RosbagFile
+    opens, walks = [], []
+    make, walk = kind.__init__, kind.walk
+    monkeypatch.setattr(kind, "__init__", lambda *a, **k: (opens.append(1), make(*a, **k))[1])
+    monkeypatch.setattr(kind, "walk", lambda *a, **k: (walks.append(1), walk(*a, **k))[1])
+    counts = []
+    pose = "topic('/localization/kinematic_state').pose_with_covariance.pose.position.x < 1000"
+    seen = "topic('/perception/object_recognition/tracked/objects').header.stamp.sec < 1000"
+    for text in ("ego.speed < 100", pose, f"{pose} AND {seen}"):
+        opens.clear()
+        walks.clear()
+        with opened(str(path), sgstore.Config()) as source:
+            monitor = Monitor(f"CHECK a: ALWAYS {text}", source.road_map, topics=source.topics)
+            for frame in source.frames:
+                monitor.step(frame)
+            assert [one.verdict for one in monitor.finish()] == ["true"]
+        counts.append((len(opens), len(walks)))
+    assert [number for number, _ in counts] == [counts[0][0]] * 3
+    assert counts[1] == counts[2]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -96,9 +97,9 @@ class Definitions:
 
     def _register(self, text: str, name: str) -> None:
         """Register the types of a definition that are not known yet."""
-        found = import_module("rosbags.typesys").get_types_from_msg(text, name)
         known = self._store.types
-        self._store.register({key: value for key, value in found.items() if key not in known})
+        found = _parsed(text, name).items()
+        self._store.register({key: value for key, value in found if key not in known})
 
     def _standard(self, name: str) -> str:
         if self._store is None:
@@ -113,6 +114,11 @@ class Definitions:
             self._missing.add(name)
             self._lose(f"the bag has no definition of {name}: {why}"[:300])
         return ""
+
+
+@lru_cache(maxsize=256)  # a bag is opened several times
+def _parsed(text: str, name: str) -> Any:
+    return import_module("rosbags.typesys").get_types_from_msg(text, name)
 
 
 def _full(name: str) -> str:
