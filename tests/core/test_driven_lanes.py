@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
+from weakref import ref
 
 import numpy as np
 import oracle_turned
@@ -19,7 +21,7 @@ from scenes import Scene, actor, crossroads, ego, store_of, through
 from sgstore.graphs.online import replayed
 from sgstore.ingest import ingest
 from sgstore.lang.library import patterns
-from sgstore.maps.roads import PlainLane, lane_text, read_lane_text
+from sgstore.maps.roads import PlainLane, RoadMap, lane_text, read_lane_text
 from sgstore.model.config import Config, RangeSettings
 from sgstore.model.vocabulary import RELATION_CODE
 from sgstore.pipeline.derive import derive
@@ -31,7 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import GraphBlock, SceneGraph
     from sgstore.model.world import FrameBlock
     from sgstore.temporal import MonitorEvent
@@ -187,6 +188,27 @@ def test_points_without_a_finite_place_are_near_no_surface() -> None:
 
     assert town().surface_of(np.array([2]), 3.0).near(x, y).tolist() == [False] * 3 + [True]
     assert not town().surface_of(np.zeros(0, np.int64), 3.0).near(x, y).any()
+
+
+def test_the_traces_of_a_map_share_its_junctions(monkeypatch: pytest.MonkeyPatch) -> None:
+    computed: list[float] = []
+    compute = RoadMap.surface_of
+
+    def surface_of(road_map: RoadMap, lanes: Any, distance: float) -> Any:
+        computed.append(distance)
+        return compute(road_map, lanes, distance)
+
+    wanted = lanes_of("left")
+    monkeypatch.setattr(RoadMap, "surface_of", surface_of)
+    road_map = town.__wrapped__()
+    lanes = [primary(road_map, recorded(road_map, blocks_of(drive("left"), 20))) for _ in range(2)]
+
+    assert lanes == [wanted] * 2
+    assert len(computed) == 1
+    kept = ref(road_map)
+    del road_map
+    gc.collect()
+    assert kept() is None
 
 
 @pytest.mark.parametrize("size", [7, 50])

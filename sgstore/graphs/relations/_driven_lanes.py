@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -122,7 +123,6 @@ class _Junctions:
     """Surface of the junctions of a map, and the links of its lanes."""
 
     def __init__(self, road_map: RoadMap) -> None:
-        self.road_map = road_map
         net, edges, count = LaneNet(road_map), road_map.edges, len(road_map.ribbons)
         self.traffic, self.widths = net.traffic, np.maximum(net.widths, 1.0)
         self.lanes: Bools = net.traffic & (net.junction >= 0)
@@ -151,6 +151,18 @@ class _Junctions:
 
 _BESIDE: Final = ("toLeftOf", "toRightOf", "opposes")
 
+_KNOWN: WeakKeyDictionary[RoadMap, _Junctions] = WeakKeyDictionary()
+
+
+def _junctions_of(road_map: RoadMap | None) -> _Junctions | None:
+    """Return the junctions of a map with lanes in junctions. They are computed once for each map."""
+    if road_map is None:
+        return None
+    found = _KNOWN.get(road_map)
+    if found is None:
+        found = _KNOWN[road_map] = _Junctions(road_map)
+    return found if found.lanes.any() else None
+
 
 def _among(keys: Ints, wanted: Ints) -> Bools:
     if not len(keys):
@@ -176,8 +188,7 @@ class DrivenLanes:
 
     @cached_property
     def _junctions(self) -> _Junctions | None:
-        junctions = None if self._map is None else _Junctions(self._map)
-        return junctions if junctions is not None and junctions.lanes.any() else None
+        return _junctions_of(self._map)
 
     def chosen(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
         """Yield the blocks of a recording, with the driven lanes of their states."""
@@ -277,7 +288,8 @@ class DrivenLanes:
         box = np.column_stack([box, of.z - np.nan_to_num(of.height) / 2])
         # A vehicle that stands is looked up once.
         moved = begins(node[rows], *box.view(np.int64).T)
-        self._asked.append(_Lookups(junctions.road_map, box[moved]))
+        assert self._map is not None  # noqa: S101 - it has junctions
+        self._asked.append(_Lookups(self._map, box[moved]))
         hits = self._asked[-1].hits
         owner, hit = joined(hits.row, np.cumsum(moved) - 1)
         lane, row = -2 - hits.lane[hit], rows[owner]

@@ -6,7 +6,6 @@ import hashlib
 import json
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from threading import Lock
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -23,7 +22,14 @@ from sgstore.maps.roads._places import (
     signal_places,
     whole_lanes,
 )
-from sgstore.maps.roads._ribbons import LanePoints, LaneSurface, Ribbons, lane_polygons, waypoints
+from sgstore.maps.roads._ribbons import (
+    PREPARED,
+    LanePoints,
+    LaneSurface,
+    Ribbons,
+    lane_polygons,
+    waypoints,
+)
 from sgstore.maps.roads._zones import zones
 from sgstore.model.vocabulary import DRIVING, KIND_CODE, KINDS, RELATION_CODE
 
@@ -38,8 +44,6 @@ FARTHEST: Final = 200.0
 _CELL: Final = 8.0
 """Cell size of the grid that finds bodies far from all crosswalks; m."""
 _MOST_CELLS: Final = 1 << 16
-_PREPARED: Final = Lock()
-"""Only one thread at a time prepares shapes."""
 
 _MOST_AT_ONCE: Final = 1 << 22
 """Pairs of lanes whose distances are in memory at a time."""
@@ -354,7 +358,7 @@ class RoadMap:
 
     def surface_of(self, lanes: Ints, distance: float) -> LaneSurface:
         """Return the surroundings of some lanes, counted from 0, up to a distance; m."""
-        with _PREPARED:
+        with PREPARED:
             return LaneSurface(self._outlines[1 + lanes], distance)
 
     def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
@@ -442,7 +446,7 @@ class RoadMap:
         near &= radius > _TOUCH
         ask = np.flatnonzero(~near & ((aside**2).sum(axis=1) <= (radius + _TOUCH) ** 2))
         points: Any = shapely.points(at[ask])
-        with _PREPARED:
+        with PREPARED:
             near[ask] = shapely.dwithin(tree.geometries[place[ask]], points, radius)
         row, place = row[near], place[near]
         present = np.zeros((len(places), len(self.nodes)), np.bool_)

@@ -6,7 +6,8 @@ Ribbons describe lane surfaces independent of the source format.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import shapely
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.model.world import Bools, Floats, Ints
+
+PREPARED: Final = Lock()
+"""Only one thread at a time prepares shapes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,5 +292,6 @@ class LaneSurface:
         points: Any = shapely.points(x, y)
         row, part = self._boxes.query(points)
         near = np.zeros(len(x), np.bool_)
-        near[row[shapely.dwithin(self._parts[part], points[row], self._distance)]] = True
+        with PREPARED:
+            near[row[shapely.dwithin(self._parts[part], points[row], self._distance)]] = True
         return near
