@@ -58,7 +58,7 @@ class Home(StrEnum):
     scenery = "scenery"
     """Pose and size of static entities: also in table ``entity``."""
     map = "map"
-    """Parts of the road map: table ``map_node``."""
+    """Tables for values of parts of the road map: table ``map_node``."""
 
 
 class DisplayUnit(StrEnum):
@@ -77,7 +77,7 @@ class DisplayUnit(StrEnum):
     along = "along"
     """Length of (ax, ay) along the heading."""
     given = "given"
-    """True if the column has a value."""
+    """True if the table has a value in this column."""
     velocity = "velocity"
     """Velocity in m/s; 0 for static nodes."""
     standing = "standing"
@@ -262,22 +262,22 @@ IN_GRAPH: Final = Attribute(
     DisplayUnit.inside,
     _ENTITIES,
 )
-"""Used only in generated queries. Queries of users have the scope instead."""
+"""Attribute "is in the scene graph of the frame". Only generated queries use it; user queries set a scope."""
 
 UNSURE_LANE: Final = Attribute(
     "unsure_lane", Type.boolean, {}, "whether later frames decide the lane that it drives"
 )
-"""Of a vehicle, of its edge ``isIn`` to a lane, or of the ego for a frame. Only in online mode."""
+"""Attribute "later frames decide the lane" of a vehicle, an ``isIn`` edge or a frame. Online mode only."""
 
 UNSURE_LEAD: Final = Attribute(
     "unsure_lead", Type.boolean, {}, "whether a vehicle ahead of it depends on an unsure lane"
 )
-"""Of a vehicle, or of any one for a frame. Used only in generated conditions of the online mode."""
+"""Attribute "the lane of a vehicle ahead is undecided", for generated conditions of the online mode."""
 
 COMPUTED: Final = Attribute(
     "computed", Type.boolean, {}, "whether its relations were computed here, and not imported"
 )
-"""Attribute of a trace, used only in generated queries. Its value comes from the settings."""
+"""Attribute "relations were computed by sgstore, not imported" of a trace, for generated queries."""
 
 NODE_ATTRIBUTES: Final = _named(
     (
@@ -477,7 +477,7 @@ MAP_OWN: Final[Mapping[str, Type]] = {
     **{f"landmark_{name}": kind for name, kind in _OF_SIGN.items()},
     **{f"{side}_marking_{n}": k for side in ("left", "right") for n, k in _OF_MARKING.items()},
 }
-"""Attributes without a column of the signs and lanes of a map."""
+"""User-defined attributes of traffic signs and lanes in a map: name → type. No table has columns for them."""
 
 RECORDED_OWN: Final[Mapping[str, Type]] = {
     **dict.fromkeys(("ang_vel_x", "ang_vel_y"), Type.number),
@@ -488,7 +488,7 @@ RECORDED_OWN: Final[Mapping[str, Type]] = {
     **dict.fromkeys(("manual_gear", f"{CONTROL}manual_gear"), Type.boolean),
     **MAP_OWN,
 }
-"""Attributes without a column that recordings usually have. They are valid in every store."""
+"""User-defined attributes that recordings usually have: name → type. They are valid in every store."""
 
 
 def own_type(types: Collection[Type]) -> Type:
@@ -559,7 +559,7 @@ EDGE_ATTRIBUTES: Final = _named(
         ),
     )
 )
-"""Attributes of edges: of ``isIn`` from entities to lanes (table ``lane_state``); ``gap`` (``lane_gap``)."""
+"""Attributes of edges by folded name: of ``isIn`` edges (table ``lane_state``), and ``gap`` (``lane_gap``)."""
 
 FOLLOWING: Final = ("leads", "follows")
 """Relations whose edges have the attribute ``gap``."""
@@ -811,7 +811,7 @@ _PART: Final = re.compile(r"\[\d+\]|[^.\[]+|\[")
 
 @dataclass(frozen=True, slots=True)
 class TopicValue:
-    """Value of a topic at frames: a field, and the message that counts for a frame.
+    """Reference to a topic field in a query, with the rule that selects one message for each frame.
 
     Attributes
     ----------
@@ -829,7 +829,7 @@ class TopicValue:
 
     @property
     def written(self) -> str:
-        """Value as a query writes it: ``topic('/imu', nearest, 0.1s).angular_velocity.z``."""
+        """Query text of the value, such as ``topic('/imu', nearest, 0.1s).angular_velocity.z``."""
         topic = self.topic.replace("\\", "\\\\").replace("'", "\\'")
         parts = [f"'{topic}'", *([self.rule] if self.rule != "last" else [])]
         if self.tolerance_ns is None:
@@ -844,13 +844,13 @@ class TopicValue:
 
     @property
     def relation(self) -> str:
-        """Name of the relation with the values, a row for each frame."""
+        """Name of the table in SQL that has the value for each frame."""
         parts = [self.topic, self.field, self.rule, self.tolerance_ns]
         return TOPIC + json.dumps(parts, ensure_ascii=False)
 
     @classmethod
     def of(cls, relation: str) -> Self | None:
-        """Return the value of a relation with this name. ``None`` means another relation."""
+        """Return the topic value for the name of its SQL table. ``None`` means another table."""
         told = relation.removeprefix(TOPIC)
         return None if told == relation else cls(*json.loads(told))
 
@@ -1082,7 +1082,7 @@ def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:
 def relations_of_set(
     answered: frozenset[str], known: frozenset[str], *, mapped: bool
 ) -> frozenset[str]:
-    """Return the relations of a derived set according to its settings.
+    """Return the relations of an imported graph set that the store can decide, according to its settings.
 
     Parameters
     ----------

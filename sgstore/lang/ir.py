@@ -416,7 +416,7 @@ OF_MATCH: Final = ("min", "max", "avg", "sum", "first", "last", "argmin", "argma
 """Functions over the frames of a match."""
 
 PLACES: Final = frozenset({"argmin", "argmax"})
-"""Functions over a match that select one frame."""
+"""Functions over a match that select one of its frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -631,7 +631,7 @@ class Result:
 
     @property
     def chooses(self) -> bool:
-        """True if ``SKIP``, ``LIMIT``, or ``HAVING`` without groups, chooses among the rows of the query."""
+        """True if the result leaves out matches: by ``SKIP``, ``LIMIT``, or a ``HAVING`` without groups."""
         chosen = self.limit is not None or self.top is not None or self.skip > 0
         return chosen or (self.having is not None and not self.aggregated)
 
@@ -902,7 +902,7 @@ class Query:
 
     @property
     def spans(self) -> bool:
-        """True if a match of the query may span several frames. Such a match is returned once."""
+        """True if a match of the query can last for several frames."""
         return len(self.steps) > 1 or bool(self.alternatives)
 
     @property
@@ -919,7 +919,7 @@ class Query:
 
     @property
     def required(self) -> tuple[Scope, ...]:
-        """Single-frame patterns that every match needs: all except those of ``OPTIONAL MATCH``."""
+        """Patterns for single frames that every match needs: all except those of ``OPTIONAL MATCH``."""
         stages = (s for s in self.stages if isinstance(s, MatchStage) and not s.optional)
         return tuple(stage.scope for stage in stages) or (self.scope,)
 
@@ -1096,7 +1096,7 @@ _COMPARE: Final[Mapping[str, Callable[[Any, int, int], Any]]] = {
     "<": lambda length, amount, by: length < amount - by,
     "=": lambda length, amount, by: abs(length - amount) <= by,
 }
-"""Comparisons that treat lengths within a tolerance as equal."""
+"""Comparison operators for lengths. Lengths within the tolerance are equal."""
 
 
 @dataclass(frozen=True, slots=True)

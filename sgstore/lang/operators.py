@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     SqlOf = Callable[[Sequence[str]], str]
 
 MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "=", "<>": "<>"}
-"""Comparison → comparison with the operands exchanged."""
+"""Comparison signs with the sign for exchanged operands, such as ``<`` → ``>``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Column:
 
 
 def all_known(columns: Iterable[Column]) -> Any:
-    """Return the mask of positions where all columns have known values. ``True`` means all positions."""
+    """Return the mask of the positions at which every column has a known value. ``True`` means all."""
     found: Any = True
     for column in columns:
         if column.known is not True:
@@ -97,7 +97,7 @@ class Operator:
 
 
 _WHOLE: Final = re.compile(r"""\$\d+|\w+|"[^"]*"(\."[^"]*")*|'[^']*'""")
-"""Text without need of brackets: a placeholder, a word, a number, a column or a string."""
+"""Regular expression of SQL text that needs no brackets: placeholder, word, number, column or string."""
 
 _BRACKETS: Final = re.compile(r"""(?:"[^"]*"|'[^']*'|[^"'()])*([()])""")
 
@@ -144,7 +144,7 @@ def _odd(parts: Sequence[str]) -> str:
 
 
 def _where(part: str, condition: str) -> str:
-    """Return SQL for a value that becomes NULL unless a condition on it (``v``) is true.
+    """Return SQL for a value if a condition on it (``v``) is true, otherwise NULL.
 
     The value is written only once. Otherwise, the text of nested operators would grow exponentially.
     """
@@ -152,7 +152,7 @@ def _where(part: str, condition: str) -> str:
 
 
 def _not_zero(part: str) -> str:
-    """Return the SQL of a divisor, in which NULL replaces zero.
+    """Return the SQL of a divisor, with NULL in place of zero.
 
     ``nullif`` is faster, but it is a macro that plans its argument twice. So only the innermost of several
     nested divisors uses it.
@@ -242,7 +242,7 @@ def _divided(a: float, by: float) -> float | None:
 
 
 def _over_columns(function: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
-    """Return the array form of a division, without a value where the divisor is 0."""
+    """Return the array version of a division. The result is unknown where the divisor is 0."""
 
     def of_columns(a: Any, by: Any) -> tuple[Any, Any]:
         fits = np.not_equal(by, 0)
@@ -269,7 +269,7 @@ def _sign(a: float) -> int:
 
 
 def _finite(function: Callable[..., float]) -> Callable[..., float | None]:
-    """Return a version of a :mod:`math` function with the result ``None`` for errors and non-finite numbers."""
+    """Return a version of a :mod:`math` function that returns ``None`` for errors and non-finite numbers."""
 
     def one(*values: float) -> float | None:
         try:
@@ -298,7 +298,7 @@ def _each(one: Callable[..., float | None]) -> Callable[..., Any]:
 
 
 def _computed(sql: str, function: Callable[..., float]) -> Operator:
-    """Return an operator for a function of :mod:`math`. A result that is not finite counts as unknown."""
+    """Return an operator for a function of :mod:`math`. A non-finite result counts as unknown."""
     one = _finite(function)
     return _strict(sql, one, _each(one), partial=True)
 
@@ -597,14 +597,14 @@ OPERATORS: Final[Mapping[str, Operator]] = {
     "IS NOT NULL": _null_test("IS NOT NULL", null=False),
     "IN": Operator(_member, _is_member, _is_member_columns, infix=True),
 }
-"""All operators by the word that an :class:`~sgstore.lang.ir.Operation` has. ``IN`` has two operands: a
-value, and in memory all its choices as one operand."""
+"""All operators, by the word of an :class:`~sgstore.lang.ir.Operation`. In memory, ``IN`` has two operands: a
+value, and one operand with all choices."""
 
 ROUNDINGS: Final[Mapping[str, Callable[[float], float | None]]] = {
     "float32": float32,
     "microseconds": microseconds,
 }
-"""Operators that round a side of a comparison, in ``_precision``. Queries cannot use them."""
+"""Operators that round one side of a comparison (see ``_precision``). Queries cannot use them."""
 
 INFIX: Final = frozenset(word for word, one in OPERATORS.items() if one.infix)
 
@@ -612,4 +612,4 @@ COMPILER_SQL: Final = {
     "name": _sql("{0} || ' ' || CAST({1} AS VARCHAR)"),
     "whose": _sql("CASE WHEN {0} IS NOT NULL THEN ({1}, {0}) END"),
 }
-"""SQL of operations that only the compiler creates."""
+"""SQL templates of operations that only the compiler creates."""

@@ -1,4 +1,4 @@
-"""Topics of recordings as columns: their fields, and errors for unknown names.
+"""Topics of recordings: their fields as columns, and errors for unknown names.
 
 A topic is a channel of a recording, such as ``/imu``. Its messages are rows, and its fields are columns:
 ``linear_acceleration.z``. An element of a list is a field, too: ``covariance[0]``.
@@ -23,7 +23,7 @@ _INDEX: Final = re.compile(r"(?P<list>.+)\[(?P<index>\d{1,6})\]")
 
 
 class TopicError(SgstoreError):
-    """A topic, a field, or a rule does not exist, or the topic cannot be decoded.
+    """Error: a topic, field or rule does not exist, or a topic cannot be decoded.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class TopicError(SgstoreError):
 
 
 class NoTopicError(TopicError):
-    """A topic does not exist.
+    """Error: a topic does not exist.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ _READ: Final = {("protobuf", "protobuf"), ("cdr", "ros2msg")}
 
 
 def refusal(message_encoding: str, schema_encoding: str) -> str:
-    """Return the reason why messages of an encoding cannot be decoded; empty if they can."""
+    """Return the reason why messages with an encoding cannot be decoded, or an empty text if they can."""
     if message_encoding == "json" or (message_encoding, schema_encoding) in _READ:
         return ""
     by = f" with a schema in {schema_encoding!r}" if schema_encoding else " without a schema"
@@ -79,7 +79,7 @@ def refusal(message_encoding: str, schema_encoding: str) -> str:
 
 
 def topic_of(topics: Mapping[str, TopicFacts], name: str) -> TopicFacts:
-    """Return the facts of a topic.
+    """Return the facts of the topic with a name. An unknown name raises an error.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def unknown_topic(name: str, known: Iterable[str]) -> NoTopicError:
 
 
 def field_list(names: Iterable[tuple[str, str]]) -> dict[str, TopicField]:
-    """Return fields by name, from names and database types."""
+    """Return the fields of a topic by name, from pairs of name and database type."""
     return {name: TopicField(name, declared) for name, declared in names}
 
 
@@ -117,7 +117,7 @@ def field_of(facts: TopicFacts, path: str) -> TopicField:
 
 
 def field_named(fields: Mapping[str, TopicField], topic: str, path: str) -> TopicField:
-    """Return a field of a topic, as :func:`field_of`, from all of its fields."""
+    """Return a field of a topic from the given fields. See :func:`field_of`."""
     found = find_field(fields, path)
     if found is None:
         hint = _like(path, fields)
@@ -154,7 +154,7 @@ _WHOLE: Final = frozenset(
 
 
 def common_fields(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    """Return the fields of several recordings of a topic, with database types for all of their values."""
+    """Return the fields of a topic in several recordings, with types that can hold the values of each."""
     found: dict[str, str] = {}
     for fields in several:
         for name, kind in fields.items():
@@ -163,7 +163,7 @@ def common_fields(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
 
 
 def common_type(one: str, other: str) -> str:
-    """Return a database type for the values of two types."""
+    """Return a database type that can hold the values of both given types."""
     if one == other:
         return one
     if one.endswith("[]") and other.endswith("[]"):
@@ -175,7 +175,7 @@ def common_type(one: str, other: str) -> str:
 
 
 def topics_of_parts(told: Mapping[str, Mapping[str, str]]) -> dict[str, TopicFacts]:
-    """Return the topics of the parts of a collection, without their traces.
+    """Merge the topics of the stores of a collection. The result has no traces.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 PLACE: Final = '":rows".":place"'
-"""Column with the order of matches, which ``collect`` keeps."""
+"""SQL column that holds the order of the matches. ``collect`` returns its values in this order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
 
 
 def _note_habits(e: s.Call, operand: b.Bound, share: float, names: SymbolTable) -> None:
-    """Note a share in place of a percentage, and sums of angles."""
+    """Add a note if a call has a fraction where a percentage is expected, or if it sums angles."""
     written = names.session.text[e.span.start : e.span.end]
     if 0 < share <= 0.01:
         names.session.doubt(

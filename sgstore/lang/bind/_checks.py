@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CheckInCatalog:
-    """Bound ``CHECK`` statement, with the catalog (of a store or an abstraction) that resolved its names."""
+    """Return the bound columns of a check's ``RETURN`` clause, and its bound ``HAVING`` condition."""
 
     check: b.BoundCheck
     catalog: Catalog

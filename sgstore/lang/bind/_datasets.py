@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from sgstore.lang.catalog import TableFacts, TraceFacts
 
 CLASSES_GIVEN: Final = "sgstore_classes"
-"""Table with the frame classes of all parts of a collection: ``dataset`` (empty: all frames),
-``abstraction``, ``class``, ``frames``."""
+"""Table with the frame classes of all stores of a collection. An empty ``dataset`` means all frames. Columns:
+``dataset``, ``abstraction``, ``class``, ``frames``."""
 
 CLASSES: Final = "datasetclasses"
 """Folded name of the function after ``IN``: ``frame.class IN dataset_classes('train')``."""
@@ -72,7 +72,7 @@ def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
 def seen_in(
     classes: b.FrameAttribute, name: str, span: TextSpan, session: Session
 ) -> b.FrameAttribute:
-    """Return the condition that the graph class of a frame also occurs in a dataset of traces or frames.
+    """Return the condition that the class of a frame's graph also occurs in a dataset.
 
     Raises
     ------

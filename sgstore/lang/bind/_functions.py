@@ -68,7 +68,7 @@ _ALONG_LANES: Final = """DEFINE PREDICATE ttc_lane(a, b) AS
     speeds=" - ".join(_LANE_SPEED.replace("@", one) for one in "ab"),
     halves=" - ".join(_LANE_HALF.replace("@", one) for one in "ab"),
 )
-"""Defined as a predicate, not as a column, because it combines table look-ups and attributes."""
+"""Definition of ``ttc_lane``. It is a predicate, not a column, because it combines tables and attributes."""
 FUNCTIONS: Final = frozenset(
     {
         *(*PAIR_FUNCTIONS, *RECORDED, TTC_LANE, *OF_ONE, *NUMERIC, *EXTREMES, *OF_TWO),

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 Interval = tuple[float, float]
 
 BODY: Final = 10.0
-"""Sum of the half lengths of two bodies: the extra distance of centres compared with edges; m."""
+"""Extra distance between the centres of two bodies, compared with their edges: sum of the half lengths; m."""
 FASTEST: Final = 150.0
 """Greatest valid speed. Faster speeds count as unknown; m/s."""
 _FAR: Final = 200.0 + BODY
 """Largest known distance along lanes; m."""
 WAITING: Final = 200.0
-"""Largest distance to a relevant light or sign of the lane ahead; m."""
+"""Largest distance from a vehicle to the light or sign that applies to it; m."""
 LINKS: Final = dict.fromkeys(PROXIMITY, 25.0 + BODY) | {
     **dict.fromkeys(("leads", "follows"), 100.0 + BODY),
     "overlaps": 2 * BODY,
@@ -123,7 +123,7 @@ def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
 
 
 def spoken_kinds(check: BoundCheck) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the node kinds whose missing nodes can make a check wrongly true, and wrongly false.
+    """Return the node kinds whose absence can make a check wrongly true, and those that make it wrongly false.
 
     The result is a pair of sets.
 
@@ -152,7 +152,7 @@ def _farther(found: Horizon, reach: float, *, true: bool, false: bool) -> Horizo
 
 @dataclass(frozen=True, slots=True)
 class _Missed:
-    """Node of a pattern in braces: its kinds, its largest distance from the ego, and wrong verdicts.
+    """Pattern node that a recording may lack: its kinds, its largest distance, the wrong verdicts it can cause.
 
     ``true`` and ``false`` are set if a missing node can cause that wrong verdict.
     """
@@ -170,7 +170,7 @@ class _Missed:
 
 @dataclass(slots=True)
 class _Looking:
-    """Analysis of the range of a check: known distances of variables from the ego, and the greatest speed."""
+    """Analysis of a check: how far from the ego its variables can be, and the greatest speed of vehicles."""
 
     known: dict[str, float]
     speed: float
@@ -310,7 +310,7 @@ class _Looking:
 
 
 def _goes_on(formula: Bound, *, wanted: bool) -> bool:
-    """True if a formula can have a value only in a frame before the last one."""
+    """True if a formula can have its value only if a later frame exists."""
     match formula:
         case b.Tense(word="NEXT" | "WEAKNEXT"):
             return wanted == (formula.word == "NEXT")
@@ -325,7 +325,7 @@ def _goes_on(formula: Bound, *, wanted: bool) -> bool:
 
 
 def _may_be_empty(tense: b.Tense, *, wanted: bool) -> bool:
-    """True if a temporal operator can have a value without any frame in its window.
+    """True if a temporal operator has its value already because its time window contains no frame.
 
     Examples: ``NEXT`` in the last frame is false, ``HISTORICALLY[1s, 2s]`` in the first frame is true.
     """
@@ -382,10 +382,10 @@ _SMALL: Final[Mapping[str, Callable[[float, float], float]]] = {
     "ttc_mild": lambda value, speed: 2 * speed * value + 4 * value * value + BODY,
     "rss_margin": _safe,
 }
-"""Numbers that are small only for near entities: the largest distance for a given value."""
+"""Pair numbers that are small only for near entities: name → function (value, speed) → largest distance; m."""
 
 _BRAKING: Final = {"a_long_req": -1.0, "drac": 1.0, "btn": 11.5}
-"""Numbers that are large only for near entities: the deceleration for a value of 1; m/s²."""
+"""Pair numbers that are large only for near entities: name → deceleration for a value of 1; m/s²."""
 
 
 def bounds(value: Bound, speed: float) -> Interval:

@@ -179,7 +179,7 @@ _ON_LANES: Final = frozenset({"lane", "road", "junction", "roundabout", "crosswa
 
 
 def _needed(expression: Bound) -> Iterator[PairNumber]:
-    """Yield the pair numbers (such as ``ttc(a, b)``) without which an expression is NULL."""
+    """Yield the pair numbers, such as ``ttc(a, b)``, that must be known for an expression to have a value."""
     match expression:
         case PairNumber():
             yield expression

@@ -49,7 +49,7 @@ MEASURED: Final = MOTION | {
 """Measured attributes of nodes, which are unknown if the recording does not have them."""
 
 _TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
-"""Operators with a known value for unknown operands."""
+"""Operators whose result is known even if an operand is unknown."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     Ends = Sequence[tuple[b.Kinds, b.Kinds]]
     Written = tuple[s.EdgePattern, s.NodePattern, s.NodePattern, str]
-    """Edge of the text with its nodes to the left and to the right, and its key."""
+    """Edge of the query text, the nodes to its left and right, and its key."""
 
 Interval = tuple[float, float]
 
@@ -103,14 +103,14 @@ def check_edges(written: Sequence[Written], names: SymbolTable) -> None:
 
 
 def _sort(kinds: b.Kinds) -> b.Kinds:
-    """Return all entities for a node of an outer pattern that can be one: a block can be about some kinds."""
+    """Widen the kinds to all entities if they include some entities."""
     return kinds | _WORDS["entity"] if kinds.other & _OWN else kinds
 
 
 def _ways(
     edge: b.Edge, src: b.Kinds, dst: b.Kinds, ends: Sequence[tuple[b.Kinds, b.Kinds]]
 ) -> list[tuple[b.Kinds, b.Kinds]]:
-    """Return the kinds at both ends that an edge can join; of a repeated edge, only if there are some."""
+    """Return the pairs of kinds (source, destination) that an edge, also a repeated one, can join."""
     ends = [*ends, *((other, one) for one, other in ends)] if edge.both else ends
     found: list[tuple[b.Kinds, b.Kinds]] = []
     reached = [src]
@@ -138,7 +138,7 @@ def _refuse_edge(
 def _correct_edge(
     edge: b.Edge, kinds: tuple[b.Kinds, b.Kinds], texts: tuple[str, str, str], direction: str
 ) -> str:
-    """Return the correct form of an edge that no recording has: turned, repeated, or of other kinds."""
+    """Return a hint to correct an impossible edge: turn, repeat or replace it, or use other nodes."""
     src, dst = kinds
     of = {name: _ENDS[name] for name in RELATION_ENDS if name in edge.relations}
     ends = [pair for some in of.values() for pair in some]
@@ -162,7 +162,7 @@ def _correct_edge(
 
 
 def _told(relation: str) -> str:
-    """Return the ends of a relation as text: ``a lane to a road``."""
+    """Return the kinds at the ends of a relation as text, such as ``a lane to a road``."""
     pairs = RELATION_ENDS[relation]
     text = ", or from ".join(f"{one} to {other}" for one, other in pairs)
     return text.replace("|", ", ").replace("body", "entity")
@@ -189,7 +189,7 @@ Readers do not check controls and the weather, so their limits are wide: they ar
 """
 
 ROUNDED: Final = 0.01
-"""Tolerance of limits on both sides: stored numbers have 32 bits, and angles can be above 180 by it."""
+"""Tolerance at both limits of a range, because stored numbers have only 32 bits."""
 
 
 _ANY: Final = (-math.inf, math.inf)
@@ -222,7 +222,7 @@ def limits(value: b.Bound) -> Interval:
 
 
 def check_comparison(e: s.Expression, found: b.Bound, names: SymbolTable) -> b.Bound:
-    """Return a bound comparison, or raise an error if it never holds in a recording.
+    """Return a comparison, or raise an error if no recorded value can make it true.
 
     A comparison that always holds gets a note.
 
@@ -265,7 +265,7 @@ def check_comparison(e: s.Expression, found: b.Bound, names: SymbolTable) -> b.B
 
 
 def _range(low: float, high: float, constant: b.Value) -> str:
-    """Return the range of a value, and a number beyond it in the unit of the language."""
+    """Return the valid range of an attribute as text, with a hint for a value in the wrong unit."""
     number = float(constant.shown or 0)
     text = (
         f"it is at least {low:g}" if high == math.inf else f"it lies between {low:g} and {high:g}"
@@ -282,7 +282,7 @@ def _range(low: float, high: float, constant: b.Value) -> str:
 
 
 def _wrong_words(left: b.Bound, word: str, texts: set[str], names: SymbolTable) -> tuple[str, str]:
-    """Return ``never`` or ``always`` for a kind or relation that a node or edge cannot have, and a hint."""
+    """Return ``never`` or ``always`` and a hint, for a comparison with a kind or relation that cannot occur."""
     possible, hint = None, ""
     if isinstance(left, b.NodeAttribute) and left.attribute.name == "kind":
         possible = (names.session.kinds_left.get(left.node) or names.scope.kinds(left.node)).every

@@ -36,10 +36,10 @@ _CONVERTED: Final = frozenset({DisplayUnit.degrees, DisplayUnit.along})
 """Units of numbers that are computed from 32-bit columns of one row."""
 
 _SAME: Final = frozenset({"abs", "negative", "min", "max", "coalesce", "case"})
-"""Operators that return one of their operands, apart from the sign."""
+"""Operators that return one of their operands, possibly with the opposite sign."""
 
 _CHOSEN: Final = frozenset({"min", "max", "first", "last", "median", "percentile", "avg"})
-"""Functions of many values. The result lies between the smallest and the largest value."""
+"""Functions whose result lies between the smallest and the largest of their arguments."""
 
 _OVER_TIME: Final = frozenset({"prev", "min_over", "max_over", "avg_over"})
 
@@ -66,7 +66,7 @@ def precision_of(value: b.Bound) -> Precision | None:
 
 
 def _of_whole(attribute: Attribute) -> Precision | None:
-    """Return the stored precision of an attribute of a frame or trace, or of a value passed by ``WITH``.
+    """Return the stored precision of an attribute. ``None`` means 64 bits.
 
     ``None`` means 64 bits.
     """
@@ -77,7 +77,7 @@ def _of_whole(attribute: Attribute) -> Precision | None:
 
 
 def _of_many(value: b.Bound) -> Precision | None:
-    """Return the stored precision of a value that is selected from several values. ``None`` means 64 bits."""
+    """Return the stored precision of a value that is chosen from several values. ``None`` means 64 bits."""
     match value:
         case b.OverMatch(word="argmin" | "argmax", at=at) if at is not None:
             return precision_of(at)

@@ -105,7 +105,7 @@ def bind_query(
 
 
 def _merged_names(query: b.Query, catalog: Catalog) -> list[str]:
-    """Return a note on groups by the name of an entity, which is unique only in its trace."""
+    """Return a note if a query groups by an entity's name or id, which are unique only within one trace."""
     values = [column.value for column in query.result.columns]
     parts = [part for value in values for part in b.walk(value)]
     grouped = query.result.distinct or any(isinstance(part, b.Aggregate) for part in parts)

@@ -154,7 +154,7 @@ def names_written(sequence: s.SequenceClause) -> frozenset[str]:
 
 
 def names_of_group(group: s.GroupStep) -> frozenset[str]:
-    """Return the variables of a group of steps that are not the ego by their label."""
+    """Return the variables of a group of steps, without variables that have the label ``Ego``."""
     egos = {
         node.name
         for step in _steps_in(group)

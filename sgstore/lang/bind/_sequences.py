@@ -180,7 +180,7 @@ class _WrittenSteps:
         return _WrittenSteps(steps, links)
 
     def flat(self) -> Iterator[_Written]:
-        """Yield every step of the sequence in reading order, including steps in groups of alternatives."""
+        """Yield every step of the sequence in reading order, including the steps of groups."""
         for one in self.steps:
             if isinstance(one, _Written):
                 yield one
@@ -203,7 +203,7 @@ class _WrittenGroup:
 
     @property
     def rounds(self) -> list[list[_WrittenSteps]]:
-        """Alternatives of each repetition that has steps of its own."""
+        """Alternatives of a group, one list for each repetition with its own copy of the steps."""
         size = len(self.alternatives) // (self.group.high if self.fresh else 1)
         every = self.alternatives
         return [every[first : first + size] for first in range(0, len(every), size)]
@@ -258,7 +258,7 @@ MAX_WAYS: Final = 100
 def _ways(
     written: _WrittenSteps, before: list[_Way], span: TextSpan, session: Session
 ) -> list[_Way]:
-    """Return all step sequences without groups (repetitions, alternatives) that equal a sequence with groups.
+    """Return all sequences without groups that together equal a sequence with groups.
 
     Each one is appended to each of the given beginnings.
     """
@@ -305,7 +305,7 @@ def _bind_steps(
     *,
     again: bool = False,
 ) -> None:
-    """Bind the steps of a sequence in reading order. ``again`` is true if the steps are repeated."""
+    """Bind the steps of a sequence in reading order. ``again`` means that a group repeats them."""
     for one in written.steps:
         if isinstance(one, _Written):
             if again and one.step.name is not None:
@@ -323,7 +323,7 @@ def _bind_steps(
 
 
 def _forget(names: frozenset[str], found: BoundSequence) -> None:
-    """Remove variables of a repetition, which are new in the next one."""
+    """Remove the variables of a group, so that its next repetition can define them again."""
     symbols = {name: found.meanings.pop(name) for name in names & found.meanings.keys()}
     keys = {symbol.node or symbol.edge for symbol in symbols.values()}
     found.known = {key: node for key, node in found.known.items() if key not in keys}

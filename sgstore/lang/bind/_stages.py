@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class StagedScope(ScopeBuilder):
-    """Nodes and edges of all query stages (``MATCH`` and ``WITH`` clauses) bound until now.
+    """Nodes and edges of all clauses (``MATCH``, ``WITH``) of a query that are bound so far.
 
     The first pattern always binds the ego.
 
@@ -67,7 +67,7 @@ class _Match:
     optional: bool = field(kw_only=True)
 
     def finished(self, ego: b.Node | None) -> b.MatchStage:
-        """Return the final stage. Its nodes differ from the ego if any clause uses it."""
+        """Return the stage for the query, with the pairs of new and earlier nodes that must differ."""
         earlier = self.earlier | ({} if ego is None else {ego.key: ego})
         apart = tuple(
             (key, other)
@@ -80,7 +80,7 @@ class _Match:
 
 
 def _may_be_same(one: b.Kinds, other: b.Kinds) -> bool:
-    """True if two variables can be the same node. Two that must be the ego are not compared."""
+    """True if two variables can match the same node. The result is False if both must be the ego."""
     return bool(one.other & other.other or (one.ego & other.ego and (one.other or other.other)))
 
 
@@ -275,7 +275,7 @@ class StageBinder:
     def _named(
         self, item: s.Item, names: SymbolTable, written: list[s.Item]
     ) -> Mapping[str, Symbol]:
-        """Return the name that an item of ``WITH`` passes on, for a variable or a value bound later."""
+        """Return the name and symbol that a ``WITH`` item passes on. Unbound items are added to ``written``."""
         value = item.value
         if isinstance(value, s.Variable):
             symbol = names.meaning(value.name)
@@ -292,7 +292,7 @@ class StageBinder:
     def _renamed(
         self, symbols: dict[str, Symbol]
     ) -> tuple[tuple[tuple[str, str], ...], tuple[tuple[b.Edge, str], ...]]:
-        """Return the node and edge keys that ``WITH`` passes on: the key after it with the key before it.
+        """Give unique keys to the passed nodes and edges. Return pairs: new key, old key.
 
         ``symbols`` is updated.
         """
@@ -337,7 +337,7 @@ class StageBinder:
         return _bare(self._told.nodes, self._told.edges)
 
     def stages(self) -> tuple[b.Stage, ...]:
-        """Return all bound clauses of the query. Call this last: any clause may be the first to use the ego."""
+        """Return all bound clauses of the query. Call this last, because every clause may introduce the ego."""
         told = self._told
         ego = told.first.nodes.get(told.ego)
         ego = ego and replace(ego, role="unnamed")
@@ -395,7 +395,7 @@ def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTab
 
 
 def _bare(nodes: Mapping[str, b.Node], edges: Iterable[b.Edge]) -> b.Scope:
-    """Return a pattern of nodes and edges without conditions."""
+    """Return a pattern of nodes and edges that has no conditions."""
     return b.Scope(nodes, {}, tuple(edges), (), frozenset())
 
 

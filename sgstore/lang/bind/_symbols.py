@@ -43,7 +43,7 @@ THE_EGO: Final = "ego"
 """Name that is always bound to the ego of the frame."""
 
 RESERVED: Final = frozenset({"env", "frame", "trace"})
-"""Names with attributes that are not nodes."""
+"""Reserved names, such as ``frame``, that have attributes but are not nodes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class Session:
         self.strict = not (catalog.part or others or any(one.reach is None for one in self.traces))
 
     def look_beyond(self, catalog: Catalog, *, world: bool) -> None:
-        """Set the pair settings of the traces, if the statement also uses entities outside the scene graphs."""
+        """Load the pair settings of the traces, if the statement uses entities outside the scene graphs."""
         if world and (catalog.world or catalog.online):
             self.beyond = scopes_of(self.traces)
 
@@ -181,13 +181,13 @@ class Session:
         raise QueryError(reason, text=self.text, span=span, hint=hint)
 
     def impossible(self, reason: str, span: TextSpan, hint: str) -> None:
-        """Raise an error for a part that no recording has; in a predicate or for other graphs, note it."""
+        """Raise an error for a part that no recording has. Inside a predicate, only add a note."""
         if self.strict and not self.calls and not self.shipped:
             self.refuse(reason, span, hint)
         self.doubt(f"{reason}; {hint}")
 
     def doubt(self, note: str) -> None:
-        """Keep a note on a part of the query. Bodies of the library get none."""
+        """Add a note about a part of the query, except inside definitions of the standard library."""
         written = (self.predicates[normalize_name(name)] for name in self.calls)
         library = predicates() if self.calls else {}
         shipped = any(library.get(normalize_name(one.name)) is one for one in written)
@@ -256,7 +256,7 @@ class ScopeBuilder:
         return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
 
     def distinct(self) -> frozenset[tuple[str, str]]:
-        """Return the pairs of nodes that must differ: nodes of the pattern, also from nodes of outer ones."""
+        """Return the pairs of nodes that must differ, including pairs with nodes of outer patterns."""
         if not self.session.injective:
             return frozenset()
         pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
@@ -416,7 +416,7 @@ class SymbolTable:
 
 
 def of_type(value: Bound, kind: Type) -> Bound:
-    """Return a value of an unknown topic with the type that its place requires; others are unchanged."""
+    """Set the type of a value whose topic type is unknown to the given type. Return other values unchanged."""
     if value.type is not Type.open or kind in {Type.open, Type.null}:
         return value
     if isinstance(value, FrameAttribute):

@@ -99,7 +99,7 @@ def timespan(e: s.Duration, _: SymbolTable) -> b.Value:
 
 
 def course(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Return the bound call of a function over time: ``prev``, ``delta``, a window, ``run_length``, ….
+    """Return the bound form of a function over time, such as ``prev(x)`` or ``delta(x, 2s)``.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def _delta(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def _how_far(e: s.Call, names: SymbolTable) -> b.Length:
-    """Return the bound duration in the second argument of a function over time, such as ``delta(x, 2s)``."""
+    """Return the bound duration in a call such as ``delta(x, 2s)``."""
     back = e.arguments[1]
     if not isinstance(back, s.Duration | s.Parameter):
         names.session.refuse("expected a duration such as 2s", back.span)
@@ -169,7 +169,7 @@ def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def refuse_window(e: s.FrameWindow, names: SymbolTable) -> b.Bound:
-    """Raise an error for a window outside of a function over time."""
+    """Raise an error for a time window that is not an argument of a function over time."""
     names.session.refuse(
         "-1s..1s is a window of min_over, max_over, avg_over or sum_over",
         e.span,
@@ -178,7 +178,7 @@ def refuse_window(e: s.FrameWindow, names: SymbolTable) -> b.Bound:
 
 
 def refuse_ahead(found: b.Bound, span: TextSpan, names: SymbolTable) -> None:
-    """Raise an error for a window with later frames in a check, which must decide without them."""
+    """Raise an error for a window with later frames in a ``CHECK``, whose windows must end at the frame."""
     if any(isinstance(part, b.SignalCall) and part.ahead for part in b.walk(found)):
         names.session.refuse(
             "a window of a CHECK ends at the frame",
@@ -323,7 +323,7 @@ def _counting(expression: b.Bound, frames: bool | None) -> b.Bound:  # noqa: FBT
 
 
 def _lengths(expression: b.Bound) -> Iterator[b.Value]:
-    """Yield the constants in an expression, and in its patterns in braces."""
+    """Yield the constants of an expression, also those of its patterns in braces."""
     for part in b.walk(expression):
         match part:
             case b.Value():

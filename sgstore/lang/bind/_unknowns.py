@@ -44,14 +44,14 @@ CONNECTIVES: Final = frozenset({"AND", "OR", "NOT", "XOR", "IMPLIES"})
 """Words that join conditions."""
 
 _ANSWERS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
-"""Operations with a known value even for unknown operands."""
+"""Operations whose result is known even if an operand is unknown."""
 
 _FLIPPED: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
 _TURNED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<="}
 _EVERYWHERE: Final = frozenset({*BEYOND, *MAP_ONLY, "mayAffect"})
-"""Relations that are also known beyond the graphs."""
+"""Relations that are also known between entities outside the scene graphs."""
 _OF_PAIRS: Final = frozenset({*DIRECTIONS, *SIDES})
-"""Relations of all pairs selected by the settings."""
+"""Relations that the generator computes for all entity pairs that the settings select."""
 _BOX: Final = frozenset({"heading", "length", "width"})
 _NONE: Final = frozenset[str]()
 _MADE_OF: Final = {
@@ -60,14 +60,13 @@ _MADE_OF: Final = {
     "sees": (frozenset({"height"}), _BOX),
     "isIn": (_BOX, _NONE),
 }
-"""Measured attributes of source and destination. Without them, a missing edge does not mean that the relation
-does not hold. Other relations are taken as recorded.
-"""
+"""Attributes of the source and of the destination that a relation is computed from: relation → two sets.
+Without these attributes, a missing edge is unknown, not false. All other relations count as recorded."""
 _CHOSEN: Final = frozenset({"is_primary", "is_own"})
-"""Attributes of edges ``isIn`` that depend on the driven lane."""
+"""Attributes of ``isIn`` edges that depend on the driven lane."""
 _FALSE: Final = b.Value(value=False, type=Type.boolean)
 _LOOSE: Final = 1 << 20
-"""Offset of the number of a block that also includes matches with unknown values."""
+"""Number added to the number of a pattern in braces for its copy that also includes uncertain matches."""
 
 
 def unknown(value: b.Bound) -> b.Bound | None:
@@ -94,7 +93,7 @@ def has_pairs(value: b.Bound) -> bool:
 
 
 def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
-    """Return the negation of a condition, with ``NOT`` only before conditions without ``AND`` and ``OR``."""
+    """Return the negation of a condition, with ``NOT`` moved inside every ``AND`` and ``OR``."""
     match condition:
         case b.Operation("NOT", (operand,)):
             return pushed(operand)
@@ -116,7 +115,7 @@ def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
 
 
 def pushed(condition: b.Bound) -> b.Bound:
-    """Return an equivalent condition, with ``NOT`` only before conditions without ``AND`` and ``OR``."""
+    """Return an equivalent condition, with ``NOT`` moved inside every ``AND`` and ``OR``."""
     match condition:
         case b.Operation("NOT", (operand,)):
             return negated(operand)
@@ -197,7 +196,7 @@ def possible(condition: b.Bound) -> b.Bound:
 
 
 def undecided(condition: b.Bound) -> b.Bound | None:
-    """Return the condition that the truth of another condition is unknown but possible.
+    """Return the condition that another condition is possible, but not certain.
 
     ``None`` means that it is always known.
 
@@ -259,7 +258,7 @@ def _unknown(value: b.Bound) -> Iterable[b.Bound]:  # noqa: C901, PLR0912 - a ca
 
 
 def by_lanes(value: b.Bound) -> bool:
-    """True if an expression of the online mode depends on the lanes that vehicles drive in junctions."""
+    """True if an expression in online mode depends on the driven lanes in junctions."""
     match value:
         case b.NodeAttribute(attribute=attribute, online=True):
             return attribute.unit is DisplayUnit.role
@@ -277,7 +276,7 @@ def by_lanes(value: b.Bound) -> bool:
 
 
 def _later(value: b.NodeAttribute | b.FrameAttribute | b.EdgeAttribute | b.PairNumber) -> b.Bound:
-    """Return the condition that later frames decide the lane on which a value depends."""
+    """Return the condition that a value depends on a lane that only later frames decide."""
     match value:
         case b.EdgeAttribute(edge=edge):
             return b.EdgeAttribute(edge, UNSURE_LANE, Type.boolean)
@@ -297,7 +296,7 @@ def _frame(attribute: Attribute) -> b.Bound:
 
 
 def without_guesses(query: b.Query) -> b.Query:
-    """Return a query of the online mode that has no match because of an unknown driven lane."""
+    """Return a query of the online mode without matches that depend on an undecided driven lane."""
 
     def sure(condition: b.Bound) -> b.Bound:
         if not by_lanes(condition):
@@ -338,7 +337,7 @@ def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
 
 @lru_cache(maxsize=1024)
 def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
-    """Return conditions that a pattern in braces may match, but depends on unknown values.
+    """Return the conditions that a pattern in braces has a match only if unknown values fit.
 
     The result is cached.
     """
@@ -458,7 +457,7 @@ def _of_counts(condition: b.Operation, *, least: bool) -> b.Bound:
 
 
 def _can_be_counted(block: b.BlockValue) -> bool:
-    """True if the nodes of a pattern in braces alone give its possible matches outside the scene graph."""
+    """True if the possible matches of a pattern in braces can be counted from its nodes alone."""
     beyond = _of_apart(block)
     told = not any(edge.named for edge in block.scope.edges)
     return beyond is None or (told and isinstance(beyond, b.BlockValue))
@@ -473,7 +472,7 @@ def _total(blocks: Iterable[b.BlockValue]) -> b.Bound:
 
 
 def _all_of(block: b.BlockValue) -> Iterable[b.BlockValue]:
-    """Yield patterns in braces that together have all possible matches of the given pattern."""
+    """Yield patterns in braces that together cover every possible match of a pattern in braces."""
     where = tuple(possible(pushed(part)) for part in block.scope.where)
     scope = replace(block.scope, where=where)
     yield replace(block, scope=scope, number=block.number + 8 * _LOOSE)
@@ -488,7 +487,7 @@ def _edges_of(condition: b.Bound) -> frozenset[str]:
 
 
 def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
-    """Return the condition that an edge of a pattern in braces is unknown.
+    """Return the condition that an edge of a pattern in braces was not computed, or None.
 
     ``None`` means that it is always known.
     """
@@ -510,7 +509,7 @@ def _unsure(edge: b.Edge) -> Iterable[b.Bound]:
 
 
 def _beyond(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
-    """Yield the condition that an edge was not computed because one node is outside the scene graph.
+    """Yield the condition that an edge is not computed because a node is outside the scene graph.
 
     A relation does not hold between entities that the settings do not relate. A distance relation does not
     hold beyond its distance.
@@ -533,7 +532,7 @@ def _related(edge: b.Edge, reach: RelationScope | None) -> b.Bound:
 
 
 def _unmeasured_ends(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
-    """Yield conditions that an edge may be missing because a measurement of one of its nodes is missing."""
+    """Yield the conditions that an edge may be missing because a measurement of a node is missing."""
     for forward in (True, False) if edge.both else (True,):
         for end, key in enumerate((edge.src, edge.dst) if forward else (edge.dst, edge.src)):
             every = scope.kinds(key).every

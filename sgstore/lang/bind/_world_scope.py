@@ -25,12 +25,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
 _MOST: Final = 3
-"""Largest number of edges in braces with this evaluation. Each subset is one more query. With more edges, a
-check is unknown and a pattern matches within the graph.
-"""
+"""Largest number of such edges in one pattern in braces, because each subset of them adds a query. Above it, a
+check is unknown, and a pattern matches within the graph only."""
 
 _SIDES: Final = 10.0
-"""Sum of the half lengths of two bodies: the extra distance of centres compared with edges; m."""
+"""Extra distance between the centres of two bodies, compared with their edges: sum of the half lengths; m."""
 
 
 def beyond_graph(edge: b.Edge) -> b.Bound:
@@ -95,7 +94,7 @@ def _reach(edge: b.Edge, reach: RelationScope) -> float:
 
 
 def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.BlockValue:
-    """Return a copy of a pattern in braces for entities outside the scene graph.
+    """Return a copy of a pattern in braces with some edges replaced by their geometric definition.
 
     Some edges become conditions on distances.
     """
@@ -215,4 +214,4 @@ _JOINED: Final[Mapping[str, Callable[[list[b.BlockValue]], b.Bound]]] = {
     "MIN": lambda blocks: _extreme("min", blocks),
     "MAX": lambda blocks: _extreme("max", blocks),
 }
-"""Functions that combine the blocks with disjoint matches into one value."""
+"""Ways to combine the results of patterns without common matches: first word of the pattern → function."""

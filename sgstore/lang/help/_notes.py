@@ -179,7 +179,7 @@ def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str,
 def _first_absent(
     query: b.Query, exists: Callable[[b.Scope], bool], calls: b.Calls
 ) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope, Writer, list[str]]]:
-    """Yield the first part that no frame has, the pattern up to it, its writer, and the parts before.
+    """Yield the first part that no frame has, the pattern up to it, a text writer, and the earlier parts.
 
     The calls of predicates in ``calls`` are one part each.
     """
@@ -202,7 +202,7 @@ def _first_absent(
 
 
 def nearest_query(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str, str, str] | None:
-    """Return the query for the frame that comes nearest to the first part that no frame has.
+    """Return a query for the frame that comes closest to the first pattern part that no frame has.
 
     Parameters
     ----------
@@ -238,7 +238,7 @@ def nearest_query(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[st
 
 
 def _is_scene(condition: b.Bound) -> bool:
-    """True for a condition that describes a scene, and not the absence of one or a part of a text."""
+    """True if a condition describes the presence of a scene; False for an absence, an id or a text test."""
     match condition:
         case b.Operation(operands=(b.NodeAttribute(attribute=one), _)) if one.name == "id":
             return False
@@ -271,7 +271,7 @@ def _alone(part: b.Node | b.Edge | b.Bound, scope: b.Scope) -> b.Scope:
 
 
 def unknown_in_or(query: b.Query, ask: Ask) -> tuple[str, ...]:
-    """Return notes on attributes in ``OR`` that are unknown for all entities: unknown counts as false there."""
+    """Return notes on attributes in ``OR`` without any known value. There, unknown counts as false."""
     conditions = [one for scope in query.patterns for one in scope.where]
     either = [part for one in conditions for part in b.walk(one) if _is_or(part)]
     used = [leaf for part in either for leaf in b.walk(part) if isinstance(leaf, b.NodeAttribute)]

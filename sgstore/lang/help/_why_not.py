@@ -46,7 +46,7 @@ def _beyond(sign: str, limit: float, value: float) -> float:
 
 
 MOST_LOOKED_AT: Final = 10_000
-"""Largest number of bindings of the valid parts that are searched for the nearest match."""
+"""Largest number of partial matches that are searched for the nearest match."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +264,7 @@ def _parts(scope: b.Scope, calls: b.Calls) -> list[_Part]:
 
 
 def _together(where: Sequence[b.Bound], calls: b.Calls) -> Iterator[b.Bound]:
-    """Yield the conditions of a pattern. Those of one predicate are joined again."""
+    """Yield the conditions of a pattern, with the conditions of one predicate call joined by ``AND``."""
     joined = {parts: call for call in calls if len(parts := tuple(b.conjuncts(call))) > 1}
     at = 0
     while at < len(where):

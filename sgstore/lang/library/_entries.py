@@ -59,7 +59,7 @@ _MORE: Final = re.compile(r"--   \s*(\S.*)")
 _DURATION: Final = re.compile(r"\d+(\.\d+)?(ms|s|min|frames)")
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?")
 _PLACE: Final = re.compile(r"'(?:[^'\\]|\\.)*'|\"(?:[^\"\\]|\\.)*\"|--[^\n]*|\$(\w+)")
-"""Texts in quotes and comments, which are kept, and parameters, which are replaced."""
+"""Regular expression: quoted texts and comments, which stay, and ``$parameters``, which are replaced."""
 _DRAWING: Final = re.compile(r"^==== (\w+)\n(.*?)(?=^==== |\Z)", re.MULTILINE | re.DOTALL)
 
 

@@ -21,7 +21,7 @@ _SYNONYMS: Final = {
 }
 
 _STEM: Final = 4
-"""Smallest number of letters that words of one stem share: ``brakes``, ``braking``."""
+"""Smallest number of first letters that words of the same stem share: ``brakes``, ``braking``."""
 
 
 def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:

@@ -1,4 +1,4 @@
-"""Texts of users: the name of a pattern, a query, a check or a formula."""
+"""Reader of user input that can be a pattern name, a query, a check or a formula."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ _UNSURE: Final = frozenset({UNSURE_LANE, UNSURE_LEAD})
 
 
 def _unsure(value: b.EdgeAttribute | b.FrameAttribute) -> Evaluate:
-    """Return a function for "later frames decide the lane" of an edge to a lane, the ego, or any vehicle."""
+    """Return a function that evaluates "later frames decide the lane" of an edge, the ego, or any vehicle."""
     if isinstance(value, b.FrameAttribute) and value.attribute is UNSURE_LANE:
         return lambda at: at.view.graph.ego in at.view.graph.unsure_lane
     if isinstance(value, b.FrameAttribute):
@@ -327,7 +327,7 @@ def _is_derived(attribute: Attribute) -> bool:
 
 
 def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:
-    """Return a function for a value of nodes that are already chosen.
+    """Return a function for a value that depends only on nodes that are already chosen.
 
     The value is the same for all candidates.
     """

@@ -82,7 +82,7 @@ class FrameView:
         return replace(self, graph=known, drawn=self.graph)
 
     def linked(self, edge: b.Edge) -> FrameView:
-        """Return the view in which an edge is searched.
+        """Return the view that contains the possible matches of an edge.
 
         For an edge in braces it has all data, otherwise the scene graph.
         """
@@ -330,7 +330,7 @@ class NodeColumns:
 
 
 def attribute_of(about: Mapping[str, Any], name: str) -> Any:
-    """Return an attribute of a node. Bodies of a recording without noise have no mark of noise."""
+    """Return an attribute of a node. For entities, a missing noise mark means False."""
     if name in NOISE_MARKS and "derived_velocity" in about:
         return about.get(name, False)
     return about.get(name)

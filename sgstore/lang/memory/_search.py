@@ -45,7 +45,7 @@ class _SearchStep:
 
     @property
     def among(self) -> bool:
-        """True if all nodes of some kinds are candidates, not only neighbours of a node or the ego."""
+        """True if the candidates are all nodes of some kinds, not only neighbours of a node or the ego."""
         return bool(self.key) and self.via is None and bool(self.kinds.other)
 
 
@@ -58,7 +58,7 @@ class _NamedEdge:
 
 
 class ScopeSearch:
-    """Search plan of one graph pattern: the order in which its nodes are chosen."""
+    """Search plan of one graph pattern: the order in which the search chooses nodes for the variables."""
 
     def __init__(self, scope: Scope, *, injective: bool) -> None:
         self._scope = scope
@@ -114,7 +114,7 @@ class ScopeSearch:
         return steps
 
     def _way(self, key: str, bound: set[str]) -> Edge | None:
-        """Return an edge of the pattern from a node already chosen to the given node, or None.
+        """Return an edge of the pattern that leads from an already chosen node to the given node, or None.
 
         Paths of several edges do not count.
         """
@@ -125,7 +125,7 @@ class ScopeSearch:
         return None
 
     def run(self, at: Binding) -> Iterator[None]:
-        """Yield None once for each match of the pattern. Meanwhile ``at`` holds the chosen nodes and edges."""
+        """Yield None once for each match of the pattern. ``at`` then holds the chosen nodes and edges."""
         if all(at.view.is_one(at.nodes[key], kinds) for key, kinds in self._outer):
             yield from self._bound(at, 0)
 
@@ -147,7 +147,7 @@ class ScopeSearch:
                 yield from self._bound(at, number)
 
     def _bound(self, at: Binding, number: int) -> Iterator[None]:
-        """Yield once for each match that extends the chosen nodes, if all tests of a search step are true."""
+        """Extend the chosen nodes by one search step. Yield once for each match."""
         step = self._steps[number]
         if all(self._linked(at, edge) for edge in step.edges) and _all(step.tests, at):
             yield from self._name(at, number, 0)
@@ -236,7 +236,7 @@ def _all(tests: list[Evaluate], at: Binding) -> bool:
 
 
 def _needs(condition: b.Bound) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the nodes and edges that must be chosen before a condition can be tested."""
+    """Return the node and edge variables that must have values before a condition can be tested."""
     return b.nodes_of(condition), b.edges_of(condition)
 
 
@@ -268,7 +268,7 @@ def _fitting(at: Binding, step: _SearchStep) -> list[int]:
 def _steps(
     view: FrameView, relations: frozenset[str], here: int, *, both: bool, forward: bool = True
 ) -> Iterator[int]:
-    """Yield the neighbours of a node along edges with some relations, without duplicates."""
+    """Yield each neighbour of a node along edges with the given relations, without duplicates."""
     sides = (view.ahead, view.back) if both else (view.ahead,) if forward else (view.back,)
     found: dict[int, None] = {}
     for side in sides:
@@ -322,7 +322,7 @@ class StageSearch:
         return rows
 
     def value(self, of: b.Bound) -> Evaluate:
-        """Return a function that evaluates an expression for one match, whose optional nodes may be absent."""
+        """Return a function that evaluates an expression for one match. Optional nodes may be missing."""
         return _value(of, injective=self._injective)
 
 
@@ -363,7 +363,7 @@ class _Joining:
         return found
 
     def _beside(self, view: FrameView, row: Binding) -> Iterator[Binding]:
-        """Yield the given match, extended by each match of the next pattern."""
+        """Yield the given match, extended by each match of the clause's pattern."""
         if _absent(row, self._stage.scope.outer, ()):
             return
         told: set[object] = set()
@@ -392,7 +392,7 @@ def _row(view: FrameView, nodes: Any, edges: Any, passed: Any) -> Binding:
 
 
 class _Passing:
-    """``WITH`` clause: converts the matches in a frame, as by grouping, sorting and limits."""
+    """``WITH`` clause: groups, sorts and limits the matches of a frame, and keeps the listed values."""
 
     def __init__(self, stage: b.WithStage, injective: bool) -> None:  # noqa: FBT001
         self._stage, self._injective = stage, injective
@@ -424,7 +424,7 @@ class _Passing:
         return [row for row in found if all(test(row) is True for test in self._where)]
 
     def _passed(self, row: Binding, *, bare: bool = False) -> Binding:
-        """Return a match with the names and values that ``WITH`` passes on.
+        """Return a match that has only the names and values that ``WITH`` passes on.
 
         With ``bare``, all others are removed.
         """
@@ -481,7 +481,7 @@ def _place(row: Binding) -> tuple[tuple[bool, Any], ...]:
 
 
 def _aggregate(of: b.Aggregate, rows: Rows, *, injective: bool) -> Any:
-    """Return the value of an aggregate such as ``COUNT`` over some matches.
+    """Return the value of an aggregate, such as ``COUNT``, over the given matches.
 
     See :mod:`sgstore.lang.bind._aggregates`.
     """
@@ -514,15 +514,15 @@ AGGREGATE: Final[Mapping[str, Callable[[list[Any], b.Aggregate], Any]]] = {
     "percentile": _quantile,
     "collect": lambda values, of: sorted(values) if of.distinct else values,
 }
-"""Functions that compute aggregates from the known values."""
+"""Functions that compute an aggregate from its known values, by name."""
 
 
 _OF_NOTHING: Final = {"EXISTS": False, "COUNT": 0, "SUM": 0.0}
-"""Values of blocks that use an absent node. Other blocks are unknown."""
+"""Values of patterns in braces that use a missing optional node. All other words give an unknown value."""
 
 
 def _value(of: b.Bound, *, injective: bool) -> Evaluate:
-    """Return a function that evaluates an expression for one match, whose optional nodes may be absent."""
+    """Return a function that evaluates an expression for one match in which optional nodes may be missing."""
     match of:
         case b.Operation(word=word, operands=operands):
             return OPERATORS[word].one([_value(one, injective=injective) for one in operands])

@@ -38,7 +38,7 @@ _ORIGINS: Final = {
 }
 
 PLACES: Final = ", ".join(literal(kind) for kind in MAP_KINDS)
-"""Kinds of map parts that are not entities. Signs and lights are entities."""
+"""Kinds of map parts. Signs and lights are entities, and therefore not included."""
 
 _ABSENT: Final = {
     Type.number: "CAST(NULL AS DOUBLE)",
@@ -213,7 +213,7 @@ _STILL: Final = {
     (DisplayUnit.velocity, Home.scenery): "CASE WHEN {0} THEN 0e0 END",
     (DisplayUnit.velocity, Home.map): f"CASE WHEN {{0}} NOT IN ({PLACES}) THEN 0e0 END",
 }
-"""Values of entities and map parts that never move."""
+"""SQL values of the motion attributes for entities and map parts that never move."""
 
 _CONVERTED: Final = {DisplayUnit.degrees: "degrees({1})", DisplayUnit.whole: "CAST({0} AS BIGINT)"}
 
@@ -308,7 +308,7 @@ def _looked_up(attribute: Attribute, frame: str) -> str:
 
 
 def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
-    """Return the SQL of a frame attribute that depends on the frame classes of a whole collection."""
+    """Return SQL for a frame attribute that needs the frame classes of all stores of a collection."""
     seen = attribute.unit is DisplayUnit.seen
     dataset = attribute.name.removeprefix(f"class_{abstraction} in ") if seen else ""
     on = [f'"k"."abstraction" = {literal(abstraction)}', f'"k"."dataset" = {literal(dataset)}']
@@ -322,7 +322,7 @@ def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
 
 
 def _weather_text(word_: str, frame: str) -> str:
-    """Return SQL for a weather attribute of a frame, from the last weather event until the frame."""
+    """Return SQL for a weather attribute of a frame: its value in the last weather event up to the frame."""
     told = f'regexp_extract("v"."detail", \'(^|, ){word_}=([^,]*)\', 2)'
     if word_ == "time_of_day":
         parts = [

@@ -67,12 +67,12 @@ class Compiled:
 
     @property
     def whole(self) -> Query:
-        """Query before rewriting. For ``RETURN SUBGRAPHS`` it returns the rows that form the subgraphs."""
+        """Query before rewriting. For ``RETURN SUBGRAPHS``, the query for the rows with the subgraphs."""
         return self.bound if self.layout is None else Layout.of(self.bound).query
 
     @property
     def layout(self) -> Layout | None:
-        """Layout of the rows of ``RETURN SUBGRAPHS``. ``None`` if the query returns no subgraphs."""
+        """Positions of graph values in the rows of ``RETURN SUBGRAPHS``. ``None`` for other results."""
         return Layout.of(self.bound) if self.bound.result.form == "subgraphs" else None
 
     @property
@@ -84,14 +84,14 @@ class Compiled:
 
     @property
     def chosen(self) -> tuple[TraceFacts, ...]:
-        """Traces that the settings of the query select, even if they lack the needed data."""
+        """Traces that the query settings select, including traces that lack necessary data."""
         only, ego = self.catalog.only, self.query.ego
         chosen = [t for t in self.catalog.traces if ego in {None, t.ego}]
         return tuple(t for t in chosen if only is None or t.trace_id in only)
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Selected traces that lack a relation of the query: trace name → message."""
+        """Selected traces that lack a relation of the query: trace name → message for the user."""
         if self.query.unknown_is_false:
             return {}
         wanted = self.query.relations
@@ -111,7 +111,7 @@ class Compiled:
     def _told(
         self, query: Query, window: Window | None
     ) -> tuple[Query, SqlBuilder | None, results.Span | None]:
-        """Return the query, a builder if its matches are computed already, and the time span of a match.
+        """Return the query, a builder for matches computed elsewhere (or None), and the span columns (or None).
 
         Builder and span can be None.
         """
@@ -160,7 +160,7 @@ class Compiled:
         return self.rows(window, results.with_bindings(self.query))
 
     def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for clips around the matching frames. Offsets of ``RETURN CLIPS`` take precedence.
+        """Return the SQL for clips around the matching frames. ``RETURN CLIPS`` can override the two offsets.
 
         Parameters
         ----------
@@ -174,7 +174,7 @@ class Compiled:
         return self.rows(window, replace(self.query, result=result))
 
     def told_apart(self) -> Compiled:
-        """Return a copy that also returns the owner (trace or map) of each node, if rows have no frame."""
+        """Return a copy of the query with the owner (trace or map) of each node as an extra column."""
         result = with_owners(self.query.result)
         return replace(self, query=replace(self.query, result=result))
 
@@ -190,7 +190,7 @@ class Compiled:
 
     @property
     def in_windows(self) -> bool:
-        """True if the result can be computed in time windows, each independent of the others."""
+        """True if the result can be computed in separate time windows."""
         result = self.query.result
         framed = result.whole or result.framed or result.form != "rows"
         across = result.distinct and not framed
@@ -199,7 +199,7 @@ class Compiled:
 
     @property
     def limited_to_frames(self) -> Compiled | None:
-        """Return a copy that also returns frame and log time of each row. ``None`` if no limit selects rows."""
+        """Return a copy that also returns frame and log time of each row. ``None`` if no limit drops rows."""
         result = self.query.result
         if not result.chooses or result.form != "rows" or result.aggregated:
             return None
@@ -285,7 +285,7 @@ def compile_checks(
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
-    """Return the catalog of the abstraction, dataset and scope that the ``USING`` settings select."""
+    """Return the catalog for the abstraction, dataset and scope in the ``USING`` settings."""
     seen, world = catalog, any(isinstance(one, CheckClause) for one in statements)
     for statement in statements:
         for setting in (

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def for_people(
     columns: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, graphs: bool
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return result columns and rows in a shorter form for display.
+    """Return the columns and rows of a result in a shorter form for display.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def for_people(
 
 
 def _named(name: str) -> str | None:
-    """Return ``v`` for a column ``v.name``, or None for another column."""
+    """Return the variable ``v`` if the column is ``v.name``; otherwise None."""
     return name.removesuffix(".name") if name.endswith(".name") else None
 
 

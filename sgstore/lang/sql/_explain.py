@@ -89,7 +89,7 @@ def query_text(query: Query) -> str:
 
 
 def _stage(stage: Stage) -> list[str]:
-    """Return the readable text lines of one clause (``MATCH`` or ``WITH``) of a query."""
+    """Return one clause (``MATCH`` or ``WITH``) of a query as readable lines of text."""
     if isinstance(stage, MatchStage):
         return ["optional match" if stage.optional else "match", *_scope(stage.scope, "  ")]
     nodes = [new if new == key else f"{key} AS {new}" for new, key in stage.nodes]
@@ -108,7 +108,7 @@ def _stage(stage: Stage) -> list[str]:
 
 
 def _passed(name: str) -> str:
-    """Return the name that the query text uses for a value passed by ``WITH``."""
+    """Return the name of a ``WITH`` value as it appears in the query text."""
     return name.removeprefix(PASSED).rpartition(" ")[0]
 
 
@@ -158,7 +158,7 @@ def unnumbered_text(value: Bound) -> str:
 
 
 _NUMBERED: Final = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|#\d+""")
-"""Quoted texts, which are kept, and numbers of unnamed nodes."""
+"""Regular expression: quoted texts, which stay, and the numbers of unnamed nodes."""
 
 
 def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case each

@@ -67,7 +67,7 @@ Leaf = (
     | BlockValue
     | GroupKey
 )
-"""Leaves of an expression that a statement must provide as columns."""
+"""Parts of an expression, such as attributes, that an SQL statement must provide as columns."""
 
 
 def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
@@ -115,7 +115,7 @@ def _operation(operation: Operation, leaf: Callable[[Leaf], str], values: BoundV
 def _compared(
     operand: Bound, operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues
 ) -> str:
-    """Return the SQL of one side of a comparison. Columns with a fixed list of words need no cast."""
+    """Return the SQL of one side of a comparison. Columns with an enumerated type need no cast."""
     closed = all(
         (isinstance(o, Value) and o.closed) or (isinstance(o, NodeAttribute) and o.attribute.values)
         for o in operation.operands
@@ -141,7 +141,7 @@ def _membership(
 
 
 def leaves(expression: Bound) -> Iterable[Leaf]:
-    """Yield the parts of an expression that are read from a column, such as attributes."""
+    """Yield the parts of an expression that SQL reads from a column, such as attributes."""
     match expression:
         case Value() | Choices() | LabelTest() | GroupKey() | Tense() | SignalCall():
             return
@@ -214,7 +214,7 @@ def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
 
 
 def lane_text(leaf: Leaf, alias: str) -> str:
-    """Return the SQL expression of an edge attribute, read from a row of :func:`edge_table`."""
+    """Return the SQL of an edge attribute, read from a row of :func:`edge_table`."""
     assert isinstance(leaf, EdgeAttribute)  # noqa: S101 - the condition was filed so
     return attribute_text(leaf.attribute, Aliases(state=alias))
 
@@ -249,7 +249,7 @@ def node_text(condition: Bound, node: str, at: Aliases, values: BoundValues) -> 
 def bound_text(
     condition: Bound, nodes: Mapping[str, str], edges: Mapping[str, str], values: BoundValues
 ) -> str:
-    """Return the SQL of a condition that uses only node ids and edge relations, from their columns."""
+    """Return the SQL of a condition on node ids and edge relations only."""
 
     def leaf(found: Leaf) -> str:
         match found:
@@ -264,7 +264,7 @@ def bound_text(
 
 
 def trace_text(condition: Bound, trace: str, values: BoundValues) -> str:
-    """Return the SQL of a condition on attributes of the trace, from the column of its id."""
+    """Return the SQL of a condition on attributes of the trace. ``trace`` is the SQL of the trace id."""
     select = Select(['"t"."trace_id"'], ['"trace" AS "t"'])
     select.join('"map" AS "m"', ['"m"."map_id" = "t"."map_id"'], "LEFT JOIN")
 

@@ -1,4 +1,4 @@
-"""SQL for sets of matching frames, of entities and of traces.
+"""SQL for the frames, the entities and the traces that match a query.
 
 Conditions over several frames are evaluated on columns read from a store (:func:`relation`). The matches then
 become a relation again (:mod:`sgstore.lang.sql._known_matches`).
@@ -47,11 +47,11 @@ if TYPE_CHECKING:
 
 
 _WORDS: Final = frozenset({Type.text, Type.edge})
-"""Types of values that may be enumerations in the database."""
+"""Types of values that the database may store as enumerations."""
 
 FRAME: Final = "frame_id"
 GATHERED: Final = ":gathered"
-"""Table with all matches."""
+"""Name of the table with all matches."""
 
 
 def relation(
@@ -123,22 +123,22 @@ def relation(
 _CLOCK: Final = """SELECT "frame_id", "seq", "time_ns", "log_time_ns" FROM "frame"
 WHERE "frame_id" >= $1 AND "frame_id" < $2"""
 CLOCK: Final = f'{_CLOCK} ORDER BY "frame_id"'
-"""Frames of a range, in order."""
+"""SQL for the frames of a time range, in order."""
 
 CLOCK_OF_TRACES: Final = f"""{_CLOCK}
   AND "frame_id" >> {TRACE_OF_FRAME} IN (SELECT unnest(CAST($3 AS BIGINT[]))) ORDER BY "frame_id" """
-"""Frames of some traces in a range, in order."""
+"""SQL for the frames of the selected traces in a time range, in order."""
 
 BUCKETS: Final = """SELECT "bucket", "valid", "joined" FROM "bucket"
 WHERE "bucket" >= $1 AND "bucket" < $2"""
-"""Buckets of a range, with the masks of their frames and of the frames without a gap before; unsorted."""
+"""SQL for frame buckets of a time range: masks of frames, and of frames without a gap before; unsorted."""
 
 TIMES: Final = """SELECT "frame_id", "time_ns" FROM "frame"
 WHERE "frame_id" >= $1 AND "frame_id" < $2"""
-"""Times of the frames of a range; unsorted."""
+"""SQL for the times of the frames of a range. Unsorted."""
 
 TRACES: Final = 'SELECT "trace_id", "name", "start_ns", coalesce("period_ns", 0) FROM "trace"'
-"""All traces with their start times and median periods."""
+"""SQL for all traces with their start times and median frame periods."""
 
 
 def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -> SqlStatement:
@@ -168,7 +168,7 @@ def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -
 
 
 def traces_with(kinds: Kinds, attribute: Attribute | None, *, moving: bool) -> str:
-    """Return the SQL for the traces that have a node of given kinds with a known attribute.
+    """Return the SQL for the traces that have a node of the given kinds with a known attribute.
 
     The statement reads tables without a frame join, so it is fast in a large store.
 
@@ -219,4 +219,4 @@ def traces_with(kinds: Kinds, attribute: Attribute | None, *, moving: bool) -> s
 
 TOLD_WEATHER: Final = """SELECT DISTINCT "trace_id" FROM "event"
 WHERE "kind" = 'environment' AND regexp_matches("detail", $1)"""
-"""Traces with a weather event that matches a regular expression."""
+"""SQL for the traces with a weather event that matches a regular expression."""

@@ -140,7 +140,7 @@ def existence(sql: SqlBuilder, scope: Scope, given: SharedRelation | None) -> st
 def _block(
     sql: SqlBuilder, condition: Bound, given: SharedRelation
 ) -> tuple[str, frozenset[str], bool]:
-    """Return SQL for ``EXISTS {…}`` or a count, its outer nodes, and False if a match is excluded (``NOT``)."""
+    """Return SQL for ``EXISTS {…}`` or a count, its outer nodes, and False for a negated condition."""
     match condition:
         case BlockValue(scope=scope):
             return existence(sql, scope, given), frozenset(scope.outer), True
@@ -180,7 +180,7 @@ def block_matches(
 
 
 def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the nodes and edges that distinguish two matches of a pattern in braces."""
+    """Return the nodes and edges whose values make two matches of a pattern in braces different."""
     nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
     edges = frozenset(edge.key for edge in scope.edges if edge.named)
     return frozenset(nodes) | frozenset(scope.outer), edges
@@ -245,7 +245,7 @@ def frames(
 def _needless(
     catalog: Catalog, pairs: Iterable[PairNumber], users: frozenset[str]
 ) -> frozenset[str]:
-    """Return the inputs of pair numbers that are unnecessary for the entities in the selected traces.
+    """Return the tests for special pairs (such as an entity and its carrier) that no selected trace needs.
 
     An example is the height on flat roads.
     """
@@ -262,13 +262,13 @@ def _needless(
 
 
 _USERS: Final = frozenset({*VEHICLES, "person", "animal"})
-"""Road users, which are never flat."""
+"""Kinds of road users. Their bodies are never flat."""
 
 
 def _kinds_of_edges(
     sql: SqlBuilder, scope: Scope, parts: Phases, needed: list[Leaf]
 ) -> dict[Leaf, str]:
-    """Return the node kinds that can be read from edge rows, because no other table of the node is needed.
+    """Return node kinds that edge rows already contain, so that no table of the node is joined: value → SQL.
 
     The result is: expression → node.
     """
@@ -287,7 +287,7 @@ def _by_buckets(
     edges: frozenset[str],
     wanted: list[Leaf],
 ) -> str:
-    """Return SQL with one row for each match and bucket (64 frames), with the number of matching frames."""
+    """Return SQL with one row for each match and bucket (64 frames): the number of matching frames."""
     select, texts = _of_buckets(sql, scope, parts, given, nodes, edges, wanted)
     texts[INVARIANT] = held(PATTERN)
     columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
@@ -333,7 +333,7 @@ def _of_buckets(
 def in_masks(
     sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf], values: Mapping[str, str]
 ) -> str:
-    """Return SQL for the frames in which a match has given values: values, with frames as 64-bit masks.
+    """Return SQL with the values of each match, and the frames with these values as 64-bit masks.
 
     Parameters
     ----------
@@ -354,7 +354,7 @@ def in_masks(
 
 
 def _lasting(sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
-    """Return SQL with one row for each match and bucket (64 frames) if all values are constant, or None."""
+    """Return SQL with one row for each match and bucket (64 frames). ``None`` if a value can change in one."""
     parts, wanted = phases(sql, scope), list(dict.fromkeys(wanted))
     known = sql.found_in(scope)
     if (known and not known.runs) or parts.rest or parts.late:
@@ -418,7 +418,7 @@ def _first_phase(
 def _leader(
     sql: SqlBuilder, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
 ) -> str | None:
-    """Return the pattern node whose states are read first, to avoid expanding bit masks; or None.
+    """Return the node whose states are read first, so that no bit masks need to be expanded; or None.
 
     The states are then looked up in the few rows of the first phase, and not these rows among the many
     states. If the query selects traces, it is faster to start from the frames.
@@ -507,7 +507,7 @@ def _second_phase(
 
 
 def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
-    """Join the states of a node that the first phase (bit masks) left out."""
+    """Join the states of a node that is not part of the first phase (bit masks)."""
     alias = quoted(key)
     on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
     on += _of_kinds(sql, scope, key, alias)
@@ -519,7 +519,7 @@ def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
 
 
 def _join_rows(sql: SqlBuilder, join: Join, scope: Scope, needed: list[Leaf]) -> None:
-    """Join the table rows of the frame, its trace and its map, if their attributes are needed."""
+    """Join the rows of the frame, its trace and its map if a value needs them."""
     kinds = {type(leaf) for leaf in needed}
     about = {key for leaf in needed for key in _valued(leaf)}
     about |= {
@@ -575,7 +575,7 @@ def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set
 def _value_text(  # noqa: PLR0911 - a case each
     sql: SqlBuilder, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf
 ) -> str:
-    """Return the SQL of one needed value. Join the table of its edge, or its pattern in braces."""
+    """Return the SQL of one value. Join the table of its edge or of its pattern in braces, if it has one."""
     match leaf:
         case NodeValue(node=node):
             return join.nodes[node]
@@ -646,7 +646,7 @@ def _of_edge(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttr
 
 
 def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str:
-    """Return the SQL of a number along lanes. The lane distance of the ego is joined once for all mentions."""
+    """Return the SQL of a number along lanes. All uses of the ego's lane distance share one join."""
     nodes = join.nodes[leaf.a], join.nodes[leaf.b]
     kinds = [scope.kinds(key) for key in (leaf.a, leaf.b)]
     never = frozenset(SIGNALS) - sql.catalog.ego_signals
@@ -712,11 +712,11 @@ def _is(leaf: Leaf, name: str) -> TypeGuard[NodeAttribute]:
 
 
 _BARE: Final = {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, DisplayUnit.own}
-"""Units of attributes that need no table of the node."""
+"""Units of attributes that SQL computes without any table of the node."""
 
 
 def _valued(leaf: Leaf) -> frozenset[str]:
-    """Return the nodes whose tables must be joined to compute a value."""
+    """Return the nodes whose tables must be joined before a value can be computed."""
     match leaf:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit in _BARE else frozenset({node})
@@ -738,7 +738,7 @@ def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
 
 
 def _of_kind(leaf: Leaf) -> bool:
-    """True if a value is the kind of a node, or its name, which follows from kind and id."""
+    """True if a value is the kind or the name of a node. A name consists of kind and id."""
     return _is(leaf, "kind") or _is(leaf, "name")
 
 
@@ -750,7 +750,7 @@ def _join_lasting(
     catalog: Catalog,
     needed: Iterable[Leaf],
 ) -> dict[Leaf, str]:
-    """Join tables of constant node values to rows of the first phase (bit masks). Return the SQL of each value.
+    """Join tables of constant node values to the first phase (bit masks). Return the SQL of each value.
 
     Results with only such values need no single frames. Their count is the number of frames in a mask.
     """

@@ -1,4 +1,4 @@
-"""SQL of results for matches computed outside the database, such as those of a sequence."""
+"""SQL for results of matches that are computed outside the database, such as matches of a sequence."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class ExternalRelation:
 
 
 def nothing(query: Query, values: int) -> ExternalRelation:
-    """Return an empty table of matches, with the columns of a query."""
+    """Return a table of matches without rows, but with the columns of a query."""
     nodes: dict[str, list[int]] = {key: [] for key in query.scope.nodes}
     edges: dict[str, list[str]] = {edge.key: [] for edge in query.scope.edges}
     return ExternalRelation([], [], nodes, edges, [[] for _ in range(values)])
@@ -64,7 +64,7 @@ FROM: Final = FrameAttribute(
 TO: Final = FrameAttribute(Attribute(":to", Type.number, {}, "", DisplayUnit.whole), Type.number)
 
 SPAN: Final = (FROM, TO)
-"""First and last ``frame_id`` of a match over several frames."""
+"""Placeholders for the first and last ``frame_id`` of a match over several frames."""
 
 
 def external_matches(
@@ -111,7 +111,7 @@ def external_matches(
 
 
 def _columns(found: ExternalRelation, shape: ExternalRelation) -> list[list[Any]]:
-    """Return all columns of matches computed outside the database.
+    """Return the matches computed outside the database as a list of columns.
 
     Nodes and edges have the order of ``shape``.
     """
@@ -121,7 +121,7 @@ def _columns(found: ExternalRelation, shape: ExternalRelation) -> list[list[Any]
 
 
 def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
-    """Replace values over several frames in a query's result by placeholders.
+    """Replace the values over several frames in a query's result by placeholders.
 
     Return the new query and the placeholder of each value.
     """

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from sgstore.lang.sql._select import BoundValues
 
 Part = tuple[str, str, str]
-"""Pair number: its name and the two nodes."""
+"""Reference to a pair number: its name and the two nodes."""
 
 
 def pairs_of(found: Iterable[Leaf]) -> list[PairNumber]:
@@ -157,7 +157,7 @@ class Layers:
         return final.text()
 
     def _without_later(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
-        """Return the SQL of the nested SELECT statements, without conditions on measures from later frames."""
+        """Return the SQL of the nested SELECT statements, without conditions that depend on later frames."""
         pairs = pairs_of(self.needed)
         last = max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
         innermost = self.join.select
@@ -206,7 +206,7 @@ class Layers:
         ]
 
     def _raw(self, pairs: list[PairNumber]) -> dict[str, str]:
-        """Return the stored columns that numbers of entity pairs need: column name → SQL."""
+        """Return the stored columns that the numbers of entity pairs are computed from: name → SQL."""
         columns: dict[str, str] = {}
         for pair in pairs:
             for name in sorted(needed_for(pair.function, self.without)):

@@ -64,7 +64,7 @@ _BEHIND: Final = """max(CASE WHEN "way" < 0 THEN "way" END)"""
 _SHORTER: Final = (
     f"CASE WHEN {_BEHIND} IS NULL OR {_AHEAD} <= -{_BEHIND} THEN {_AHEAD} ELSE {_BEHIND} END"
 )
-"""Shorter one of the ways ahead and behind, with its sign."""
+"""SQL for the shorter of two routes: ahead (positive) or behind (negative)."""
 
 
 def is_between_entities(function: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> bool:
@@ -99,7 +99,7 @@ def lane_distances(ends: tuple[WayEnd, WayEnd], catalog: Catalog, within: list[s
 
 
 def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
-    """Return the SQL of the lane distance between two entities. Each entity is a point on its lane."""
+    """Return the SQL of the lane distance between two entities, each taken as a point on its lane."""
     a, b = (end.node for end in ends)
     conditions = _kinds_of(ends[0], ":a", catalog) + _kinds_of(ends[1], ":b", catalog)
     # Each row is joined to the given frame, not to other rows. So DuckDB starts with the frame.
@@ -137,7 +137,7 @@ def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts
 
 
 def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
-    """Return the SQL of the distance along lanes to the next map part, such as a junction.
+    """Return the SQL of the distance along lanes to the next map part of a kind, such as a junction.
 
     It is 0 inside the part.
     """
@@ -169,7 +169,7 @@ def _course_text(frame: str, end: WayEnd, column: str, catalog: Catalog) -> str:
 
 
 def told_lanes(what: str) -> str:
-    """Return SQL for the traces whose map has lane data: ``ways``, ``curvature`` or ``slope``."""
+    """Return SQL for the traces whose map has data on ``ways``, ``curvature`` or ``slope`` of lanes."""
     known = "" if what == "ways" else f' AND ":c"."{what}" IS NOT NULL'
     table = "map_reach" if what == "ways" else "map_course"
     return (
@@ -206,7 +206,7 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
 
 
 def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str:
-    """Return SQL for the places where traffic waits at a light or sign.
+    """Return SQL for the points on lanes where traffic waits at a light or sign.
 
     They come from the map, otherwise from the junction.
     """
@@ -222,18 +222,18 @@ def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str
 
 
 def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
-    """Return SQL conditions on the kinds of ``lane_state`` rows, so that fewer rows are read."""
+    """Return SQL conditions on the kind in ``lane_state`` rows. They reduce the number of rows to read."""
     kinds = end.kinds.only(entity_kinds() - _SIGNALS)
     held = catalog.moving | catalog.fixed
     return kind_conditions(kinds, f'"{alias}"."kind"', f'"{alias}"."is_ego"', held)
 
 
 LOOKED_UP: Final = WAYS | RECORDED.keys()
-"""Pair numbers that are looked up, not computed from values of both nodes."""
+"""Pair numbers that are read from the store, not computed from values of both nodes."""
 
 
 def of_later(found: Iterable[Leaf]) -> list[PairNumber]:
-    """Return the numbers of entity pairs that use later frames. They are expensive and evaluated last."""
+    """Return the pair numbers that use later frames. They are evaluated last because they are expensive."""
     return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function in RECORDED]
 
 

@@ -1,4 +1,4 @@
-"""Number of SQL rows per frame, computed by adding 64-bit masks of frames.
+"""SQL that counts rows per frame by adding 64-bit masks of frames.
 
 A mask is spread over twelve numbers, each with every twelfth bit, so that each frame has a field of twelve
 bits. The sums of these numbers over many rows are the counts of all frames of a bucket, five counts in each
@@ -20,10 +20,10 @@ from sgstore.lang.sql._masks import folded
 from sgstore.lang.sql._select import Select, nested
 
 WIDTH: Final = 12
-"""Bits of each count; 60 frames are five counts in each of twelve numbers."""
+"""Bits of each count. Twelve integers of five counts each cover 60 frames."""
 
 MOST: Final = (1 << (WIDTH - 1)) - 1
-"""Largest number of rows that can be added."""
+"""Largest number of rows that such a sum can count."""
 
 _ONES: Final = sum(1 << place for place in range(0, 60, WIDTH))
 _TOPS: Final = _ONES << (WIDTH - 1)
@@ -116,7 +116,7 @@ def _sum(shift: int) -> str:
 
 
 def _reached(bound: int) -> str:
-    """Return SQL for the 64-bit mask of the frames whose row counts reach a bound."""
+    """Return SQL for the 64-bit mask of the frames whose row count is at least ``bound``."""
     less = bound * _ONES
     parts = [
         f"((({_sum(shift)} | {_TOPS}) - {less}) & {_TOPS}) >> {WIDTH - 1 - shift}"

@@ -54,7 +54,7 @@ _BIT: Final = '"bit"'
 
 
 def bit_of(frame: str) -> str:
-    """Return SQL for the 64-bit mask of a single frame, from its id or its number in the bucket (64 frames)."""
+    """Return SQL for the 64-bit mask with the bit of a single frame."""
     number = frame if frame.endswith(_BIT) else f"{frame} & 63"
     return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
 
@@ -69,7 +69,7 @@ def folded(text: str, keys: list[str]) -> str:
 
 
 def merged(text: str, values: Mapping[str, str]) -> str:
-    """Return SQL that merges rows with the same bucket (64 frames) and values, and joins their bit masks by OR.
+    """Return SQL that merges rows with equal bucket (64 frames) and values: their bit masks are joined by OR.
 
     Parameters
     ----------
@@ -90,13 +90,13 @@ _MANY: Final = 5
 """Largest number of masks that are compared in pairs, so that each join removes rows early."""
 
 _FEW: Final = 2
-"""Largest number of edges that are joined at once, in an order that the database chooses."""
+"""Largest number of edges that one join contains. The database chooses their order."""
 
 _EDGES: Final = 2
-"""Number of edges that each further step joins."""
+"""Number of edges that each further join adds."""
 
 _BRANCHES: Final = 8
-"""Largest number of joins of a pattern with paths, one for each combination of path lengths."""
+"""Largest number of joins for a pattern with paths of variable length: one join for each combination."""
 
 
 @dataclass(slots=True)
@@ -210,11 +210,11 @@ class SqlBuilder:
         return self.catalog.fixed | self.catalog.mapped
 
     def edges_of(self, edge: Edge) -> str:
-        """Return the table to search for an edge: all known edges, or only edges of scene graphs."""
+        """Return the table with the rows of an edge: all known edges, or only edges of scene graphs."""
         return '"known_edge"' if self.catalog.world and edge.known else '"edge"'
 
     def nodes_of(self, edge: Edge) -> str:
-        """Return the table with the presence of static nodes, to test the two nodes of a map edge."""
+        """Return the table with the presence of static nodes that limits the two nodes of a map edge."""
         return '"graph_node"' if self.catalog.world and not edge.known else '"node"'
 
     def found_in(self, scope: Scope) -> SharedRelation | None:
@@ -222,7 +222,7 @@ class SqlBuilder:
         return self.found if scope is self.query.scope else None
 
     def within(self, column: str, per: int = 1, *, met: bool = False) -> list[str]:
-        """Return SQL conditions that limit a column to the time window.
+        """Return SQL conditions that limit a column of frame or bucket numbers to the time window.
 
         It holds buckets of 64 frames, or frames if ``per`` is 64.
 
@@ -257,7 +257,7 @@ class SqlBuilder:
 
 
 def if_bound(sql: SqlBuilder, node: str, value: str) -> str:
-    """Return SQL for a value that is NULL if its node of an ``OPTIONAL MATCH`` is absent."""
+    """Return SQL for a value that becomes NULL if its optional node is missing."""
     return f"CASE WHEN {node} IS NOT NULL THEN {value} END" if sql.query.stages else value
 
 
@@ -287,7 +287,7 @@ def stands_text(frame: str, node: str) -> str:
 
 
 def number_of_frames(text: str) -> str:
-    """Return SQL that counts the frames in the bit masks of a subquery without node columns."""
+    """Return SQL that counts the frames in the bit masks of a subquery."""
     total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
     return Select([total], [nested(text, ":pattern")]).text()
 
@@ -310,7 +310,7 @@ def in_which(alias: str) -> list[str]:
 
 
 def held(alias: str) -> str:
-    """Return the SQL expression that counts the frames in the bit mask of a row."""
+    """Return the SQL expression for the number of frames in the bit mask of a row."""
     return f'bit_count({alias}."mask")'
 
 
@@ -320,7 +320,7 @@ def with_blocks(
     nodes: frozenset[str],
     edges: frozenset[str],
 ) -> str:
-    """Return SQL that limits rows with bit masks to frames in which ``EXISTS {…}`` conditions are true, or not.
+    """Return SQL that limits bit masks to the frames in which ``EXISTS {…}`` conditions hold, or do not hold.
 
     Parameters
     ----------
@@ -397,7 +397,7 @@ def base_rows(
 
 
 def _from_ego(sql: SqlBuilder, scope: Scope, base: Base) -> tuple[tuple[Edge, ...], range]:
-    """Return the edges in the order of their joins, and the numbers of edges after which a step ends.
+    """Return the edges in join order, and the numbers of edges after which a step ends.
 
     The database misjudges joins of many tables of masks. So the few rows of the ego, or of the outer pattern,
     come first, and each step begins with a table of the rows found so far.
@@ -427,7 +427,7 @@ def _join_tests(
 
 
 def _begin_anew(sql: SqlBuilder, base: Base, scope: Scope) -> None:
-    """Put the rows of a join into a shared table, and begin the next join with it."""
+    """Put the current join into a shared table, and start a new join with that table."""
     base.need_bucket()
     base.select.where += [*_differences(base, scope), *sql.within(base.bucket)]
     keep = {"map_id": f'{BUCKET}."map_id"'}
@@ -449,14 +449,14 @@ def _begin_anew(sql: SqlBuilder, base: Base, scope: Scope) -> None:
 
 
 def _differences(base: Base, scope: Scope) -> list[str]:
-    """Return SQL conditions that nodes differ. Earlier steps have compared the nodes that they bound."""
+    """Return SQL conditions that nodes differ, for nodes that the earlier steps did not compare."""
     bound = set(base.nodes)
     pairs = apart(scope, bound, bound - base.apart)
     return [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in pairs]
 
 
 def _common(base: Base) -> str:
-    """Return the SQL of the common bits of all masks of a join, and require that there are some."""
+    """Return the SQL of the common bits of all masks of a join. Exclude rows without common bits."""
     mask = " & ".join(base.masks)
     if len(base.masks) <= _MANY:
         base.select.where += [f"({a} & {b}) <> 0" for a, b in combinations(base.masks, 2)]
@@ -718,7 +718,7 @@ def _join_presence(
 
 
 def _kinds_to_test(scope: Scope, key: str) -> Kinds:
-    """Return the kinds of a node to test in its states. An ego that is the end of an edge needs no test."""
+    """Return the kinds of a node to test in its states. An ego at the end of an edge needs no test."""
     kinds = scope.kinds(key)
     said = any(edge.high == 1 and key in {edge.src, edge.dst} for edge in scope.edges)
     return ego_kinds() if said and kinds.one_a_frame else kinds
@@ -753,7 +753,7 @@ def _join_lane(
     conditions: list[Bound],
     of_lane: list[Bound],
 ) -> None:
-    """Join the bit masks of the frames in which an edge meets conditions on its attributes, and on its lane.
+    """Join the bit masks of the frames in which an edge meets the conditions on its attributes and its lane.
 
     The kinds of its entity, and the conditions ``of_lane`` if the lane is read anyway, are tested here too,
     because the table has a row for each entity, lane and frame.
@@ -796,7 +796,7 @@ def _join_lane(
 
 
 def stored_rows(catalog: Catalog, view: str, alias: str) -> dict[str, str]:
-    """Return the tables behind a view of edge attributes, each with the SQL of the bit mask of its rows.
+    """Return the tables behind a view of edge attributes: table → SQL of the bit mask of a row.
 
     The view has a row for each frame. A table has one row for many frames with equal values.
     """
@@ -905,7 +905,7 @@ def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
 def _on_the_way(
     sql: SqlBuilder, join: Select, stops: list[tuple[str, str]], keys: list[str]
 ) -> str:
-    """Limit the bit masks of a join to frames in which the inner nodes of paths are present."""
+    """Return SQL that limits a join to the frames in which the inner nodes of paths are present."""
     names = [f"stop {number}" for number in range(1, len(stops) + 1)]
     tables = {name: table for name, (_, table) in zip(names, stops, strict=True)}
     join.columns += [

@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
 
 _TRACE_KEYS: Final = (TRACE_ATTRIBUTES["id"], TRACE_ATTRIBUTES["name"], FRAME_ATTRIBUTES["id"])
-"""Attributes that identify the trace, and therefore the owner of node ids."""
+"""Attributes that identify a trace, and therefore also the owner of node ids."""
 
 OWNER: Final = Attribute("owner", Type.number, {}, "whose number the node id is", DisplayUnit.owner)
-"""Owner of a node id, which distinguishes nodes of several traces: the trace of an entity, or the map of a
-map part. Traces may share a map. Queries cannot use this attribute."""
+"""Owner of a node id: the trace of an entity, or the map of a map part. Ids are unique only for one owner, and
+traces may share a map. Queries cannot use this attribute."""
 
 
 def owner_of(node: str) -> NodeAttribute:
@@ -50,7 +50,7 @@ def owner_of(node: str) -> NodeAttribute:
 
 
 def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[NodeAttribute]:
-    """Return the owner (trace or map) of each returned node, if node ids alone are ambiguous.
+    """Return the owner (trace or map) of each returned node, for results in which node ids are ambiguous.
 
     Empty if only one trace is searched, or if a value identifies the trace.
     """

@@ -128,7 +128,7 @@ class Phases:
 
 
 def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
-    """Group the conditions of a graph pattern by the SQL that evaluates them."""
+    """Group the conditions of a graph pattern by the SQL phase that evaluates them."""
     parts = Phases()
     for condition in scope.where:
         if stands_alone(condition, catalog):
@@ -215,7 +215,7 @@ def _edge_alone(found: set[Leaf], scope: Scope, catalog: Catalog) -> str | None:
 
 
 def _of_null(condition: Bound) -> bool:
-    """True if a condition may be true for a missing row, such as ``IS NULL`` for an edge without attributes."""
+    """True if a condition can be true for a missing row, such as ``IS NULL`` for an edge without attributes."""
     return any(
         isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce", "case"}
         for part in walk(condition)
@@ -223,7 +223,7 @@ def _of_null(condition: Bound) -> bool:
 
 
 def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterator[str]:
-    """Yield the nodes to join in the second phase (single frames): used in values, but without edges or braces.
+    """Yield nodes to join in the second phase (single frames): nodes with values, but without edges or braces.
 
     Otherwise, all states would be grouped into masks and then expanded again.
     """
@@ -272,7 +272,7 @@ def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]
 
 
 def apart(scope: Scope, nodes: set[str], new: set[str]) -> Iterator[tuple[str, str]]:
-    """Yield the pairs of joined nodes that must differ, if at least one of them is new.
+    """Yield the pairs of nodes that must differ, if at least one node of the pair is new in this join.
 
     Pairs with disjoint kinds differ anyway and are omitted.
     """

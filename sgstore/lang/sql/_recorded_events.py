@@ -1,4 +1,4 @@
-"""SQL of the condition ``HAPPENS name(…)``, which tests recorded events."""
+"""SQL of the condition ``HAPPENS name(…)``: true if the recording has this event in the frame."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ EVENT_SCHEMAS: Final = {
     "collision": "CarlaCollisionEvent",
     "lane_invasion": "CarlaLaneInvasionEvent",
 }
-"""Ends of the schema names of event channels. With such a channel, no messages means no events."""
+"""Ends of the schema names of event channels. A trace with such a channel and no messages has no events."""
 
 
 def told_events(kind: str) -> str:

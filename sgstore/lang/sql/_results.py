@@ -57,10 +57,10 @@ if TYPE_CHECKING:
 CONSTANTS: Final = """
 SELECT node_id, ident, type_name, lifetime, {parked} AS parked FROM inside.entity WHERE trace_id = ?
 """
-"""Constants of the entities of a trace that are not stored with frames."""
+"""Tables with constants of the entities of a trace. The frames do not repeat these values."""
 
 FIRST, OWNER_KEY, TOP_OWNER = ":first frame", ":owner", ":top owner"
-"""Extra columns of intervals with ``keyed``: the id of the first frame, and the owners of the nodes used as
+"""Extra columns of intervals in collections: id of the first frame, owner of each node, and owner of nodes in
 sampling keys."""
 
 LOG_TIME: Final = "log_time_ns"
@@ -114,10 +114,10 @@ class SqlStatement:
 
 
 _BOUND: Final = re.compile(r"""'(?:[^']|'')*'|"(?:[^"]|"")*"|\$(\d+)""")
-"""Quoted text or name, or number of a bound value."""
+"""Regular expression: quoted texts and names, which stay, and numbers of bound values."""
 
 Span = tuple[Leaf, Leaf]
-"""Values of the first and the last ``frame_id`` of a match over several frames."""
+"""Expressions for the first and the last ``frame_id`` of a match over several frames."""
 
 
 def names_of(query: Query) -> tuple[str, ...]:
@@ -242,7 +242,7 @@ def with_bindings(query: Query) -> Query:
 
 
 def told_apart_by(query: Query) -> list[FrameAttribute]:
-    """Return the values passed by ``WITH`` that distinguish two result rows with the same nodes."""
+    """Return the values passed by ``WITH`` that make two results with the same nodes different."""
     result = query.result
     if result.whole:
         return [one.value for one in result.columns if is_passed_on(one.value)]
@@ -334,7 +334,7 @@ class _RowStatement:
         return {f":top {number}": self._text(value) for number, value in enumerate(values)}
 
     def _placed(self, relation: str) -> str:
-        """Return SQL for matches with an extra column: their number in the default order."""
+        """Return SQL for the matches, with their number in the default order as an extra column."""
         select = Select([f"{_ROWS}.*"])
         select.join(nested(relation, ":rows"), [])
         frame, writer = f'{_ROWS}."frame_id"', self.writer
@@ -376,7 +376,7 @@ class _RowStatement:
         return self._of_group(leaf.name) if isinstance(leaf, GroupKey) else _column(leaf)
 
     def _of_group(self, name: str) -> str:
-        """Return the SQL of a grouping value of a query; each use gets the same text."""
+        """Return the SQL of a grouping value. Repeated uses return the same text."""
         if name not in self.texts:
             value = next(c.value for c in self.result.columns if c.name == name)
             self.texts[name] = self._text(value)
@@ -487,7 +487,7 @@ class _IntervalStatement:
         return finished(self.writer, select.text(), names)
 
     def _hidden(self, told: dict[str, str]) -> dict[str, str]:
-        """Return extra columns for sorting intervals of several stores: first frame, and owners of nodes."""
+        """Return extra columns that sort the intervals of several stores: first frame, and owners of nodes."""
         hidden = {FIRST: '":runs"."first"'}
         for name, chosen in ((OWNER_KEY, self.result.sample), (TOP_OWNER, self.result.top)):
             for owner in self._per(chosen, told)[1:]:
@@ -520,7 +520,7 @@ class _IntervalStatement:
         return per
 
     def _told(self, value: Bound) -> str:
-        """Return the SQL of a returned value, from the columns that are constant in each interval."""
+        """Return the SQL of the values after ``PER`` in ``SAMPLE n PER value``."""
         if value in self.keys and not isinstance(value, NodeAttribute):
             return self.keys[value]
         return expression_text(value, self.keys.__getitem__, self.writer.values)
@@ -530,7 +530,7 @@ class _IntervalStatement:
         return shortest_text(text) if column.single else text
 
     def _keys(self) -> dict[str, str]:
-        """Return the columns that are constant in each interval: SQL of the value by column."""
+        """Return the SQL of a returned value, computed from the constant columns of the interval."""
         # A word of the vocabulary stays an internal number until it is returned.
         texts = [
             _column(value)
@@ -541,7 +541,7 @@ class _IntervalStatement:
         return dict(zip(self.keys.values(), texts, strict=True))
 
     def _spans(self, wanted: list[Leaf]) -> str:
-        """Return SQL for the first and last frame of each interval, with its constant columns."""
+        """Return SQL for the first and last frame of each interval, with the constant columns."""
         scope = self.query.scope
         if self.span is not None:
             wanted = [*wanted, *self.span]
@@ -584,7 +584,7 @@ def _column(leaf: Leaf) -> str:
 
 
 def _kept(value: Bound) -> tuple[Bound, ...]:
-    """Return the expressions whose columns determine a value. A node's name needs its kind and id."""
+    """Return the expressions that determine a value. For the name of a node: its kind and id."""
     return (
         tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
     )
@@ -606,7 +606,7 @@ def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
 
 
 def _spelled(query: Query, catalog: Catalog) -> Query:
-    """Return a query in which the outermost SELECT composes the names of nodes, which is faster."""
+    """Return a query that builds the names of nodes in its outermost SELECT, which is faster."""
 
     def spelled(value: Bound) -> Bound:
         match value:
@@ -635,7 +635,7 @@ def _from_frames(select: Select, relation: str) -> None:
 
 
 def shortest_text(text: str) -> str:
-    """Return SQL that converts a 32-bit number to the 64-bit number with the same shortest text."""
+    """Return SQL that converts a 32-bit number to a 64-bit number with the same shortest decimal text."""
     return f"CAST(CAST(CAST({text} AS FLOAT) AS VARCHAR) AS DOUBLE)"
 
 
@@ -661,7 +661,7 @@ def _per(result: Result, chosen: Sampling | None) -> Bound | None:
 
 
 def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) -> Select:
-    """Return SQL for distinct rows, in which equal node ids of two traces or maps count as different."""
+    """Return SQL for distinct rows. Equal node ids of different traces or maps count as different."""
     select.columns += [f'{_column(one)} AS ":owner {i}"' for i, one in enumerate(apart)]
     return Select([quoted(name) for name in names], [nested(select.text(), ":distinct")])
 
@@ -719,7 +719,7 @@ def in_order(part: Bound) -> bool:
 
 
 def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatement:
-    """Return the final SQL statement, with the shared subqueries in a ``WITH`` clause before it."""
+    """Return the final SQL statement, with the shared subqueries in a ``WITH`` clause."""
     shadows = [
         (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows
     ]
@@ -731,7 +731,7 @@ def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatem
 
 
 def _preceded(relations: Iterable[tuple[str, str]], text: str) -> str:
-    """Return an SQL statement with named subqueries before it, in a ``WITH`` clause."""
+    """Return an SQL statement with a ``WITH`` clause of named subqueries."""
     before = ",\n".join(
         f"{head} (\n" + "\n".join(f"  {line}" for line in body.splitlines()) + "\n)"
         for head, body in relations

@@ -158,7 +158,7 @@ def _staged(query: Query, catalog: Catalog) -> Query:
 
 
 def path_ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
-    """Yield the pattern of a ``MATCH`` clause once for each combination of lengths of its named paths."""
+    """Yield one pattern of a ``MATCH`` clause for each combination of path lengths of its named paths."""
     edges = {edge.key: edge for edge in stage.scope.edges}
     repeated = [edges[key] for path in stage.paths for key, _ in path.edges if edges[key].high > 1]
     for lengths in product(*(range(edge.low, edge.high + 1) for edge in repeated)):
@@ -187,7 +187,7 @@ def _kinds_in(scopes: Iterable[Scope]) -> dict[str, Kinds]:
 
 
 def _expression(value: Any, values: Callable[[Result], Result]) -> Any:
-    """Return one expression after the rewriting rules for result columns."""
+    """Apply the rewriting rules for result columns to one expression."""
     return values(Result(columns=(ReturnColumn("", value),))).columns[0].value
 
 
@@ -221,7 +221,7 @@ def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
-    """Replace the trace attribute ``computed`` by a test of trace ids.
+    """Replace the trace attribute ``computed`` by a condition on trace ids.
 
     It is true if sgstore computed the trace's relations.
     """
@@ -239,7 +239,7 @@ def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def values_lacking(scope: Scope, catalog: Catalog) -> Scope:
-    """Replace ``v.heading IS NULL`` by a test of the kinds of ``v`` that lack a heading somewhere in the store.
+    """Replace ``v.heading IS NULL`` by a test of the kinds that have no heading in some frame of the store.
 
     Such conditions come from checks, which ask whether a value is unknown. Most recordings have all values.
     """
@@ -267,7 +267,7 @@ def values_lacking(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def _folded(value: Bound) -> Bound:
-    """Return an equal condition without constants among the operands of AND, OR, NOT and CASE."""
+    """Return an equivalent condition without constants in AND, OR, NOT and CASE."""
     match value:
         case Operation("=", (Value(value=one, type=kind), Value(value=other, type=same))) if (
             kind is same and one is not None and other is not None
@@ -286,7 +286,7 @@ def _folded(value: Bound) -> Bound:
 
 
 def _branch(value: Operation) -> Bound:
-    """Return an equal ``CASE`` without leading branches whose condition is a constant."""
+    """Return an equivalent ``CASE`` without the first branches if their conditions are constant."""
     match value.operands:
         case (otherwise,):
             return otherwise
@@ -299,7 +299,7 @@ def _branch(value: Operation) -> Bound:
 
 
 def _joined(word: str, operands: tuple[Bound, ...]) -> Bound:
-    """Join conditions by AND or OR, without constants. A label that all parts of an OR share is put first."""
+    """Join conditions by AND or OR, without constants. A label common to all parts of an OR is put first."""
     neutral, strong = (TRUE, FALSE) if word == "AND" else (FALSE, TRUE)
     rest = [one for one in operands if one != neutral]
     if not rest:
@@ -500,7 +500,7 @@ def open_exists(scope: Scope, catalog: Catalog) -> Scope:
 
 
 LONG_WAY: Final = 3
-"""Smallest number of edges of a block that becomes its own relation."""
+"""Smallest number of edges of a pattern in braces that is evaluated as a separate subquery."""
 
 
 def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
@@ -571,7 +571,7 @@ def kinds_left(
 
 
 def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) -> bool:
-    """Remove node kinds and triples that the edges of a pattern exclude, once.
+    """Remove the node kinds and triples that edges of the pattern exclude. This is one pass.
 
     Return True if something changed.
     """
@@ -589,7 +589,7 @@ def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) 
 
 
 def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> Iterator[Triple]:
-    """Yield the triples (relation, kind, kind) that a pattern edge can match.
+    """Yield the triples (relation, source kind, destination kind) that a pattern edge can match.
 
     The second item is the kind of ``src``.
     """
@@ -652,11 +652,11 @@ def _words(kinds: frozenset[str]) -> Choices:
 INVARIANT: Final = FrameAttribute(
     Attribute("held", Type.number, {}, "how many frames a row stands for"), Type.number
 )
-"""Number of frames of a row. ``COUNT(*)`` sums it if a row can stand for several frames."""
+"""Number of frames that a row represents. ``COUNT(*)`` sums it if rows represent several frames."""
 
 
 def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
-    """True if a value is the same in all 64 frames of a bucket, for the same matched nodes."""
+    """True if a value of a match is constant within a bucket of 64 frames."""
     match leaf:
         case NodeValue() | EdgeRelation() | TraceAttribute():
             return True
@@ -672,7 +672,7 @@ def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
 
 
 def count_by_buckets(query: Query, catalog: Catalog) -> Query:
-    """Replace ``COUNT(*)`` by a sum of frame counts of SQL rows, if no value needs single frames.
+    """Replace ``COUNT(*)`` by a sum of frame counts of SQL rows, if no value changes within a bucket.
 
     All values must be constant within a bucket. Other aggregates must not depend on how often a value occurs.
     """
@@ -711,7 +711,7 @@ _MORE: Final = {">", ">=", "="}
 
 
 def bounds(conditions: list[Bound]) -> list[Bound]:
-    """Return cheaper conditions that follow from others.
+    """Return cheaper conditions that follow from the given conditions.
 
     Example: ``gap < t`` implies that a lower bound of ``gap`` is at most t.
     """

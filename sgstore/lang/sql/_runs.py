@@ -14,7 +14,7 @@ from sgstore.lang.sql._select import Select, nested
 from sgstore.lang.sql._windows import TRACE_OF_BUCKET
 
 _LAST: Final = 59
-"""Bit of the last frame of a bucket."""
+"""SQL of the bit for the last frame of a bucket (64 frames)."""
 
 
 def runs(masks: str, keys: list[str], apart: list[str]) -> str:

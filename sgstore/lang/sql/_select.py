@@ -22,7 +22,7 @@ class BoundValues:
     items: list[Any] = field(default_factory=list[Any])
 
     def add(self, value: object) -> str:
-        """Add a parameter value of the SQL statement and return its placeholder, such as ``$3``."""
+        """Add a parameter value to the SQL statement, and return its placeholder, such as ``$3``."""
         self.items.append(value)
         return f"${len(self.items)}"
 

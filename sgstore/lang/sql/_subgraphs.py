@@ -36,10 +36,10 @@ Record = dict[str, Any]
 """Node or edge in the node-link form of networkx."""
 
 COLUMNS: Final = ("nodes", "edges")
-"""Columns with the graph of a row: lists of :data:`Record`."""
+"""Columns of the result with the graph of each match: lists of :data:`Record`."""
 
 _TWICE: Final = frozenset({"id", "type"})
-"""Attributes that are already present, or present under other names (``type_name``, ``lane_type``)."""
+"""Attributes that a record already has, in part under other names (``type_name``, ``lane_type``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class _ValuePlace:
     names: tuple[str, ...]
 
     def known(self, row: Sequence[Any]) -> Record:
-        """Return the values of the pattern node or edge in an SQL row, without NULL."""
+        """Return the values of this node or edge from an SQL row, without NULL."""
         values = zip(self.names, row[self.first :], strict=False)
         return {name: value for name, value in values if value is not None}
 

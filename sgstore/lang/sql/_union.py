@@ -54,7 +54,7 @@ class UnionParts:
     distinct: bool
 
     def each(self, find: Callable[[str, Mapping[str, Any]], T], text: str) -> list[T]:
-        """Run every query of the union with a function, and return the list of results.
+        """Call a function with each query of the union, and return the list of results.
 
         Raises
         ------

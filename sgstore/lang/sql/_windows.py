@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Range of frame buckets (64 frames each): from ``low`` to before ``high``.
+    """Range of frame buckets (64 frames each), from ``low`` up to, but not including, ``high``.
 
     ``traces`` limits it to some traces.
     """
@@ -41,7 +41,7 @@ class Window:
         return cls(low, high, traces if len(traces) > 1 else None)
 
     def whole(self, extents: Iterable[tuple[int, int]]) -> Window:
-        """Return the window without its list of traces, if no other trace begins inside it."""
+        """Return the window without its list of traces, if no other trace begins in its range."""
         if self.traces is None:
             return self
         many = sum(self.low <= first < self.high for first, _ in extents)
@@ -53,10 +53,10 @@ class Window:
 
 
 TRACE_OF_BUCKET: Final = 18
-"""``bucket >> 18`` is the trace id of a bucket."""
+"""Right shift from a bucket number to its trace id: ``bucket >> 18``."""
 
 TRACE_OF_FRAME: Final = 24
-"""``frame_id >> 24`` is the trace id of a frame. The lower bits are its position in the trace."""
+"""Right shift from a ``frame_id`` to its trace id. The lower bits are the position in the trace."""
 
 
 def extents(catalog: Catalog) -> list[tuple[int, int]]:
@@ -125,7 +125,7 @@ def _join(
     column: str,
     values: BoundValues,
 ) -> None:
-    """Join a list of numbers to the ``SELECT`` statement: one number for each value of a column."""
+    """Join a list to the ``SELECT`` statement that assigns a number to each value of a column."""
     kind, keys = known
     text = (
         f'SELECT unnest(CAST({values.add(list(keys))} AS {kind}[])) AS ":trace",'

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from sgstore.lang.sql._compile import Compiled
 
 PARTS: Final = "parts"
-"""Table with the answers to the first query. The other tables have a number after this name."""
+"""Name of the table with results of the first query. Further queries append a number to it."""
 
 LOG_TIME_COLUMN: Final = ":log_time_ns"
 
@@ -68,7 +68,7 @@ _LOG_TIME: Final = FrameAttribute(FRAME_ATTRIBUTES["logtimens"], Type.number)
 _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 
 Terms = list[str]
-"""Expressions of an ``ORDER BY``."""
+"""SQL expressions of an ``ORDER BY`` clause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,13 +158,13 @@ MERGED: Final = frozenset(
         *("skip", "limit", "before", "after", "keyed"),
     }
 )
-"""Fields of :class:`Result` with a rule for merging the answers of parts."""
+"""Fields of :class:`Result` that have a rule for merging the results of several stores."""
 
 SUMMED: Final = frozenset({"count", "sum", "min", "max", "avg"})
-"""Aggregates that are computed in each part and then merged."""
+"""Aggregates that each store computes and the collection merges."""
 
 LISTED: Final = frozenset({"stddev", "median", "percentile", "collect"})
-"""Aggregates for which each part returns all values."""
+"""Aggregates that need all values from each store."""
 
 
 def _refuse_strange(result: Result) -> None:
@@ -222,7 +222,7 @@ def _parted_rows(query: Query) -> Parted:
 
 
 Placed = tuple[Terms, Terms, str]
-"""Column names of rows, their sort keys, and the column of their frames."""
+"""Column names of rows, SQL sort keys of the rows, and the column with the frame."""
 
 
 def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, Terms]) -> str:
@@ -262,7 +262,7 @@ def _of_part(result: Result) -> Result:
 
 
 def _bindings(query: Query, hidden: _Hidden) -> Terms:
-    """Return sort keys for the result rows of one frame: the nodes and edges that identify a match.
+    """Return sort keys for the rows of one frame: the nodes and edges that identify a match.
 
     A store sorts relations by their enumeration, but returns them as texts.
     """
@@ -291,7 +291,7 @@ def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
 
 
 def _value_of(result: Result, per: Bound | str) -> Bound | str:
-    """Return the expression of a result column, given its name. Expressions are returned unchanged."""
+    """Return the expression of a result column, given by name. Return expressions unchanged."""
     if not isinstance(per, str):
         return per
     return next((column.value for column in result.columns if column.name == per), per)
@@ -305,13 +305,13 @@ class _Hidden:
         self._numbers = count(first)
 
     def add(self, value: Bound) -> str:
-        """Add a column that users do not see, and return its quoted name."""
+        """Add a hidden column for a value, and return its quoted name."""
         column = ReturnColumn(f":{next(self._numbers)}", value)
         self.columns.append(column)
         return quoted(column.name)
 
     def key(self, value: Bound | str) -> str:
-        """Return the quoted column of a sort key: a result column, or a new column that users do not see."""
+        """Return the quoted column of a sort key: a result column, or a new hidden column."""
         return quoted(value) if isinstance(value, str) else self.add(value)
 
 
@@ -377,7 +377,7 @@ def _in_names(
     bound: tuple[Catalog, BoundValues],
     owners: Mapping[str, str],
 ) -> str:
-    """Return SQL for merged rows in query order, then sorted by column, with ``run2`` before ``run10``.
+    """Return SQL that sorts merged rows: by query order, then by columns, with ``run2`` before ``run10``.
 
     ``owners``: the columns with the owners of the nodes in a column.
     """
@@ -396,7 +396,7 @@ def _in_names(
 
 
 class _Grouping:
-    """Split of a query with aggregates into queries for the stores of a collection, and their merging.
+    """Split of a query with aggregates into one query per store, and the SQL that merges the results.
 
     The first query for a part has a column for each grouping value, and one or two summable columns for each
     aggregate. An aggregate over *distinct* values needs its own query, which returns the set of values for
@@ -463,7 +463,7 @@ class _Grouping:
                 return with_operands(value, self._text)
 
     def _number(self, number: Aggregate) -> str:
-        """Return the SQL of an aggregate over a collection, computed from results of the stores."""
+        """Return the SQL of an aggregate over a collection, computed from the results of its stores."""
         if number not in self._known:
             self._known[number] = self._merged(number)
         return self._known[number]
@@ -539,7 +539,7 @@ _PLACE: Final = '":place"'
 
 
 def _sql(value: Bound, values: BoundValues) -> str:
-    """Return the SQL of an expression whose leaves are SQL columns already."""
+    """Return the SQL of an expression that already contains SQL columns."""
 
     def leaf(found: Any) -> str:
         return found.edge

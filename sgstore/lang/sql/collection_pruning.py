@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 _WITNESSES: Final = 32
-"""Largest number of remembered sets of triples and kinds that are sufficient for a match."""
+"""Largest number of cached sets of triples and kinds that suffice for a match."""
 
 
 class Pruning:
@@ -65,7 +65,7 @@ class Pruning:
         ]
 
     def matters(self, triple: Triple) -> bool:
-        """True if an edge of the query pattern can match a triple (relation, kind, kind)."""
+        """True if a pattern edge of the query can match a triple (relation, source kind, destination kind)."""
         return any(True for of in self._edges for _ in possible(*of, (triple,)))
 
     def may_answer(self, held: frozenset[Triple], kinds: Sequence[frozenset[str]]) -> bool:
@@ -90,7 +90,7 @@ class Pruning:
         return known
 
     def _possible(self, every: frozenset[Any]) -> bool:
-        """True if the query can match in a store with these triples (relation, kind, kind) and node kinds."""
+        """True if the query can match in a store that has these triples and node kinds."""
         triples = [one for one in every if isinstance(one, tuple)]
         return any(
             all(s.where != (FALSE,) and kinds_left(s, triples, every) is not None for s in scopes)
@@ -98,7 +98,7 @@ class Pruning:
         )
 
     def _least(self, every: frozenset[Any]) -> frozenset[Any]:
-        """Return a minimal subset of triples and node kinds with which the query can still match."""
+        """Return a minimal set of triples and node kinds with which the query can still match."""
         for one in every:
             if self._possible(every - {one}):
                 every -= {one}
@@ -107,7 +107,7 @@ class Pruning:
 
 @dataclass(frozen=True, slots=True)
 class ClassQuestion:
-    """Use of frame classes in a query. These classes must be collected from all stores of a collection.
+    """Reference to frame classes in a query. They must be collected from all stores of a collection.
 
     Attributes
     ----------

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sgstore.model.graph import SceneGraph
 
 _SCENERY: Final = frozenset({"building", "pole", "barrier", "vegetation"})
-"""Kinds that are not traffic."""
+"""Node kinds that are scenery, not traffic."""
 
 _LANES: Final = {
     "same": "EXISTS {{({0})-[:isIn]->(:Lane)<-[:isIn]-(ego)}}",

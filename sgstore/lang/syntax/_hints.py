@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 LOOK_BACK: Final = 400
-"""Number of characters checked before the unexpected part. A longer part is not a known mistake."""
+"""Number of characters that are checked before the unexpected part of a query."""
 
 MANY: Final = 24
-"""Largest number of names in a hint."""
+"""Largest number of names that a hint lists."""
 
 
 @cache
@@ -39,7 +39,7 @@ def _tables() -> dict[str, Any]:
 
 @cache
 def _words(table: str, of: str) -> Mapping[str, str]:
-    """Return the entries of a table in ``hints.toml``, by word in lower case without underscores."""
+    """Return one table of ``hints.toml``: word in lower case without underscores → hint."""
     told = _tables()[table][of].items()
     return {normalize_name(w.replace(" ", "_")): meant for meant, words in told for w in words}
 
@@ -101,7 +101,7 @@ _ODD: Final = {
     **dict(zip("≥≤≠∈∧∨¬", (">=", "<=", "<>", "IN", "AND", "OR", "NOT"), strict=True)),  # noqa: RUF001
     **dict(zip("×÷∞…", ("*", "/", "INF", ".."), strict=True)),  # noqa: RUF001
 }
-"""Characters that look like a sign of the language, with that sign."""
+"""Unusual characters that look like a sign of the language → that sign."""
 
 
 def slip_hint(
@@ -135,7 +135,7 @@ def slip_hint(
 
 
 def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) -> str | None:
-    """Return the hint of the first table row that fits the query text around a position, or None."""
+    """Return the hint of the first table row that fits the query text at a position, or None."""
     flags = re.IGNORECASE | re.DOTALL
     for looks, hint, *where in _tables()[table]:
         place, then = (*where, "", "")[:2]
@@ -148,7 +148,7 @@ def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) ->
 
 
 def _character(found: str, at: frozenset[str]) -> str | None:
-    """Return a hint for a character of the query that is not allowed, or not allowed at this place; or None."""
+    """Return a hint for a character that is not allowed in queries, or not at this place; otherwise None."""
     if found in {"'", '"'}:
         return "the text in quotes is not closed"
     if found[:1] in {"'", '"'}:
@@ -171,7 +171,7 @@ def _unknown_letter(found: str, at: frozenset[str]) -> str | None:
 
 
 def _like(word: str, keywords: Iterable[str]) -> str | None:
-    """Return the keyword most similar to a word, if both start with the same letter; otherwise None."""
+    """Return the most similar keyword with the same first letter, or None."""
     like = (
         suggestion(word.upper(), [w for w in keywords if w.isalpha()]) if word.isalpha() else None
     )
@@ -250,7 +250,7 @@ def bracket_hint(text: str, position: int, found: str) -> str | None:
 _BRACKETS: Final = re.compile(
     r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|/\*(?:.|\n)*?\*/|[()\[\]{}]"""
 )
-"""Brackets, and texts and comments, whose brackets do not count."""
+"""Regular expression: brackets, and also texts and comments, whose brackets are ignored."""
 
 _CLOSES: Final = {")": "(", "]": "[", "}": "{"}
 _EXCERPT: Final = 24
@@ -285,7 +285,7 @@ def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | N
 
 
 def condition_hint(found: Type, written: str) -> str | None:
-    """Return a hint for a query that has a plain value in place of a condition, or None.
+    """Return a hint for a query with a plain value where a condition is required, or None.
 
     Parameters
     ----------

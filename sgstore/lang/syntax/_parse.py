@@ -26,7 +26,7 @@ MAX_LENGTH: Final = 100_000
 """Longest text that the parser accepts; characters."""
 
 MAX_DEPTH: Final = 200
-"""Largest stack of the parser. It limits nesting before any recursion."""
+"""Largest size of the parser stack. It limits nested brackets before any recursion starts."""
 
 _END: Final = "$END"
 _BLANK: Final = re.compile(r"\s+")
@@ -88,7 +88,7 @@ _parsed_once = lru_cache(maxsize=64)(_parsed)
 
 
 def joined(texts: Sequence[str]) -> str:
-    """Return the statements of several query texts as one text. A single text is unchanged.
+    """Join several query texts into one text of statements. A single text stays unchanged.
 
     Raises
     ------
@@ -204,7 +204,7 @@ _OPERATORS: Final = frozenset(
 )
 _EDGES: Final = frozenset({"BARE_RIGHT", "BARE_LEFT", "BARE_ANY", "_OPEN", "_OPEN_LEFT"})
 _OF_TOPICS: Final = frozenset({"FIELD", "SPAN", "_ITEM"})
-"""Terminals of topics only. Error messages do not list them."""
+"""Grammar terminals that only topics use. Error messages do not list them."""
 _LATER: Final = frozenset(
     {
         "HOLDS",
@@ -220,7 +220,7 @@ _LATER: Final = frozenset(
     }
     | {"_ARROW", "_GROUP", "HAVING", "OPTIONAL", "PATH_NAME", "SKIP", "UNION", "WITH"}
 )
-"""Terminals left out of suggestions to keep the list short: temporal words and synonyms."""
+"""Grammar terminals that error messages omit, to keep the list short: temporal words and synonyms."""
 
 _STARTS: Final = frozenset({"NUMBER", "STRING", "PARAM", "TRUTH", "NULL", "EXISTS"})
 _SAID: Final = {
@@ -243,7 +243,7 @@ _SAID: Final = {
     "BOUND": ("a bound such as [0s, 2s]",),
     _END: ("the end",),
 }
-"""Descriptions of terminals."""
+"""Descriptions of grammar terminals for error messages."""
 
 _MANY: Final = 8
 _LONGEST: Final = 40
@@ -272,7 +272,7 @@ def _shown(found: str) -> str:
 
 
 def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
-    """True if the parser would accept a terminal next, after all pending reductions."""
+    """True if the parser would accept a terminal as the next one."""
     states = [entry.state for entry in stack]
     while (action := machine.states[states[-1]].get(name)) is not None:
         if action >= 0:

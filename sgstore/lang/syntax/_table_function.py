@@ -1,4 +1,4 @@
-"""Calls in SQL that are tables: ``sgql('MATCH …')`` of the matches of a query, ``topic('/imu')`` of messages.
+"""Replacement of ``sgql('MATCH …')`` (matches) and ``topic('/imu')`` (messages) in SQL by tables.
 
 The SQL statement is not parsed. Texts, quoted names and comments are skipped, so only real calls are found.
 """
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PatternTable:
-    """Call of ``sgql`` in an SQL statement: the query text and its parameter values.
+    """Call ``sgql(…)`` in an SQL statement: the query text and its parameter values.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ _EXAMPLE: Final = "SELECT * FROM sgql('MATCH (e:Ego) RETURN FRAMES')"
 
 
 def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[PatternTable, ...]]:
-    """Return an SQL statement in which table names replace the ``sgql('MATCH …')`` calls, and the calls.
+    """Replace the calls ``sgql('MATCH …')`` of an SQL statement by table names. Return the SQL and the calls.
 
     Parameters
     ----------
@@ -84,11 +84,11 @@ def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[Pa
 
 
 TOPIC: Final = ":topic"
-"""Start of the name of a view with the messages of a topic."""
+"""Prefix of the name of a view with the messages of a topic."""
 
 
 def topic_tables(sql: str) -> str:
-    """Return an SQL statement in which names of views replace the ``topic('/imu')`` calls.
+    """Return an SQL statement in which names of views replace calls such as ``topic('/imu')``.
 
     Raises
     ------

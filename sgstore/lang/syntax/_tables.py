@@ -125,7 +125,7 @@ def keywords() -> list[str]:
 
 
 def made_from(grammar: str) -> dict[str, Any]:
-    """Return the parser tables of a grammar as JSON data. The same grammar always gives the same tables."""
+    """Return the parser tables of a grammar as JSON data. Equal grammars have equal tables."""
     from lark import Lark
     from lark.grammar import Rule as LarkRule
     from lark.lexer import TerminalDef

@@ -159,7 +159,7 @@ def _topic_field(
 
 
 TOPIC_RULES: Final = ("last", "nearest", "linear")
-"""Rules that choose the message of a topic for a frame."""
+"""Names of rules that select a message of a topic for a frame."""
 _TOPIC_EXAMPLE: Final = "topic('/imu', nearest, 0.1s).linear_acceleration.z"
 
 
@@ -268,7 +268,7 @@ def rule_case(span: TextSpan, children: Children) -> s.Case:
 
 
 _SYNONYMS: Final = {"GLOBALLY": "ALWAYS", "FINALLY": "EVENTUALLY", "NEVER": "ALWAYS"}
-"""Temporal operators of other tools, with the operator of the language. NEVER also negates its operand."""
+"""Temporal operators of other tools → operator of this language. ``NEVER`` also negates its operand."""
 
 
 def rule_temporal(span: TextSpan, children: Children) -> s.Temporal | s.Logic:
@@ -292,13 +292,13 @@ _MIRRORED: Final = {
     "HISTORICALLY": "ALWAYS",
     "ONCE": "EVENTUALLY",
 }
-"""Temporal operators, with the operator of the other direction of time."""
+"""Temporal operators → operator for the opposite direction of time."""
 
 
 def _around(
     name: str, operand: s.Expression, place: TextSpan, bound: tuple[Any, Any]
 ) -> s.Temporal | s.Logic:
-    """Return a temporal operator over frames on both sides: ``EVENTUALLY[-2s, 2s] p``.
+    """Return the syntax tree of a temporal operator with frames on both sides: ``EVENTUALLY[-2s, 2s] p``.
 
     It is the operator with the part of the bound ahead, joined with its mirror image for the part before.
     """

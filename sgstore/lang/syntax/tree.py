@@ -24,9 +24,9 @@ class Constant:
 
 
 LONGEST: Final = 1e18
-"""Largest amount of a :class:`Duration`. No trace is this long in any unit."""
+"""Largest amount of a :class:`Duration`, in any unit. It exceeds every trace."""
 TOO_LONG: Final = "this duration is longer than any trace can be"
-"""Message for a duration above the limit."""
+"""Error message for a duration above the limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Duration:
 
 @dataclass(frozen=True, slots=True)
 class FrameWindow:
-    """Time around a frame, ``-1s..2s``: ``before`` and ``ahead`` of it."""
+    """Time window around a frame, such as ``-1s..2s``: start ``before`` the frame, end ``ahead`` of it."""
 
     before: Duration
     ahead: Duration
@@ -276,7 +276,7 @@ Expression = (
 
 
 Given = Constant | Duration | Parameter | Variable
-"""Expressions that can be arguments of a scenario."""
+"""Syntax tree types that can be arguments of a scenario."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -560,7 +560,7 @@ class UnionClause:
 
 @dataclass(frozen=True, slots=True)
 class Formal:
-    """Formal parameter of a predicate or scenario definition.
+    """Parameter in the definition of a predicate or scenario.
 
     A parameter of a scenario may have a default value.
     """
@@ -628,7 +628,7 @@ def parameters_in(part: object) -> Iterator[str]:
 
 
 def parts_of(part: object) -> Iterator[object]:
-    """Yield a part of a syntax tree and all its subparts."""
+    """Yield a part of a syntax tree and all parts inside it."""
     yield part
     inner = part if isinstance(part, tuple) else ()
     if is_dataclass(part):
