@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     Parameters = Sequence[object] | Mapping[str, object]
     ArrowStream = tuple[list[tuple[str, str]], Iterator[Any]]
-    """Names and types of columns, and batches of their rows."""
+    """Names and types of columns, with an iterator over batches of rows."""
 
 
 def table_of(connection: DuckDBPyConnection, sql: str, parameters: Parameters | None = None) -> Any:
@@ -52,7 +52,7 @@ def is_plain(relation: Any) -> bool:
 def as_told(
     tables: Sequence[Any], columns: Sequence[str] | None = None, most: int | None = None
 ) -> Any:
-    """Concatenate Arrow tables, and convert integers to int64 and floats to float64, like Python.
+    """Concatenate Arrow tables, with all integers as int64 and all floats as float64.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ ARROW_TYPES: Final = {
     "BOOLEAN": "bool_",
     "VARCHAR": "string",
 }
-"""Database type → pyarrow function. Other types are inferred from values."""
+"""Database type → name of the pyarrow function for the type. Other types are inferred from the values."""
 
 
 _ENUM: Final = re.compile(r"ENUM\(('([^']|'')*'(, )?)*\)")
@@ -98,7 +98,7 @@ _EXTRAS: Final = {
     "pandas": ("data frames", "pandas"),
     "polars": ("data frames of polars", "polars"),
 }
-"""Optional packages: purpose, and the extra that installs them."""
+"""Optional packages: name → purpose, and the ``pip`` extra that installs the package."""
 
 
 def package(name: str) -> Any:
@@ -109,7 +109,7 @@ def package(name: str) -> Any:
 
 
 ROWS_AT_ONCE: Final = 50_000
-"""Rows written at once. They also determine column types that are not given."""
+"""Rows written at once. The first such rows determine unspecified column types."""
 
 
 def record_batches(

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sgstore.store._file import StoreFile
 
 TOGETHER: Final = 64
-"""Largest number of stores to join at once. More stores are joined in several steps."""
+"""Largest number of stores in one join. More stores are joined in several steps."""
 
 _TRACE_OF: Final = {
     FRAME: f"{quoted(FRAME)} >> {SEQ_BITS}",
@@ -46,7 +46,7 @@ _TRACE_OF: Final = {
     "bucket": f"bucket >> {BUCKET_BITS}",
     "frame_id": f"frame_id >> {SEQ_BITS}",
 }
-"""Column → SQL of the trace of a row. The first column present in a table counts."""
+"""SQL of the trace id of a row, by column. The first column that a table has is used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +210,7 @@ def _choose(
 
 
 _ONCE: Final = {table: owner for owner, tables in SHARED.items() for table in tables}
-"""Tables shared by several traces → table with the references."""
+"""Tables whose rows several traces share → table that refers to these rows."""
 
 
 def _chosen(table: str, database: str) -> str:
@@ -264,7 +264,7 @@ CATALOGUE: Final = {
         "answers VARCHAR",
     }.items()
 }
-"""Tables of a catalogue, with their columns and the types of these in the database.
+"""Tables of the catalogue of a collection: table → column → database type.
 
 ``word``: the names that the compiler must know beside its own: of an enumeration (``kind``, ``relation``,
 ``light_state``), of user-defined attributes (``own``, ``own_edges``, with their types), of abstractions
@@ -274,7 +274,7 @@ report, as JSON; empty or NULL: unknown.
 """
 
 Facts = dict[str, list[tuple[Any, ...]]]
-"""Rows of a catalogue by table."""
+"""Rows of the catalogue of a collection, by table."""
 
 _TRACES: Final = """
 SELECT t.trace_id, t.name, r.digest, coalesce(t.ego, ''), coalesce(m.name, ''), coalesce(m.digest, ''),

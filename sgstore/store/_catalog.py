@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 _NUMBERS: Final = frozenset({"BIGINT", "UBIGINT", "HUGEINT", "DOUBLE"})
-"""JSON types of numbers."""
+"""JSON types that are numbers."""
 
 
 def catalog_of(connection: DuckDBPyConnection) -> Catalog:
@@ -100,7 +100,7 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
 
 
 def subset_catalogs() -> dict[str, Callable[[Catalog], Catalog]]:
-    """Return functions for abstractions that drop nodes or edges: store catalog → abstraction catalog."""
+    """Return one function per abstraction that drops nodes or edges. It converts the catalog of the store."""
     return {name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()}
 
 
@@ -178,7 +178,7 @@ def _type_of(traces: list[tuple[Type, bool, bool]]) -> Type:
 
 
 _STATED: Final = ("heading", "length", "width", "height", "speed", "vx")
-"""Attributes whose missing values are looked up in the states."""
+"""Attributes whose missing values are searched in the table of states."""
 
 _HOLDERS: Final = {
     Home.state: ("state", "world_state"),
@@ -191,7 +191,7 @@ _HOLDERS: Final = {
 def _lacking(
     connection: DuckDBPyConnection, held: Mapping[Home, frozenset[str]]
 ) -> dict[str, frozenset[str]]:
-    """Return the kinds of nodes that lack an attribute in some frame: attribute → kinds.
+    """Return the kinds of nodes that have no value of an attribute in some frame: attribute → kinds.
 
     DuckDB skips row groups without missing values. ``held``: kinds in tables that may not have the column.
     """
@@ -328,7 +328,7 @@ def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) 
 def _relations(
     connection: DuckDBPyConnection, whole: Catalog, of: list[DerivedSet]
 ) -> frozenset[str] | None:
-    """Return the relation names that a derived set can contain. ``None`` means unknown.
+    """Return the relations that a derived set can contain. ``None`` means unknown.
 
     If a trace has a road map, the set lacks the relations that no trace answers: a relation needs only settings
     and a map. Without a map, the set lacks only the relations that the traces can answer in the store.

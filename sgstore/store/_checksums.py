@@ -38,10 +38,10 @@ _FIRST: Final = np.uint64(0xBF58476D1CE4E5B9)
 _SECOND: Final = np.uint64(0x94D049BB133111EB)
 
 _MISSING: Final = np.uint64(0x6E756C6C6E756C6C)
-"""Hash word of NULL."""
+"""Hash value that represents NULL."""
 
 _AT_ONCE: Final = 1 << 13
-"""Rows hashed at once: their words fit into the processor cache."""
+"""Number of rows that are hashed at once, so that their hashes fit into the processor cache."""
 
 _ASSIGNED: Final = {
     ("trace", "name"),
@@ -49,7 +49,7 @@ _ASSIGNED: Final = {
     ("map", "name"),
     ("recording", "place"),
 }
-"""Tables and columns whose values the store assigns."""
+"""Tables and columns whose values the store assigns when it inserts a trace."""
 
 
 @dataclass(slots=True)
@@ -147,7 +147,7 @@ def _number(kind: str, text: str) -> int:
 
 
 def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:
-    """Return enumeration codes that are equal in every store. Codes of user-defined names become hashes."""
+    """Return enumeration codes that are the same in every store. Codes of user-defined names become hashes."""
     own = len(own_labels(enum))
     if codes.max(initial=0) < own:
         return codes

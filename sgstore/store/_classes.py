@@ -59,11 +59,11 @@ _TOGETHER: Final = 2000
 _REMEMBERED: Final = 4096
 """Number of frames with cached classes."""
 _FEW_EDGES: Final = 1 << 16
-"""Up to this number of edges, all abstractions are in memory at once."""
+"""Largest number of edges for which all abstractions are in memory at once."""
 
 
 class TraceClasses:
-    """Frame classes of one trace for several abstractions, computed from one block of frames at a time.
+    """Frame classes of one trace for several abstractions. Callers add blocks of frames one after another.
 
     Parameters
     ----------

@@ -27,7 +27,7 @@ MESSAGES: Final = {
     "channel": "INTEGER",
     **dict.fromkeys(("log_time_ns", "chunk_offset", "offset", "length"), "BIGINT"),
 }
-"""Columns of messages, staged like a table until the join to frames."""
+"""Columns of recorded messages. They are prepared like a table until the join to frames."""
 
 TEXTS: Final = {"VARCHAR", "VARCHAR[]", "JSON", "TIMESTAMP", "UUID"}
 
@@ -59,7 +59,7 @@ def types_of(table: str) -> Mapping[str, str]:
 
 
 def kept(table: str, name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """Convert a numeric column to the array type of its table. Missing values become NaN or :data:`MISSING`.
+    """Convert a numeric column to the array type of its table, with NaN or :data:`MISSING` for missing values.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def blank(table: str, name: str, count: int) -> NDArray[Any]:
 
 
 def missing_of(table: str, name: str, values: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Return a mask of the missing values in a table column. ``None`` means all values are present."""
+    """Return a mask of the missing values in a table column. ``None`` means that no value is missing."""
     if types_of(table)[name] in TEXTS:
         missing = values < 0
     elif values.dtype.kind == "f":
@@ -138,10 +138,10 @@ MASKS: Final = (
         "derived_edge",
     ),
 )
-"""Tables with a mask. Rows that differ only in the mask are merged."""
+"""Tables with a mask of frames. Rows that differ only in the mask are merged."""
 
 STATES: Final = ("state", "world_state")
-"""Tables of states."""
+"""Names of the tables with states of entities, inside and outside the graphs."""
 
 REPEATED: Final = {
     "lane_single": "lane_repeated",
@@ -149,7 +149,7 @@ REPEATED: Final = {
     "world_gap_single": "world_gap_repeated",
     "gap_single": "gap_repeated",
 }
-"""Tables with one row per frame → tables with one row for several frames of a bucket."""
+"""Tables with one row per frame → tables with one row for several frames with equal values."""
 
 
 @cache
@@ -209,7 +209,7 @@ def in_order(table: str, columns: Columns, texts: Sequence[str]) -> Columns:
 
 
 def parted(columns: Columns) -> tuple[Columns, Columns]:
-    """Split rows into rows that differ from frame to frame, and runs of equal rows; return two tables.
+    """Split rows into those that differ from frame to frame, and runs of equal rows. Return two tables.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def marked(columns: Columns) -> Columns:
 
 
 def _as_before(columns: Columns) -> NDArray[np.bool_]:
-    """Return a mask of the rows that equal the previous row. The mask has no value for the first row."""
+    """Return a mask of the rows that equal the row before them, without an entry for the first row."""
     same = np.ones(len(next(iter(columns.values()))) - 1, np.bool_)
     for values in columns.values():
         if not same.any():
@@ -254,7 +254,7 @@ def _as_before(columns: Columns) -> NDArray[np.bool_]:
 
 
 def chained(table: str, blocks: Sequence[Columns]) -> Columns:
-    """Concatenate blocks of rows of a table. A column of any block is a column of the result."""
+    """Concatenate blocks of rows of a table. The result has every column that occurs in a block."""
     if len(blocks) == 1:
         return blocks[0]
     return {

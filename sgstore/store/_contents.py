@@ -39,7 +39,7 @@ GROUP BY f.trace_id, p.chunk_offset, p."offset"
 """
 
 TOGETHER: Final = 200_000
-"""Approximate number of frames per query, in whole traces."""
+"""Approximate number of frames for each query. A query always reads whole traces."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 _NEW: Final = f"STORAGE_VERSION '{STORAGE_VERSION}', BLOCK_SIZE {BLOCK_SIZE}"
-"""DuckDB options of a new file."""
+"""DuckDB options for a new store file."""
 
 
 def create(path: Path) -> None:
@@ -88,7 +88,7 @@ def write_empty(place: Path) -> None:
 
 
 _empty: Final[list[bytes]] = []
-"""Cached bytes of an empty store. Writing them is a hundred times faster than a new creation."""
+"""Cached bytes of an empty store file. Copying them is a hundred times faster than a new database."""
 
 
 def _make_empty(place: Path) -> None:

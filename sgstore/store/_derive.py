@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 TABLES: Final = ("derived", "derived_node", "derived_edge", "derived_gap")
 _BUCKETS: Final = 2
-"""Buckets of a block: as many as at ingest."""
+"""Buckets of frames in a block, the same number as during ingest."""
 
 _NUMBERS: Final = (*POSE, *INPUTS)
 _POSE: Final = ("x", "y", "z", "heading", "length", "width", "height")

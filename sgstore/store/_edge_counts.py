@@ -1,4 +1,4 @@
-"""Counts of edges in SQL statements of users, from the masks of edges instead of single edges and frames."""
+"""Fast counts of edges for SQL statements of users, computed from bit masks instead of single rows."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _PLAIN: Final = {
     "CAST",
     "BETWEEN",
 }
-"""Classes of expressions that have one value for equal edges."""
+"""DuckDB classes of expressions whose value is the same for equal edges."""
 
 
 def counted_edges(sql: str) -> tuple[str, str] | None:
-    """Return statements that count edges from masks: one that creates a table, and the query.
+    """Return two statements that count edges from masks: one creates a table, the other is the query.
 
     ``None`` means that the SQL statement is not a count of the rows of the view ``edges``, by columns that all
     frames of a mask share.
@@ -63,7 +63,7 @@ _EDGES: Final = """sum(bit_count(e.mask & b.valid)) AS ":frames" FROM inside.buc
     JOIN inside.map_edge m ON m.map_id = b.map_id AND m.src = s.node_id
     JOIN inside.node d ON d.bucket = b.bucket AND d.node_id = m.dst
 ) e ON e.bucket = b.bucket WHERE (e.mask & b.valid) <> 0 GROUP BY ALL"""
-"""Number of frames of each edge, as in the view ``edges``."""
+"""SQL for the number of frames of each edge, as the view ``edges`` shows it."""
 
 
 def _tree(connection: duckdb.DuckDBPyConnection, sql: str) -> dict[str, Any]:
@@ -72,7 +72,7 @@ def _tree(connection: duckdb.DuckDBPyConnection, sql: str) -> dict[str, Any]:
 
 
 def _columns(node: dict[str, Any]) -> set[str] | None:
-    """Return the columns of ``edges`` that a statement uses. ``None`` means that masks are not enough."""
+    """Return the columns of ``edges`` that a statement uses. ``None`` if masks cannot answer the statement."""
     table = node.get("from_table") or {}
     plain = (
         table.get("type") == "BASE_TABLE"
@@ -96,7 +96,7 @@ def _columns(node: dict[str, Any]) -> set[str] | None:
 
 
 def _path(table: dict[str, Any]) -> list[str]:
-    """Return the schema and the name of a table, in the form of any version of DuckDB."""
+    """Return the schema and the name of a table in a parsed statement, for any version of DuckDB."""
     if "qualified_name" in table:
         return table["qualified_name"]["path"]
     return [*filter(None, (table.get("schema_name"),)), table.get("table_name", "")]
@@ -118,7 +118,7 @@ def _is_count(one: dict[str, Any]) -> bool:
 
 
 def _replace(node: dict[str, Any], count: dict[str, Any], table: dict[str, Any]) -> None:
-    """Replace the counts in a statement by sums, and the view by the table of the sums."""
+    """Replace the counts in a statement by sums, and the view ``edges`` by the table of these sums."""
     for one in node["select_list"]:
         if _is_count(one):
             one["alias"] = one["alias"] or "count_star()"

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sgstore.store._locking import Access
 
 _MOST_CALLS: Final = 1 << 16
-"""Number of calls whose values are returned without a look-up: a pair is measured again in each frame."""
+"""Largest number of cached calls of the SQL function, because SQL repeats a pair in each frame."""
 _FILES: Final = 4
 """Number of files with cached measures."""
 

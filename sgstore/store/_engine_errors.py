@@ -95,7 +95,7 @@ def translated(path: Path) -> Generator[None]:
 
 
 def _without_room(message: str) -> str | None:
-    """Return the words for a DuckDB error at a write without room; ``None`` for other errors."""
+    """Return the message for a DuckDB error about missing disk space at a write; ``None`` for other errors."""
     if os.strerror(errno.EFBIG) in message and "duckdb_temp" in message:
         return None  # temporary data of a sandbox: its memory is too small, not the disk
     found = (words for code, words in FULL.items() if os.strerror(code) in message)
@@ -103,7 +103,7 @@ def _without_room(message: str) -> str | None:
 
 
 def move(path: Path, to: Path, fault: str) -> Path:
-    """Move a file, replacing another one, and return its new path.
+    """Move a file to a path, replace an existing file there, and return the new path.
 
     Raises
     ------

@@ -141,7 +141,7 @@ class StoreFile:
 
     @classmethod
     def together(cls, path: str | Path) -> StoreFile:
-        """Open a store in the database instance of its folder; four times faster for many stores.
+        """Open a store in the database that all stores of its folder share. This is four times faster.
 
         Raises
         ------
@@ -402,7 +402,7 @@ class StoreFile:
         return self._graphs
 
     def trace_id(self, trace: int | str) -> int:
-        """Return the id of a trace.
+        """Return the id of a trace, given by name or id.
 
         Raises
         ------
@@ -413,7 +413,7 @@ class StoreFile:
             return trace_named(connection, str(trace))[0]
 
     def meetings(self, measures: Sequence[str]) -> Iterator[Meetings]:
-        """Yield the encounters of the egos with other known objects, in windows, for recorded measures."""
+        """Yield the encounters of the egos with other known objects, in windows, for the given measures."""
         from sgstore.store._meetings import meetings
 
         with translated(self.path), self.access.reading() as connection:
@@ -487,7 +487,7 @@ class StoreFile:
         return read_message(path, **place)
 
     def carried(self, ref: int | str, channel: str) -> Media:
-        """Return a channel's message at a frame as a picture, as a video, or as raw bytes.
+        """Return a channel's message at a frame as a picture, a video, or raw bytes.
 
         Parameters
         ----------
@@ -666,7 +666,7 @@ class StoreFile:
         return str(found[0]) if found and found[0] else ""
 
     def requested(self, path: Path, request: str) -> tuple[str, str, int, dict[str, Any]] | None:
-        """Return name, ego, frames and report of the trace that an equal request of a recording gave.
+        """Return name, ego, frames and report of the stored trace that the same ingest request produced.
 
         ``None`` means no such trace, or a file that has changed.
         """

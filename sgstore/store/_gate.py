@@ -43,7 +43,7 @@ class Deadline:
         return max(self._end - time.monotonic(), 0)
 
     def pause(self, error: StoreError) -> None:
-        """Sleep before the next retry. After the time limit, raise the given error."""
+        """Sleep until the next attempt. Raise the given error if no time is left."""
         if isinstance(error, HeldHereError):
             if time.monotonic() - self._start > _HELD_HERE_S:
                 raise error

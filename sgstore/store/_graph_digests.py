@@ -1,4 +1,4 @@
-"""Digests of the graphs in frames. Frames with equal digests have equal nodes, edges and attributes.
+"""Digests of scene graphs. Frames with equal digests have equal nodes, edges and attributes.
 
 A digest covers the bits of numbers, the characters of texts, and frame numbers in the trace. So the digest of a
 part of a trace does not depend on the store, nor on its other content.
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 FIRST: Final = 50
-"""Buckets (of 60 frames) in the first read. Later reads are limited by the number of rows:"""
+"""Number of frame buckets in the first read. Later reads are limited by the number of rows:"""
 _ROWS_TOGETHER: Final = 700_000
 
 _WANTED: Final = (
@@ -67,7 +67,7 @@ _COLUMNS: Final = {
     ),
     "map_edge": ("src relation dst", _MAPS),
 }
-"""Columns that define a graph, and the condition of the rows. A change here changes every digest."""
+"""Table → columns that define a scene graph, and condition for its rows. A change alters all digests."""
 
 _OF_FRAME: Final = f"""
 SELECT r.* EXCLUDE (frame_id), w.place, w.mask & (1::BIGINT << (r.frame_id & 63)) AS mask
@@ -107,10 +107,10 @@ WHERE b.{_BUCKETS} AND (w.mask & s.mask & d.mask) <> 0""",
     "gaps": _OF_BUCKET.format(rows="(FROM {gap_single} UNION ALL BY NAME FROM {gap_repeated})"),
     "attributes": _OF_FRAME.format(rows="{attribute}"),
 }
-"""Parts of a graph, and SQL of their rows with a place (index of a bucket) and a mask of frames."""
+"""Part of a scene graph → SQL of its rows, with a place (index of the bucket) and a mask of frames."""
 
 _SHARED: Final = ("entity", "map_node", "map_edge")
-"""Tables whose rows belong to many frames. They are hashed once, and found by row id."""
+"""Tables whose rows belong to many frames. Each row is hashed only once, and found by its row id."""
 
 
 def graph_digests(file: StoreFile, frames: Sequence[Ints], *, older: bool = False) -> list[str]:
@@ -154,7 +154,7 @@ def graph_digests(file: StoreFile, frames: Sequence[Ints], *, older: bool = Fals
 
 
 def _tables(file: StoreFile) -> dict[str, str]:
-    """Return SQL of the rows of each table as numbers: table → subquery."""
+    """Return SQL for the rows of each table with all values as numbers: table → subquery."""
     found: dict[str, str] = {}
     with file.access.reading() as connection:
         for table, (names, condition) in _COLUMNS.items():
@@ -167,7 +167,7 @@ def _tables(file: StoreFile) -> dict[str, str]:
 
 
 def _frame_words(file: StoreFile, tables: dict[str, str], frame_id: Ints) -> tuple[Words, int]:
-    """Return two words for each frame, (N, 2), and the number of rows that were read."""
+    """Return two 64-bit hashes for each frame, (N, 2), and the number of rows that were read."""
     bucket, bit = frame_id >> FRAME_BITS, frame_id & ((1 << FRAME_BITS) - 1)
     starts = np.flatnonzero(np.diff(bucket, prepend=-1))
     buckets = bucket[starts]
@@ -193,7 +193,7 @@ def _frame_words(file: StoreFile, tables: dict[str, str], frame_id: Ints) -> tup
 
 
 def _hashed(file: StoreFile, table: str, values: dict[str, Any]) -> tuple[int, Words]:
-    """Return the hashes of the rows of a table by row id, from the first row id on."""
+    """Return the smallest row id of a table, and the hashes of its rows by their offset from this id."""
     bounds = {name: values[name] for name in ("first", "last")}
     rows = file.arrays(f"FROM {table}", bounds, plain=True)
     number = rows.pop("row").astype(np.int64)
@@ -204,7 +204,7 @@ def _hashed(file: StoreFile, table: str, values: dict[str, Any]) -> tuple[int, W
 
 
 def _of_rows(hashed: tuple[int, Words], number: NDArray[Any]) -> NDArray[Any]:
-    """Return hashes for row ids. The hash of a missing row is missing."""
+    """Return the hash of each given row id. A missing row id gives a missing hash."""
     first, words = hashed
     missing = np.ma.getmaskarray(number)
     found = np.zeros(len(number), np.uint64)
@@ -213,7 +213,7 @@ def _of_rows(hashed: tuple[int, Words], number: NDArray[Any]) -> NDArray[Any]:
 
 
 def _by_frame(place: Ints, mask: Ints, hashes: Words, count: int) -> Words:
-    """Return the sums of row hashes by frame, (64 B,), of ``count`` buckets of 64 frames."""
+    """Return the sum of row hashes for each frame, (64 B,), in ``count`` = B buckets of 64 frames."""
     sums = np.zeros(count << FRAME_BITS, np.uint64)
     first, behind = place << FRAME_BITS, mask << 1
     _add_at_bits(sums, first, mask & ~behind, hashes)
@@ -222,7 +222,7 @@ def _by_frame(place: Ints, mask: Ints, hashes: Words, count: int) -> Words:
 
 
 def _add_at_bits(sums: Words, first: Ints, bits: Ints, words: Words) -> None:
-    """Add a word to the sum of each bit that is set. ``first``: index of the sum of bit 0."""
+    """Add the hash of each row to the sums at its set bits. ``first`` is the index of bit 0 of each row."""
     while len(bits):
         low = bits & -bits
         np.add.at(sums, first + np.bitwise_count(low - 1), words)

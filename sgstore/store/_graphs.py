@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 WINDOW: Final = 8
-"""Buckets to read at once."""
+"""Number of frame buckets that are read at once."""
 
 _MAPS: Final = 4
 """Number of cached maps. Many frames share a map."""
@@ -121,7 +121,7 @@ _MAP_PLACES: Final = (
 _MAP_COURSES: Final = "SELECT lane, start, curvature, slope FROM map_course WHERE map_id = $map_id"
 
 FIRST: Final = 2_000
-"""Frames of any traces in the first read. Later reads are limited by the number of edges:"""
+"""Number of frames, of any traces, in the first read. Later reads are limited by the number of edges:"""
 _EDGES_TOGETHER: Final = 2_000_000
 
 
@@ -295,7 +295,7 @@ _OF_GRAPHS: Final = re.compile(r"\bFROM (node|edge|lane_state|lane_gap)\b")
 
 
 def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -> T:
-    """Return a road map by its digest, from a cache of the most recently used maps."""
+    """Return the map with a digest from a cache of recently used maps. ``read`` loads a missing map."""
     if digest not in maps:
         maps[digest] = read()
         while len(maps) > _MAPS:
@@ -307,7 +307,7 @@ def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -
 def _asked(
     frame_id: NDArray[np.int64], otherwise: int = 0
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return two dicts of SQL parameters for some frames: as frame ids, and as bit masks of 64 frames.
+    """Return the SQL parameters for a selection of frames twice: as frame ids, and as bit masks of 64 frames.
 
     ``otherwise``: bounds without any frame.
     """
@@ -404,7 +404,7 @@ def _map_columns(connection: DuckDBPyConnection, map_id: int) -> MapColumns:
 
 @dataclass(frozen=True, slots=True)
 class _Traces:
-    """Coordinate origin and map id of each trace in a range. Map id -1 means no road map."""
+    """Coordinate origin and map id of each trace in a range. Map id -1 means that the trace has no map."""
 
     trace_id: NDArray[np.int64]
     origin: dict[str, NDArray[np.float64]]

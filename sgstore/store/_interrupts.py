@@ -1,4 +1,4 @@
-"""Calls of DuckDB that a signal, such as Ctrl+C, interrupts at once.
+"""Calls of DuckDB that end at once after a signal such as Ctrl+C.
 
 Python runs signal handlers only in the main thread, between bytecodes. DuckDB allows this only between its
 tasks, and a task may take minutes. So another thread runs the call, and the main thread waits. A signal
@@ -23,7 +23,7 @@ T = TypeVar("T")
 _LOOK_S: Final = 0.5
 """Interval of signal checks if signals do not interrupt waiting (on Windows); s."""
 _AGAIN_S: Final = 0.01
-"""Interval of repeated interrupts: one may arrive before the statement begins; s."""
+"""Interval of repeated interrupts, because DuckDB ignores an interrupt before the statement begins; s."""
 
 
 def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
@@ -64,7 +64,7 @@ def interruptible(connection: DuckDBPyConnection, step: Callable[[], T]) -> T:
 
 
 interrupted: Final[set[int]] = set()
-"""Ids of interrupted connections. Python functions check it, because DuckDB does not stop them."""
+"""Ids of the interrupted connections. Functions in Python check this set, because DuckDB cannot stop them."""
 
 
 def interrupt(connection: DuckDBPyConnection) -> None:

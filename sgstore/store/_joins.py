@@ -43,7 +43,7 @@ MAX_TABLES: Final = 64
 
 _NAME: Final = re.compile(r"[A-Za-z_]\w{0,62}", re.ASCII)
 _TAKEN: Final = frozenset({"ego", "env", "frame", "trace"})
-"""Names with another meaning in patterns."""
+"""Names that have another meaning in query patterns, and are not allowed for user tables."""
 
 _READERS: Final = {
     ".parquet": "read_parquet({})",
@@ -125,7 +125,7 @@ class UserTable:
 
 @dataclass(frozen=True, slots=True)
 class JoinedTable:
-    """Row counts of the join of a user table with the frames of a store.
+    """Result of the join of a user table with the frames of a store: numbers of rows.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Store files that stay open between queries, and close when a writer process waits.
+"""Store files that stay open between queries and close if a writer process waits.
 
 Opening a file takes a hundred times as long as a small query. So the database instance of a file stays open for
 a while after a query. It closes
@@ -50,7 +50,7 @@ LOOK_S: Final = 0.05
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Return identity, size and times of a store file and its log. Every write changes this value."""
+    """Return identity, size and times of a store file and its log. The value changes at every write."""
     found: list[tuple[int, ...]] = []
     for file in (path, _beside(path, ".wal")):
         with suppress(OSError):
@@ -128,7 +128,7 @@ class AttachedFile:
 
 
 _instances: Final[dict[tuple[object, ...], DuckDBPyConnection]] = {}
-"""Database instances for the life of the process, by key."""
+"""Shared database instances by key. They exist until the process ends."""
 
 _instances_lock = threading.Lock()
 
@@ -232,7 +232,7 @@ class OpenFile:
             self.close()
 
     def let_go(self, token: object) -> None:
-        """Unregister an object that uses the store file. Close the file after the last object."""
+        """Unregister an object that uses the store file. The last one closes the file."""
         self.holders.discard(token)
         # An object may be deleted at any time and in any thread, so this code must not wait. The watcher also
         # checks.
@@ -250,7 +250,7 @@ class _Watch:
         self.begin()
 
     def begin(self) -> None:
-        """Reset the thread that closes idle files: no files and no thread."""
+        """Forget all idle files and the thread that closes them."""
         self.kept: set[OpenFile] = set()
         self.running = False
         self._lock = threading.Lock()
@@ -319,11 +319,11 @@ def _end() -> None:
 
 
 _of_parents: Final[list[object]] = []
-"""Objects inherited over a fork. They must stay alive, because DuckDB objects cannot be closed after a fork."""
+"""Objects that a forked process inherits. They stay alive, as DuckDB objects cannot be closed there."""
 
 
 def _begin_anew() -> None:
-    """Reset the list of open store files in a forked process, which inherits it from its parent."""
+    """Forget the inherited open store files after a fork of the process."""
     _watch.begin()
     _of_parents.extend(_instances.values())
     _instances.clear()

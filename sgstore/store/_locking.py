@@ -78,7 +78,7 @@ _SURPRISES: Final = (
     *(ArithmeticError, AssertionError, AttributeError, LookupError, StopIteration),
     *(TypeError, ValueError),
 )
-"""Exceptions that invalid store rows can cause."""
+"""Exceptions that invalid rows of a store can cause in Python."""
 
 
 def without_faults(connection: DuckDBPyConnection) -> None:
@@ -105,7 +105,7 @@ _CAREFUL: Final = (
     *("common_aggregate", "common_subplan", "compressed_materialization", "duplicate_groups"),
     *("join_filter_pushdown", "late_materialization", "statistics_propagation", "top_n"),
 )
-"""DuckDB optimizers that can be disabled after a fault."""
+"""DuckDB optimizers to disable after an internal error. The query then runs again."""
 
 
 def _be_careful(connection: DuckDBPyConnection) -> None:

@@ -1,4 +1,4 @@
-"""Criticality measures of whole recordings, for all pairs of an object, in windows of traces.
+"""Criticality measures of whole traces between an object and all other objects, computed in windows.
 
 Notes
 -----
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats, Ints
 
 MOST_BYTES: Final = 64 << 20
-"""Largest size of the cached measures, and of the cached states."""
+"""Largest size of the cached measures, and the same limit for the cached states; bytes."""
 MOST_STATES: Final = 1 << 19
-"""Number of states that are compared together. The objects of a longer trace are divided into parts."""
+"""Number of states that are compared at once. The objects of a longer trace are compared in parts."""
 _MOST_TRACES: Final = 64
-"""Largest number of traces that are read ahead together."""
+"""Largest number of following traces that are computed in advance."""
 
 _PART: Final = f"k.kind NOT IN {FIXED_KINDS} AND (abs(k.node_id) % $3 = $4 OR k.node_id = $5)"
 _PLACE: Final = """radians(degrees({0}.heading)) AS heading,
@@ -132,7 +132,7 @@ class RecordedValues:
     def _compute(
         self, reader: DuckDBPyConnection, scope: str, measure: str, trace: int, src: int
     ) -> None:
-        """Compute a measure of an object; for an ego, also of the egos of the following traces."""
+        """Compute a measure of an object with all others. For an ego, also compute the following traces."""
         if not self._traces:
             self._traces = reader.execute(_TRACES).fetchnumpy()
             self._egos = {one: min(nodes) for one, nodes in _egos(reader).items()}
@@ -203,7 +203,7 @@ def _meetings(
     cache: BoundedCache[_States] | None = None,
     measures: Sequence[str] = (*Meetings.of_motion,),
 ) -> Iterator[Meetings]:
-    """Yield the encounters of one object of each trace, in one or more parts of the other objects."""
+    """Yield the encounters of one object of each trace with the other objects, in one or more parts."""
     ids = traces["trace_id"]
     parts = max(-(-int(traces["states"].sum()) // MOST_STATES), 1) if len(sources) == 1 else 1
     ends = [int(ids[0]) << SEQ_BITS, ((int(ids[-1]) + 1) << SEQ_BITS) - 1]

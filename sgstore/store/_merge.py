@@ -41,22 +41,22 @@ if TYPE_CHECKING:
     from sgstore.store._temporary_tables import Given
 
     Written = tuple[Path | None, tuple[str, ...], int, list[tuple[Any, ...]]]
-    """Partial result: file or ``None``, types, number of rows, and the rows if few."""
+    """Partial result: path of its file or None, column types, number of rows, and the rows if few."""
 
 
 _EXACT: Final = {"HUGEINT": "DECIMAL(38,0)", "UHUGEINT": "DECIMAL(38,0)"}
-"""Types that Parquet lacks → types for the same integers."""
+"""Types that Parquet lacks → types that hold the same integers."""
 
 _NOTHING: Final = ""
-"""Type of a column with only NULL values."""
+"""Database type of a column in which all values are NULL."""
 
 FEW: Final = 200
-"""Largest number of rows kept in memory. A file would take as long as a query."""
+"""Largest number of rows that stay in memory. Writing a file would take as long as a query."""
 
 _PLAIN: Final = frozenset(
     {"BOOLEAN", "TINYINT", "SMALLINT", "INTEGER", "BIGINT", "FLOAT", "DOUBLE", "VARCHAR"}
 )
-"""Types with equal values in Python and JSON. Enumeration values are texts."""
+"""Database types whose values are equal in Python and JSON. Enumeration values become texts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +254,7 @@ def _making(sql: str, columns: int) -> str:
 
 
 def _written(connection: DuckDBPyConnection) -> Written:
-    """Write a partial query result to a Parquet file. A small result stays in memory."""
+    """Write a partial result to a Parquet file and return its description. A small result stays in memory."""
     described = connection.execute(f"DESCRIBE {_PART}").fetchall()
     kinds = {str(row[0]): str(row[1]) for row in described}
     # A column with only NULL has no type, which a table does not support.
@@ -283,7 +283,7 @@ def _is_plain(kind: str) -> bool:
 
 
 Parts = dict[str, list[PartFile]]
-"""Table of a statement → files of its rows, with the same columns."""
+"""Partial results by the name of their table in SQL. All results of a table have the same columns."""
 
 
 def _numbered(values: Sequence[Any]) -> dict[str, Any]:
@@ -309,7 +309,7 @@ def _tables(parts: Parts, words: Mapping[str, Sequence[str]]) -> Generator[DuckD
 def _told(
     connection: DuckDBPyConnection, table: str, files: Sequence[PartFile]
 ) -> dict[tuple[str, ...], str]:
-    """Create tables for the query results held in memory. Return column types → table name."""
+    """Create temporary tables for the partial results in memory. Return column types → table name."""
     alike: dict[tuple[str, ...], list[Sequence[Any]]] = {}
     for one in files:
         if one.few:
@@ -334,7 +334,7 @@ def _merging(kinds: Mapping[str, Sequence[str]]) -> DuckDBPyConnection:
 
 
 def _rows_of(files: Sequence[PartFile], told: Mapping[tuple[str, ...], str]) -> str:
-    """Return SQL for the rows of several query results in files and tables, with their original types."""
+    """Return SQL for the rows of several partial results (files and tables), with common column types."""
     if not files:
         raise StoreError("nothing was answered")
     first = files[0]

@@ -1,4 +1,4 @@
-"""Digests of the graphs in frames as in locks of format 1. Frames with equal digests have equal graphs.
+"""Digests of scene graphs in the older format of locks, format 1. Equal digests mean equal graphs.
 
 A digest covers the bits of numbers, the characters of texts, and frame numbers in the trace.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 GRAPHS: Final = 500
-"""Frames to read graphs of at once. A frame usually has a thousand edges, and 45 values per node."""
+"""Number of frames whose graphs are read at once. A usual frame has a thousand edges."""
 
 DIGEST_BYTES: Final = 16
 
@@ -47,14 +47,14 @@ _TABLES: Final = {
     ),
     "lane_gaps": ("src", "dst", "gap"),
 }
-"""Views and columns that define a graph. A change here changes every digest."""
+"""View → columns that define a scene graph. A change alters all digests."""
 
 _LATER: Final = {
     "(SELECT * FROM nodes WHERE gear IS NOT NULL OR hand_brake IS NOT NULL)": (
         *("node_id", "gear", "hand_brake"),
     ),
 }
-"""Newer columns that define a graph. If their values are missing, the digest does not include them."""
+"""View → newer columns that define a scene graph. The digest includes them only if they have values."""
 
 
 def older_graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
@@ -85,7 +85,7 @@ def older_graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
 
 
 def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Yield index ranges of groups; each range has at least one group and about :data:`GRAPHS` frames."""
+    """Yield ranges of groups to read at once: at least one group, and up to :data:`GRAPHS` frames."""
     low = together = 0
     for high, size in enumerate(sizes):
         if together + size > GRAPHS and high > low:
@@ -113,7 +113,7 @@ def _rows(
     labels: Mapping[str, Words],
     wanted: Ints,
 ) -> tuple[Ints, Words]:
-    """Return the rows of a view for some frames, as frame ids and 64-bit words, sorted by value."""
+    """Return the distinct rows of a view for some frames: frame ids, and values as 64-bit hashes, sorted."""
     listed = ", ".join(
         f'enum_code(v."{name}") AS "{name}"' if name in labels else f'v."{name}"'
         for name in columns
@@ -138,7 +138,7 @@ def _rows(
 
 
 def _like_before(order: NDArray[np.intp], *columns: NDArray[Any]) -> Bools:
-    """Return a mask (N,): True if a row equals the previous row in the given order."""
+    """Return a mask (N,) of the rows that equal the row before them, in the given order."""
     like = np.ones(len(order), np.bool_)
     like[:1] = False
     for column in columns:
@@ -151,7 +151,7 @@ _MISSING_DIGEST: Final = np.uint64(0x6E756C6C6E756C6C)
 
 
 def _words(values: NDArray[Any], labels: Words | None) -> Words:
-    """Return column values as 64-bit words for a digest. Enumeration codes become hashes of their names."""
+    """Return the values of a column as 64-bit words. Enumeration codes become the hashes of their names."""
     plain = np.ma.getdata(values)
     missing = np.ma.getmaskarray(values)
     if labels is not None:

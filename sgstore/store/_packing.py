@@ -42,12 +42,12 @@ MISSING: Final = -(1 << 31)
 """Missing integer value. DuckDB 1.5 ignores the mask of a masked array."""
 
 EDGE_ROWS: Final = 1 << 18
-"""Edges converted to rows at once, to limit the memory for intermediate arrays."""
+"""Number of edges that are converted to rows at once. It limits the memory for intermediate arrays."""
 
 TOLERANCE: Final = f"greatest({TOLERANCE_NS}, coalesce(period_ns, 0) // {TOLERANCE_SHARE})"
-"""SQL: :func:`sgstore.model.world.tolerance_ns` of a trace's ``period_ns``."""
+"""SQL text of :func:`sgstore.model.world.tolerance_ns`, computed from the ``period_ns`` of a trace."""
 LONGEST_STEP: Final = f"{GAP} * period_ns + {TOLERANCE}"
-"""SQL: :func:`sgstore.model.world.longest_step_ns` of a trace's ``period_ns``."""
+"""SQL text of :func:`sgstore.model.world.longest_step_ns`, computed from the ``period_ns`` of a trace."""
 
 
 @dataclass(slots=True)
@@ -58,7 +58,7 @@ class NodeKinds:
     map: Codes
 
     def learn(self, entities: Entities) -> None:
-        """Append the kinds of new objects, ordered by node id."""
+        """Add the kinds of new objects. Their order is that of the node ids."""
         if len(entities) and entities.first != len(self.entities):
             raise ValueError(f"new entities begin at {entities.first}, not {len(self.entities)}")
         self.entities = np.concatenate([self.entities, entities.kind])
@@ -100,7 +100,7 @@ def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints
 
 
 def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
-    """Combine key columns into one integer with the same sort order. ``None`` means that this is impossible.
+    """Combine key columns into one integer column with the same order. ``None`` if they need too many bits.
 
     Parameters
     ----------

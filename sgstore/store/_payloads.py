@@ -1,4 +1,4 @@
-"""Sensor messages and events, each assigned to a frame.
+"""Assignment of sensor messages and events to frames.
 
 The tables hold the message of each channel at a frame, and its file position.
 """
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 _SAMPLE: Final = 8192
-"""Number of first messages used to estimate the period of a channel."""
+"""Number of first messages from which the period of a channel is estimated."""
 
 
 @dataclass(slots=True)
@@ -63,10 +63,10 @@ class Periods:
 
 
 FRAMES: Final = -1
-"""Channel number of the frames themselves in :class:`Periods`."""
+"""Number that stands for the frames in place of a channel number in :class:`Periods`."""
 
 _AT_ONCE: Final = 250_000
-"""Messages of a channel in memory at once."""
+"""Largest number of messages of a channel that are in memory at once."""
 
 _PLACE: Final = ("log_time_ns", "chunk_offset", "offset", "length")
 
@@ -162,7 +162,7 @@ def _own(
 def _chosen(
     frames: FrameTimes, messages: Iterable[Columns], allowed: int, *, nearest: bool
 ) -> Columns:
-    """Return the sensor message of each frame: the nearest or the latest by log time.
+    """Choose a sensor message for each frame: the nearest one or the latest earlier one by log time.
 
     Among messages of equal time, the last one in the file counts.
     """
@@ -192,7 +192,7 @@ def _none(count: int) -> Ints:
 
 
 def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
-    """Choose between two messages for each frame: the later or the earlier one by log time.
+    """Choose the later or the earlier of two messages for each frame, by log time and then by position.
 
     At equal times, the message with the later file position is chosen.
     """
@@ -252,7 +252,7 @@ def _no_payload(connection: DuckDBPyConnection, frame: FrameRef, channel: str) -
 
 
 MOST_WAITING: Final = 100_000
-"""Largest number of held-back events. Beyond it, they are assigned to the last frame so far."""
+"""Largest number of events that wait for their frame. Further events are assigned to the newest frame."""
 
 
 class Happenings:
@@ -292,7 +292,7 @@ class Happenings:
         return _columns(told, known[2][frame[~waits]])
 
     def rest(self) -> Columns:
-        """Return the rows of the store table ``event`` that remain after the last frame."""
+        """Assign all waiting events to the last frame, and return them as rows of the table ``event``."""
         events, self._waiting = self._waiting, []
         return _columns(events, self._last[2][np.zeros(len(events), np.intp)])
 

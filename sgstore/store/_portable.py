@@ -41,7 +41,7 @@ _ROWS: Final = {
     " FROM {table} x JOIN masks c USING (bucket)",
     "trace_id": "SELECT * FROM {table} WHERE trace_id IN (SELECT frame_id >> 24 FROM chosen)",
 }
-"""Column → rows of the chosen frames. The first column present in a table counts."""
+"""SQL of the rows to copy for the chosen frames, by key column. The first column that a table has is used."""
 
 
 def write_portable(
@@ -124,7 +124,7 @@ def _copy(connection: DuckDBPyConnection, frame_id: Ints) -> None:
 
 
 def _rewrite_views(connection: DuckDBPyConnection) -> None:
-    """Rewrite views for older versions of DuckDB, in which an enumeration and NULL together are text."""
+    """Rewrite the views of the copy for older DuckDB versions, which mix enumerations and NULL only as text."""
     for name in ("nodes", "world_nodes"):
         body = shape.expected().views[name]
         connection.execute(

@@ -71,7 +71,7 @@ SHARED: Final = {
     "config": ("config",),
     "map": ("map", "map_node", "map_edge", "map_reach", "map_place", "map_course"),
 }
-"""Tables with data shared by traces. Each row is stored once, by its digest."""
+"""Tables whose rows several traces can share. Each row is stored once, by its digest."""
 
 
 class PresentError(StoreError):
@@ -300,7 +300,7 @@ _OWNED: Final = {
     "bucket": "bucket >= $trace_id << 18 AND bucket < ($trace_id + 1) << 18",
     "frame_id": "frame_id >= $trace_id << 24 AND frame_id < ($trace_id + 1) << 24",
 }
-"""Column → SQL condition for the rows of a trace. The first column present in a table counts."""
+"""SQL condition for the rows of a trace, by key column. The first column that a table has is used."""
 
 ORPHANS: Final = "".join(
     f"DELETE FROM store.inside.{table} WHERE {owner}_id NOT IN"
@@ -312,7 +312,7 @@ ORPHANS: Final = "".join(
     f" (SELECT {owner}_id FROM store.inside.{owner});\n"
     for owner in (*SHARED, "trace")
 )
-"""SQL that deletes data without a trace."""
+"""SQL that deletes maps, settings and other shared rows that no trace uses."""
 
 
 def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, str]]:
@@ -369,7 +369,7 @@ def copy_sorted(connection: DuckDBPyConnection) -> None:
 
 
 STEP: Final = 64
-"""Buckets of rows in memory at once: 3,840 frames."""
+"""Number of frame buckets whose rows are in memory at once: 3,840 frames."""
 
 
 @contextmanager
@@ -454,7 +454,7 @@ def checksums(
 
 
 def _add(found: dict[int, Checksum], owner: Ints, hashes: Words) -> None:
-    """Add row hashes to the checksums of their owners. Rows of one owner often lie together."""
+    """Add row hashes to the checksums of their owners. It is fast if the rows of one owner are adjacent."""
     starts = np.flatnonzero(np.diff(owner, prepend=owner[:1] - 1))
     ids, place = np.unique(owner[starts], return_inverse=True)
     sums, counts = np.zeros(len(ids), np.uint64), np.zeros(len(ids), np.int64)

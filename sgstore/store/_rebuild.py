@@ -162,7 +162,7 @@ class Remains:
 
 
 def remains_in(connection: DuckDBPyConnection, database: str, path: Path) -> Remains:
-    """Return the traces, maps and derived sets that a rebuild needs, from a store that is already open."""
+    """Return the traces, maps and derived sets of an already open store, for its rebuild."""
     objects = shape.objects_of(connection, database)
     if shape.about_store(connection, database, objects) is None:
         raise StoreError(f"{path}: a DuckDB database, but not a store")
@@ -336,7 +336,7 @@ def compact(path: Path, access: Access, memory: int) -> None:
 
 
 _LISTED: Final = 100
-"""Number of listed objects that a rewrite would delete."""
+"""Largest number of object names in the error about objects that a rewrite would delete."""
 
 
 def settle(path: Path, access: Access, memory: int) -> None:

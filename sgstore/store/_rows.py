@@ -37,10 +37,10 @@ MAX_SQL: Final = 1 << 20
 """Longest statement of a user; characters."""
 
 _TO_A_TABLE: Final = re.compile(rf'Did you mean "{INSIDE}\.\w+"\?')
-"""Hint in DuckDB errors at an internal table. Users can query only the views."""
+"""Regular expression of a DuckDB hint to an internal table. Users can query only the views."""
 
 _READS: Final = {"SELECT", "EXPLAIN"}
-"""Types of statements that only read: WITH, FROM, VALUES, TABLE, DESCRIBE, SHOW and SUMMARIZE are SELECT."""
+"""Types of statements that only read. ``SELECT`` includes WITH, FROM, VALUES, TABLE, DESCRIBE and others."""
 
 
 _OTHER_WORDS: Final = {
@@ -50,7 +50,7 @@ _OTHER_WORDS: Final = {
     "to_csv": "csv",
     "to_parquet": "parquet",
 }
-"""Names of other libraries → the method of a result."""
+"""Method names of pandas, polars and others → name of the method of a query result."""
 
 
 class Tabular:
@@ -142,7 +142,7 @@ class Tabular:
         return polars.DataFrame([polars.Series(name, of, strict=False) for name, of in columns])
 
     def _by_values(self) -> Any:
-        """Return the result as an Arrow table with types from its Python values; ``None`` if impossible."""
+        """Return the result as an Arrow table with types from its Python values. ``None`` if impossible."""
         with suppress(MissingExtraError):
             package("pyarrow")
             table = self._table()
@@ -329,7 +329,7 @@ class Batches:
         self._single = [i for i, kind in enumerate(self.types) if kind == "FLOAT" and shortened]
 
     def _told(self, values: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """Convert float32 values in rows to the float64 values with the same shortest text."""
+        """Convert float32 values in rows to the float64 values with the same shortest decimal text."""
         if not self._single:
             return values
         columns = list(zip(*values, strict=True))
@@ -377,7 +377,7 @@ def arrays(
 
 
 def _columns(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[list[Any]]:
-    """Transpose rows to columns in batches, which keeps related values close in memory."""
+    """Transpose rows to columns. It works in batches to keep related values close in memory."""
     found: list[list[Any]] = [[] for _ in columns]
     rows = iter(rows)
     while batch := list(islice(rows, BATCH)):

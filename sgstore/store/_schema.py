@@ -54,7 +54,7 @@ TEXT: Final = (
     "1dd5ae585b258bb6ce8ca77ae469040829f80c6da68771f461419ac47af9c2af",
     "b97bda47e1fdf0a4a970985fd707ae4ee0fa509ef4d7056cbef17b61ee7f0bb5",
 )
-"""Digests of the text and of the statements of ``schema.sql``. Parsing the statements takes 10 ms."""
+"""Known digests: of the text of ``schema.sql``, and of its statements, whose parsing takes 10 ms."""
 
 
 @cache
@@ -115,7 +115,7 @@ _written: dict[str, Tokens] = {}
 
 
 BEFORE_TRACE: Final = "7535a0e47dd54aff42b430f36fcecb652340d281021f582733125e752a644a4c"
-"""Digest of the statements before ``nodes`` and ``edges`` had the column ``trace``.
+"""Digest of the older schema, in which ``nodes`` and ``edges`` have no column ``trace``.
 
 Such stores are read. The next write adds the column: see :func:`add_trace`.
 """
@@ -125,7 +125,7 @@ _TRACE: Final = re.compile(
     r" , (t \. name AS trace|n \. trace|t \. name(?= FROM))"
     r"| JOIN inside \. trace t ON t \. trace_id = [bf] \. trace_id(?= JOIN)"
 )
-"""Parts of the views for the column ``trace``."""
+"""Regular expression for the parts of the views that provide the column ``trace``."""
 
 
 def add_trace(connection: DuckDBPyConnection, database: str = "") -> None:
@@ -233,7 +233,7 @@ TOPIC_TYPES: Final[frozenset[str]] = frozenset(
         *("BIGINT", "UBIGINT", "FLOAT", "DOUBLE", "VARCHAR", "BLOB", "JSON"),
     )
 )
-"""Types of the columns of a topic."""
+"""Column types that tables of topics can have."""
 
 
 def topic_statements(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
@@ -250,7 +250,7 @@ def topic_statements(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
 
 
 def _plain_columns(words: Tokens) -> str:
-    """Return the columns of a CREATE TABLE statement; empty if one is more than a name and a plain type."""
+    """Return the columns of a CREATE TABLE statement. Empty if a column has more than a name and plain type."""
     *inner, end = words[4:] if words[-1] != ";" else words[4:-1]
     found: list[str] = []
     column: list[str] = []
@@ -268,7 +268,7 @@ def _plain_columns(words: Tokens) -> str:
 
 
 def _without_topics(objects: Objects) -> Objects:
-    """Return the objects of a store without its tables of topics, which a store may lack."""
+    """Return the objects of a store except its tables of topics, which are optional."""
     told = {
         (name, str(sql))
         for what, schema, name, sql in objects
@@ -378,14 +378,14 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 _MOST_COMPARED: Final = 64
 
 KNOWN: Final = "c1120163ae1e3e28cff199bb5cd2dcb4d0e6a712c280e3391c9b619a30691b79"
-"""Digest of a store's objects in DuckDB 2. A comparison of tokens takes 30 ms.
+"""Known digest of a valid store's objects in DuckDB 2. It avoids a comparison of tokens (30 ms).
 
 Objects of other versions are compared token by token.
 """
 
 
 KNOWN_BEFORE_TRACE: Final = "00fb0323a035b16d0080d34433e0e113b97fafec157fc98bc1b7cb7873778ca9"
-"""The same of a store without the column ``trace`` in ``nodes`` and ``edges``."""
+"""Known digest of a valid older store, in which ``nodes`` and ``edges`` have no column ``trace``."""
 
 
 def digest_of(objects: Objects) -> str:
@@ -518,7 +518,7 @@ def others(objects: Objects) -> list[str]:
 
 
 def unlisted(connection: DuckDBPyConnection, database: str) -> list[str]:
-    """Return user macros, sequences, types and empty schemas of a database, each with its sort."""
+    """Return user macros, sequences, types and empty schemas of a database, each as sort and name."""
     found = [("macro", name) for name in _names_in(connection, database, "functions", "function")]
     found += [
         ("sequence", name) for name in _names_in(connection, database, "sequences", "sequence")
@@ -692,7 +692,7 @@ BEYOND: Final = {
         "gap_repeated",
     )
 }
-"""Graph tables → tables of the data outside the graphs, with the same columns."""
+"""Graph tables → tables with the data outside the graphs. Both have the same columns."""
 
 _VIEWS_BEYOND: Final[Mapping[str, Mapping[str, str]]] = {
     "nodes": BEYOND,
@@ -701,7 +701,7 @@ _VIEWS_BEYOND: Final[Mapping[str, Mapping[str, str]]] = {
     "criticality": {"state": "known_state"},
     "lane_dists": {"lane_state": "known_lane_state"},
 }
-"""Views of graphs → replaced tables, which give the views with the data outside the graphs."""
+"""Views of graphs → replacements of tables that turn them into views of the data outside the graphs."""
 
 
 def _between(text: str, before: str, behind: str) -> str:
@@ -758,4 +758,4 @@ def with_types(words: Tokens, types: dict[str, Tokens]) -> Iterator[str]:
 
 
 SCHEMA_VERSION: Final = schema_version()
-"""Version of ``schema.sql``. A store of another version is rejected: it can be rebuilt from its traces."""
+"""Version of ``schema.sql``. Stores of other versions are rejected, but can be rebuilt from recordings."""

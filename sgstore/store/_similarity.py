@@ -169,11 +169,11 @@ class Example:
 
 
 BESIDE_S: Final = 5.0
-"""Frames of the same trace within this time are near the example, and similar for that reason; s."""
+"""Frames of the same trace within this time of the example are left out, as they are always similar; s."""
 
 
 def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
-    """Return the numbers of the first and last frame close in time to a given frame."""
+    """Return the numbers of the first and the last frame that are close in time to the given frame."""
     sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
     found = connection.execute(sql, [frame.trace_id, frame.t, BESIDE_S]).fetchone()
     return found or (0, -1)
@@ -222,7 +222,7 @@ class _Runs:
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """Similarity of all frames of a store to an example, each (N,); frame ids ascend.
+    """Similarity of every frame of a store to an example: arrays (N,), by ascending frame id.
 
     ``digest`` is equal for frames with equal features. ``same`` is as in :class:`_Runs`.
     """
@@ -234,7 +234,7 @@ class _Compared:
     same: NDArray[np.int8]
 
     def runs(self, trace_ids: Sequence[int], example_trace: int, beside: range) -> _Runs:
-        """Join consecutive frames with equal features. Leave out some frames of the example's trace."""
+        """Join consecutive frames with equal features. Leave out frames of the example's trace in a range."""
         trace_id = self.frame_id >> SEQ_BITS
         out = (trace_id == example_trace) & (self.seq >= beside.start) & (self.seq < beside.stop)
         differs = np.ones(len(trace_id), np.bool_)
@@ -293,7 +293,7 @@ def _compared(connection: DuckDBPyConnection, example: Example) -> _Compared:
 def _described(
     connection: DuckDBPyConnection, runs: _Runs, traces: Sequence[StoredTrace], example: Example
 ) -> Iterator[SimilarFrames]:
-    """Yield runs with their frames and with the features that they share with the example."""
+    """Yield the runs with their first and last frames and with the features shared with the example."""
     function, counts = abstraction_named(example.abstraction).function, Counter(example.features)
     features: dict[int, Counter[str]] = {}
     ids = np.sort(runs.frame_id)

@@ -48,26 +48,26 @@ if TYPE_CHECKING:
 
 
 PART_ROWS: Final = 20_000
-"""Rows of all growing tables in memory."""
+"""Largest number of rows in memory, for all growing tables together."""
 
 PIECE_ROWS: Final = 60_000
-"""Largest number of rows read and inserted at once."""
+"""Largest number of rows that are read and inserted at once."""
 
 MERGE_ROWS: Final = 1 << 19
-"""Number of rows at which partial masks are merged before their bucket is complete."""
+"""Number of rows at which incomplete masks are merged, before their bucket is complete."""
 
 _GROWING: Final = (
     *("state", "lane_single", "gap_single", "node", "edge", "frame_class", "lane_role"),
     *("world_state", "world_lane_single", "world_gap_single", "world_node", "world_edge"),
     *("later_class", "derived_node", "derived_edge", "derived_gap", "message"),
 )
-"""Tables that grow with a trace."""
+"""Tables whose size grows with the length of a trace."""
 
 _ALONG: Final = ("frame", "imported", "attribute")
-"""Tables that also grow, but do not count for the row limit."""
+"""Further growing tables, which do not count for the limit of rows in memory."""
 
 _CUT: Final = frozenset({*_GROWING, *_ALONG})
-"""All tables split into parts."""
+"""All tables whose rows are written in parts."""
 
 _RUNS: Final = {
     "node": "kind",
@@ -75,7 +75,7 @@ _RUNS: Final = {
     "derived_node": "moves",
     "derived_edge": "relation",
 }
-"""Tables whose partial masks may exceed memory → first sort column."""
+"""Tables whose merged masks may exceed the memory → column by which they are sorted first."""
 
 
 class StagedRows(NamedTuple):
@@ -157,7 +157,7 @@ class Staging:
         return np.array(found, np.int32)
 
     def _learn(self, enum: str, codes: NDArray[Any]) -> None:
-        """Collect the enumeration values in a column that ``schema.sql`` lacks."""
+        """Collect the enumeration values of a column that are not in ``schema.sql``."""
         own = len(own_labels(enum))
         if codes.max() < own:
             return
@@ -177,7 +177,7 @@ class Staging:
         return StagedRows(self._file.behind(0), dict(self.checksums), dict(self._new))
 
     def adopt(self, rows: StagedRows) -> None:
-        """Add table rows that another trace has already written. This must precede all other rows."""
+        """Add the rows that another trace has already written. Call this before all other rows."""
         self._file.adopt(rows.pieces)
         self.checksums.update(rows.checksums)
         self._new.update({enum: [*names] for enum, names in rows.words.items()})
@@ -191,7 +191,7 @@ class Staging:
             first += rows
 
     def settle(self, *, whole: bool) -> None:
-        """Write large tables to the file to free memory. Called between blocks of frames.
+        """Write large tables to the file to free memory. Called between two blocks of frames.
 
         Parameters
         ----------

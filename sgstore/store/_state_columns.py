@@ -191,7 +191,7 @@ def _ids(trace_id: int, first: int, last: int) -> tuple[int, int]:
 
 
 def _typed(found: Mapping[str, NDArray[Any]], types: Mapping[str, Any]) -> Columns:
-    """Convert columns to given types. NULL becomes NaN or 0."""
+    """Convert columns to the given types. NULL becomes NaN or 0."""
     told: Columns = {}
     for name, values in found.items():
         type_ = np.dtype(types[name])

@@ -23,7 +23,7 @@ _KINDS: Final = {
 }
 
 _NO_NAME: Final = frozenset("?\\")
-"""Characters that DuckDB treats as the end of a path, or as a slash."""
+"""Characters in file names that DuckDB treats as the end of a path, or as a slash."""
 
 
 def refuse_special(path: Path) -> None:

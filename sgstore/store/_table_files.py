@@ -61,7 +61,7 @@ def _cell(value: Any) -> Any:
 
 
 ROW_GROUP: Final = 122_880
-"""Rows of a row group."""
+"""Number of rows in a row group of a Parquet file."""
 
 
 _TYPES: Final = ((bool, "BOOLEAN"), (int, "BIGINT"), ((int, float), "DOUBLE"))

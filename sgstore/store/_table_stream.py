@@ -1,4 +1,4 @@
-"""File with the rows of several tables, in pieces. A piece is a header line and the columns of some rows."""
+"""File with rows of several tables, in pieces: a header line, then the columns of a group of rows."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FILE: Final = "tables"
 _ALIGNED: Final = 8
 
 _HEAD: Final = 8
-"""Size of the length field of a header line; bytes."""
+"""Size of the length field before a header line; bytes."""
 
 _PLAIN: Final = frozenset({"|b1", "|i1", "<i2", "<i4", "<i8", "<f4", "<f8"})
 
@@ -130,11 +130,11 @@ class TableFile:
         return self._size
 
     def behind(self, at: int) -> bytes:
-        """Return the raw bytes of the file from an offset to the end."""
+        """Return the raw bytes of the file from an offset up to its end."""
         return self._bytes(at, self._size - at)
 
     def adopt(self, pieces: bytes) -> None:
-        """Append raw bytes of another file of tables. Only a new reader of the file lists their rows."""
+        """Append raw bytes from another file of tables. Only readers opened later see these rows."""
         self._write(pieces)
         self._size += len(pieces)
 

@@ -1,4 +1,4 @@
-"""Temporary SQL tables of rows from outside the store, which exist during one statement.
+"""Temporary SQL tables with rows from outside the store. They exist during one statement.
 
 Rows come block by block. DuckDB moves data beyond the memory limit to temporary files.
 """
@@ -59,7 +59,7 @@ def give(connection: DuckDBPyConnection, given: Iterable[Given]) -> None:
 
 
 _BLOCK: Final = ":block"
-"""Name of the registered rows during an insert. No user table has this name."""
+"""Name under which rows are registered in DuckDB during an insert. User tables cannot have this name."""
 
 
 def _insert(
@@ -83,11 +83,11 @@ _NUMBERS: Final[Mapping[str, tuple[str, object]]] = {
     "DOUBLE": ("fi", 0.0),
     "BOOLEAN": ("b", False),
 }
-"""Array kinds that DuckDB accepts for a type, with the stand-in for NULL."""
+"""Database types that DuckDB reads from arrays: type → allowed kinds of array, and the substitute for NULL."""
 
 
 def _arrays_of(block: Sequence[list[Any]], kinds: Sequence[str]) -> dict[str, Any] | None:
-    """Return columns as arrays, which DuckDB reads ten times faster. ``None`` means unsuitable values.
+    """Return columns as arrays, which DuckDB reads ten times faster. ``None`` if the values are not suitable.
 
     NaN is unsuitable, because it would become NULL.
     """

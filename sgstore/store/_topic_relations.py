@@ -1,4 +1,4 @@
-"""Views with the value of a topic at each frame, made for the statements that name them.
+"""SQL views with the value of a topic at each frame. They are created for statements that name them.
 
 The values are computed once per process and state of the store, and kept as Parquet files in the folder of user
 tables, because a query has one statement for each window of frames.

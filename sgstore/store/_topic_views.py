@@ -1,4 +1,4 @@
-"""Topics in SQL: views of their messages, and their values at frames.
+"""Topics in SQL: views with their messages, and their values at frames.
 
 Messages come from the tables of the store, and for traces without them from the recording: it is converted once
 per process to Parquet files in the folder of user tables, which store connections can read.
@@ -100,13 +100,13 @@ def _show(connection: DuckDBPyConnection, access: Access, facts: TopicFacts, top
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """Messages of a topic in one table of the store, or in files of one recording."""
+    """Messages of a topic, either in a table of the store or in files made from one recording."""
 
     table: str
     fields: Mapping[str, str]
 
     def rows(self, fields: Mapping[str, str]) -> str:
-        """Return SQL of the messages, with the same columns for all sources of a topic."""
+        """Return SQL that selects the messages. The columns are the same for all sources of a topic."""
         listed = [*map(quoted, KEYS)]
         for name, kind in fields.items():
             value = quoted(name) if name in self.fields else "NULL"
@@ -160,7 +160,7 @@ def _listed(connection: DuckDBPyConnection) -> Iterator[tuple[int, TopicFile]]:
 
 
 _converted: Final[dict[tuple[Any, ...], TopicFile]] = {}
-"""Topics of recordings that this process has converted to files."""
+"""Topics of recordings that this process has already converted to files, by key."""
 
 
 def _of_recording(
@@ -177,7 +177,7 @@ def _of_recording(
 
 
 def _once(key: tuple[Any, ...], convert: Callable[[Path], TopicFile]) -> _Source:
-    """Return the files of a topic. They are made in a new folder if this process has not made them before."""
+    """Return the converted files of a topic. The first call in a process creates them."""
     name = hashlib.sha256(repr(key).encode("utf-8", "replace")).hexdigest()[:16]
     folder = tables_folder() / "topics" / name
     file = _converted.get((folder, *key))
@@ -306,7 +306,7 @@ def topic_facts(connection: DuckDBPyConnection, access: Access) -> dict[str, Top
 
 
 def _fields(held: ref[Access], topic: str) -> Mapping[str, TopicField]:
-    """Return the fields of a topic: of its tables, and of the first recording without."""
+    """Return the fields of a topic: of the stored tables, and of one recording whose topic is not stored."""
     access = held()
     if access is None:
         raise StoreError("the store of these topics is closed")
@@ -385,7 +385,7 @@ def topic_values(
     rule: str = "last",
     tolerance_ns: int | None = None,
 ) -> str:
-    """Return SQL of the value of a field at each frame: frame_id, value. Frames without a value are left out.
+    """Return SQL that selects the value of a field at each frame: frame_id, value. Unknown values are left out.
 
     Parameters
     ----------
@@ -420,7 +420,7 @@ def topic_values(
 
 
 def values_text(topic: str, field: TopicField, rule: str, tolerance_ns: int | None) -> str:
-    """Return SQL as :func:`topic_values`, for a connection that has the view of the messages."""
+    """Return SQL that selects the value of a topic field at each frame, if the view of messages exists."""
     within = "" if tolerance_ns is None else f" <= {int(tolerance_ns)}"
     value = _value(field.name)
     if field.declared in {"FLOAT", "DOUBLE"}:

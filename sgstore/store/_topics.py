@@ -1,4 +1,4 @@
-"""Topics of recordings in a store: messages of chosen channels as columns, in tables of their own.
+"""Recorded topics in a store: the messages of selected channels, as tables with one column per field.
 
 The table ``topic`` lists the topics of each trace. The messages are in tables ``topic_…``, whose names are
 digests of the topic and its fields: tables of equal names have equal columns, in every store. All of them are
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 LISTING: Final = "topic"
 TOPIC_FILES: Final = "topic-*.parquet"
-"""Pattern of the names of files with messages in a folder."""
+"""Name pattern of the files with the messages of topics."""
 _LISTING: Final = (
     f'{LISTING}(trace_id BIGINT NOT NULL, topic VARCHAR NOT NULL, "table" VARCHAR NOT NULL,'
     " schema VARCHAR NOT NULL, encoding VARCHAR NOT NULL, fields JSON NOT NULL, messages BIGINT NOT NULL,"
@@ -54,7 +54,7 @@ KEYS: Final = {
     "log_time_ns": "BIGINT",
     "publish_time_ns": "BIGINT",
 }
-"""Columns of each table of messages, before those of the fields."""
+"""Columns that every table of messages has, before the columns of the fields."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +105,11 @@ class TopicFile:
 
 
 _FAR_NS: Final = 1 << 62
-"""Greatest distance of a message from its frame: 146 years; ns."""
+"""Largest time between a message and its frame: 146 years; ns."""
 
 
 class FrameClock:
-    """Times of the frames of a trace, to find the frame and the time of a message from its log time.
+    """Frame times of a trace. They map the log time of a message to its frame and its simulation time.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class FrameClock:
         return cls(*(np.ma.getdata(found[name]) for name in names.split(", ")))
 
     def columns(self, log_time_ns: Ints) -> dict[str, Ints]:
-        """Return the columns of a table of messages that follow from log times."""
+        """Return the table columns that follow from log times: frame, run of the clock, and time."""
         at = np.maximum(np.searchsorted(self.log, log_time_ns, side="right") - 1, 0)
         past = log_time_ns - self.log[at]
         rate = np.where(past >= 0, self._rate[at], 1.0)
@@ -156,7 +156,7 @@ def topic_scratch(spill: Path) -> DuckDBPyConnection:
 
 
 MEMORY: Final = 256 << 20
-"""Memory limit of the database that writes messages; bytes."""
+"""Memory limit of the database that writes the messages of topics; bytes."""
 
 
 class TopicWriter:
@@ -272,7 +272,7 @@ def _value(name: str, declared: str, values: Any, arrays: dict[str, Any]) -> str
 
 
 def topic_tables(connection: DuckDBPyConnection, database: str) -> dict[str, str]:
-    """Return the tables of topics in an attached store: name → statement that creates it, without its place."""
+    """Return the tables of topics in an attached store: name → CREATE statement without the schema name."""
     rows = connection.execute(
         "SELECT table_name, sql FROM system.main.duckdb_tables()"
         " WHERE database_name = $1 AND schema_name = $2 AND starts_with(table_name, $3)",
@@ -284,7 +284,7 @@ def topic_tables(connection: DuckDBPyConnection, database: str) -> dict[str, str
 def copy_topic_tables(
     connection: DuckDBPyConnection, sources: Iterable[str], to: str
 ) -> dict[str, list[str]]:
-    """Create the empty tables of topics of some attached stores in another one.
+    """Create empty tables of topics in a database, for all topics of some attached stores.
 
     Returns
     -------
@@ -317,7 +317,7 @@ def publish_topics(connection: DuckDBPyConnection, sealed: Sealed) -> list[str]:
 
 
 def drop_topic_tables(connection: DuckDBPyConnection) -> None:
-    """Delete the tables of topics without messages of any trace from the attached store."""
+    """Delete tables of topics from the attached store if no trace has messages in them."""
     tables = topic_tables(connection, "store")
     used = {LISTING}
     if LISTING in tables:

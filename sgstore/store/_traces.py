@@ -91,7 +91,7 @@ class Identity:
 
     @property
     def shared(self) -> dict[str, str]:
-        """Digests of the recording, settings and map of a trace, by table. Traces can share these rows."""
+        """Digests of the rows that several traces can share: table (recording, config, map) → digest."""
         found = {"recording": self.digest, "config": self.settings_digest}
         return found | ({"map": self.map_digest} if self.map_digest else {})
 
@@ -101,7 +101,7 @@ class Identity:
         return {f"{table}_id": id_of(digest) for table, digest in self.shared.items()}
 
     def request(self, text: str) -> str:
-        """Return a digest of the request that the trace answers, with its settings and map.
+        """Return a digest of an ingest request together with the settings and the map of the trace.
 
         The report of the trace keeps it. Without a text, it is empty.
         """
@@ -123,7 +123,7 @@ class Identity:
 
     @staticmethod
     def among(known: Mapping[str, int], ref: str) -> tuple[int, str]:
-        """Find a trace by name, id or unique name prefix, among given names and ids. Return (id, name)."""
+        """Find a trace among given names and ids, by name, id or unique name prefix. Return (id, name)."""
         if ref in known:
             return known[ref], ref
         found = [name for name, trace_id in known.items() if str(trace_id) == ref]
@@ -214,7 +214,7 @@ class StoredTrace:
 
     @property
     def seconds(self) -> float:
-        """Duration of the trace; s. Never negative, also if the clock runs backwards."""
+        """Duration of the trace; s. It is never negative, even if the clock runs backwards."""
         return covered_s(self.start_ns, self.end_ns, self.frames, self.period_ns)
 
     def __repr__(self) -> str:
@@ -269,7 +269,7 @@ FROM trace t JOIN recording r ON r.recording_id = t.recording_id JOIN config c O
 
 
 ROOT: Final = "SGSTORE_ROOT"
-"""Environment variable with the first folder to search for recordings."""
+"""Environment variable for the folder in which recordings are searched first."""
 
 
 def uri_of(path: Path) -> str:
@@ -278,7 +278,7 @@ def uri_of(path: Path) -> str:
 
 
 def place_below(store: Path, path: Path) -> str:
-    """Return the path of a recording relative to the store's folder. It is empty for a path outside."""
+    """Return the path of a recording relative to the store's folder, or an empty text for a path outside."""
     if url_named(path) is not None:
         return ""
     with suppress(ValueError):
@@ -289,7 +289,7 @@ def place_below(store: Path, path: Path) -> str:
 def located(
     uri: str, place: str | None, size: int, store: Path | None, root: str | Path | None = None
 ) -> Path:
-    """Return the current path of a stored recording: below a root, below the store's folder, or as before.
+    """Return the current path of a stored recording: below a root, below the store's folder, or unchanged.
 
     Parameters
     ----------
@@ -325,7 +325,7 @@ def located(
 
 
 _seen: Final[set[tuple[str, int, int]]] = set()
-"""Path, size and modification time of recordings that have been checked."""
+"""Path, size and modification time of the recordings that this process has already checked."""
 
 
 def unchanged(path: Path, size: int, mtime_ns: int, digest: str) -> Path:
@@ -380,7 +380,7 @@ def _object(text: str) -> dict[str, Any]:
 def stored_name(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
-    """Return the stored name of a trace, whatever its settings. ``None`` means not stored.
+    """Return the stored name of a trace, regardless of its settings. ``None`` if it is not stored.
 
     Raises
     ------
@@ -411,7 +411,7 @@ def _request_digest(text: str, settings_digest: str, map_digest: str) -> str:
 def trace_of_request(
     connection: DuckDBPyConnection, digest: str, text: str
 ) -> tuple[str, str, int, dict[str, Any]] | None:
-    """Return name, ego, frames and report of the trace of a recording that was read by an equal request.
+    """Return name, ego, frames and report of the trace that an equal ingest request of a recording produced.
 
     A trace whose settings or map have changed since then does not count. ``None`` means no such trace.
     """
@@ -430,7 +430,7 @@ def trace_of_request(
 def already_stored(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
-    """Return the stored name of a trace with the same settings and map. ``None`` means not stored.
+    """Return the stored name of a trace with equal settings and map. ``None`` if it is not stored.
 
     Raises
     ------

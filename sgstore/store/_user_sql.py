@@ -34,13 +34,13 @@ MAX_SQL: Final = 1 << 20
 """Largest length of a user's SQL statement; characters."""
 
 _TO_A_TABLE: Final = re.compile(rf'Did you mean "{INSIDE}\.\w+"\?')
-"""DuckDB suggests internal tables, which users cannot read."""
+"""Regular expression of a DuckDB hint to an internal table, which users cannot read."""
 
 _READS: Final = {"SELECT", "EXPLAIN"}
-"""Statement types that only read, as named by DuckDB."""
+"""DuckDB types of statements that only read."""
 
 UserTablesGiven = Callable[[], Iterable[Given]]
-"""Function that returns the temporary tables of a user's statement. Called while the store is open."""
+"""Function that returns the temporary tables of a user's statement. It is called with the store open."""
 
 
 class UserSql:
@@ -127,7 +127,7 @@ class UserSql:
 
     @contextmanager
     def _answered(self, step: Callable[[DuckDBPyConnection, str], T]) -> Generator[T]:
-        """Yield the result of a step, a function of a connection and a statement with the rows of this one."""
+        """Run a function with a connection and the SQL statement, and yield its result."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
             if re.search(r"(?i)\btrace\b", self.sql) and _lacks_trace(connection):
@@ -255,7 +255,7 @@ def _check(connection: DuckDBPyConnection, sql: str) -> None:
 
 
 def _lacks_trace(connection: DuckDBPyConnection) -> bool:
-    """True if a store is older than the column ``trace`` of the views ``nodes`` and ``edges``."""
+    """True if the store is so old that the views ``nodes`` and ``edges`` have no column ``trace``."""
     sql = f"SELECT 1 FROM {INSIDE}.store_info WHERE key = 'schema_digest' AND value = $1"
     return bool(connection.execute(sql, [BEFORE_TRACE]).fetchall())
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 _MEMORY: Final = 1 << 29
-"""Memory limit of the database; bytes. All of the file is read once, so a larger cache has no use."""
+"""Memory limit of the database; bytes. A larger cache has no use, because the file is read only once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +253,7 @@ _ROWS_TOGETHER: Final = 500_000
 
 
 def _cuts(traces: Mapping[int, StoredTrace], published: _Published, table: str) -> Iterator[int]:
-    """Yield buckets that split the rows of a table into ranges that fit into memory."""
+    """Yield bucket numbers that divide the rows of a table into ranges that fit into memory."""
     together = 0
     for trace_id, trace in sorted(traces.items()):
         rows = published.get(("trace", trace_id), {}).get(table, Checksum()).rows

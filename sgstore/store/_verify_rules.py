@@ -1,4 +1,4 @@
-"""Rules that the rows of a store obey, as SQL that finds the faulty traces.
+"""Rules that valid rows of a store satisfy, as SQL that returns the traces with invalid rows.
 
 They cover bit masks of frames, numbers of frames, and references between rows and to the road map.
 """
@@ -204,4 +204,4 @@ RULES: Final[tuple[tuple[str, str, str], ...]] = (
         WHERE n.kind IS DISTINCT FROM 'lane'""",
     ),
 )
-"""Check name, fault text, and the SQL that returns the ids of faulty traces."""
+"""Rules: name of the check, text of the fault, and SQL that returns the ids of the invalid traces."""

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class OnMap:
-    """Data that the traces on one road map share: frame classes, and the table rows of the map.
+    """Data that all traces on one road map share: the cache of frame classes, and the table rows of the map.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class OnMap:
 
 
 _ROWS: Final[WeakKeyDictionary[RoadMap, StagedRows]] = WeakKeyDictionary()
-"""Cached table rows of each road map. An entry lives as long as its map."""
+"""Cached table rows of road maps. An entry is removed together with its map."""
 
 
 class Segment:
@@ -143,7 +143,7 @@ class Segment:
         self._staging.close()
 
     def as_kept(self, frames: FrameBlock) -> FrameBlock:
-        """Return a block of frames with values rounded to the precision of the store.
+        """Return a block of frames with all values rounded to the precision of the store.
 
         Positions are float32 relative to an origin; other values are float32. The generator uses these rounded
         values, so the store can reproduce its graphs exactly.
@@ -337,7 +337,7 @@ class Segment:
         self._staging.write("payload")
 
     def _bucket_columns(self, time_ns: Ints, period_ns: int) -> Columns:
-        """Return rows for each 64 frames: bit masks of the frames, and of those without a time gap before."""
+        """Return one row for each 64 frames: a mask of the frames, and a mask of those without a gap before."""
         seq = np.arange(len(time_ns))
         one = np.left_shift(1, seq % BUCKET_FRAMES)
         step = np.diff(time_ns, prepend=time_ns[0])
@@ -432,7 +432,7 @@ class Segment:
 
 
 def _period_ns(time_ns: Ints) -> int:
-    """Return the median time between frames (the lower of two medians); ns. One frame gives 0."""
+    """Return the median time between frames (of two middle values, the smaller); ns. One frame gives 0."""
     steps = np.sort(np.diff(time_ns))
     return int(steps[(len(steps) - 1) // 2]) if len(steps) else 0
 
