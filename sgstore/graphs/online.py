@@ -76,7 +76,7 @@ _LIGHT: Final = 1
 NUMBERS: Final = (*POSE, *INPUTS)
 _TEXTS: Final = ("ident", "special", "subkind", "type_name", "map_ref", "trailer")
 WHOLE: Final = ("lights", "light_state", "derived")
-"""Columns of :attr:`Entity.numbers` and :attr:`Entity.whole`, named as in ``States``."""
+"""Names of the integer values of an entity, as in ``States``."""
 _ANGLES: Final = {"heading", "pitch", "roll", "yaw_rate"}
 
 
@@ -101,11 +101,11 @@ class Entity(NamedTuple):
 
     @property
     def constants(self) -> tuple[int, str, str]:
-        """Attributes that must stay the same while the object exists."""
+        """Attributes (kind and names) that must stay the same while the object exists."""
         return self.kind, self.special, self.subkind
 
     def meant(self, told: TypeMeaning | None) -> Entity:
-        """Return the object with the kind from the type mapping; unchanged without a mapping."""
+        """Return the object with its kind replaced by the type mapping. Without a mapping it is unchanged."""
         if told is None:
             return self
         kind = KIND_CODE[told.kind]
@@ -164,7 +164,7 @@ class Frame:
         return len(self.entities)
 
     def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
-        """Return the frame with the kinds of its objects replaced as in the type mapping of the settings.
+        """Return the frame with the kinds of its objects replaced by the type mapping of the settings.
 
         Examples
         --------
@@ -405,7 +405,7 @@ class Frame:
         return frame
 
     def _plausible(self, ident: str, pose: tuple[float, ...]) -> tuple[float, ...]:
-        """Return pose and motion values without implausible ones, which are reported as lost.
+        """Return pose and motion values with implausible values removed. Removed values are reported as losses.
 
         An unknown position is reported, too, because the graph then lacks the entity.
         """
@@ -454,7 +454,7 @@ def _one_of(what: str, name: str, known: Sequence[str]) -> str:
 
 
 def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iterator[Frame]:
-    """Yield the frames of a recording in order, each with its events, for the online generator.
+    """Yield the frames of a recording in order, with their events, as input of the online generator.
 
     Parameters
     ----------
@@ -488,7 +488,7 @@ def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iter
 
 
 def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
-    """Add events to a frame, and their kinds to the known kinds. Return the frame."""
+    """Return a frame with its events added. Also add the kinds of these events to ``known``."""
     frame.events += [(event.kind, event.ident, event.other) for event in events]
     known.update(kind for kind, _, _ in frame.events)
     frame.recorded = frozenset(known)
@@ -507,7 +507,7 @@ class Replay:
         self._trailers: list[str] = []
 
     def frames(self, block: FrameBlock) -> Iterator[Frame]:
-        """Yield the frames of the next block of a recording, with unchanged values."""
+        """Yield the frames of the next block of a recording. Their values are unchanged."""
         new = block.entities
         columns = (new.ident, new.kind.tolist(), new.special, new.subkind, new.type_name)
         columns = (*columns, new.static.tolist(), new.map_ref)
@@ -558,7 +558,7 @@ TRACE: Final = "online"
 _BOX: Final = ("x", "y", "z", "length", "width", "height")
 _MOTION: Final = ("vx", "vy", "vz", "ax", "ay", "az")
 _STILL: Final = dict.fromkeys(("speed", "vx", "vy", "vz"), 0.0)
-"""Velocity of static entities."""
+"""Velocities of static entities: all zero."""
 _DERIVED: Final = ("derived_velocity", "derived_acceleration", "derived_yaw_rate")
 _MAP_TEXTS: Final = ("name", "lane_type", "road", "junction", "turn")
 _MAP_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
@@ -609,7 +609,7 @@ class Records:
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:
-        """Store the attributes of a static object, because its pose is given only once."""
+        """Keep the attributes of a static object, because the recording gives its pose only once."""
         numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
         numbers["heading"] = float(np.degrees(wrapped(states.heading[row])))
         about = known.attributes(is_ego=False, is_static=True)
@@ -649,7 +649,7 @@ class Records:
         outer: Ints,
         known: dict[int, EntityConstants],
     ) -> SceneGraph:
-        """Return one scene graph from the graph of a frame and, if given, the objects around it."""
+        """Return the scene graph of one frame, optionally with the objects around it."""
         frames = graph.frames
         states = chained([part.frames.states for part in parts])
         presence = chained([part.presence for part in parts])
@@ -782,7 +782,7 @@ def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attribut
 
 
 def _outward(nodes: Whole, outer: Ints) -> Ints:
-    """Convert node ids of a block to the node ids of the returned scene graphs."""
+    """Convert the node ids of a block to the ids in the returned scene graphs."""
     return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
 
 
@@ -797,10 +797,10 @@ def _numbers(values: dict[str, float]) -> Attributes:
 # entities; if it returns, it is a new entity.
 
 REMEMBERED: Final = 20_000
-"""Absent entities that are still known by their ids; about 5 MB."""
+"""Largest number of absent entities whose ids stay known; about 5 MB."""
 
 SPARE: Final = 2048
-"""Absent entities that are allowed before a generator is replaced."""
+"""Number of absent entities above which a new generator replaces the current one."""
 
 
 class Generator(Protocol):
@@ -920,7 +920,7 @@ class Stepper:
         return self._moving[ident].last.entity.node if ident in self._moving else None
 
     def _met(self, frame: Frame) -> tuple[list[Entity], list[Entity]]:
-        """Return the moving objects of a frame, and its new static objects.
+        """Return the moving objects of a frame, and its new static objects, with node ids assigned.
 
         All checks come first: a rejected frame changes nothing.
         """
@@ -1057,7 +1057,7 @@ class GcPaused:
 
 
 def entities_of(first: int, new: list[Entity]) -> Entities:
-    """Return the table of new entities. ``first``: number of the first one."""
+    """Return the table of new entities. ``first`` is the number of the first of them."""
     names = ("ident", "special", "subkind", "type_name", "map_ref", "trailer")
     return Entities(
         first=first,

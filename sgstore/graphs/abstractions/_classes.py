@@ -1,4 +1,4 @@
-"""Classes of labelled graphs: two isomorphic graphs have the same class identifier (canonical form).
+"""Classes of labelled graphs. Isomorphic graphs have the same class, computed from a canonical form.
 
 The search finds an order of the nodes that depends on the graph only, even if colours do not
 distinguish all nodes.
@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 
 
 Arcs = dict[int, dict[int, int]]
-"""Node → node → number of the label of the edge between them."""
+"""Edges of a graph: source node → destination node → label number."""
 
 Form = tuple[object, ...]
 
 _DEEPEST: Final = 150
-"""Greatest depth of nested individualised nodes."""
+"""Largest depth of the recursive search for a canonical order."""
 
 
 class TooSymmetricError(Exception):
@@ -90,7 +90,7 @@ class SymmetrySearch:
             return None
 
     def _canonical(self, arcs: Arcs, colour: dict[int, int]) -> list[int]:
-        """Return the canonical node order of a graph: refine colours, order each component."""
+        """Return the canonical node order of a graph. Colours are refined and components ordered one by one."""
         colour = self._refined(arcs, colour)
         sizes = Counter(colour.values())
         alone = sorted((n for n in colour if sizes[colour[n]] == 1), key=colour.__getitem__)
@@ -164,7 +164,7 @@ class SymmetrySearch:
 
 
 def _telling(arcs: Arcs, colour: dict[int, int], sizes: Counter[int]) -> Arcs:
-    """Return the edges of a graph that distinguish nodes of the same colour."""
+    """Return only the edges of a graph that can distinguish nodes of equal colour."""
     many = Counter(
         (colour[src], label, colour[dst]) for src, to in arcs.items() for dst, label in to.items()
     )
@@ -206,7 +206,7 @@ def _components_of_graph(arcs: Arcs) -> list[Arcs]:
 
 
 def _form(arcs: Arcs, colour: dict[int, int], order: Sequence[int]) -> Form:
-    """Return a graph as its ordered node colours, and its edges by positions in this order."""
+    """Return a graph as the colours of its nodes in the given order, and its edges by position in the order."""
     place = {node: i for i, node in enumerate(order)}
     edges = sorted(
         (place[src], place[dst], label) for src, to in arcs.items() for dst, label in to.items()
@@ -237,17 +237,17 @@ def _root(orbit: dict[int, int], node: int) -> int:
 Words = NDArray[np.uint64]
 
 WORK: Final = 5_000_000
-"""Greatest number of visited edges for the order of one graph: some seconds."""
+"""Largest number of edge visits to find the order of one graph. It takes some seconds."""
 
 REMEMBERED: Final = 8192
-"""Number of graphs with cached classes."""
+"""Number of graphs whose classes are cached."""
 
 _A: Final = np.uint64(0x9E3779B97F4A7C15)
 _B: Final = np.uint64(0xBF58476D1CE4E5B9)
 _C: Final = np.uint64(0x94D049BB133111EB)
 _D: Final = np.uint64(0xD6E8FEB86659FD93)
 _SHIFT: Final = np.uint64(32)
-"""Constants of SplitMix64 and of Mulvey's rrmxmx: odd, with mixed bits."""
+"""Constants of the hash functions SplitMix64 and Mulvey's rrmxmx."""
 
 _EDGE: Final = np.dtype([("src", "<u4"), ("dst", "<u4"), ("low", "<u8"), ("high", "<u8")])
 
@@ -313,7 +313,7 @@ def contents_of(seen: GraphColumns) -> list[bytes]:
 
 
 def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
-    """Add hash values of table rows to the hash sums of their frames."""
+    """Hash table rows, and add the hashes to the sums of their frames."""
     if not len(frame):
         return
     words = np.full(len(frame), sort, np.uint64)
@@ -386,7 +386,7 @@ class _Block:
         return replace(chained(moved), graphs=int(graphs[-1]))
 
     def contents(self) -> list[bytes]:
-        """Return a 128-bit hash per graph, equal for graphs with equal nodes, edges and labels."""
+        """Return a 128-bit hash of each graph. Graphs with equal nodes, edges and labels have equal hashes."""
         of_node = _mixed(self.node.view(np.uint64) * _A + self.node_low)
         src, dst = self.node[self.src].view(np.uint64), self.node[self.dst].view(np.uint64)
         of_edge = _mixed(_mixed(src * _B + self.low) + dst * _C)
@@ -437,7 +437,7 @@ def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
 
 
 def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
-    """Return hash words of edge labels and of sets of labels."""
+    """Return the hash words of edge labels, followed by those of label sets."""
     words = _mixed(words)
     several = bundles[::-1]
     flat = np.array([label for bundle in several for label in bundle], np.int64)
@@ -455,7 +455,7 @@ def _mixed(words: Words) -> Words:
 
 
 def _sums(owner: Ints, values: Words, count: int) -> Words:
-    """Return sums of hash words (modulo 2⁶⁴) for each graph or node."""
+    """Return the sum (modulo 2⁶⁴) of the hash words of each owner, a graph or a node."""
     total = np.zeros(count, np.uint64)
     if len(owner):
         starts = np.flatnonzero(begins(owner))
@@ -524,7 +524,7 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
 
 
 def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
-    """Return a component number for each node, by the edges that distinguish equal colours."""
+    """Return the component of each node. Components are joined by edges that distinguish equal colours."""
     src, dst = block.src, block.dst
     rows = np.flatnonzero((src != dst) & (size[cell[src]] > 1) & (size[cell[dst]] > 1))
     if not len(rows):
@@ -540,7 +540,7 @@ def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
 
 
 def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> Ints | None:
-    """Return the nodes of one graph in canonical order, by a search over nodes of equal colour."""
+    """Return the nodes of one graph in canonical order, or ``None`` if the search exceeds its limit."""
     first, last = np.searchsorted(block.edge_graph, [number, number + 1])
     src, dst = block.src[first:last], block.dst[first:last]
     low, high = block.low[first:last].tolist(), block.high[first:last].tolist()

@@ -38,13 +38,13 @@ if TYPE_CHECKING:
 Labels = NDArray[np.int32]
 
 Part = tuple[NDArray[Any], ...]
-"""Columns of nodes or of edges."""
+"""Columns of nodes or of edges, in a fixed order."""
 
 EGO: Final = "ego"
 """Label of the ego in every abstraction, as in the literature."""
 
 EGOS: Final = (EGO, "ego_car")
-"""Labels of the single ego node; they serve as its name."""
+"""Labels of the ego node. A node with such a label is named by the label alone."""
 
 _SMALL: Final = np.zeros(MOST_KINDS, np.bool_)
 _SMALL[[KIND_CODE[kind] for kind in SCENERY]] = True
@@ -55,7 +55,7 @@ _LANE: Final = KIND_CODE["lane"]
 
 @dataclass(frozen=True, eq=False)
 class MapColumns:
-    """Nodes and edges of a road map as columns. Row i has node id -1 - i.
+    """Nodes and edges of a road map as columns. The node in row i has the id -1 - i.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class MapColumns:
 
 
 _MAPS: Final[WeakKeyDictionary[RoadMap, MapColumns]] = WeakKeyDictionary()
-"""Cached columns of road maps; removed with the map."""
+"""Cached columns of road maps. An entry is removed together with its map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,7 @@ class GraphColumns:
         )
 
     def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
-        """Return map edges for each frame that contains both end nodes.
+        """Return the map edges of each frame that contains both of their nodes.
 
         Returns
         -------
@@ -239,7 +239,7 @@ class GraphColumns:
 
     @cached_property
     def pairs(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Pairs of traffic objects with a relation, once per frame, with all their relations as bits.
+        """Pairs of traffic objects with at least one relation: frame, two nodes, and the relations as bits.
 
         Returns
         -------
@@ -292,7 +292,7 @@ class GraphColumns:
 
 
 def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
-    """Return distinct keys in ascending order, and the bitwise OR of each key's bits."""
+    """Return the distinct keys in ascending order, and for each key the bitwise OR of its bits."""
     if bound <= _CELLS:
         sums = np.bincount(cell, weights=np.exp2(bit))
         cells = np.flatnonzero(sums)
@@ -331,10 +331,10 @@ def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
 
 
 _TABLE: Final = 1 << 18
-"""Greatest size of a look-up table, which is faster than a binary search."""
+"""Largest size of a look-up table. Up to this size it is faster than a binary search."""
 
 _CELLS: Final = 1 << 23
-"""Greatest number of ordered pairs that are counted in a table."""
+"""Largest number of possible pairs for which an array with one count per pair is used."""
 
 
 @dataclass(frozen=True)
@@ -511,4 +511,4 @@ class EgoLanes:
 
 
 LANES_OF: Final[WeakKeyDictionary[GraphColumns, EgoLanes]] = WeakKeyDictionary()
-"""Cached lanes of columns; removed with the columns."""
+"""Cached lanes, by the columns of the graphs. An entry is removed together with the columns."""

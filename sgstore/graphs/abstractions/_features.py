@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class GraphFeatures:
-    """Label counts of many graphs, one row per frame and feature (node label, or edge with end labels).
+    """Label counts of many graphs: one row for each frame and feature (node label, or edge with end labels).
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class GraphFeatures:
         return np.divide(shared, either, out=np.ones(self.frames), where=either > 0)
 
     def digests(self) -> NDArray[np.uint64]:
-        """Return a hash per frame, (frames,): equal for frames with equal label counts."""
+        """Return a hash of each frame, (frames,). Frames with equal label counts have equal hashes."""
         hashes = [blake2b(text.encode(), digest_size=8).digest() for text in self.texts]
         mixed = np.frombuffer(b"".join(hashes) or bytes(8), "<u8").astype(np.uint64)
         sums = np.zeros(self.frames, np.uint64)
@@ -116,7 +116,7 @@ def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
 
 
 def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
-    """Return labelled graphs in which the graphs of all frames not chosen are empty."""
+    """Return the labelled graphs with the graphs of all frames outside ``chosen`` emptied."""
     nodes, edges = chosen[graphs.node_frame], chosen[graphs.frame]
     return replace(
         graphs,
@@ -131,7 +131,7 @@ def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
 
 
 def _single(graphs: Labelled) -> tuple[Ints, Ints, Ints, Ints]:
-    """Return edges with one label per row: frame, source, label, destination."""
+    """Return one row for each label of each edge: frame, source, label, destination."""
     label = graphs.label.astype(np.int64)
     if not graphs.bundles:
         return graphs.frame, graphs.src, label, graphs.dst
@@ -170,6 +170,6 @@ def _ignored(label: str, names: list[str]) -> bool:
 
 
 _PLACES: Final = frozenset({"lane", "road", "junction", "crosswalk"})
-"""Words in labels of map parts, such as ``Left 1 of Ego Lane``."""
+"""Regular expression of labels of map parts, such as ``Left 1 of Ego Lane``."""
 
 _EXACT: Final = frozenset({"offroad"})

@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 
 OPPOSING: Final = 1 << 16
-"""Roles from here on: ``Opposing Lane 0``, ``1``, …"""
+"""First code of the roles of opposing lanes: ``Opposing Lane 0``, ``Opposing Lane 1``, …"""
 
 _MOST: Final = 1000
-"""Greatest number of named lanes on one side of the ego's lane."""
+"""Largest number of lanes with a role on each side of the ego's lane."""
 
 UNNAMED: Final = -(1 << 21)
-"""Role code for names without a role."""
+"""Code for a name that is not a lane role."""
 
 
 class Strands:
@@ -61,7 +61,7 @@ class Strands:
         self._roles: OrderedDict[int, dict[int, int]] = OrderedDict()
 
     def roles(self, ego: int) -> dict[int, int]:
-        """Return the role of each strand (chain of lanes).
+        """Return the role of each strand (chain of lanes) relative to the strand of the ego.
 
         The role is 0 for the ego's strand, n for the n-th on its left, and -n for the n-th on its
         right.
@@ -92,7 +92,7 @@ class Strands:
 
 
 _STRANDS: Final[WeakKeyDictionary[MapColumns, Strands]] = WeakKeyDictionary()
-"""Cached strands of maps; removed with the map."""
+"""Cached strands by map. An entry is removed together with its map."""
 
 
 def strands_of(grounds: MapColumns) -> Strands:
@@ -103,7 +103,7 @@ def strands_of(grounds: MapColumns) -> Strands:
 
 
 def _strands(grounds: MapColumns) -> Ints:
-    """Return the strand (chain of consecutive lanes) of each map node; 0 for other nodes."""
+    """Return the number of the strand (chain of consecutive lanes) of each map node; 0 for other nodes."""
     on = grounds.relation == RELATION_CODE["travelsTo"]
     src, dst = -1 - grounds.src[on], -1 - grounds.dst[on]
     driven = grounds.driving
@@ -138,7 +138,7 @@ _ROLES: Final = {
     "lane_left": 1,
     "lane_right": -1,
 }
-"""Lane names of S3C and CARLASGG, and of RoadScene2Vec, whose ego is always in the middle lane."""
+"""Names of lanes in S3C, CARLASGG and RoadScene2Vec. In the latter, the ego is always in the middle lane."""
 
 
 def _role_named(name: str) -> int:
@@ -152,10 +152,10 @@ def _role_named(name: str) -> int:
 
 
 OFF_ROAD: Final = -1
-"""Node id of the off-road node."""
+"""Node id of the node that stands for everything off the road."""
 
 NAMELESS: Final = -(1 << 20)
-"""Role of a lane without a known place relative to the ego."""
+"""Code for a lane whose place relative to the ego is unknown."""
 
 _IS_IN: Final = RELATION_CODE["isIn"]
 
@@ -223,7 +223,7 @@ def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
 
 
 def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints]:
-    """Return the role of each lane relative to the ego of the frame: (frame, lane strand, role)."""
+    """Return frame, strand of lanes, and role relative to the ego, for each strand in each frame."""
     frame, src, strand = inside
     ego = np.where(seen.ego_lane < 0, strands.of[-1 - seen.ego_lane], 0)
     present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
@@ -276,7 +276,7 @@ def _numbered(seen: GraphColumns, inside: Part, lanes: Part) -> Ints:
 
 
 def _from_ego(seen: GraphColumns) -> tuple[NDArray[np.float64], Bools]:
-    """Return the distance of each node from the ego (infinite if unknown), and a mask of frames with ego."""
+    """Return the distance of each node from the ego (infinite if unknown), and a mask of frames with an ego."""
     x, y = (np.full(seen.frames, np.nan) for _ in range(2))
     ego = np.flatnonzero(seen.is_ego)
     x[seen.node_frame[ego]], y[seen.node_frame[ego]] = seen.x[ego], seen.y[ego]

@@ -62,10 +62,10 @@ if TYPE_CHECKING:
 
 
 ROOT_ROAD: Final = -(1 << 40)
-"""Node number of ``Root Road``."""
+"""Node id of the node ``Root Road``."""
 
 _MAPS: Final = 4
-"""Number of maps with cached results."""
+"""Number of road maps whose results are cached."""
 
 _IS_IN: Final = RELATION_CODE["isIn"]
 _ON_ROADS: Final = np.zeros(MOST_RELATIONS, np.bool_)
@@ -100,7 +100,7 @@ def road_scene(seen: GraphColumns) -> Labelled:
 
 
 def related_scene(seen: GraphColumns) -> Labelled:
-    """Abstraction ``RSV_related``: ``RSV`` with the objects related to the ego, and the lanes with them."""
+    """Abstraction ``RSV_related``: ``RSV`` reduced to objects with a relation to the ego, and their lanes."""
     found = road_scene(replace(seen, **_rows(seen, _OF_NODES, _related_to_ego(seen))))
     inside = (found.src >= 0) & (found.dst < 0)
     used = np.unique(np.stack([found.frame[inside], found.dst[inside]]), axis=1)
@@ -114,7 +114,7 @@ def related_scene(seen: GraphColumns) -> Labelled:
 
 
 def _related_to_ego(seen: GraphColumns) -> Bools:
-    """Return a mask of the nodes without the objects that have no relation to the ego."""
+    """Return a mask of the nodes that are scenery, map parts, the ego, or objects with a relation to it."""
     ego = np.full(seen.frames, -1)
     ego[seen.node_frame[seen.is_ego]] = seen.node[seen.is_ego]
     frame, src, dst, _ = seen.pairs
@@ -126,7 +126,7 @@ def _related_to_ego(seen: GraphColumns) -> Bools:
 
 
 def _among(frame: Ints, node: Ints, wanted: set[tuple[int, int]]) -> Bools:
-    """Return a mask of the objects, and of the map parts that are in a set of (frame, node)."""
+    """Return a mask of all objects, and of the map parts whose (frame, node) is in a given set."""
     pairs = zip(frame.tolist(), node.tolist(), strict=True)
     return np.array([one[1] >= 0 or one in wanted for one in pairs], np.bool_)
 
@@ -141,7 +141,7 @@ _OF_NODES: Final = ("node_frame", "node", "kind", "is_ego", "x", "y", "z", "head
 
 
 def curved_scene(seen: GraphColumns) -> Labelled:
-    """Abstraction ``RSV_curvature``: ``RSV`` with the bend of the ego's lane in its name, ``Ego Lane@-2``.
+    """Abstraction ``RSV_curvature``: ``RSV`` with a curve class in the name of the ego's lane, ``Ego Lane@-2``.
 
     The number counts the thresholds :data:`BENDS` that the turn of the lane over 2 m exceeds; it is positive to
     the left. Without a known curvature, the name stays ``Ego Lane``.
@@ -167,13 +167,13 @@ def curved_scene(seen: GraphColumns) -> Labelled:
 
 
 def _bend(curvature: Floats) -> Ints:
-    """Return the number of exceeded thresholds of curvatures, positive to the left."""
+    """Return how many thresholds each curvature exceeds, positive for left curves."""
     turn = np.degrees(curvature * 2.0)
     return np.sign(turn).astype(np.int64) * np.searchsorted(BENDS, np.abs(turn), side="left")
 
 
 BENDS: Final = (1.0, 2.5, 5.0, 7.5, 10.0)
-"""Thresholds of the turn of a lane over 2 m, as in CARLASGG; degrees."""
+"""Thresholds for the change of direction of a lane over 2 m, as in CARLASGG; degrees."""
 
 
 def whole(seen: GraphColumns) -> Labelled:
@@ -196,7 +196,7 @@ def whole(seen: GraphColumns) -> Labelled:
 def _with_roles(
     seen: GraphColumns, grounds: MapColumns, label: Ints, first: int
 ) -> tuple[Ints, list[str]]:
-    """Return node labels. A lane whose name contains a role relative to the ego gets this role as label."""
+    """Return the node labels. A lane with a role relative to the ego in its name gets the role as label."""
     named = strands_of(grounds).named
     roles = np.unique(named[named != UNNAMED])
     if not len(roles):
@@ -242,7 +242,7 @@ def junction(seen: GraphColumns) -> Labelled:
 
 
 def _drawn(seen: GraphColumns, kept: Bools, columns: Part, whose: Ints | None) -> Part:
-    """Return edges between merged nodes (such as all sections of a lane), each edge once, without loops."""
+    """Return the edges between merged nodes (such as all sections of a lane), without duplicates and loops."""
     frame, relation, src, dst = columns
     a, b = seen.row_of(frame, src), seen.row_of(frame, dst)
     both = (a >= 0) & (b >= 0) & kept[a] & kept[b]
@@ -399,7 +399,7 @@ ACTORS: Final[Mapping[str, str]] = {
     "traffic_light": "light",
     **dict.fromkeys(("stop_sign", "yield_sign", "speed_limit", "sign"), "sign"),
 }
-"""Our kinds → its actors; it has no other kinds."""
+"""Kind of entity → actor type of roadscene2vec, which knows no other types."""
 
 PROXIMITY: Final = (
     ("near_coll", 4.0),
@@ -408,7 +408,7 @@ PROXIMITY: Final = (
     ("near", 16.0),
     ("visible", 25.0),
 )
-"""Names and thresholds; m, between centres in space."""
+"""Distance relations of roadscene2vec with their limits between centres in 3D; m."""
 
 DIRECTIONS: Final = (
     ("inDFrontOf", 0.0, 45.0),
@@ -416,10 +416,10 @@ DIRECTIONS: Final = (
     ("atSRearOf", 90.0, 135.0),
     ("atDRearOf", 135.0, 180.0),
 )
-"""Names and bins of the bearing, to both sides; degrees, both ends included."""
+"""Direction relations of roadscene2vec with their ranges of angles, both ends included; degrees."""
 
 LANE_THRESHOLD: Final = 6.0
-"""Half the width of the middle lane; m."""
+"""Half the width of the middle lane in roadscene2vec; m."""
 
 LANES: Final = ("Left Lane", "Middle Lane", "Right Lane")
 
@@ -462,7 +462,7 @@ def _all(rows: NDArray[np.signedinteger], label: str) -> NDArray[np.signedintege
 
 
 def _of_ego(seen: GraphColumns, rows: NDArray[np.signedinteger]) -> list[Part]:
-    """Return edges of objects with a known position: to one of three lanes, and to the ego."""
+    """Return the edges of objects with a known position: to one of three lanes, and to or from the ego."""
     ego = np.full(seen.frames, -1)
     own = np.flatnonzero(seen.is_ego)
     ego[seen.node_frame[own]] = own

@@ -43,7 +43,7 @@ ABSTRACTIONS: Final = tuple(
 """Built-in abstractions."""
 
 AT_INGEST: Final = ("E", "EL", "ER", "RSV", "junction")
-"""Abstractions whose classes every store has from ingest on."""
+"""Abstractions whose frame classes are computed at ingest, and therefore in every store."""
 
 _OWN: Final = {normalize_name(one.name): one for one in ABSTRACTIONS}
 _REGISTERED: dict[str, Abstraction] = {}

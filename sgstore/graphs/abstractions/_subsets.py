@@ -12,10 +12,10 @@ if TYPE_CHECKING:
 
 
 SCENERY: Final = ("building", "pole", "barrier", "vegetation")
-"""Kinds of entities that only ``SG`` has."""
+"""Kinds of scenery entities. Only the abstraction ``SG`` keeps them."""
 
 BETWEEN_ENTITIES: Final = (*PROXIMITY, *DIRECTIONS, "toLeftOf", "toRightOf")
-"""Relations among entities in the literature."""
+"""Relations between entities that the abstractions of the literature use."""
 
 OF_JUNCTION: Final = (
     *BETWEEN_ENTITIES,
@@ -60,4 +60,4 @@ SUBSETS: Final[Mapping[str, Subset]] = {
     "junction": Subset(_PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
     "SG": Subset(None),
 }
-"""In queries lanes keep their names and sections of the map."""
+"""Part of the scene graph that each such abstraction keeps. In queries, lanes keep their own names."""

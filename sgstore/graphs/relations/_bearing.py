@@ -40,17 +40,17 @@ if TYPE_CHECKING:
 
 
 NOISE: Final = 1e-6
-"""Bearings that differ by less count as equal: a millimetre at a kilometre; rad."""
+"""Largest difference of bearings that count as equal: a millimetre at a kilometre; rad."""
 
 BESIDE: Final = 1e-3
-"""A body closer to the axis is neither left nor right; m."""
+"""Distance from the lengthwise axis below which an object is neither left nor right; m."""
 
 
 TINY: Final = np.float32(1e-30)
-"""Distances below this underflow in 32 bits; m."""
+"""Smallest distance that 32-bit numbers can represent safely; m."""
 
 DOUBT: Final = 4e-6
-"""Directions this close to a bound are computed as bearings; greater than :data:`NOISE`; rad."""
+"""Distance from the limit of a sector within which the exact angle decides; greater than :data:`NOISE`; rad."""
 
 
 # Vector products decide sectors and sides quickly. If a product is within rounding of a bound, or a
@@ -128,7 +128,7 @@ def _sectors(
 
 
 def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows, Rows]:
-    """Return direction sectors of object pairs from exact angles. A pair on a limit can be in two sectors."""
+    """Return the direction relations of object pairs by exact angle. A pair on a limit can have two."""
     bearing = pairs.bearings(rows)
     known = ~np.isnan(bearing)
     rows, bearing = rows[known], bearing[known]
@@ -144,7 +144,7 @@ def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows
 
 
 def _behind(bearing: Floats) -> Bools:
-    """Return a mask of angles that CARLASGG puts into the rear sector at the sector's limit.
+    """Return a mask of the angles behind ±90°. At the limit itself, the right side counts, as in CARLASGG.
 
     CARLASGG tests its sectors in the order direct front, side front, direct rear, side rear; all of
     them include both bounds. Straight left is 180° in its count; straight right is 360°, not 0°.

@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 
 
 SURE: Final = 1e-4
-"""Separations farther from a bound need no exact gap; m."""
+"""Difference from the limit above which the quick test of a separation is certain; m."""
 
 PLAIN: Final = 1e8
-"""Positions and headings below this are exact enough for the quick test; m, rad."""
+"""Largest positions and headings for which the quick test is exact enough; m, rad."""
 
 
 def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:

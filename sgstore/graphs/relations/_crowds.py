@@ -29,7 +29,7 @@ NEAR: Final = "near"
 TOUCHING: Final = "touching"
 
 _WIDEST: Final = 1 << 20
-"""Positions beyond this cell of the plane share a cell."""
+"""Largest number of a grid cell. All positions beyond it share this cell."""
 
 
 def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Iterator[FrameBlock]:
@@ -71,7 +71,7 @@ def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Itera
 
 
 def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
-    """Return an upper bound for the number of near object pairs in each frame, (F,)."""
+    """Return an upper bound for the number of near object pairs of each frame, (F,)."""
     states = frames.states
     reach = max(config.pairs.within, 1.0)
     size = np.nan_to_num(np.hypot(states.length, states.width)[rows])

@@ -1,17 +1,18 @@
-"""Lanes that vehicles drive through junctions, chosen by path.
+"""Choice of the lane that a vehicle drives in a junction, by the cheapest path along connected lanes.
 
 Lanes of a junction overlap, so that one footprint fits several of them. The *driven lane* is on the
-cheapest way along ``travelsTo`` over all frames of a passage. A way costs its evidence (overlap,
-heading, offset) for each metre driven, and much more where its lanes are not linked.
+cheapest path along ``travelsTo`` over all frames of a *crossing*, the part of a drive near junctions. The
+cost of a path is its evidence (overlap, heading, offset) for each metre driven. It is much higher if the
+lanes of the path are not linked.
 
-In a recording, a passage is decided after its last frame: :meth:`DrivenLanes.chosen` holds blocks
-back until then. A passage of more than :data:`MOST_STATES` states of the recording is decided in
+In a recording, a crossing is decided after its last frame: :meth:`DrivenLanes.chosen` holds blocks
+back until then. A crossing of more than :data:`MOST_STATES` states of the recording is decided in
 parts, so that memory does not grow with time. Where blocks end does not matter. In online mode only
 the past counts (:meth:`DrivenLanes.now`): the costs so far make the choice stable.
 
 A choice is *unsure* if a lane that is not linked to it costs almost the same. In online mode later
 frames can reverse a choice. It is then unsure until the other ways have ended, and while another lane
-fits better. At equal costs the lower lane counts.
+fits better. At equal costs, the lane with the lower number is chosen.
 """
 
 from __future__ import annotations
@@ -42,40 +43,40 @@ if TYPE_CHECKING:
 
 
 MOST_STATES: Final = 1 << 17
-"""States of a recording, from the first to the last frame of a passage that is decided as a whole."""
+"""Number of states of a recording after which a crossing is decided in parts."""
 
 APART: Final = 3
-"""Frames without a vehicle near junctions that end its passage."""
+"""Number of frames away from all junctions after which a vehicle's crossing ends."""
 
 NEAR: Final = 3.0
-"""Greatest distance of a vehicle's centre from lanes of junctions in a passage; m."""
+"""Largest distance of a vehicle's centre from junction lanes during a crossing; m."""
 
 HOPS: Final = 3
-"""Links between lanes of successive frames: short lanes have no frame."""
+"""Largest number of lane links between two successive frames. A short lane may have no frame of its own."""
 
 SIDE: Final = 2.0
-"""Cost of a change to the lane beside: as of 2 m with the centre on the border."""
+"""Cost of a change to the neighbouring lane. It equals 2 m of driving with the centre on the border."""
 
 MISS: Final = 3.0
-"""Cost of a lane that the vehicle does not touch."""
+"""Cost of a lane that the vehicle does not touch, for each metre."""
 
 JUMP: Final = 100.0
-"""Cost of a change to a lane that is not linked."""
+"""Cost of a change to a lane without a link from the current lane."""
 
 SURE: Final = 0.3
-"""Difference of costs above which a choice is sure."""
+"""Difference of costs above which the choice of a lane is certain."""
 
 OPEN: Final = 60.0
-"""Difference of costs up to which later frames can still reverse a choice in online mode."""
+"""Online mode: difference of costs up to which later frames can still reverse the choice of a lane."""
 
 BESIDE: Final = 1.0
-"""The same difference for a lane beside the chosen one."""
+"""Online mode: the smaller difference of costs that applies to a neighbouring lane."""
 
 EQUAL: Final = 1e-3
-"""Difference of costs that is rounding."""
+"""Difference of costs that is only rounding."""
 
 LEAST: Final = 0.01
-"""Least weight of a frame: evidence of a vehicle that stands."""
+"""Smallest weight of a frame, used while a vehicle stands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,7 @@ class _Junctions:
         self.surface = road_map.surface_of(np.flatnonzero(self.lanes), NEAR)
 
     def toll(self, src: Ints, dst: Ints) -> Floats:
-        """Return the cost of driving from lane to lane between two frames."""
+        """Return the cost to get from one lane to another between two successive frames."""
         key = src * self._count + dst
         beside = np.where(_among(self._beside, key), SIDE, JUMP)
         return np.where(_among(self._linked, key), 0.0, beside)
@@ -216,7 +217,7 @@ class DrivenLanes:
     def _decided(
         self, junctions: _Junctions, block: FrameBlock | None
     ) -> Iterator[tuple[Ints, Ints]]:
-        """Decide the passages that are over. Yield rows of states and their lanes, as in ``States``.
+        """Decide the finished crossings. Yield rows of states, and their lanes as in ``States``.
 
         ``block`` is the last block so far; ``None`` means that the recording is over.
         """
@@ -236,10 +237,10 @@ class DrivenLanes:
             over = over[run - 1] & ~late
             again = bool(late.any())
             self._open = taken(of, ~over)
-            passages = _Passages(junctions, *_filled(taken(of, over), run[over]))
-            cost = passages.of.cost * passages.metres
-            cost = passages.onward(cost) + passages.back(cost) - cost
-            yield passages.chosen(cost, passages.apart(cost) & (passages.more(cost) < SURE))
+            crossings = _Crossings(junctions, *_filled(taken(of, over), run[over]))
+            cost = crossings.of.cost * crossings.metres
+            cost = crossings.onward(cost) + crossings.back(cost) - cost
+            yield crossings.chosen(cost, crossings.apart(cost) & (crossings.more(cost) < SURE))
 
     def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
         """Return the lanes that footprints of the last yielded block touch, as :class:`RoadMap` does."""
@@ -264,14 +265,14 @@ class DrivenLanes:
         found = self._candidates(self._junctions, block, node)
         recent = taken(self._open, self._open.seq >= int(block.seq[0]) - APART)
         of = _sorted([recent, found])
-        passages = _Passages(self._junctions, of, np.cumsum(begins(of.node), dtype=np.int64))
+        crossings = _Crossings(self._junctions, of, np.cumsum(begins(of.node), dtype=np.int64))
         here = of.row >= start
-        cost = passages.onward(np.where(here, of.cost * passages.metres, of.cost))
-        row, driven = passages.chosen(cost, passages.may_change(cost))
+        cost = crossings.onward(np.where(here, of.cost * crossings.metres, of.cost))
+        row, driven = crossings.chosen(cost, crossings.may_change(cost))
         lane = np.zeros(len(block.states), np.int64)
         lane[row[row >= start] - start] = driven[row >= start]
         over = ~here & np.isin(of.node, found.node)
-        self._open = taken(replace(of, cost=cost - passages.least(cost)), ~over)
+        self._open = taken(replace(of, cost=cost - crossings.least(cost)), ~over)
         self._asked.clear()
         return _with_lanes(block, lane)
 
@@ -309,7 +310,7 @@ class DrivenLanes:
 
 
 class _Lookups:
-    """Lanes below the footprints of a block, looked up for the choice and used again for the graphs."""
+    """Cache of the lanes below the footprints of a block, for the lane choice and for the graphs."""
 
     def __init__(self, road_map: RoadMap, box: Floats) -> None:
         self._map, self._box = road_map, box
@@ -339,7 +340,7 @@ class _Lookups:
 
 
 def _keys(box: Floats) -> Ints:
-    """Return a number for each footprint. Few footprints share a number."""
+    """Return a hash of each footprint."""
     return (box.view(np.int64) * _ODD).sum(axis=1)
 
 
@@ -352,7 +353,7 @@ def _sorted(tables: Sequence[_Candidates]) -> _Candidates:
 
 
 def _filled(of: _Candidates, run: Ints) -> tuple[_Candidates, Ints]:
-    """Add the lanes that a vehicle leaves and touches again in a passage, at a high cost."""
+    """Add the lanes that a vehicle leaves and touches again during a crossing, with a high cost."""
     new = begins(run, of.seq)
     frame, first = np.cumsum(new) - 1, np.flatnonzero(new)
     order = np.lexsort((frame, of.lane, run))
@@ -371,15 +372,15 @@ def _with_lanes(block: FrameBlock, lane: Ints) -> FrameBlock:
     return replace(block, states=replace(block.states, lane=lane))
 
 
-class _Passages:
-    """Passages of vehicles through junctions: candidates by passage, frame and lane.
+class _Crossings:
+    """Crossings of junctions by vehicles: candidate lanes, sorted by crossing, frame and lane.
 
     Parameters
     ----------
     junctions : _Junctions
     of : _Candidates
     run : (n,) int64
-        Number of the passage of each candidate, ascending.
+        Number of the crossing of each candidate, ascending.
     """
 
     def __init__(self, junctions: _Junctions, of: _Candidates, run: Ints) -> None:
@@ -400,19 +401,19 @@ class _Passages:
         self.metres = np.nan_to_num(metres, nan=LEAST)[self._frame]
 
     def onward(self, cost: Floats) -> Floats:
-        """Return the least cost of the ways from the start of a passage to each candidate."""
+        """Return the least cost of a path from the start of the crossing to each candidate lane."""
         return _summed(cost, self._step, self._src, self._dst, self._toll)
 
     def back(self, cost: Floats) -> Floats:
-        """Return the least cost of the ways from each candidate to the end of its passage."""
+        """Return the least cost of a path from each candidate lane to the end of the crossing."""
         return _summed(cost, -self._step, self._dst, self._src, self._toll)
 
     def least(self, cost: Floats) -> Floats:
-        """Return the least cost among the candidates of the same frame, for each candidate."""
+        """Return, for each candidate, the least cost among all candidates of its frame."""
         return np.minimum.reduceat(cost, self._first)[self._frame] if len(cost) else cost
 
     def more(self, cost: Floats) -> Floats:
-        """Return the cost of each candidate above the least of its frame."""
+        """Return how much each candidate costs more than the cheapest candidate of its frame."""
         return cost - self.least(cost)
 
     def best(self, cost: Floats) -> Ints:
@@ -421,18 +422,18 @@ class _Passages:
         return best[begins(self._frame[best])]
 
     def _toll_of(self, cost: Floats) -> Floats:
-        """Return the cost of a change between each candidate for traffic and the best one; 0 for others."""
+        """Return the cost of a change between each candidate lane and the best one; 0 without traffic."""
         lane, toll = self.of.lane, self._junctions.toll
         best = lane[self.best(cost)][self._frame]
         change = np.minimum(toll(lane, best), toll(best, lane))
         return np.where(self._junctions.traffic[lane] & (lane != best), change, 0.0)
 
     def apart(self, cost: Floats) -> Bools:
-        """Return a mask of the candidates that are not linked to the best one of their frame."""
+        """Return a mask of the candidate lanes that have no link with the best lane of their frame."""
         return self._toll_of(cost) == JUMP
 
     def may_change(self, cost: Floats) -> Bools:
-        """Return a mask of the candidates that later frames can prefer to the best one."""
+        """Return a mask of the candidate lanes that later frames may still prefer to the best lane."""
         toll, more, own = self._toll_of(cost), self.more(cost), self.of.cost
         fits = own < own[self.best(cost)][self._frame]
         return (toll == JUMP) & (fits | (more < OPEN)) | (toll == SIDE) & (fits | (more < BESIDE))
@@ -450,7 +451,7 @@ class _Passages:
 
 
 def _summed(cost: Floats, step: Ints, src: Rows, dst: Rows, toll: Floats) -> Floats:
-    """Return the cost of the cheapest chain of pairs that ends at each candidate, step by step."""
+    """Return the cost of the cheapest path that ends at each candidate, frame by frame."""
     total, order = cost.copy(), np.lexsort((dst, step[dst]))
     src, dst, toll = src[order], dst[order], toll[order]
     heads = np.flatnonzero(begins(dst))

@@ -1,4 +1,4 @@
-"""Range of a scene graph: the area around the ego, and the storey, in which objects become nodes.
+"""Range of a scene graph around the ego: an area and a storey. Objects inside become nodes.
 
 An area is a disc, the inside of a polygon in the ego's axes, or a strip along lines (the lanes
 ahead). An entity is in the area if its footprint touches it, or if its centre is in it, depending
@@ -31,20 +31,20 @@ if TYPE_CHECKING:
 
 
 TOUCH: Final = 1e-9
-"""Tolerance for touching the edge of an area: rounding; m."""
+"""Rounding tolerance for objects that touch the border of an area; m."""
 
 HANG: Final = 6.0
-"""Greatest height of signals above the ground of their storey; m. (Clearance over roads is 4.5 to 5.5 m.)"""
+"""Largest height of signals above the ground of their storey; m. The clearance over roads is 4.5 to 5.5 m."""
 
 STEP: Final = 2.0
-"""Distance between the points of a lane for its height; m."""
+"""Distance between the points of a lane whose heights are known; m."""
 MOST_POINTS: Final = 1_000_000
-"""Greatest number of these points per map; above 2,000 km of lanes their distance grows."""
+"""Largest number of such points in a map. With more than 2,000 km of lanes, their distance grows."""
 
 
 @dataclass(frozen=True, slots=True)
 class EgoPoses:
-    """Poses of the ego in F frames. NaN means a missing ego.
+    """Poses of the ego in F frames. NaN marks frames without an ego.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class Extent:
         return Outlines(settings, egos, np.array(corners))
 
     def _lines(self, egos: EgoPoses) -> tuple[Rows, Floats]:
-        """Return the line pieces of the ego's corridor (lanes ahead): frames, and ends (S, 2, 2)."""
+        """Return centre lines of the ego's corridor (the lanes ahead) in pieces: frame, and ends (S, 2, 2)."""
         length = self.settings.length
         there = np.flatnonzero(_exist(egos, turned=True))
         owner, ends = np.zeros(0, np.intp), np.zeros((0, 2, 2))
@@ -151,7 +151,7 @@ class Extent:
     def _lane_lines(
         self, road_map: RoadMap, centres: Centrelines, egos: EgoPoses, there: Rows
     ) -> tuple[Rows, Floats]:
-        """Return centre lines of the ego's lane and of the following lanes, as pieces."""
+        """Return the centre lines of the ego's lane and of the lanes after it, in pieces."""
         points = np.column_stack([egos.x[there], egos.y[there], np.zeros((len(there), 3))])
         points[:, 2] = egos.heading[there]
         hits = road_map.lanes_of(points, egos.ground[there])
@@ -205,7 +205,7 @@ class Areas:
         self.exist = _exist(egos, turned=turned)
 
     def near(self, x: Floats, y: Floats, extent: Floats) -> tuple[Rows, Rows]:
-        """Return pairs of a frame and an object that may be inside the area: a fast first test.
+        """Return pairs (frame, object) that may be inside the area. This is a fast test with false positives.
 
         Parameters
         ----------
@@ -298,7 +298,7 @@ class Areas:
         return ~off | (np.abs(rise) < self.settings.grade * away) | ~self.exist[frame]
 
     def _keep_storey(self, road_map: RoadMap, heights: LaneHeights, inside: Bools) -> None:
-        """Return a mask of map nodes without those on other storeys than the ego.
+        """Remove the map nodes on other storeys than the ego from a mask.
 
         A lane is on the storey if one of its points within reach is. If no point is within reach,
         the nearest point counts.
@@ -456,7 +456,7 @@ def _as_boxes(ends: Floats) -> Floats:
 
 
 def _pieces(road_map: RoadMap, lane: Ints, begin: Floats, end: Floats) -> tuple[Rows, Floats]:
-    """Return the straight pieces of centre lines between two lengths: line index, and ends (S, 2, 2)."""
+    """Return straight pieces of centre lines between two lengths along them: line index, and ends (S, 2, 2)."""
     ribbons = road_map.ribbons
     owner, row = spread(ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1)
     here = (ribbons.along[row] < end[owner]) & (ribbons.along[row + 1] > begin[owner])

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 
 SAME_WAY: Final = np.pi / 4
-"""Greatest difference of heading between a vehicle and its lane in a junction; rad."""
+"""Largest angle between a vehicle and its lane in a junction; rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class OwnLanes:
     along: Floats
 
     def first_in(self, key: Ints, but: Rows) -> tuple[Rows, Rows]:
-        """Find the first other vehicle on each lane. Return pairs of query row and vehicle row."""
+        """Find the first vehicle on each lane, except a given one. Return pairs: query row, vehicle row."""
         place = np.searchsorted(self.key, key)
         last = max(len(self.key) - 1, 0)
         itself = (self.row[np.minimum(place, last)] == but) & (place <= last)
@@ -141,7 +141,7 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
 def following(
     net: LaneNet, bodies: Bodies, standing: Standing, limit: float
 ) -> tuple[Column, Rows]:
-    """Return the pairs of :func:`next_ahead` that are certain, and the rows with unknown leaders."""
+    """Return the certain pairs of :func:`next_ahead`, and the vehicles whose leader is uncertain."""
     found = next_ahead(net, bodies, standing, limit)
     if not len(standing.unsure):
         return found, standing.unsure
@@ -183,7 +183,7 @@ def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
 
 
 def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
-    """Keep the search states that are nearer than the best result so far, and update the best."""
+    """Return the rows nearer than the best known distance of their key, and the new best distances."""
     known, least = best
     place = np.minimum(np.searchsorted(known, key), max(len(known) - 1, 0))
     again = known[place] == key if len(known) else np.zeros(len(key), np.bool_)

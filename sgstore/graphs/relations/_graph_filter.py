@@ -33,7 +33,7 @@ Columns = TypeVar("Columns", "Edges", "LaneStates", "LaneGaps")
 
 
 class Keeping:
-    """Filter of graph nodes and relations according to the settings.
+    """Filter of the nodes and relations of graphs, as defined by the settings.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class Keeping:
         return taken(merged, np.sort(np.unique(key, axis=0, return_index=True)[1]))
 
     def lane_states(self, lanes: LaneStates) -> LaneStates:
-        """Return the positions on lanes that the settings keep. Of merged lane sections, one counts."""
+        """Return the positions on lanes that the settings keep. Merged lane sections count once."""
         if self._everything:
             return lanes
         kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
@@ -138,7 +138,7 @@ class Keeping:
         return gaps if wanted else taken(gaps, np.zeros(0, np.intp))
 
     def present(self, present: Bools) -> Bools:
-        """Return a mask (F, K) of the map nodes in the graphs, from those in range of the ego."""
+        """Return a mask (F, K) of the map nodes in the graphs, given those in range of the ego."""
         present = present & self.parts
         if self._same is None:
             return present
@@ -149,7 +149,7 @@ class Keeping:
         return present
 
     def _standing_for(self, node: Ints) -> Ints:
-        """Replace lane nodes by the common node of all sections of the lane."""
+        """Replace each lane node by the node that represents all sections of the lane."""
         if self._same is None:
             return node
         return np.where(node < 0, -1 - self._same[np.where(node < 0, -1 - node, 0)], node)

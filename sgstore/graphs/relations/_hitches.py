@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 
 
 APART: Final = 5.0
-"""Greatest gap of a hitched trailer; m."""
+"""Largest gap between a trailer and its towing vehicle; m."""
 
 _FACES: Final = 0.7
-"""Least cosine of the angle between rider and bicycle."""
+"""Smallest cosine of the angle between a rider and the bicycle."""
 
 _TRAILER: Final = KIND_CODE["trailer"]
 _PERSON: Final = KIND_CODE["person"]
@@ -78,7 +78,7 @@ class Hitches:
             self._carrier[self._vehicles[trailer]] = self._said.pop(trailer)
 
     def see(self, frames: FrameBlock, bodies: Callable[[Rows], Bodies]) -> Ints:
-        """Return the carrier of each object state in a block: node id, or -1.
+        """Return the carrier of each object state of a block: its node id, or -1 without a carrier.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class Hitches:
         return self._parted(bodies, frames, rows, found) if len(rows) else found
 
     def _meet(self, bodies: Callable[[Rows], Bodies], rows: Rows, node: Ints) -> None:
-        """Find carriers: pairs of objects that touch in the first frame with both objects."""
+        """Find carriers among the objects that touch in the first frame in which both exist."""
         of = bodies(rows)
         first = _first(of.node, of.frame, len(self._seen))
         first[self._seen] = -1
@@ -133,7 +133,7 @@ class Hitches:
     def _parted(
         self, bodies: Callable[[Rows], Bodies], frames: FrameBlock, rows: Rows, carrier: Ints
     ) -> Ints:
-        """Return the carriers in a block of frames, without pairs that separate in the block."""
+        """Return the carriers in a block of frames, without those that move apart in the block."""
         states, frame = frames.states, frames.frame_of
         a, b = _carried(frame, states.node, rows, carrier[rows])
         parted = gap(bodies(a).boxes, bodies(b).boxes) > APART
@@ -154,7 +154,7 @@ def new_frames(frames: FrameBlock, new: Bools) -> Bools:
 
 
 def _first(node: Ints, frame: Ints, count: int) -> Ints:
-    """Return the first frame of each node (count,); -1 for an absent node."""
+    """Return the first frame of each node, (count,); -1 for an absent node."""
     first = np.full(count, -1)
     order = np.lexsort((-frame, node))
     first[node[order]] = frame[order]
@@ -171,7 +171,7 @@ def _edges(scene: BlockScene) -> Edges:
 
 
 def _carried(frame: Ints, node: Ints, rows: Rows, carrier: Ints) -> tuple[Rows, Rows]:
-    """Return the rows of carried bodies and of their carriers in the same frame."""
+    """Return the rows of carried objects, and the rows of their carriers in the same frame."""
     count = int(max(node.max(), carrier.max())) + 1
     key = frame * count + node
     order = np.argsort(key, kind="stable")

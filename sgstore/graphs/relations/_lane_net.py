@@ -1,4 +1,4 @@
-"""Graph of lanes and successors, and positions along lane centre lines."""
+"""Graph of lanes with their successors, and positions along the centre lines of lanes."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ class LaneNet:
         self._from = np.searchsorted(dst[order], np.arange(count + 1))
 
     def onward(self, lane: Ints) -> tuple[Rows, Ints]:
-        """Return the successors of lanes, as pairs of query row and lane."""
+        """Return the successors of lanes as pairs: query row, successor lane."""
         first = self._first[lane]
         owner, index = spread(first, self._first[lane + 1] - first)
         return owner, self._next[index]
 
     def upstream(self, lane: int, along: float, limit: float) -> Ints:
-        """Return the lane of a position, and the lanes that end at most ``limit`` metres before it."""
+        """Return the given lane, and all lanes that end at most ``limit`` metres before the position on it."""
         nearest: dict[int, float] = {lane: 0.0}
         queue, settled = [(along, lane)], set[int]()
         while queue:
@@ -79,7 +79,7 @@ class LaneNet:
 
 
 RUN: Final = 8
-"""Number of pieces of a centre line that are skipped together if none of them can be the nearest."""
+"""Number of centre line pieces that one test can skip together."""
 
 
 class Centrelines:

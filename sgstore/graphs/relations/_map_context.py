@@ -40,13 +40,13 @@ if TYPE_CHECKING:
 
 
 ON_OR_OFF: Final = kinds_mask((*VEHICLES, "person", "animal", "prop"))
-"""Kinds that can be off the road even if they never move, unlike trees."""
+"""Kinds of entities that can be off the road. Trees and similar kinds cannot."""
 
 SAME_PLACE: Final = 1.0
-"""Greatest distance between an entity and its object in the map, if several are alike; m."""
+"""Largest distance between a recorded entity and its map object, if several map objects are alike; m."""
 
 DEPTH: Final = 3
-"""Levels of ``isIn`` within a map: lane, road, junction."""
+"""Number of ``isIn`` levels within a map: lane, road, junction."""
 
 
 class LaneContact:
@@ -214,7 +214,7 @@ class LaneContact:
 
 
 def driven(hits: LaneHits, lane: Ints, same: Ints) -> tuple[LaneHits, Bools]:
-    """Return the touched lanes with the driven lane as the primary one, and a mask of the sure choices.
+    """Return the touched lanes with the driven lane as primary lane, and a mask of the certain choices.
 
     ``same`` is the first section of the same lane, as a column, for each map node. A driven lane
     that the footprint does not touch does not count, unless it touches another section.
@@ -236,11 +236,11 @@ def _appended(table: tuple[Ints, Ints], lines: list[tuple[int, int]]) -> tuple[I
 
 
 Table = tuple["NDArray[Any]", ...]
-"""Columns of equal length and different types; the first, ascending, is the row of a footprint."""
+"""Table of columns. The first column is the row of a footprint, in ascending order."""
 
 
 class _Footing:
-    """Cache of lanes and crosswalks below objects. A result is used again until the object moves."""
+    """Cache of the lanes and crosswalks below objects. An entry is valid until the object moves."""
 
     def __init__(self, road_map: RoadMap, lines: Centrelines, lanes_of: LookUp) -> None:
         self._map, self._lanes_of = road_map, lanes_of
@@ -285,7 +285,7 @@ class _Footing:
 
 
 def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
-    """Return, for each row, the first row of the same unchanged box, and each node's last row."""
+    """Return for each row the first row with the same unchanged box, and the last row of each node."""
     order = np.lexsort((frame, node))
     node, bits = (
         node[order],
@@ -302,6 +302,6 @@ def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
 
 
 def _looked_up(table: Table, wanted: Rows) -> Table:
-    """Return the table rows (map parts below objects) that belong to selected objects."""
+    """Return the table rows of the wanted objects."""
     owner, index = joined(table[0], wanted)
     return (owner, *(column[index] for column in table[1:]))

@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 
 
 CELLS: Final = 8
-"""Strips of the plane per search distance; more strips reduce the candidates a little."""
+"""Number of grid strips for each search distance. More strips give slightly fewer candidates."""
 
 FAR_STRIP: Final = 1 << 40
-"""Positions beyond this strip share a strip, so that keys fit into 64 bits."""
+"""Largest number of a grid strip, so that keys fit into 64 bits. Positions beyond it share this strip."""
 
 NO_PAIRS: Final[Halves] = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
@@ -107,7 +107,7 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Bo
 
 
 def _behind(pairs: Halves, others: Halves, rows: Rows) -> Halves:
-    """Append selected pairs of a second list to a list of object pairs."""
+    """Append the given rows of a second list of object pairs to the first list."""
     count = len(pairs[0])
     a, b = np.empty((2, count + len(rows)), np.intp)
     for column, first, rest in zip((a, b), pairs, others, strict=True):
@@ -214,7 +214,7 @@ def _near_in_loops(
 # range.
 
 MOST_LEARNT: Final = 1 << 22
-"""Greatest number of remembered pairs; above it they are computed in every frame."""
+"""Largest number of cached pairs of static objects. Above it, each frame computes them again."""
 
 
 class StillPairs:
@@ -251,7 +251,7 @@ class StillPairs:
     def among(
         self, bodies: Bodies, keys: Ints, states: int, count: int, unwanted: Bools
     ) -> Iterator[tuple[Rows, Rows]]:
-        """Yield the near pairs of static objects that are both in range of the ego.
+        """Yield the near pairs of static objects in which both are in range of the ego.
 
         Parameters
         ----------
@@ -296,11 +296,11 @@ class StillPairs:
 # limit bodies are related to the ego only; the store records this as a loss.
 
 MOST_PAIRS: Final = 1 << 18
-"""Greatest number of related pairs in one frame, each counted once, and of pairs that touch. 724
-bodies near each other reach it, or 5,000 bodies with a hundred neighbours each."""
+"""Largest number of related or touching pairs in one frame, each pair counted once. 724 mutually near objects
+reach it, or 5,000 objects with a hundred neighbours each."""
 
 AT_ONCE: Final = 1 << 18
-"""Estimated pairs of the frames that are processed together: about 200 MB with all results."""
+"""Estimated number of pairs in the frames of one computation: about 200 MB with all results."""
 
 
 def gathered(

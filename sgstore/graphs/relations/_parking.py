@@ -15,26 +15,26 @@ if TYPE_CHECKING:
 
 
 MOVED: Final = 0.3
-"""An entity that stays within this distance of its first position has not moved: poses tremble; m."""
+"""Largest distance from the first position at which an object counts as not moved, because poses vary; m."""
 
 
 STRAYED: Final = 2.0
-"""The same in recordings with noise, where boxes of standing vehicles wander; m."""
+"""The same limit for recordings with noise, in which the boxes of standing vehicles vary more; m."""
 
 SHARE: Final = 0.3
-"""Least share of frames with noise in which a parked vehicle stands."""
+"""Smallest share of noisy frames in which a parked vehicle stands."""
 
 DRIFT: Final = 0.2
-"""Greatest mean speed of a parked vehicle, from its first to its last noisy position; m/s."""
+"""Largest mean speed of a parked vehicle between its first and its last noisy position; m/s."""
 
 IN_LANE: Final = 0.4
-"""Least share of the footprint of a noisy box in its primary lane; a parked vehicle may reach into it."""
+"""Smallest share of a noisy footprint in its primary lane for which the vehicle counts as in the lane."""
 
 LEAST_NS: Final = 3_000_000_000 - 1_000
-"""Least time for which a parked vehicle is seen if there is no map; ns."""
+"""Shortest time for which a vehicle without a road map must be seen to count as parked; ns."""
 
 NEVER: Final = np.iinfo(np.int64).min
-"""Time of a vehicle that was not seen."""
+"""Time value of a vehicle that was never seen."""
 
 
 class Parking:
@@ -104,7 +104,7 @@ class Parking:
     def stand(
         self, bodies: Bodies, standing: Standing, driving: Bools, *, beyond: bool = False
     ) -> None:
-        """Record the lanes and other map parts below vehicles in the next frames.
+        """Record the lanes and other map parts below the vehicles in the next frames.
 
         ``beyond``: the bodies are all known ones, not only those in graphs.
         """

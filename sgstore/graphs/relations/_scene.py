@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 
 
 CHUNK: Final = 1 << 16
-"""Candidates that are processed together: bounds the memory, and fits a cache."""
+"""Number of candidates that are processed together. It limits the memory and fits into a cache."""
 
 FAR: Final = 1e9
-"""End of the line; m. Places beyond it are moved to it and can only add candidates."""
+"""Largest position on the line; m. Positions beyond it are moved to it, which can only add candidates."""
 
 _ROUNDING: Final = 1e-15
-"""Relative error of a place on the line that holds all groups in sequence."""
+"""Relative rounding error of a position on the line on which all groups follow one another."""
 
 
 def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows]]:
@@ -248,7 +248,7 @@ class BodyPairs:
 
     @cached_property
     def of_bodies(self) -> Bools:
-        """Mask (K / 2,) of the pairs of solid objects on the same storey. An empty mask means all pairs."""
+        """Mask (K / 2,) of the pairs of two solid objects on the same storey. An empty mask means all pairs."""
         of = self._bodies
         plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
         levels = of.low_and_high
@@ -280,10 +280,10 @@ class BodyPairs:
 
 
 MOST_TURNED: Final = 1e3
-"""Headings beyond this have errors above a tenth of a nanoradian; rad."""
+"""Largest heading whose rounding error stays below a tenth of a nanoradian; rad."""
 
 EVEN_PART: Final = 1 << 13
-"""Pairs whose numbers are computed together, to fit the fastest caches."""
+"""Number of pairs that are computed together, so that their values fit into the fastest cache."""
 
 
 def by_frame(frame: Ints, frames: int) -> tuple[Rows, Ints]:
@@ -460,7 +460,7 @@ def _columns_of(count: int) -> Columns:
 
 
 class EdgeRoom:
-    """Preallocated arrays into which all relations write the edges of a block of frames.
+    """Preallocated arrays for the edges of a block of frames. All relations write into them.
 
     Therefore edges are written once. A family can also return its own columns, which are copied at
     the end.
@@ -477,7 +477,7 @@ class EdgeRoom:
         self._used = 0
 
     def rest(self, count: int) -> Columns:
-        """Return preallocated arrays with room for ``count`` edges."""
+        """Return arrays with space for at least ``count`` more edges."""
         if self._used + count > len(self._columns[0]):
             return _columns_of(count)
         frame, relation, src, dst = self._columns
@@ -485,7 +485,7 @@ class EdgeRoom:
         return frame[first:], relation[first:], src[first:], dst[first:]
 
     def filled(self, columns: Columns, count: int, more: Edges | None = None) -> Edges:
-        """Return the written part of preallocated arrays as edges, with ``more`` edges appended."""
+        """Return the written part of the arrays as edges. ``more`` edges are appended to it."""
         if more is not None and len(more):
             if count + len(more) > len(columns[0]):
                 return Edges.chained([self.filled(columns, count), more])
@@ -498,7 +498,7 @@ class EdgeRoom:
         return edges
 
     def chained(self, parts: Sequence[Edges]) -> Edges:
-        """Concatenate edges. Edges that are already in the preallocated arrays are not copied."""
+        """Concatenate edges. Edges that already lie in the preallocated arrays are not copied."""
         others = [part for part in parts if not any(part is own for own in self._parts)]
         count = self._used + sum(map(len, others))
         if len(parts) - len(others) < len(self._parts) or count > len(self._columns[0]):
@@ -686,6 +686,6 @@ IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
 
 
 def joined(keys: Ints, wanted: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return all pairs of equal values in two arrays, as rows of ``wanted`` and rows of ``keys``."""
+    """Return all pairs of equal values in two arrays: rows of ``wanted``, and rows of ``keys``."""
     start = np.searchsorted(keys, wanted)
     return spread(start, np.searchsorted(keys, wanted, side="right") - start)

@@ -46,13 +46,13 @@ if TYPE_CHECKING:
 
 
 GRAZE: Final = 1e-6
-"""A line that enters a footprint by less does not cross it; m."""
+"""Length inside a footprint up to which a sight line does not count as blocked; m."""
 
 AT_ONCE: Final = 4096
-"""Pairs of a body and a possible cover that are processed together."""
+"""Number of pairs of an object and a possibly hiding object that are processed together."""
 
 POINTS: Final = 5
-"""Points of a body that are tested: its centre and the four corners."""
+"""Number of tested points of an object: its centre and its four corners."""
 
 
 def seen(bodies: Bodies, ego: Rows) -> Rows:
@@ -207,7 +207,7 @@ def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
 def _within(
     start: Floats, run: Floats, half: Floats, enters: Floats | float, leaves: Floats | float
 ) -> tuple[Floats, Floats]:
-    """Clip a line to the part where a coordinate is within ±``half``; return start and end fractions."""
+    """Return the part of a line in which a coordinate is within ±``half``: start and end as fractions."""
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - start) / run, (half - start) / run
     return (

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 FIRST_LANE: Final = 1
-"""Column of the first lane among the nodes of a map."""
+"""Index of the first lane among the nodes of a map."""
 
 MOST: Final = 500_000
-"""Greatest number of waypoints of a map: each frame stores the presence of each."""
+"""Largest number of waypoints of a map, because every frame stores the presence of each waypoint."""
 
 
 ROUNDING: Final = 1e-6
-"""Error of places along roads; m."""
+"""Rounding error of positions along roads; m."""
 
 
 class Waypoints:
