@@ -1,4 +1,4 @@
-"""Truth values of many bindings in one frame: one bit for each condition of an evaluation plan."""
+"""Truth values of the conditions of a plan in one frame, for many combinations of nodes, as bits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Valuation:
-    """Truth values of the named conditions of a plan in the current frame, for all known combinations of nodes.
+    """Truth values of the conditions of a plan in the current frame, for all known combinations of nodes.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Valuation:
         return letters, self._measure(list(rows), letters, memory)
 
     def _told(self) -> dict[Partial, int]:
-        """Return the true single-frame conditions as bits, for each partial binding.
+        """Return the single-frame conditions that are true, as bits, for each partial binding.
 
         A partial binding has nodes for some variables.
         """
@@ -137,7 +137,7 @@ class Valuation:
                     yield self.lattice.placed(key, places)
 
     def _state(self, name: str, rows: list[Partial], letters: Mapping[Partial, int]) -> Column:
-        """Return a column: 0 where a value is known, 1 where it is unknown.
+        """Return 0 for each binding with a known value, 1 with an unknown value, NULL with absent entities.
 
         It is masked where an entity is absent.
         """
@@ -161,7 +161,7 @@ class Valuation:
         letters: dict[Partial, int],
         memory: Callable[[Partial], Memory | None],
     ) -> dict[Partial, Memory]:
-        """Set the bits of true expressions for each partial binding, and return the new memory of each."""
+        """Evaluate expressions over time: set the bits of true ones, and return the new memory per binding."""
         self._courses.step()
         columns: dict[str, Bools] = {}
 

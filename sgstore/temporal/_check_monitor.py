@@ -73,10 +73,10 @@ if TYPE_CHECKING:
     Span = tuple[FrameTime, FrameTime]
 
 REMEMBERED: Final = 100_000
-"""Largest number of cached transitions before a reset."""
+"""Largest number of cached transitions. A larger cache is cleared."""
 
 Duties = tuple["frozenset[Term] | Term | None", ...]
-"""Open obligations of each part of a formula: a set for an ``ALWAYS``, else one term."""
+"""Open obligations of each part of a formula: a set of terms for an ``ALWAYS``, otherwise one term."""
 
 
 class ObligationState:
@@ -157,7 +157,7 @@ class ObligationStep:
 
 
 class Automaton:
-    """Monitored formula of a check as a state machine, with its reset condition and quantifier conditions.
+    """State machine for the formula of a check, with its reset condition and quantifier conditions.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ class Automaton:
         return found
 
     def _until(self, state: ObligationState, tick: Tick) -> tuple[int, int]:
-        """Return the time (ns) and frame number until which no time bound of the formula begins or ends."""
+        """Return the time (ns) and frame number up to which no time bound of the formula starts or ends."""
         bounds = [begun for term in state.terms for begun in term.bounds()]
         for part, (_, entries) in zip(self._progression.past, state.past, strict=True):
             if isinstance(part, Since):
@@ -331,7 +331,7 @@ def _conjuncts(formula: Formula) -> list[Formula]:
 
 
 def _part(formula: Formula) -> tuple[bool, Formula]:
-    """Split a formula ``ALWAYS p``: return True and p, or False and the whole formula.
+    """Split off an ``ALWAYS``: return (True, p) for ``ALWAYS p``, otherwise (False, formula).
 
     The split requires a p with bounded future.
     """
@@ -343,7 +343,7 @@ def _part(formula: Formula) -> tuple[bool, Formula]:
 
 @dataclass(frozen=True, slots=True)
 class _CheckEntry:
-    """Monitoring data of one combination of entities (binding) of a check.
+    """Monitoring state of a check for one combination of entities (binding).
 
     Attributes
     ----------
@@ -373,7 +373,7 @@ class _CheckEntry:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Second state of a monitored combination of entities, in which unknown conditions count against the check.
+    """Second monitoring state of a binding, in which unknown conditions count as violations.
 
     Attributes
     ----------
@@ -540,7 +540,7 @@ class CheckMonitor:
         letter: int,
         here: FrameTime,
     ) -> Doubt | None:
-        """Return the state of a combination of entities with unknown conditions counted against the check.
+        """Return the second state of a binding, in which unknown conditions count against the check, or None.
 
         ``None`` means that they change nothing.
         """
@@ -596,7 +596,7 @@ class CheckMonitor:
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
     ) -> _CheckEntry:
-        """Return the next monitoring data of a combination of entities in SGSM mode.
+        """Return the next monitoring state of a combination of entities in SGSM mode.
 
         In this mode, a violation lasts while the trace must not end.
         """
@@ -616,7 +616,7 @@ class CheckMonitor:
     # Results
 
     def _events(self, here: FrameTime, changed: list[Partial]) -> Iterator[MonitorEvent]:
-        """Yield events for combinations of entities whose status changed in this frame.
+        """Yield events for the combinations of entities whose status changed in this frame.
 
         A new entity produces events for all its combinations. ``HAVING`` chooses ended violations.
         """
@@ -644,7 +644,7 @@ class CheckMonitor:
                     yield self._event("violated", here, key, entry.since, entry.since)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
-        """Yield the combinations of known entities that share one monitoring state."""
+        """Yield the combinations of known entities to which one monitoring state applies."""
         if None not in row:
             yield row  # type: ignore[misc]
             return
@@ -689,7 +689,7 @@ class CheckMonitor:
 
     @property
     def robustness(self) -> Robustness | None:
-        """Robustness (margin of the verdict) of the check if the trace ends now. ``None`` if not requested."""
+        """Robustness (margin of the verdict) if the trace ended now. ``None`` if it was not requested."""
         return None if self._margins is None else self._margins.told(self._levels(), self._domains)
 
     def status(self) -> str:
@@ -702,7 +702,7 @@ class CheckMonitor:
         return known
 
     def _worst(self) -> int:
-        """Return the verdict if the trace ends now and all unknown conditions count against the check."""
+        """Return the verdict for a trace that ends now if all unknown conditions count against the check."""
         levels = self._levels(doubted=True)
         codes = [self._code_at_end(self._of(key)) for key in innermost(levels).tolist()]
         return int(folded_values(levels, np.array(codes, np.int8), HOLDS)[0][0])
@@ -711,7 +711,7 @@ class CheckMonitor:
         return self._known.of(tuple(key))
 
     def _levels(self, *, doubted: bool = False, waiting: bool = False) -> list[Level]:
-        """Return the combinations of entities for each quantifier of the check, outermost first.
+        """Return the combinations of entities at each quantifier of the check, outermost quantifier first.
 
         ``doubted``: use the second evaluation. ``waiting``: add future bindings of ``FORSOME``.
         """
@@ -802,7 +802,7 @@ class CheckMonitor:
         return found, list(self._at_end(last, holds=holds, bindings=bindings, spans=spans))
 
     def _waits(self, levels: list[Level]) -> bool:
-        """True if a false check can still become true through entities that appear later."""
+        """True if entities that appear later can still make a false check true."""
         if self._compat or not may_wait(self._check):
             return False
         wider = self._levels(waiting=True)
@@ -823,7 +823,7 @@ class CheckMonitor:
     def _at_end(
         self, last: FrameTime, *, holds: bool, bindings: Keys, spans: list[list[Span]]
     ) -> Iterator[MonitorEvent]:
-        """Yield events at the trace end for violations that were not reported before."""
+        """Yield events for violations that are certain only at the end of the trace."""
         if holds:
             return
         if not self._immediate:

@@ -48,17 +48,17 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import BoundCheck
 
 STATE: Final = "state"
-"""Internal operation: 0 for a known value, 1 for an unknown value, NULL for absent entities."""
+"""Internal operation for the state of a value: 0 known, 1 unknown, NULL for absent entities."""
 
 POSSIBLY: Final = "possibly"
-"""Internal operation: a condition whose unknown parts count as true."""
+"""Internal operation for a condition in which unknown parts count as true."""
 
 IN_FAVOUR: Final = "in favour"
-"""Internal operation: a condition that counts absence as true."""
+"""Internal operation for a condition in which absent entities count as true."""
 
 FAVOURABLE: Final = "+"
 UNFAVOURABLE: Final = "-"
-"""Name suffixes of unknown propositions that count in the first or the second evaluation."""
+"""Name suffixes of the propositions for unknown values: for the first and for the second evaluation."""
 
 SIGNS: Final = (FAVOURABLE, UNFAVOURABLE)
 
@@ -67,7 +67,7 @@ _CONTRARY: Final = {"+": "-", "-": "+", "": "*", "*": ""}
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Rules for one place in a formula: if unknown values and absent entities count as true or false.
+    """Rules for one part of a formula: if unknown values and absent entities count as true or as false.
 
     Attributes
     ----------
@@ -91,13 +91,13 @@ class Reading:
 
 
 WHOLE: Final = Reading(FAVOURABLE)
-"""Reading of a whole check."""
+"""Rules for the whole formula of a check."""
 
 WITHOUT_ABSENCE: Final = Reading(FAVOURABLE, absent=True)
-"""Reading in which conditions on absent entities count in favour of a check."""
+"""Rules in which conditions on absent entities count in favour of the check."""
 
 CERTAIN: Final = Reading("", absent=False)
-"""Reading of a condition that must be known to be true."""
+"""Rules for a condition that must be known to be true."""
 
 
 def base_name(name: str) -> str:
@@ -187,7 +187,7 @@ class CheckPlan(Plan):
                 return self.read(found, reading)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """Return the nodes without which a condition is false, if absence counts as false."""
+        """Return the nodes that must be present for a condition to be true, if absence counts as false."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -197,7 +197,7 @@ class CheckPlan(Plan):
                 return self._things(expression)
 
     def _counted(self, things: frozenset[str], reading: Reading) -> bool | None:
-        """Return the truth value of a condition if one of its entities is absent.
+        """Return the truth value of a condition with an absent entity. ``None`` if quantifiers disagree.
 
         ``None`` means that it depends on the node.
         """
@@ -264,7 +264,7 @@ class CheckPlan(Plan):
                 return f.LOGIC[word](*(self.read(one, reading) for one in operands))
 
     def _by_levels(self, found: f.Formula, things: frozenset[str], reading: Reading) -> f.Formula:
-        """Return a formula completed by the rules for absent entities.
+        """Return a formula with the rules for absent entities added, one quantifier after another.
 
         The outermost quantifier has priority.
         """
@@ -277,7 +277,7 @@ class CheckPlan(Plan):
         return found
 
     def _asked(self, wanted: b.Bound, things: frozenset[str], sign: str) -> f.Formula:
-        """Return a formula that is true if a condition is true.
+        """Return the proposition that a condition is true, with a second one for unknown values if needed.
 
         If unknown values count as true, it is also true for them.
         """
@@ -332,7 +332,7 @@ class CheckPlan(Plan):
         return name
 
     def _doubtful(self, expression: b.Bound, state: b.Bound) -> b.Bound | None:
-        """Return the condition under which a comparison over several frames is unknown; None if never."""
+        """Return the condition that a comparison over several frames is unknown. ``None`` means never."""
         ways: list[b.Bound] = []
         if any(self._may_be_unknown(part) for part in b.walk(state)):
             ways.append(b.Operation(">", (state, _number(0)), Type.boolean))
@@ -346,7 +346,7 @@ class CheckPlan(Plan):
         return ways[0] if ways else None
 
     def _open_courses(self, expression: b.Bound) -> bool:
-        """True if the condition inside a function over time, such as ``run_length``, may be unknown."""
+        """True if a condition inside a function over time, such as ``run_length``, may be unknown."""
         parts = (part for part in b.walk(expression) if isinstance(part, b.SignalCall))
         return any(self._open(p.operand) for p in parts if p.word in _OF_CONDITIONS)
 
@@ -373,7 +373,7 @@ class CheckPlan(Plan):
         )
 
     def _state(self, expression: b.Bound) -> b.Bound:
-        """Return an expression that is 0 if all values of another expression are known.
+        """Return the state of an expression: 0 if all of its values are known, otherwise 1 or NULL.
 
         It is greater if a value is unknown, and NULL if an entity is absent.
         """
@@ -552,7 +552,7 @@ def _has_state(expression: b.Bound) -> bool:
 
 
 _OF_CONDITIONS: Final = frozenset({"run_length", "since_true", "robustness"})
-"""Time functions of conditions."""
+"""Functions over time whose operand is a condition."""
 
 
 def _with_possible(expression: b.Bound) -> b.Bound:
@@ -576,7 +576,7 @@ def _in_favour(expression: b.Bound) -> b.Bound:
 
 
 def _absence_tried(expression: b.Bound, *, counted: bool) -> b.Bound:
-    """Return a condition evaluated with absent entities counted as false and as true.
+    """Return a condition that holds for both ways, or for one way, to count absent entities.
 
     If ``counted``, one result must be true, otherwise both.
     """
@@ -613,7 +613,7 @@ def _state_of(value: b.Bound) -> b.Operation:
 
 
 PlannedCheck = tuple[CheckPlan, f.Formula, "f.Formula | None", dict[int, f.Formula]]
-"""Plan, formula, reset formula and guards (by quantifier number) of a check."""
+"""Plan of a check, its formula, its reset formula, and its quantifier conditions by quantifier number."""
 
 
 def empty_plan(check: BoundCheck) -> CheckPlan:

@@ -73,7 +73,7 @@ _IN_BRACES: Final = re.compile(r"\{[^{}]*\}")
 
 
 def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
-    """Return the text "condition is unknown of entities in frame" for an unknown verdict."""
+    """Return the reason of an unknown verdict as text: "condition is unknown of entities in frame"."""
     written = value_text(condition).removeprefix("(").removesuffix(")")
     while (shorter := _IN_BRACES.sub("\0", written)) != written:
         written = shorter
@@ -188,7 +188,7 @@ _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
 
 def within_range(found: Verdict, short: ShortRange) -> Verdict:
-    """Return the verdict about the whole world, not only about the entities in range.
+    """Return the verdict, or ``unknown`` if entities beyond the range of the trace could change it.
 
     It becomes unknown if the trace stores too small a range around the ego.
     """
@@ -288,7 +288,7 @@ def verdict_of(
     violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
     last: Interval,
 ) -> Verdict:
-    """Return a verdict completed by its violations and deciding entities.
+    """Return a verdict with its violations and deciding entities added.
 
     Witnesses bind the outermost quantifiers of one kind.
 

@@ -203,7 +203,7 @@ class CheckRun:
 
     @property
     def lasting(self) -> bool:
-        """True if each check of the text is a condition that all entities must meet in every frame.
+        """True if every check only requires a condition for all entities in every frame.
 
         Frames then have margins.
 
@@ -321,7 +321,7 @@ class CheckRun:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Verdict and violations of each combination of entities of a check.
+    """Verdict of a check for each combination of entities, with its violations.
 
     Attributes
     ----------
@@ -338,7 +338,7 @@ class Judged:
 
 
 _BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None"]
-"""Violations of one binding, or of a check without quantifiers; and its status at each frame, if requested."""
+"""Violations of one binding (combination of entities), and its status after each frame if requested."""
 
 
 class StoreCheck:
@@ -427,7 +427,7 @@ class StoreCheck:
     def readers(
         self, within: Window | None = None, *, premises: Premises | None = None
     ) -> Iterator[TraceReader]:
-        """Yield the traces with data for the check, loaded into memory.
+        """Yield the traces that have data for the check, loaded into memory.
 
         ``within`` limits the traces to a window, ``premises`` the data to what the verdicts need.
         """
@@ -442,7 +442,7 @@ class StoreCheck:
         yield from self._unknown(self._knowing, self._lacks)
 
     def watched(self) -> dict[str, str]:
-        """Return, for each check variable, the name of the query for the presence of its entity.
+        """Return the name of the query for the presence of each check variable: variable → query name.
 
         Later reads include this query.
         """
@@ -452,7 +452,7 @@ class StoreCheck:
         return {node: one.name for node, one in found if isinstance(one, Proposition)}
 
     def violated(self, trace: TraceReader, present: Mapping[str, str]) -> bool:
-        """True if the selected frames of a trace violate the check, as if they were the whole trace.
+        """True if a range of frames, taken as a whole trace, violates the check.
 
         Parameters
         ----------
@@ -474,7 +474,7 @@ class StoreCheck:
             self._people[trace.trace_id] = everybody
 
     def _unknown(self, catalog: Catalog, lacks: Mapping[int, str]) -> Iterator[Verdict]:
-        """Yield the unknown verdicts of the traces in ``lacks``, with the reasons."""
+        """Yield an unknown verdict for each trace in ``lacks``, with its reason."""
         _, left = traces_of(self._whole, catalog)
         for facts in catalog.traces:
             chosen = catalog.only is None or facts.trace_id in catalog.only
@@ -697,7 +697,7 @@ class StoreCheck:
     def _levels(
         self, trace: TraceReader, counted: str = FAVOURABLE, *, waiting: bool = False
     ) -> list[Level]:
-        """Return the combinations of entities for each quantifier.
+        """Return the combinations of entities at each quantifier of the check, outermost quantifier first.
 
         ``waiting`` adds entities that may appear later.
         """
@@ -734,7 +734,7 @@ class StoreCheck:
         return levels_of(quantifiers, domains, apart=apart if injective else None, counts=counts)
 
     def _alike(self, trace: TraceReader, bindings: Keys) -> tuple[Keys, Ints]:
-        """Group combinations of entities with equal truth values in all frames, to evaluate each group once.
+        """Group the combinations of entities with equal query results. Each group is evaluated once.
 
         Return one binding per group, and the group of each binding.
         """
@@ -769,7 +769,7 @@ class StoreCheck:
     def _in_evaluation(
         self, trace: TraceReader, values: PlanValues, rows: int, among: Bools | None = None
     ) -> tuple[Codes, list[_BindingVerdict]]:
-        """Return the verdict and violations of each entity combination.
+        """Return the verdict of each combination of entities, and its violations.
 
         Unknown conditions all count in the same way.
         """

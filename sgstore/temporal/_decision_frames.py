@@ -1,4 +1,4 @@
-"""Decision frame of a formula: the first frame of a trace after which its truth value cannot change."""
+"""First frame after which the truth value of a formula cannot change, whatever frames follow."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 Decided = tuple["Places", "Places"]
-"""Frames (F,) from which on each value is certainly true, and certainly false; F: never."""
+"""For each frame (F,): the frame after which its value is certainly true, and certainly false. F: never."""
 
 
 def known(  # noqa: PLR0911 - a case each
@@ -109,7 +109,7 @@ def _known_until(formula: Until, table: PropositionTable, *, ended: int | None) 
 
 
 def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
-    """Return a mask (F,) of the frames whose future time bound ends before the trace ends."""
+    """Return a mask (F,) of the frames whose time bound lies completely within the trace."""
     if bound.high is None:
         return np.ones(len(table.times), np.bool_)
     if bound.frames:
@@ -160,7 +160,7 @@ def met(right: Places, left: Places | None, bound: Bound, table: PropositionTabl
 
 
 def _asked(bound: Bound, table: PropositionTable) -> tuple[Places, Places | None]:
-    """Return the frames in the time bound of an *until*, for each frame: first frame, and frame after the last.
+    """Return the range of frames in the time bound of an *until*, for each frame: first frame, and end.
 
     ``None`` means no upper bound.
     """
@@ -179,7 +179,7 @@ def _chained(
     *,
     least: bool,
 ) -> Places:
-    """Return, for each frame, the value of a temporal *until* from frame numbers for its operands.
+    """Return the frame at which a temporal *until* is certain, computed from the frames of its operands.
 
     It uses minima and maxima of the numbers.
 
@@ -219,7 +219,7 @@ def _chained(
 
 
 def _most(values: Places, start: Places, end: Places | None) -> Places:
-    """Return the maximum of the values from index ``start`` to before ``end``.
+    """Return the maximum of the values in the index range from ``start`` up to, but not including, ``end``.
 
     An empty range gives the smallest integer.
     """

@@ -1,4 +1,4 @@
-"""Graphs of the last frames of an online run, with the matches and attribute curves in these frames."""
+"""Recent graphs of an online run, with the truth of pattern parts and curves of attributes over time."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from sgstore.temporal._sequence_monitor import FrameTime
 
 MOST_EDGES: Final = 100_000
-"""Largest number of edges of stored graphs; about 30 MB."""
+"""Largest number of edges in the stored graphs; about 30 MB."""
 
 MOST_FOLLOWED: Final = 36
-"""Number of followed matches and curves, the latest requests. A page asks for a match and eight curves."""
+"""Largest number of updated matches and curves. A page needs one match and eight curves."""
 
 LONGEST_CURVE: Final = 3000
 """Largest number of frames of a curve."""
@@ -97,7 +97,7 @@ class FollowedMatch:
                     spans.append((seq, seq))
 
     def lanes(self, trace: str, first: int) -> TruthLanes:
-        """Return truth lanes (the frames in which each pattern part is true) from a frame on.
+        """Return the frames in which each part of the pattern is true, from frame ``first`` on.
 
         The format is that of :meth:`sgstore.Store.parts`.
         """
@@ -159,7 +159,7 @@ class FollowedCurve:
 
 
 class RecentGraphs:
-    """Most recent scene graphs of an online run. Each new graph updates the followed matches and curves.
+    """Most recent scene graphs of an online run. Requested matches and curves are updated with each new graph.
 
     Memory is bounded: at most :data:`MOST_EDGES` edges, or one graph, and :data:`MOST_FOLLOWED` matches and
     curves. The object is not thread-safe.

@@ -38,7 +38,7 @@ class Bound:
 
 
 WHOLE: Final = Bound()
-"""Unlimited bound: to the end, or to the start, of the trace."""
+"""Time bound without limits: up to the end, or back to the start, of the trace."""
 
 
 @dataclass(frozen=True, slots=True)

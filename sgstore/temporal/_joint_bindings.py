@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     Keys = NDArray[np.int64]
 
 ROWS: Final = 2_000_000
-"""Rows of all steps processed at once."""
+"""Number of rows, over all steps, that are processed at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class JoinedBindings:
 def joined(
     relations: Sequence[tuple[tuple[str, ...], TimedRelation]], apart: Collection[str]
 ) -> JoinedBindings:
-    """Return the node combinations that match several sequence steps, which agree on shared nodes.
+    """Return the node combinations in which all steps match and agree on their common variables.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def joined(
 
 
 def written(key: str) -> str:
-    """Return the name in the query for a node key. A variable of a repetition has one key for each round."""
+    """Return the name in the query for a node key. A repeated variable has one key per repetition."""
     return key.partition("~")[0]
 
 

@@ -25,7 +25,7 @@ SELECT frame_id >> 24 AS trace_id, max(speed) AS speed FROM known_state GROUP BY
 
 @dataclass(frozen=True, slots=True)
 class ShortRange:
-    """Reasons why a trace with a short range around the ego cannot prove a check true, or false.
+    """Reasons why the stored range of a trace is too short to decide a check as true, or as false.
 
     An empty text means that it can.
 
@@ -45,7 +45,7 @@ class ShortRange:
         return self.true if holds else self.false
 
     def or_else(self, other: ShortRange) -> ShortRange:
-        """Return the reasons against a verdict, with missing ones taken from ``other``."""
+        """Return these reasons, with each missing reason taken from ``other``."""
         return ShortRange(self.true or other.true, self.false or other.false)
 
 
@@ -123,7 +123,7 @@ def without_kinds(check: BoundCheck, excluded: frozenset[str]) -> ShortRange:
 
 @dataclass(slots=True)
 class SeenRange:
-    """Range around the ego that the frames of an online monitor covered.
+    """Smallest range around the ego that the frames of an online monitor covered.
 
     Attributes
     ----------

@@ -70,7 +70,7 @@ class ReturnedValues:
         part: Callable[[b.OverMatch], Any],
         seconds: Callable[[int], float | None] | None = None,
     ) -> dict[str, Any] | None:
-        """Return the ``RETURN`` values of one match: column name → value. None: ``HAVING`` rejects the match.
+        """Return the ``RETURN`` values of one match: column → value. ``None`` if ``HAVING`` rejects the match.
 
         Parameters
         ----------
@@ -99,12 +99,12 @@ class ReturnedValues:
 
 
 AT_FRAME: Final = -1
-"""Placeholder for a step number: the single frame of a value."""
+"""Number that stands for the single frame of a value, in place of a step number."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """First and last frame of matches, each with the row of its nodes in an array of values.
+    """First and last frame of each match, with the row of its nodes in the array of values.
 
     Attributes
     ----------

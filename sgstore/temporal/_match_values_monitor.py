@@ -37,7 +37,7 @@ Span = tuple[int, int]
 
 
 class _Course:
-    """History of one aggregated value for all matched nodes, kept while a match may need it."""
+    """History of one value for all matched nodes. It is stored as long as a match may need it."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class _Course:
         return reduce(Fold.joined, inside).told(self._word, start, end) if inside else None
 
     def forget(self, kept: Sequence[int]) -> None:
-        """Merge the values of old frames to save memory.
+        """Merge the values of frames at which no later match begins or ends, to save memory.
 
         ``kept`` lists the frames at which a later range may begin or end.
         """
@@ -208,7 +208,7 @@ class Fold:
 
     @classmethod
     def of(cls, word: str, frame: int, value: Any, at: Any) -> Fold | None:
-        """Return the aggregate data of a single frame. ``None`` means that the value is unknown or ignored."""
+        """Return the aggregates of a single frame. ``None`` if its value is unknown or not wanted."""
         if value is None:
             return None
         if word in {"first", "last"}:
@@ -223,7 +223,7 @@ class Fold:
         return cls(frame, frame, value, value, best, at)
 
     def joined(self, later: Fold) -> Fold:
-        """Return the aggregate data of two ranges of frames, this and a later one.
+        """Return the aggregates of this range of frames and the following range together.
 
         For equal extremes, the earlier frame counts.
         """
@@ -234,7 +234,7 @@ class Fold:
         )
 
     def told(self, word: str, start: int, end: int) -> Any:
-        """Return one aggregate of the value, such as the minimum, over a range of frames."""
+        """Return one aggregate, such as the minimum, of the values in this range of frames."""
         match word:
             case "first":
                 return self.first if self.start == start else None

@@ -62,7 +62,7 @@ def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[in
 def _knowing(
     file: StoreFile, catalog: Catalog, every: frozenset[int], need: Need
 ) -> frozenset[int]:
-    """Return the ids of the traces that have the required data, or have no entities that need it."""
+    """Return the ids of the traces that have the required data, or do not need it."""
     if need.event:
         return frozenset(trace for (trace,) in file.rows(told_events(need.event)).values)
     if need.lanes:

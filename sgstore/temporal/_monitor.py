@@ -383,7 +383,7 @@ class Monitor:
     def _ask(
         self, graphs: Sequence[SceneGraph], *, classed: bool = False
     ) -> tuple[FrameTime, list[NodeNames]]:
-        """Run all single-frame queries on the scene graphs of a frame."""
+        """Run all single-frame queries on the graphs of a frame. Return its time, and the nodes of each ego."""
         self._pulse.step(graphs[0].time_ns)
         tick, time = self._pulse.tick, self._pulse.told(self._pulse.tick.time)
         here = FrameTime(tick.number, time, seconds_of(time - self._pulse.start))
@@ -399,7 +399,7 @@ class Monitor:
         return here, people
 
     def _tell(self, here: FrameTime, people: list[NodeNames]) -> tuple[MonitorEvent, ...]:
-        """Update the checks and patterns with the query results of a frame, and return the new events."""
+        """Update the checks and patterns with the results of a frame, and return the new events."""
         self._last = here
         found: list[MonitorEvent] = []
         for ego, watch, waiting in self._watches:
@@ -563,7 +563,7 @@ class Monitor:
 
 
 class _PendingEvents:
-    """Monitor events that are held back until the trace has the data that they need.
+    """Monitor events that wait until the trace has all data that they need.
 
     Parameters
     ----------
@@ -586,7 +586,7 @@ class _PendingEvents:
     def passed(
         self, found: list[MonitorEvent], here: FrameTime, people: NodeNames
     ) -> list[MonitorEvent]:
-        """Return the monitor events to report at this frame, with earlier events that were held back."""
+        """Return the monitor events to report at this frame, including earlier events that had to wait."""
         if not self._open:
             return found
         self._open = [need for need in self._open if not self._told(need, people)]

@@ -82,22 +82,22 @@ def words() -> NDArray[np.str_]:
 
 
 ROW_BYTES: Final = 100
-"""Memory for sorting one row of two or three nodes; bytes."""
+"""Memory to sort one row with two or three nodes; bytes."""
 
 ROWS_LESS: Final = 4
-"""Rows of a table that take the memory of one row as counted by :class:`Windows`."""
+"""Number of rows in a table that take as much memory as one row in the count of :class:`Windows`."""
 
 EDGE_BYTES: Final = 100
-"""Additional memory for one edge of a row; bytes."""
+"""Additional memory for each edge in a row; bytes."""
 
 
 _LAST: Final = (1 << 63) - 1
 
 MOST_BINDINGS: Final = 5_000_000
-"""Largest number of node combinations of one trace."""
+"""Largest number of node combinations in one trace."""
 
 NODES_NAMED: Final = 1_000
-"""Largest number of node ids that narrow a query: each id is a parameter."""
+"""Largest number of node ids that a query can be limited to, because each id is a parameter."""
 
 
 class PlanValues(SignalValues):
@@ -130,7 +130,7 @@ class PlanValues(SignalValues):
         self._tests: dict[str, Column] = {}
 
     def evaluation(self, counted: str) -> PlanValues:
-        """Return a copy in which unknown conditions count as ``counted`` says: for or against the check.
+        """Return a copy in which unknown conditions count for, or against, the check, as ``counted`` states.
 
         Other values are shared.
         """
@@ -198,7 +198,7 @@ class PlanValues(SignalValues):
         return found.column(places, len(self._trace))
 
     def _state(self, of: Ask | None, doubt: str | None) -> Column:
-        """Return a column (B, F): 0 where a value is known, 1 where it is unknown.
+        """Return a column (B, F) with the state of a value: 0 known, 1 unknown.
 
         Frames without the entity are masked.
         """
@@ -221,7 +221,7 @@ Alternatives = frozenset[frozenset[str]]
 
 @dataclass(frozen=True, slots=True)
 class Premises:
-    """Alternative sets of queries: a check is true unless all queries of one set have matches.
+    """Sets of queries: a check can be false in a trace only if all queries of one set have matches there.
 
     Attributes
     ----------
@@ -235,7 +235,7 @@ class Premises:
 
     @property
     def order(self) -> list[str]:
-        """Names of the queries in the order of reading: those with few matches and low cost first."""
+        """Names of the queries in reading order: queries with few matches and low cost come first."""
         named = {name for one in self.alternatives for name in one}
 
         def rank(name: str) -> tuple[bool, bool, int]:
@@ -245,12 +245,12 @@ class Premises:
         return sorted(self.asks, key=rank)
 
     def left(self, relations: Mapping[str, TimedRelation]) -> list[frozenset[str]]:
-        """Return the alternatives whose queries have matches in a trace, as far as they were read."""
+        """Return the sets in which no query is known to have no matches in a trace."""
         empty = {name for name, one in relations.items() if not len(one.keys)}
         return [one for one in self.alternatives if not one & empty]
 
     def nodes(self, ask: Ask, traces: Iterable[TraceReader]) -> dict[str, Ints]:
-        """Return the only nodes that a query needs in some traces, by variable. Others need all."""
+        """Return the nodes to which a query can be limited in some traces: variable → node ids."""
         found: dict[str, list[Ints] | None] = {name: [] for name in ask.variables}
         for trace in traces:
             for one in self.left(trace.relations):
@@ -275,7 +275,7 @@ class Premises:
 
 
 def _is_dense(ask: Ask) -> bool:
-    """True if a query asks for the absence of something, which mostly has many matches."""
+    """True if all conditions of a query are negations, so that it probably has many matches."""
     return all(isinstance(c, b.Operation) and c.word == "NOT" for c in ask.query.scope.where)
 
 
@@ -392,7 +392,7 @@ def read(
 
 
 def _together(asks: Mapping[str, Ask], premises: Premises | None) -> list[list[str]]:
-    """Return groups of names of queries. Queries of one group differ only in the value of their matches."""
+    """Group the names of queries that differ only in the value that they return for each match."""
     groups: list[list[str]] = []
     for name in asks if premises is None else premises.order:
         ask = asks[name]
@@ -404,7 +404,7 @@ def _together(asks: Mapping[str, Ask], premises: Premises | None) -> list[list[s
 
 
 def _differ_in_value(ask: Ask, other: Ask) -> bool:
-    """True if two queries return different values of the same matches."""
+    """True if two queries return different values for the same matches."""
     one, two = ask.query.scope, other.query.scope
     return (
         not (ask.value is None or other.value is None or ask.edges or other.edges)
@@ -435,7 +435,7 @@ def _narrowed(ask: Ask, group: TraceGroup, left: Bools, premises: Premises | Non
 
 
 def _left(ask: Ask, group: TraceGroup, premises: Premises | None) -> Bools:
-    """Return a mask of the traces in which all earlier steps, or the queries of a premise, have matches."""
+    """Return a mask of the traces in which all earlier queries that this query needs have matches."""
     found = np.ones(len(group.ids), np.bool_)
     for before in ask.after:
         found &= np.bincount(group.relations[before.name].keys[:, 0], minlength=len(found)) > 0
@@ -454,7 +454,7 @@ def _window_of(traces: Collection[int], catalog: Catalog) -> Window:
 
 
 def no_rows(ask: Ask) -> TimedRelation:
-    """Return the table of a query without matches, for a group of traces."""
+    """Return an empty table of matches for a query."""
     keys = np.zeros((0, 1 + len(ask.columns)), np.int64)
     values = () if ask.value is None else (np.ma.masked_all(0),)
     return TimedRelation.of(np.zeros(0, np.int64), keys, values)
@@ -497,7 +497,7 @@ def times_of(file: StoreFile, window: Window | None) -> tuple[Ints, Ints]:
 
 
 def _ordered(file: StoreFile, sql: str, low: int, high: int) -> dict[str, Ints]:
-    """Return the integer columns of an SQL query on a range of frames, sorted by the first column."""
+    """Return the columns of an SQL query on a range of frames as integers, sorted by the first column."""
     asked = file.arrays(sql, (low, high), plain=True).items()
     found = {name: np.ma.getdata(column).astype(np.int64) for name, column in asked}
     first = next(iter(found.values()))

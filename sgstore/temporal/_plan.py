@@ -92,7 +92,7 @@ class Ask:
 
     @property
     def loose(self) -> bool:
-        """True if edges do not connect all nodes of the query. Such a query may have very many matches."""
+        """True if edges do not connect all nodes of the query. Such a query can have very many matches."""
         scope = self.query.scope
         groups = [{node} for node in scope.nodes]
         for edge in scope.edges:
@@ -285,7 +285,7 @@ class Plan:
         return [_all(parts) for _, parts in groups] + alone
 
     def present(self, node: str) -> f.Formula:
-        """Return the formula that is true in the frames with a node."""
+        """Return the formula that is true in the frames in which a node is present."""
         return self._atom(TRUE, frozenset({node}))
 
     def _atom(self, expression: b.Bound, things: frozenset[str]) -> f.Formula:
@@ -427,7 +427,7 @@ def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str
 
 
 def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the named nodes and edges that the steps of a sequence share, also in one repetition only."""
+    """Return the named nodes and edges that several steps share, and those shared within one repetition."""
     happen = [step for step in query.steps if query.spans and not step.absent]
     nodes = (node for step in happen for node in step.scope.nodes.values())
     edges = (edge.key for step in happen for edge in step.scope.edges if edge.named)
@@ -436,7 +436,7 @@ def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
 
 
 def _together(query: b.Query, size: int) -> list[frozenset[int]]:
-    """Return, for each sequence step, the steps that occur in every match with it, itself included."""
+    """Return, for each step, the steps that every match with this step contains, including itself."""
     if not query.alternatives:
         return [frozenset(range(size))] * size
     ways = [frozenset(way.steps) for way in query.alternatives]
@@ -481,11 +481,11 @@ MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
     "=": _equal,
     "<>": _apart,
 }
-"""Comparison → its margin: positive if it holds, negative if it fails."""
+"""Comparison sign → margin of the comparison: positive if it is true, negative if it is false."""
 
 
 def has_margin(comparison: b.Operation) -> bool:
-    """True if a condition compares numbers, not all of them constant. Then it has a robustness margin."""
+    """True if a condition compares numbers that are not all constant, so that it has a margin."""
     constants = b.Value | b.Operation
     return (
         comparison.word in MARGINS
@@ -499,7 +499,7 @@ def _all(parts: list[b.Bound]) -> b.Bound:
 
 
 def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # noqa: PLR0911 - a case each
-    """Return a single-frame condition that is never unknown: comparisons of unknown values count as false.
+    """Return a single-frame condition in which a comparison with an unknown value counts as false.
 
     A plain conjunction does not change: unknown is not true.
     """
@@ -602,7 +602,7 @@ def length_text(length: Length) -> str:
 
 
 def _refuse_large(value: b.Bound) -> None:
-    """Raise an error if an expression over several frames uses integers that float64 cannot represent exactly.
+    """Raise an error if an expression over frames uses integers that float64 cannot represent exactly.
 
     Single-frame conditions are exact.
 

@@ -86,7 +86,7 @@ class Term:
             self.begins = tuple(since for operand in operands for since in operand.begins)
 
     def bounds(self) -> Iterator[tuple[Bound, int]]:
-        """Yield the time bounds that run in these obligations, each with its start time or frame number."""
+        """Yield the time bounds that have started in these obligations, each with its start time or frame."""
         if self.word == "duty":
             if self.timed:
                 yield self.operands[0].bound, self.operands[1]
@@ -95,7 +95,7 @@ class Term:
                 yield from operand.bounds()
 
     def implies(self, other: Term) -> bool:
-        """True if these obligations imply other ones that differ only in the starts of time bounds."""
+        """True if these obligations imply other ones that differ only in when their time bounds started."""
         pairs = zip(self.begins, other.begins, strict=True)
         return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
 
@@ -216,7 +216,7 @@ class Terms:
 
 
 def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
-    """Return obligations joined by ``and`` or ``or`` without those that others imply.
+    """Return obligations joined by ``and`` or ``or``, without those that follow from others.
 
     So a repeated obligation of an ``ALWAYS`` is stored once.
     """
@@ -238,10 +238,10 @@ def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
 
 
 Entry = tuple[int, int, Term]
-"""Past frame (time, number) of the right side of a bounded *since*, with its open term."""
+"""Past frame (time, number) in which the right side of a bounded *since* can be true, with its open term."""
 
 Past = tuple[tuple[Term, tuple[Entry, ...]], ...]
-"""Memory of the past operators between frames: term and entries of each."""
+"""Memory of the past operators between two frames: a term and the entries of each operator."""
 
 
 class Progression:

@@ -26,7 +26,7 @@ VIOLATED, UNKNOWN, PENDING, HOLDS = range(4)
 """Verdict codes in order. The minimum is the code of a conjunction, the maximum of a disjunction."""
 
 NEWCOMER: Final = -(1 << 60)
-"""First id of placeholders for future entities."""
+"""First id of the placeholders for entities that may appear later."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +142,7 @@ def levels_among(
 
 
 def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]:
-    """Return the entities of each check variable, with an extra future entity for ``FORSOME`` variables."""
+    """Return the entities of each variable. ``FORSOME`` variables get an additional future entity."""
     some = [node for q in check.quantifiers if q.word == "FORSOME" for node in q.nodes]
     return {
         node: np.append(domain, NEWCOMER + some.index(node)) if node in some else domain

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 MARGIN_CELLS: Final = 16
-"""Memory of margins relative to truth values."""
+"""Number of bytes of a margin for each byte of a truth value, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Robustness:
 
 
 def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> Robustness:
-    """Replace a robustness of minus infinity that an absent entity causes.
+    """Replace minus infinity, if an absent entity causes it, by the margin without absence (at most 0).
 
     The other margin is computed without absence, and at most 0.
 

@@ -73,10 +73,10 @@ if TYPE_CHECKING:
     Margins = NDArray[Any]
 
 MOST_OPEN: Final = 8
-"""Largest number of unbounded forward operators: each doubles the memory of a margin."""
+"""Largest number of future operators without time limit. Each of them doubles the memory of a margin."""
 
 MARGIN: Final = np.dtype([("value", "f8"), ("name", "i8"), ("frame", "i8"), ("time", "i8")])
-"""Margin and its origin: proposition number (-1: none), frame, and time (ns)."""
+"""Margin with its origin: number of the proposition (-1 for none), frame number, and time (ns)."""
 
 
 def _better(one: Margins, other: Margins, *, greatest: bool) -> Margins:
@@ -112,7 +112,7 @@ def _constant(value: Any, shape: tuple[int, ...]) -> Margins:
 
 @dataclass(slots=True)
 class _Tape:
-    """Robustness margins of consecutive frames, stored while later margins need them.
+    """Robustness margins of consecutive frames. They are stored as long as later margins need them.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class _Tape:
 
 @dataclass(slots=True)
 class _Part:
-    """Subformula of a temporal formula, with its robustness margins.
+    """Part of a temporal formula, with its margins of the frames processed so far.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class _Part:
 
     @property
     def nothing(self) -> float:
-        """Margin of a condition that is always false. Under a negation, it is always true."""
+        """Margin of an always false condition. Under a negation, the margin of an always true condition."""
         return -np.inf if self.positive else np.inf
 
 
@@ -325,7 +325,7 @@ class MarginStream:
                 self._answer = part.tape.at(0)
 
     def _replace(self, bit: int, value: Margins) -> None:
-        """Replace margins that were unknown by their values, when the next frame provides them."""
+        """Replace an unknown margin by its value in all stored results, when the next frame provides it."""
         low, high = self._vertices & ~bit, self._vertices | bit
 
         def shown(old: Margins) -> Margins:
@@ -350,7 +350,7 @@ class MarginStream:
         return found
 
     def _told(self, part: _Part) -> Iterator[Margins]:
-        """Yield the margins of a subformula that have become known with this frame, frame by frame."""
+        """Yield the margins of a part of the formula that become known with this frame, frame by frame."""
         match part.formula:
             case TruthConstant(value=value):
                 if not self._ended:

@@ -46,22 +46,22 @@ if TYPE_CHECKING:
     Keys = NDArray[np.int64]
 
 FIRST_WINDOW: Final = 2_048
-"""Buckets of the first window. Each window reads most tables, and dense patterns take memory."""
+"""Number of buckets in the first window. Each window reads most tables again; dense patterns need memory."""
 
 ROWS_EACH: Final = 2
-"""Weight of a sorted row, in rows as counted by :class:`Windows`."""
+"""Weight of a sorted row in the count of rows of :class:`Windows`."""
 
 TOGETHER: Final = 1_500_000
-"""Largest number of rows of several traces to read at once."""
+"""Largest number of rows that are read at once for several traces."""
 
 VALUE_BYTES: Final = 20
-"""Additional memory for one value of a row; bytes."""
+"""Additional memory for each value in a row; bytes."""
 
 LARGE: Final = 1e12
-"""Window sums of larger numbers are computed one by one, so that they are rounded once."""
+"""Limit above which window sums are computed separately, so that each is rounded only once."""
 
 RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
-"""Runs: ids of first and last frames, nodes and edges, and returned values."""
+"""Runs of frames as columns: ids of first frames, ids of last frames, nodes and edges, returned values."""
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ class RunFinder:
         self._window_nodes = frozenset(ask.variables) if bare else None
 
     def fits(self, places: Sequence[b.Bound]) -> bool:
-        """True if the rows of the pattern's query are enough for the matches and the returned values."""
+        """True if one query can provide both the matches and the returned values."""
         step = self._query.steps[0]
         if self._query.spans or step.absent or self._query.gaps != "break" or self._ask.everywhere:
             return False
@@ -446,7 +446,7 @@ def _whole(column: Column, rows: int) -> Column:
 
 
 def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
-    """Return the first indices from ``low`` to ``high`` where ascending numbers reach some limits."""
+    """Return the first index between ``low`` and ``high`` at which the ascending ``at`` reaches a limit."""
     low, high = low.copy(), high.copy()
     while np.any(low < high):
         middle = (low + high) // 2

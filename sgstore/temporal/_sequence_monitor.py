@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from sgstore.temporal._valuation import Key, Memory, NodeNames, QueryCache
 
 Needs = bool | tuple[tuple[Partial, Term], ...]
-"""Truth value of conditions, or the open terms of which one must become true."""
+"""True or False, or open terms: the condition is true if one of the terms becomes true."""
 
 
 @dataclass(slots=True)
@@ -143,7 +143,7 @@ class StepState:
         yield from (number for number, _, _ in self._queue)
 
     def ask(self, holds: Needs, *, gap: bool) -> None:
-        """Add the next frame in which the step may match, with conditions that are still open."""
+        """Add the next frame in which the step may match. ``holds`` are the conditions that are still open."""
         self._queue.append((self._pulse.tick.number, self._pulse.tick.time, gap))
         self.open.append(holds)
 
@@ -279,10 +279,10 @@ class MonitorEvent:
 FAILED: Final = "failed"
 OPEN: Final = "open"
 Ways = tuple[StepFrame, ...] | str
-"""Frames of the remaining steps; :data:`FAILED`: none; :data:`OPEN`: not yet known."""
+"""Frames of the remaining steps; :data:`FAILED` if there are none; :data:`OPEN` if not yet known."""
 
 FoundMatch = tuple[StepWay, Binding, tuple[StepFrame, ...]]
-"""Match: alternative sequence, binding, and frames of its steps."""
+"""Match of a sequence: alternative, binding, and one frame for each step."""
 
 
 class SequenceMonitor:
@@ -355,7 +355,7 @@ class SequenceMonitor:
         return self._found(here)
 
     def _now(self, number: int) -> dict[Key, Needs]:
-        """Return the matches of a step's pattern in this frame: nodes → open conditions, or True."""
+        """Return the matches of a step's pattern in this frame: nodes → True, or conditions still open."""
         question, variables = self._asks[number]
         places = [variables.index(name) for name in self._columns[number]]
         answers = self._questions.answers[question]
@@ -405,7 +405,7 @@ class SequenceMonitor:
 
     @cached_property
     def _lasting(self) -> dict[StepWay, frozenset[int]]:
-        """Positions of the steps whose runs of frames must end before a match can be reported."""
+        """Positions of the steps whose run of frames must end before a match is reported, by alternative."""
         return {way: frozenset(self._lasting_in(happen)) for way, happen in self._happen.items()}
 
     def _lasting_in(self, happen: tuple[int, ...]) -> Iterator[int]:
@@ -471,7 +471,7 @@ class SequenceMonitor:
         return self._held[number].get(tuple(binding[name] for name in self._columns[number]))
 
     def _ways(self, way: StepWay, at: int, place: StepFrame, binding: Binding) -> Ways:
-        """Yield the possible frames of the remaining steps of a sequence, after a given frame."""
+        """Return the frames of the remaining steps of a sequence after a given frame, if known and allowed."""
         steps, following = way.steps, at + 1
         if following == len(steps):
             return (place,)
@@ -782,7 +782,7 @@ class _Conditions:
 
 
 def settled(needs: list[tuple[Partial, Term]]) -> Needs:
-    """Return True if one of the open conditions is true, False if none can be, otherwise the open ones."""
+    """Return True if one open condition is true, False if none can become true, otherwise the open ones."""
     if any(term.word == "true" for _, term in needs):
         return True
     left = tuple((row, term) for row, term in needs if term.word != "false")
@@ -790,13 +790,13 @@ def settled(needs: list[tuple[Partial, Term]]) -> Needs:
 
 
 _Group = tuple[int, "Key", int]
-"""First step, nodes by name, and run of a match. Only one match per group counts."""
+"""Group of matches of which only one counts: number of the first step, nodes, and run of frames."""
 
 _Standing = tuple["StepWay", int, "Binding", "StepFrame"]
-"""Progress of a match: sequence, step number, nodes by name, and frame."""
+"""Incomplete match: alternative sequence, position of the step, nodes, and frame of the step."""
 
 _ANY = -1
-"""Placeholder for step and run if only the first match of a binding counts."""
+"""Value of step and run in a group if only the first match of each binding counts."""
 
 
 def sequence_monitor(
@@ -854,7 +854,7 @@ class ExpressionMonitor(SequenceMonitor):
                     self._best[group] = found
 
     def _better(self, one: FoundMatch, other: FoundMatch) -> bool:
-        """True if the first of two matches is preferred.
+        """True if the first match is preferred to the second one.
 
         For equal frames, the first alternative of the query is preferred.
         """
@@ -865,7 +865,7 @@ class ExpressionMonitor(SequenceMonitor):
         return (frames, place) < (known, written)
 
     def _decided(self, group: _Group, found: FoundMatch) -> bool:
-        """True if no later match can be preferred over this match."""
+        """True if no later match can be preferred to this match."""
         step, told, run = group
         bound, frames = dict(zip(self._named, told, strict=True)), _frames(found)
         for way in self._asked:
@@ -898,7 +898,7 @@ class ExpressionMonitor(SequenceMonitor):
     def _may_be_earlier(
         self, standing: _Standing, frames: tuple[int, ...], *, before: bool
     ) -> bool:
-        """True if an incomplete match can still become complete with earlier frames than the given ones."""
+        """True if an incomplete match can still be completed with earlier frames than the given frames."""
         way, at, binding, place = standing
         if at == len(way.links):
             return False  # an ended match is already known
@@ -985,7 +985,7 @@ class ExpressionMonitor(SequenceMonitor):
         return min(found, default=NEVER)
 
     def _followed(self, n: int, key: Key, places: list[StepFrame]) -> list[StepFrame]:
-        """Return the stored frames of a first step with which later matches can begin."""
+        """Return the stored frames of a first step with which a later match can begin."""
         binding = dict(zip(self._columns[n], key, strict=True))
         ways = [way for way in self._asked if way.steps[0] == n]
         found: list[StepFrame] = []
@@ -998,7 +998,7 @@ class ExpressionMonitor(SequenceMonitor):
         return found
 
     def _open_ended(self, way: StepWay) -> bool:
-        """True if only the first frame of each run must be kept, because the next step has no time limit.
+        """True if the first step needs only the first frame of each run: the next step has no time limit.
 
         A run is a series of frames in which the step matches.
         """

@@ -1,4 +1,4 @@
-"""Search for sequences in a store: the matches of the steps are joined over time, as arrays."""
+"""Search for sequences in a store. The matches of the steps are joined over time, as arrays."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """Time relation from one sequence step to the next, with the frames of the next step.
+    """Time relation from one sequence step to the next one, with the frames of the next and absent steps.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Leg:
 
 
 class BindingLine:
-    """Frames of many node combinations in one index: frame i of combination b has position ``b * stride + i``.
+    """Frames of many node combinations on one line: frame i of combination b is at position ``b * stride + i``.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class BindingLine:
         ]  # before the clock jumps
 
     def frame(self, places: Ints) -> Ints:
-        """Return the frame number for each position in the joint index."""
+        """Return the frame number of each position on the line."""
         return places % self.stride
 
     def run_ends(self, places: Ints) -> Ints:
@@ -176,7 +176,7 @@ class BindingLine:
         return low, high
 
     def _moved(self, frame: Ints, by: Length | None, side: str) -> Ints:
-        """Return, for each frame, the frame after a delay.
+        """Return, for each frame, the frame a given time later. ``by=None`` means without a limit.
 
         ``left`` means the first frame at or after it, ``right`` the last frame within it.
         """
@@ -196,7 +196,7 @@ class BindingLine:
 
 
 def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str) -> Ints:
-    """Return the matches of a sequence as positions of its steps in the joint frame index.
+    """Return the matches of a sequence: the position of each step on the line of frames.
 
     Parameters
     ----------
@@ -260,13 +260,13 @@ def _one_a_run(line: BindingLine, first: Ints, possible: Ints) -> Ints:
 
 
 TRACE: Final = ":trace"
-"""Key column with the index of a match's trace in its group."""
+"""Name of the key column for the index of the trace in its group."""
 
 MOST_MATCHES: Final = 2_000_000
-"""Largest number of multi-frame matches of one trace: each takes about 300 bytes."""
+"""Largest number of multi-frame matches in one trace. Each match takes about 300 bytes."""
 
 _Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
-"""Matches: ids of first and last frames, nodes and edges, and returned values."""
+"""Matches as columns: id of the first frame, id of the last frame, nodes and edges, and returned values."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,7 +290,7 @@ class MatchesOfWay:
     told: Ints
 
     def chosen(self, rows: Any) -> MatchesOfWay:
-        """Return the selected matches."""
+        """Return only the given matches."""
         return replace(self, told=self.told[rows])
 
 
@@ -526,7 +526,7 @@ class Finder:
     def _true(
         self, group: TraceGroup, relation: TimedRelation, ask: Ask, formulas: Sequence[Formula]
     ) -> Any:
-        """Return a mask of the rows of a step's matches for which temporal formulas are true."""
+        """Return a mask of the rows of a table in which all given temporal formulas are true."""
         true = np.zeros(len(relation.frames), np.bool_)
         for trace, part, low in _chunks(group, relation):
             bindings = part.keys[:, : len(ask.variables)]
@@ -597,7 +597,7 @@ class Finder:
         return owner * line.stride + relation.frames[rows]
 
     def _legs(self, way: StepWay, at: list[Ints], absent: dict[int, Ints]) -> list[Leg]:
-        """Return the time relations between required steps.
+        """Return the time relations between the steps that must occur, with the frames of absent steps.
 
         A ``NOT MATCH`` step becomes part of a time relation.
         """
@@ -687,7 +687,7 @@ def _whole(window: Window | None) -> Window | None:
 def _chunks(
     group: TraceGroup, relation: TimedRelation
 ) -> Iterator[tuple[TraceReader, TimedRelation, int]]:
-    """Yield parts of a table with few node combinations of one trace, and the first row of each part."""
+    """Yield parts of a table, each with one trace and few node combinations, and the first row of each part."""
     for place in np.unique(relation.keys[:, 0]).tolist():
         trace, whole = group.reader(place), group.part(relation, place)
         begin = int(relation.starts[np.searchsorted(relation.keys[:, 0], place)])
@@ -703,7 +703,7 @@ def _chunks(
 
 
 def _worked_out(place: Bound) -> tuple[Bound, ...]:
-    """Return the single-frame values that a returned value of a match needs."""
+    """Return the single-frame values from which a returned value of a match is computed."""
     match place:
         case StepTime():
             return ()

@@ -225,7 +225,7 @@ def _of_one_frame(
 
 
 _AHEAD: Final = frozenset({"ALWAYS", "EVENTUALLY", "NEXT", "WEAKNEXT", "UNTIL", "RELEASE"})
-"""Forward time operators. They see fewer frames at the end of a clip."""
+"""Temporal operators that use later frames. At the end of a clip, they see fewer frames."""
 
 
 def _looks_ahead(condition: Bound | None) -> bool:
@@ -252,7 +252,7 @@ def _stays(query: Query) -> bool:
 
 
 def _cut(trace: TraceReader, span: Span | None) -> TraceReader:
-    """Return the frames of a trace in a given span, or the whole trace."""
+    """Return a range of frames of a trace as a separate trace, or the whole trace."""
     if span is None:
         return trace
     first, last = np.searchsorted(trace.frame_ids, [one.frame_id for one in span]).tolist()

@@ -145,7 +145,7 @@ class SignalState:
         atom: Callable[[str], Bools],
         signal: Callable[[Ask], Column],
     ) -> tuple[dict[str, Column], list[Memory]]:
-        """Return the values of all expressions in this frame, and the new memories.
+        """Return the values of all expressions in this frame, and the memory of each binding.
 
         There is one of each for every node combination.
 
@@ -168,7 +168,7 @@ class SignalState:
 
 
 class _Now(SignalValues):
-    """Evaluation of expressions over several frames at the current frame, for some combinations of nodes."""
+    """Values of expressions over several frames at the current frame, for some combinations of nodes."""
 
     def __init__(
         self,
@@ -226,7 +226,7 @@ class _Now(SignalValues):
         return np.broadcast_to(value, (self._rows, 1))
 
     def condition(self, expression: b.Bound, test: Test) -> Bools:
-        """Return a mask (B, 1) of node combinations.
+        """Return a mask (B, 1) of the node combinations for which a condition is true in this frame.
 
         It is true where the condition inside ``run_length(…)`` or similar is true in this frame.
         """
@@ -350,10 +350,10 @@ class _Now(SignalValues):
 
 
 _Point = tuple[int, float, float, int]
-"""Known angle in a frame: frame number, value, total turn, and start of the known run."""
+"""Known angle in a frame: frame number, angle, total rotation, and first frame of the known run."""
 
 _Trail = tuple[_Point, tuple[_Point, ...]]
-"""Last known point of an angle, and the earlier points still needed."""
+"""History of an angle: its last known point, and earlier points that are still needed."""
 
 
 def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _Trail | None:
@@ -382,7 +382,7 @@ def column_of(values: list[Any]) -> Column:
 
 
 class StreamClock:
-    """Times of the recent frames of an online run. Temporal operators set their number.
+    """Frame times of an online run. Temporal operators determine how many of them are kept.
 
     Parameters
     ----------
@@ -448,7 +448,7 @@ class StreamClock:
         return self.jump or (self.gap and not bridge)
 
     def told(self, time: int) -> int:
-        """Return the recorded time of a frame from its corrected, ascending time; ns."""
+        """Return the original time of a frame from its corrected, strictly ascending time; ns."""
         after = bisect_right(self._jumps, (time, NEVER, 0))
         return time - self._jumps[after - 1][1] if after else time
 

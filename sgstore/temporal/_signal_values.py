@@ -134,7 +134,7 @@ class SignalValues:
                 return self._age(seen) if word == "age" else Column(seen)
 
     def _back(self, column: Column, by: int | Ints) -> Column:
-        """Return the values of some frames earlier, at each frame.
+        """Return, for each frame, the value of a column some frames earlier.
 
         Values before the trace or across a gap are unknown.
         """
@@ -279,4 +279,4 @@ _TOLERANT: Final[Mapping[str, Callable[[Array, Array, float], Array]]] = {
     ">": lambda one, other, by: one > other + by,
     ">=": lambda one, other, by: one >= other - by,
 }
-"""Comparisons of times with a tolerance for equality."""
+"""Comparison operators for times. Times within the tolerance are equal."""

@@ -150,7 +150,7 @@ class PropositionTable:
                 return true if left == TRUE else true & (hit >= _last(~self.value(left)))
 
     def window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
-        """Return, for each frame, the nearest and farthest frame in the time bound of an operator.
+        """Return, for each frame, the nearest and the farthest frame in the time bound of an operator.
 
         ``None`` as nearest frame means the frame itself; as farthest frame, the trace end.
         """
@@ -210,7 +210,7 @@ def _last(flags: Bools) -> Places:
 
 
 def _at(places: Places, frame: Places | None) -> Places:
-    """Return an array of frame numbers, taken at other frames.
+    """Return an array of frame numbers taken at the given frames.
 
     The value is -1 before the trace, and F after it.
     """

@@ -1,4 +1,4 @@
-"""Values of topics in an online monitor, from the messages of frames."""
+"""Values of topics in an online monitor, read from the messages of the frames."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def topics_of(part: object) -> Iterator[TopicValue]:
-    """Yield the values of topics in a part of a bound query or check."""
+    """Yield the topic values that a part of a bound query or check uses."""
     if isinstance(part, FrameAttribute):
         if (value := part.attribute.topic) is not None:
             yield value
@@ -38,7 +38,7 @@ def topics_of(part: object) -> Iterator[TopicValue]:
 
 
 class RecordedTopics:
-    """Topics of a recording, for the monitor that replays it.
+    """Topics of a recording, for the monitor that replays the recording.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class RecordedTopics:
         return self._decoded.facts
 
     def followed(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
-        """Yield blocks of frames unchanged, after reading the values of all frames."""
+        """Yield the blocks of frames unchanged, after the topic values of all their frames were read."""
         if self.asked:
             asked = [*dict.fromkeys(self.asked)]
             times = [np.stack([block.time_ns, block.log_time_ns]) for block in self._again()]
@@ -85,7 +85,7 @@ class RecordedTopics:
         yield from blocks
 
     def on(self, frame: Frame) -> Frame:
-        """Add the values of the next frame to it, and return it."""
+        """Add the topic values of the next frame to it, and return the frame."""
         frame.topics = next(self._waiting, {})
         return frame
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TimedRelation:
-    """Table of query matches: node ids of each match, and the frames in which it occurs.
+    """Table of query matches: the nodes of each match, and the frames in which it occurs.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class TimedRelation:
 
     @property
     def owners(self) -> Ints:
-        """Index of the binding of each row, (R,)."""
+        """Index of the match (combination of nodes) of each row, (R,)."""
         return np.repeat(np.arange(len(self.keys)), np.diff(self.starts))
 
     @classmethod
@@ -135,7 +135,7 @@ class TimedRelation:
 
 
 CELLS: Final = 4_000_000
-"""Product of bindings and frames processed at once."""
+"""Largest product of node combinations and frames that are processed at once."""
 
 
 @dataclass(slots=True)
@@ -182,7 +182,7 @@ class TraceReader:
 
     @property
     def together(self) -> int:
-        """Number of node combinations to process at once, so that arrays over all frames fit into memory."""
+        """Number of node combinations that are processed at once, so that their arrays fit into memory."""
         return max(CELLS // max(len(self), 1), 1)
 
     def seconds(self, frame: int) -> float:
@@ -192,7 +192,7 @@ class TraceReader:
 
 @dataclass(frozen=True, slots=True)
 class JointClock:
-    """Times of the frames of several traces. A trace begins a day after the one before, as after a jump.
+    """Frame times of several traces on one time axis, with a day between each two traces.
 
     Attributes
     ----------
@@ -248,7 +248,7 @@ class TraceGroup:
     def of(
         cls, about: Mapping[int, Sequence[Any]], clock: Mapping[str, Ints], gaps: str
     ) -> TraceGroup:
-        """Return the frames of some traces. ``about``: id → name, start (ns), frame period (ns)."""
+        """Return the frames of some traces. ``about`` is: trace id → name, start (ns), frame period (ns)."""
         columns = [clock[name] for name in ("frame_id", "seq", "time_ns", "log_time_ns")]
         known = np.isin(trace_of(columns[0]), [*about])
         if not known.all():
@@ -318,7 +318,7 @@ class TraceGroup:
 
     @property
     def _whole(self) -> bool:
-        """True if no trace lacks a frame, so that frame numbers are indices."""
+        """True if no trace lacks a frame, so that a frame number is also an index."""
         first = np.repeat(self.starts[:-1], np.diff(self.starts))
         return bool(np.array_equal(self.numbers + first, np.arange(len(first))))
 
@@ -331,7 +331,7 @@ class TraceGroup:
         return places_of(frame_ids, self.frame_ids, self.ids, self.starts)
 
     def table(self, buckets: Ints, keys: Keys, masks: Ints) -> TimedRelation:
-        """Return the table of matches from rows of buckets, node ids and masks of frames, unsorted."""
+        """Return the table of matches from unsorted rows: bucket, node ids, and mask of frames."""
         traces = buckets >> BUCKET_BITS
         owners = np.searchsorted(self.ids, traces)
         if len(self.ids):
@@ -416,12 +416,12 @@ def places_of(wanted: Ints, frame_ids: Ints, traces: Ints, starts: Ints) -> Ints
 
 
 def _bits(masks: Ints) -> NDArray[np.uint8]:
-    """Return the bits of masks, 64 for each, the lowest first."""
+    """Return the 64 bits of each mask, lowest bit first."""
     return np.unpackbits(masks.astype("<i8").view(np.uint8), bitorder="little")
 
 
 def _changes(keys: Keys) -> Bools:
-    """Return a mask of the rows that differ from the row before."""
+    """Return a mask of the rows that differ from the row before them."""
     found = np.ones(len(keys), np.bool_)
     if len(keys):
         found[1:] = False
@@ -431,7 +431,7 @@ def _changes(keys: Keys) -> Bools:
 
 
 def codes_of(keys: Keys) -> Ints:
-    """Return a number for each row of a table, which equal rows share; from 0 to before the number of rows."""
+    """Return a number for each row of a table, below the number of rows. Equal rows have equal numbers."""
     order = ordering([*keys.T])
     found = np.empty(len(keys), np.int64)
     found[order] = np.cumsum(_changes(keys[order])) - 1

@@ -1,4 +1,4 @@
-"""Bindings of the online monitor in a frame, found by single-frame queries.
+"""Results of single-frame queries in an online monitor, and the node combinations (bindings) in a frame.
 
 A binding maps each variable to a node, or to ``None``: any node without known values. A binding without an
 entry uses the entry of its most specific stored generalisation. So a check over a hundred vehicles with five
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class Lattice:
-    """Partial bindings (nodes for some of the variables), ordered from none bound to all bound.
+    """Order of partial bindings (nodes for some of the variables), from none bound to all bound.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Lattice:
         return tuple(told)
 
     def wider(self, binding: Partial) -> Iterator[Partial]:
-        """Yield a partial binding, then its generalisations (fewer bound variables), most specific first."""
+        """Yield a partial binding, then the bindings with fewer of its variables, most specific first."""
         if self.size == 1:
             yield binding
             if binding[0] is not None:
@@ -106,7 +106,7 @@ def _both(one: Partial, other: Partial) -> Partial | None:
 
 
 class BindingTable(Generic[T]):
-    """Values by partial binding.
+    """Table of values for bindings. A binding without an entry has the value of a more general binding.
 
     A binding without an entry has the value of its next generalisation (fewer bound variables).
 
@@ -122,7 +122,7 @@ class BindingTable(Generic[T]):
         self.held: dict[Partial, T] = {lattice.stranger: strangers}
 
     def of(self, binding: Partial) -> T:
-        """Return the value of a partial binding, from its own entry or from a generalisation."""
+        """Return the value of a binding: its own entry, or that of the most specific generalisation."""
         held = self.held
         found = held.get(binding)
         if found is not None:
@@ -130,7 +130,7 @@ class BindingTable(Generic[T]):
         return next(held[wider] for wider in self.lattice.wider(binding) if wider in held)
 
     def keep(self, found: dict[Partial, T], same: Callable[[T, T], bool]) -> None:
-        """Store new values by partial binding.
+        """Replace the table. Entries equal to the entry of a generalisation are dropped.
 
         Bindings whose value equals that of a generalisation are dropped.
         """
@@ -150,11 +150,11 @@ class BindingTable(Generic[T]):
 
 
 Key = tuple[int, ...]
-"""Nodes of some variables, in order."""
+"""Nodes of some variables, in a fixed order."""
 
 
 def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
-    """Return a function that runs a query on one scene graph.
+    """Return a function that runs a query on one scene graph and returns the matches.
 
     Its result is: matched nodes → value (``None``: unknown).
 
@@ -263,7 +263,7 @@ class QueryCache:
     here: dict[b.Kinds, int] = field(default_factory=dict["b.Kinds", int])
 
     def met(self, kinds: b.Kinds) -> Mapping[int, str]:
-        """Return the nodes of some kinds that occurred until now: node → name.
+        """Return the nodes of the given kinds that have occurred so far: node → name.
 
         Each frame extends the mapping.
         """
@@ -332,10 +332,10 @@ def _told(query: b.Query) -> tuple[Any, ...]:
 # on from what is remembered of those that were never seen.
 
 TIMES: Final = 1001
-"""Number of latest frame intervals for the median."""
+"""Number of recent frame intervals whose median is the frame period."""
 
 NEVER: Final = 1 << 62
-"""Frame number after all frames."""
+"""Frame number that is larger than every real frame number."""
 
 Memory = tuple[Any, ...]
-"""Memory of a binding: data of earlier frames for each time function and its conditions."""
+"""Data of earlier frames for one binding: one entry for each function over time and its conditions."""

@@ -1,4 +1,4 @@
-"""Truth values of temporal formulas on whole traces, also for each possible last frame of a trace.
+"""Truth values of temporal formulas on whole traces, also for traces that end earlier.
 
 At a frame, a forward formula has a *course*: its value if the trace ends there, and the later ends at which the
 value changes. Logic combines courses. An *until* with monotonic sides is true from one end on. At the requested
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way
-    """Signal that a temporal formula is nested too deeply for the fast evaluation.
+    """Signal that a formula is nested too deeply for the fast evaluation. The caller uses a slower one.
 
     The caller then uses the slow one.
     """
@@ -51,7 +51,7 @@ class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way
 
 @dataclass(frozen=True, slots=True)
 class PrefixVerdicts:
-    """Truth values of a formula at each frame, for each possible last frame of the trace.
+    """Truth values of a formula at each frame, for every frame at which the trace could end.
 
     Attributes
     ----------
@@ -65,12 +65,12 @@ class PrefixVerdicts:
     switches: Places
 
     def at(self, ends: Places) -> Bools:
-        """Return the truth values (F,) of the formula at each frame, given a last frame for each."""
+        """Return the truth value (F,) of the formula at each frame, if the trace ends at the given frame."""
         return self.start ^ (np.sum(self.switches <= ends, axis=0) % 2 == 1)
 
     @property
     def rising(self) -> Places:
-        """Return the first last-frame from which the formula stays true, for each frame, (F,). F means never.
+        """Return, for each frame, the trace end from which on the formula is true, (F,). F means never.
 
         Raises
         ------
@@ -85,7 +85,7 @@ class PrefixVerdicts:
 
 
 def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
-    """Return the truth value of a formula at the first frame, for each possible last frame of the trace, (F,).
+    """Return the value of a formula at the first frame, for every frame at which the trace could end, (F,).
 
     Raises
     ------
@@ -96,7 +96,7 @@ def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
 
 
 def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # noqa: PLR0911
-    """Return the truth value of a formula at one frame, for each possible last frame from there on, (F,)."""
+    """Return the truth value of a formula at one frame, for every frame at which the trace could end, (F,)."""
     frames = len(table.times)
     if not looks_ahead(formula):
         return np.full(frames, table.whole(formula)[at])
@@ -120,7 +120,7 @@ def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # n
 
 
 def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
-    """Return True for each last frame of the trace at which an *until* from one frame is fulfilled already."""
+    """Return True for each trace end at which an *until* that starts at one frame is already fulfilled."""
     near, far = table.window(formula.bound, forward=True)
     frames = len(table.times)
     first = at if near is None else int(near[at])
@@ -143,7 +143,7 @@ def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
 
 
 def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
-    """Return the truth values of a formula at all frames, for each possible last frame of the trace.
+    """Return the truth values of a formula at all frames, for every frame at which the trace could end.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
 
 
 def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
-    """Combine the truth values of several formulas by a logical operator.
+    """Combine the truth values of several formulas with a logical operator.
 
     There is a value for each frame and each last frame of the trace.
     """
@@ -203,12 +203,12 @@ def _joined(courses: list[PrefixVerdicts], join: Any) -> PrefixVerdicts:
 # A formula that only the trace end can refute (``EVENTUALLY p``) is violated at the last frame.
 
 STATUS: Final = ("false", "presumably_false", "presumably_true", "true")
-"""Status words in code order. The minimum is the code of a conjunction, the maximum of a disjunction."""
+"""Status words in the order of their codes. ``AND`` takes the minimum, ``OR`` the maximum of the codes."""
 
 FALSE, PRESUMABLY_FALSE, PRESUMABLY_TRUE, CERTAINLY_TRUE = range(4)
 
 Violation = tuple[int, int, bool]
-"""First and last frame of a violation, and True if only the trace end caused it."""
+"""First and last frame of a violation. The third value is True if only the end of the trace causes it."""
 
 
 class Settled:
@@ -241,7 +241,7 @@ class Settled:
         return known(self.formula, self._table)
 
     def trap(self, start: int) -> int | None:
-        """Return the frame at which it becomes certain that the formula is false at ``start``, or ``None``."""
+        """Return the frame after which the formula is certainly false at ``start``, or ``None``."""
         trap = int(self._known[1][start])
         return trap if trap < self._frames else None
 
@@ -251,7 +251,7 @@ class Settled:
         return known(self.formula, self._table, ended=self._tolerance)[1]
 
     def due(self, start: int, end: str) -> bool:
-        """True if the formula at frame ``start`` is still open at the end of the trace, instead of false.
+        """True if the formula at frame ``start`` counts as still open at the end of the trace, not as false.
 
         Parameters
         ----------
@@ -275,7 +275,7 @@ class Settled:
         return told
 
     def _stepped(self) -> Bools:
-        """Return the truth value at the first frame for each possible last frame, computed frame by frame."""
+        """Return the truth value at the first frame for every possible trace end, computed frame by frame."""
         progression = Progression(self.formula)
         names, plain = progression.names, progression.untimed and not progression.past
         end = min(int(self._known[0][0]), int(self._known[1][0]), self._frames - 1) + 1
@@ -340,7 +340,7 @@ class Settled:
 
 
 def violations_of_always(held: Bools, reset: Bools | None) -> list[Violation]:
-    """Return the violations of ``ALWAYS p`` as frame ranges, where each frame decides p.
+    """Return the violations of ``ALWAYS p`` as frame ranges, if each frame decides p by itself.
 
     Parameters
     ----------

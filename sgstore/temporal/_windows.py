@@ -62,7 +62,7 @@ def over_columns(word: str, column: Column, first: Places, end: Places | None = 
 
 
 def greatest(values: Floats, first: Places, end: Places) -> Floats:
-    """Return, for each frame, the maximum of the values from frame ``first`` to before ``end``, (B, F).
+    """Return, for each frame, the maximum of the values from frame ``first`` up to before ``end``, (B, F).
 
     An empty range gives ``-inf``.
 
@@ -94,7 +94,7 @@ def greatest(values: Floats, first: Places, end: Places) -> Floats:
 
 
 def sums(values: Floats, first: Places, end: Places) -> Floats:
-    """Return, for each frame, the sum of the values from frame ``first`` to before ``end``, (B, F).
+    """Return, for each frame, the sum of the values from frame ``first`` up to before ``end``, (B, F).
 
     Sums are correctly rounded.
 
@@ -145,10 +145,10 @@ Point = tuple[int, int, float]
 """Known value: frame number, time (ns), and value."""
 
 Window = tuple[tuple[Point, ...], int]
-"""Window of a stream: points, and their exact sum as a multiple of the smallest positive float."""
+"""Values in a time window, and their exact sum as a multiple of the smallest positive float."""
 
 _UNIT: Final = 1074
-"""The smallest positive float is 2 to the power of minus this number."""
+"""Exponent of the smallest positive float: the float is 2 to the power of minus this number."""
 
 
 def next_window(
