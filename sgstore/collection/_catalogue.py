@@ -46,16 +46,16 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 FORMAT: Final = 1
-"""Version of the layout."""
+"""Version of the file layout of collections."""
 
 BUNDLE_TRACES: Final = 1_000
-"""Default for the greatest number of traces per bundle."""
+"""Default for the largest number of traces per bundle."""
 
 BUNDLE_BYTES: Final = 512 << 20
 """Approximate greatest size of a bundle; bytes."""
 
 ATTEMPTS: Final = 100
-"""Number of retries of a commit after concurrent commits."""
+"""Largest number of attempts to commit if other processes commit at the same time."""
 
 _SNAPSHOTS: Final = "catalogue"
 
@@ -103,7 +103,7 @@ def about(place: Place) -> About:
 
 
 def _damage(error: Exception) -> str:
-    """Return the defect of a damaged JSON file as text."""
+    """Return the cause of an unreadable JSON file as text."""
     why = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
     return f"damaged or cut off ({why}); put it back from a copy"
 
@@ -522,7 +522,7 @@ def without(facts: Facts, bundles: Iterable[str]) -> Facts:
 
 
 def files(place: Place, known: Iterable[int]) -> set[str]:
-    """Return the names of the files that store the given snapshots of a collection."""
+    """Return the names of all files that belong to the given snapshots of a collection."""
     found: set[str] = set()
     for number in known:
         told = json.loads(place.read(f"{_name(number)}.json"))

@@ -35,7 +35,7 @@ RETRIES: Final = 3
 """Number of retries of a task whose process or machine is lost."""
 
 TOGETHER: Final = 256
-"""Tasks per Spark job, whose results reach the driver together."""
+"""Number of tasks in one Spark job. The results of a job arrive together."""
 
 Task = dict[str, Any]
 Outcome = dict[str, Any]
@@ -68,11 +68,11 @@ def engine_named(name: str) -> Engine:
 
 
 _OF_QUESTIONS: Final = (QueryError, SqlError, AbstractionError, ConfigError)
-"""Errors caused by a query, not by a bundle."""
+"""Error classes that a query causes, and not a bundle."""
 
 
 def refusal(task: Task, error: SgstoreError) -> Outcome:
-    """Return the result of a task that failed with an error that a retry would repeat."""
+    """Return the result for a task that failed with an error which a retry would repeat."""
     outcome = {"bundle": task["bundle"], "error": str(error)}
     return outcome | ({"wrong": plain_error(error)} if isinstance(error, _OF_QUESTIONS) else {})
 
@@ -260,7 +260,7 @@ def _lines_done(name: str, lines: Iterable[str]) -> Iterator[str]:
 
 
 _RAISED: Final = re.compile(r'^[ \t]+File ".*\n(?:[ \t].*\n)*(\S.*)', re.MULTILINE)
-"""Python frames within the text of an error, and the error raised there."""
+"""Regular expression: stack frames of Python in an error text, and the final error."""
 
 
 def _cause(error: BaseException) -> str:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sgstore.collection._storage import Place
 
 DESCRIPTION: Final = "sealed.json"
-"""File of a landed segment that is uploaded last."""
+"""Name of the file that describes a landed segment. It is uploaded last."""
 
 
 def land(  # noqa: PLR0913  as many options as there are ways to read
@@ -163,7 +163,7 @@ class _Landing:
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
     def _told(self, key: str, path: Path) -> list[TraceOutcome] | None:
-        """Return the earlier results for a recording that was ingested before with the same settings.
+        """Return the earlier results of a recording that is already ingested with these settings, or None.
 
         ``None`` means that it was not.
         """

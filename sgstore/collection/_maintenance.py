@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sgstore.store import Facts
 
 GRACE_S: Final = 86_400.0
-"""Time that unreferenced files stay, because a commit may be in progress; s."""
+"""Minimum age of unused files before they are removed, because a commit may still need them; s."""
 
 
 @dataclass(slots=True)
@@ -78,7 +78,7 @@ def verify(url: str | Path) -> CollectionFaults:
 
 
 def _differing(snapshot: Snapshot, sha: str, facts: Facts) -> list[tuple[str, str, str]]:
-    """Return the catalogue tables whose rows for a bundle (store file) differ from its content."""
+    """Return the faults of catalogue tables whose rows for a bundle (store file) differ from its content."""
     faults: list[tuple[str, str, str]] = []
     for table in CATALOGUE:
         if table == "config":
@@ -168,7 +168,7 @@ def _segment_of(name: str) -> str:
 
 
 def _last(name: str) -> bool:
-    """True for a table file of a snapshot, which is removed after the snapshot itself."""
+    """True for a table file of a snapshot. Such a file is removed after the snapshot itself."""
     return not name.endswith(".json")
 
 
@@ -180,7 +180,7 @@ def rebuild(
     everything: bool = False,
     on_bundle: Callable[[int, int], None] | None = None,
 ) -> dict[str, str]:
-    """Rebuild the stores of other schema versions from their recordings, with one commit for each.
+    """Rebuild stores of other schema versions from their recordings. Each store is one commit.
 
     A repeated run continues with the remaining bundles. Names of traces and maps stay.
 
@@ -238,7 +238,7 @@ def _remade(place: Place, bundle: str, look_in: Sequence[str | Path], jobs: int)
 
 
 def _replaced(place: Place, bundle: str, fresh: Facts) -> bool:
-    """Replace a bundle (store file) in the newest snapshot by its rebuilt form.
+    """Replace a bundle (store file) in the newest snapshot by its rebuilt version.
 
     False: another process has replaced it.
     """

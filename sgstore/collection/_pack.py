@@ -42,7 +42,7 @@ TRACE: Final = {name: place for place, name in enumerate(CATALOGUE["trace"])}
 
 @dataclass(slots=True)
 class Commit:
-    """Result of a commit to a collection: number of the snapshot, added and renamed traces, rejections.
+    """Result of a commit to a collection: number of the snapshot, added traces, new names, and rejections.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ def pack(
 
 
 def _lacking(store: Path, place: Place, before: Snapshot, done: Commit) -> list[tuple[int, str]]:
-    """Return the traces of a store that the collection lacks, with their names, by recording digest.
+    """Return the traces of a store that the collection lacks, with their names, in order of recording digest.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def _lacking(store: Path, place: Place, before: Snapshot, done: Commit) -> list[
 
 
 def groups(names: Mapping[int, str], most: int) -> list[dict[int, str]]:
-    """Return traces in groups of at most ``most``, divided in the order of their names.
+    """Divide traces into groups of at most ``most``, in the order of their names.
 
     The groups have almost equal sizes: 1,001 traces are not split into 1,000 and 1. Few bundles
     have the first traces by name.
@@ -211,7 +211,7 @@ def put_bundle(
 
 
 def map_names(before: Snapshot, found: Mapping[str, str]) -> dict[str, str]:
-    """Return a name for each road map, by digest. Maps that the collection knows keep their names."""
+    """Return the name of each road map by digest. Maps that the collection already has keep their names."""
     names = {row["map_digest"]: row["map"] for row in before.traces if row["map_digest"]}
     taken = set(names.values())
     for digest, name in sorted(found.items()):
@@ -293,7 +293,7 @@ class _Landed:
 
     @property
     def read(self) -> tuple[Any, ...]:
-        """Return the settings, map digest, frame count and start time with which it was read."""
+        """Return the settings, map digest, frame count and start time with which the segment was ingested."""
         identity, trace = self.sealed.identity, self.sealed.trace
         about = identity.settings_digest, identity.map_digest
         return *about, trace["frames"], trace["start_ns"]
@@ -364,7 +364,7 @@ def _fetched(
 
 
 def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_Landed]:
-    """Return the segments that can be committed; rejected segments are recorded with a reason."""
+    """Return the segments that can be committed. Record the reason for each rejected segment."""
     there = {row["trace_id"]: row for row in before.traces}
     by_id: dict[int, list[_Landed]] = {}
     for one in waiting:
@@ -396,7 +396,7 @@ def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_L
 
 
 def _read_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return the settings, map digest, frame count and start time with which a trace was read."""
+    """Return the settings, map digest, frame count and start time with which a trace was ingested."""
     return row["config"], row["map_digest"] or "", row["frames"], row["start_ns"]
 
 

@@ -81,7 +81,7 @@ if TYPE_CHECKING:
     Words = Mapping[str, Sequence[str]]
 
 _SHOWN: Final = 8
-"""Number of bundles that a message names; further bundles are counted."""
+"""Number of bundles that an error message names. It only counts the others."""
 
 
 class PartialAnswerError(StoreError):
@@ -164,7 +164,7 @@ class Collection(StoreVerbs):
         self.close()
 
     def close(self) -> None:
-        """Do nothing, because the files of a collection are closed after each query.
+        """Do nothing: a collection closes its files after each query.
 
         Examples
         --------
@@ -187,7 +187,7 @@ class Collection(StoreVerbs):
 
     @cached_property
     def engine(self) -> Engine:
-        """Return the engine that runs queries in parallel. It is started by the first query."""
+        """Engine that runs queries in parallel. It starts at the first query."""
         return engine_named(self._engine_name)
 
     @cached_property
@@ -197,7 +197,7 @@ class Collection(StoreVerbs):
         return found if self._tables is None else replace(found, tables=self._table_facts())
 
     def _table_facts(self) -> dict[str, TableFacts]:
-        """Return for each user table how its rows match the frames of the collection."""
+        """Return, for each user table, how many of its rows match frames of the collection."""
         told: dict[str, dict[str, Any]] = {}
         bundles = self.bundles() or [worker.EMPTY]
         for _, tables in self.each(worker.tables_in, {one: {} for one in bundles}):
@@ -338,7 +338,7 @@ class Collection(StoreVerbs):
         return Example.best(found, limit)
 
     def pattern(self, frame: str, *, ignore: Sequence[str] = ()) -> str:
-        """Return a pattern that describes a frame around its ego; see :meth:`sgstore.Store.pattern`.
+        """Return a pattern of the surroundings of the ego in a frame; see :meth:`sgstore.Store.pattern`.
 
         Examples
         --------
@@ -378,7 +378,7 @@ class Collection(StoreVerbs):
     def each(
         self, step: Callable[..., Any], asked: Mapping[str, Mapping[str, Any]]
     ) -> Iterator[tuple[str, Any]]:
-        """Run a function on some bundles (stores) in parallel, and yield each bundle with its result.
+        """Run a function on several bundles (stores) in parallel. Yield each bundle with its result.
 
         Parameters
         ----------
@@ -444,7 +444,7 @@ class Collection(StoreVerbs):
             self._judge(failed, len(tasks))
 
     def _judge(self, failed: Mapping[str, str], asked: int) -> None:
-        """Raise an error if stores of the collection failed to answer. With ``partial``, they are recorded.
+        """Raise an error if stores of the collection failed to answer. With ``partial``, only record them.
 
         Earlier results may include bundles that answered then; such bundles cannot be left out now.
         """
@@ -488,7 +488,7 @@ class Collection(StoreVerbs):
         return {"text": "", "parameters": {}, "limit": None} | asked | about
 
     def _sent(self, path: Path) -> str:
-        """Return a user table for a task: its path, or its bytes for a machine without the same files."""
+        """Return a user table for a task: its path, or its content for a machine without shared files."""
         if self.engine.shares_files:
             return str(path)
         return "base64:" + base64.b64encode(path.read_bytes()).decode()
@@ -541,7 +541,7 @@ class Collection(StoreVerbs):
     def _held(
         self, catalog: Catalog, pruning: Pruning
     ) -> Callable[[str], tuple[frozenset[Triple], Sequence[frozenset[str]]]]:
-        """Return a function that gives the relevant triples and kinds of a store, for an abstraction."""
+        """Return a function that returns the relevant triples and node kinds of a store."""
         snapshot, name, world = self.snapshot, catalog.name, catalog.world
         if name and name not in snapshot.sets:
 
@@ -564,7 +564,7 @@ def _similar(values: dict[str, Any]) -> SimilarFrames:
 
 
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
-    """Return facts about a user table for compiling queries: how its rows match the frames."""
+    """Return the facts about a user table for the query compiler, such as how its rows match frames."""
     refused = None
     if not told["joins"]:
         refused = "no rows that belong to frames"
@@ -604,7 +604,7 @@ class CollectionMatches(TemporalMatches):
         yield self._ready
 
     def _exists(self, compiled: Compiled, scope: Scope) -> bool:
-        """Return True if some frame of the collection matches a pattern. Each store gets it as text."""
+        """Return True if some frame of the collection matches a pattern. Each store receives it as text."""
         from sgstore.lang.help import pattern_text
 
         using, values = self._settings()
@@ -635,11 +635,11 @@ class CollectionMatches(TemporalMatches):
         return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Raise an error: bindings are read from one store."""
+        """Raise an error, because the bindings in a frame need a single store."""
         raise one_store_needed(self._whole.place.url, "bindings are read from one store")
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Raise an error: parts of a pattern are read from one store."""
+        """Raise an error, because the parts of a pattern need a single store."""
         raise one_store_needed(self._whole.place.url, "parts of a pattern are read from one store")
 
     def numpy(self) -> dict[str, Any]:
@@ -975,7 +975,7 @@ _ALL: Final = f"FROM {PARTS} ORDER BY ALL"
 
 
 class CollectionFrames:
-    """Frames of all bundles of a collection, with the interface of a single store file.
+    """Frames of all bundles of a collection. It has the methods of a single store file.
 
     Parameters
     ----------
@@ -991,11 +991,11 @@ class CollectionFrames:
 
     @property
     def abstracted(self) -> Self:
-        """Return this object, which also has the methods for graph abstractions."""
+        """Return the collection's frames, which also have the methods for abstractions."""
         return self
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Return an empty context manager, because the snapshot of a collection never changes."""
+        """Return an empty context manager, because the files of a snapshot never change."""
         return nullcontext()
 
     def arrays(self, sql: str, parameters: Parameters = ()) -> dict[str, NDArray[np.generic]]:
@@ -1030,7 +1030,7 @@ class CollectionFrames:
             yield parts
 
     def by_bundle(self, frame_id: Ints) -> list[tuple[str, tuple[Ints, Ints]]]:
-        """Return the stores that contain the given frames, each with the indices and ids of its frames."""
+        """Return the stores that contain some frames: name, indices of its frames, and ids of its frames."""
         traces, number = np.unique(trace_of(frame_id), return_inverse=True)
         homes = [self._homes[trace] for trace in traces.tolist()]
         of = {bundle: place for place, bundle in enumerate(dict.fromkeys(homes))}
@@ -1039,7 +1039,7 @@ class CollectionFrames:
         return [(name, (some, frame_id[some])) for name, some in rows]
 
     def coded(self, name: str) -> CodedClasses:
-        """Return the class number of each frame in an abstraction. Classes that are not stored are computed."""
+        """Return the class of each frame in an abstraction as a number. Missing classes are computed."""
         with self._parts({"kind": "coded", "abstraction": name}) as parts:
             return PartFile.merged_classes(parts)
 
@@ -1054,7 +1054,7 @@ class CollectionFrames:
         return dict(found)
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """Yield the features of frames (label counts of their graphs) in an abstraction, store by store.
+        """Yield the label counts of the graphs of some frames in an abstraction, store by store.
 
         Parameters and results as in :meth:`sgstore.store._classes.Abstracted.features`.
         """
@@ -1072,7 +1072,7 @@ class CollectionFrames:
             yield homes[result["bundle"]][0], Triples(names, *columns)
 
     def margins(self, question: dict[str, Any]) -> Iterator[tuple[Ints, Floats]]:
-        """Yield frame ids with the robustness margins of a check, one bundle (store file) after another."""
+        """Yield frame ids and robustness margins of a check, one bundle (store file) after another."""
         with self._parts({"kind": "margins"} | question) as parts:
             found = PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
         yield (

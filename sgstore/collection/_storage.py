@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Iterator
 
 ABOUT: Final = "COLLECTION.json"
-"""The file that marks a folder as a collection."""
+"""Name of the file that marks a folder as a collection."""
 
 PIECE: Final = 1 << 20
-"""Block size for reading; bytes."""
+"""Number of bytes that one read returns at most."""
 
 
 class MissingObjectError(StoreError):
@@ -129,7 +129,7 @@ class _Folder:
 
     @contextmanager
     def _beside(self, name: str) -> Generator[tuple[Path, Path]]:
-        """Yield a temporary path and the final path of a file; the temporary file is removed at the end."""
+        """Yield a temporary path for a new file, and its final path. At the end, remove the temporary file."""
         path = self.root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
@@ -161,7 +161,7 @@ class _Folder:
                 path.parent.rmdir()
 
     def local(self, name: str) -> Path:
-        """Return the local path of a file in the storage; ``None`` means that it must be fetched."""
+        """Return the local path of a stored file. ``None`` means that it must be copied here first."""
         return self.root / name
 
 
@@ -219,11 +219,11 @@ class _Remote:
 
 
 CACHE: Final = "SGSTORE_CACHE"
-"""Environment variable: the folder for fetched bundles."""
+"""Environment variable for the folder in which copies of remote bundles are stored."""
 
 
 def cache_folder() -> Path:
-    """Return the folder for fetched bundles (store files of a collection), and create it if missing.
+    """Return the folder for copies of remote bundles (store files), and create a missing folder.
 
     Raises
     ------

@@ -37,17 +37,17 @@ if TYPE_CHECKING:
     from sgstore.matches import Matches
 
 KEPT_BYTES: Final = 256 << 20
-"""Memory for the bundles that a process keeps open; bytes."""
+"""Largest memory of all bundles that a process keeps open; bytes."""
 
 CATALOGS: Final = 128
-"""Number of catalogs of bundles that a process keeps."""
+"""Number of catalogs of bundles that a process caches."""
 
 EMPTY: Final = ""
-"""Name of the empty bundle, which provides the columns if no other bundle is relevant."""
+"""Name of an empty bundle. It provides the columns of a result if no other bundle is relevant."""
 
 
 def _in_whole(local: Catalog, whole: Mapping[str, Any]) -> Catalog:
-    """Return the catalog of one bundle for compiling queries, with the names of the whole collection.
+    """Return the catalog of one bundle, completed by names and topics of the whole collection.
 
     Parameters
     ----------
@@ -87,10 +87,10 @@ def _with_relations(
 
 
 class PartMatches(TemporalMatches):
-    """Matches of a query in one bundle (store file), in the forms that the merge of bundles needs."""
+    """Matches of a query in one bundle (store file), in the forms that the merge of all bundles needs."""
 
     def written(self, form: str, offsets: tuple[int, int], folder: Path) -> list[PartFile]:
-        """Write the rows of a query on one bundle (store file) to files, in one form, and return the files."""
+        """Write the results of a query on one bundle (store file) to files. Return these files."""
         with self._compiled() as compiled:
             if form == "count":
                 return [self._written(compiled, Compiled.count(compiled), folder)]
@@ -217,7 +217,7 @@ _of_interval, _of_robustness = _getter(Interval), _getter(Robustness)
 
 
 def _values_of(verdict: Verdict) -> list[Any]:
-    """Return a verdict as a list of values. Field names would make it three times as long."""
+    """Return a verdict as a list of values. With field names it would be three times as long."""
     margin, witnesses = verdict.robustness, verdict.witnesses
     return [
         *(verdict.check, verdict.trace, verdict.verdict),
@@ -230,7 +230,7 @@ def _values_of(verdict: Verdict) -> list[Any]:
 
 
 def as_verdict(values: list[Any]) -> Verdict:
-    """Return the verdict for a list of values that a worker has sent."""
+    """Return the verdict for a list of values from a worker process."""
     import numpy as np
 
     check, trace, word, violations, witnesses, status, reason, margin, absent = values
@@ -252,7 +252,7 @@ def as_verdict(values: list[Any]) -> Verdict:
 
 @dataclass(frozen=True, slots=True)
 class BundleTask:
-    """Part of a query on one bundle (store file). Each kind of task has a method, which returns JSON values.
+    """Part of a query that runs on one bundle (store file). Each kind of task is one method.
 
     Attributes
     ----------
@@ -370,7 +370,7 @@ class BundleTask:
 
 
 def tables_in(store: Store) -> dict[str, Any]:
-    """Return how the rows of the user tables match the frames of one bundle (store file)."""
+    """Return, for each user table, how many of its rows match frames of one bundle (store file)."""
     joined, told = store.file.joined(), dict[str, Any]()
     for name, facts in store.file.catalog().tables.items():
         rows = joined.get(name)
@@ -385,7 +385,7 @@ def tables_in(store: Store) -> dict[str, Any]:
 
 
 def example_in(store: Store, **asked: Any) -> dict[str, Any]:
-    """Return a frame of a bundle (store file) as an example, to find similar frames in other bundles."""
+    """Return a frame of a bundle (store file) as the example for a similarity search in other bundles."""
     return asdict(Example.of(store.file, **asked))
 
 
@@ -395,7 +395,7 @@ def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str,
 
 
 def _carry(found: dict[str, Any]) -> None:
-    """Replace file paths in a result by the content of the files, for another machine."""
+    """Add the content of result files to a result, because the caller runs on another machine."""
     for part in found.get("parts", ()):
         if not part["path"]:
             continue
@@ -405,7 +405,7 @@ def _carry(found: dict[str, Any]) -> None:
 
 
 def brought(result: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Write the file contents in a result to a local folder, and return the result with their paths.
+    """Write the file contents in a result to local files. Return the result with their paths.
 
     Raises
     ------
