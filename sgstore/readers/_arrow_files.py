@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MAX_FILE: Final = 2 << 30
 """Maximum size of a file; bytes."""
 _FAULTS: Final = (OSError, ValueError, TypeError, LookupError, MemoryError, NotImplementedError)
-"""Errors of pyarrow; its own classes derive from these."""
+"""Exceptions of pyarrow. Its own exceptions are subclasses of these."""
 
 
 def arrow() -> Any:
@@ -38,7 +38,7 @@ def arrow() -> Any:
 
 
 def read_arrow_file(path: Path, columns: Iterable[str], lose: Callable[[str], None]) -> Any:
-    """Return the named columns of an Arrow file as a table. Unreadable batches are lost.
+    """Return the named columns of an Arrow file as a table. Unreadable batches count as lost.
 
     Parameters
     ----------

@@ -49,10 +49,10 @@ if TYPE_CHECKING:
 Key = TypeVar("Key")
 
 LISTED: Final = 20
-"""Maximum number of names in an error."""
+"""Largest number of names that an error message lists."""
 
 Ref = tuple[int, int, int, int, int]
-"""Channel id, log time, chunk offset, offset, length."""
+"""Position of a message: channel id, log time, chunk offset, offset and length."""
 
 
 def ref_of(run: Messages, row: int) -> Ref:
@@ -136,14 +136,14 @@ def light_places(road_map: RoadMap) -> dict[str, tuple[float, float, float]]:
 # First reading.
 
 FIRST_NOISE: Final = 3
-"""Number of frames that show if velocities are recorded."""
+"""Number of first frames in which the reader looks for recorded velocities."""
 
 BEGINNING: Final = 1_000_000_000
-"""Maximum delay of a context message after the first frame; ns of log time."""
+"""Time after the first frame within which a message belongs to the start of the recording; ns of log time."""
 
 
 def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int = 1) -> int:
-    """Increase the counter of a key, and remember its first message. Return the previous count."""
+    """Increase the counter of a key, and store the position of its first message. Return the old count."""
     before, first = told.get(key, (0, ref))
     told[key] = before + times, first
     return before
@@ -156,7 +156,7 @@ def listing(things: Sequence[str]) -> str:
 
 @dataclass(slots=True)
 class Lead:
-    """Channel whose messages may be the frames of a trace, with counts of its content.
+    """Channel that may contain the frames of a trace, with counts of its content.
 
     Attributes
     ----------
@@ -315,7 +315,7 @@ class Survey(Generic[AnyLead]):
         return min(ranked)[-1] if ranked else -1
 
     def alike(self, channel: int) -> list[int]:
-        """Return the ids of all channels with the same topic and schema as a channel. They count as one."""
+        """Return the ids of all channels with the same topic and schema as the given channel."""
         channels = self.recording.channels
         return [number for number in sorted(channels) if self._key(number) == self._key(channel)]
 
@@ -326,7 +326,7 @@ class Survey(Generic[AnyLead]):
         return record.topic, record.message_encoding, *named
 
     def shared_stamps(self, channel: int, stamps: Stamps) -> Stamps:
-        """Return the time stamps of a channel with the same topic and schema, else the given time stamps."""
+        """Return the time stamps of another channel with equal topic and schema; otherwise the given ones."""
         leads = self.leads
         return next((leads[one].stamps for one in self.alike(channel) if one in leads), stamps)
 
@@ -336,7 +336,7 @@ class Survey(Generic[AnyLead]):
         return lost[0].reason if lost else "no list of objects can be read"
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego vehicle for a name. ``None`` means that a new pass may find it.
+        """Return the id of the ego vehicle for a name. ``None`` means that only a new first pass can find it.
 
         Raises
         ------
@@ -461,7 +461,7 @@ class MessageTrace:
         self.recording.close()
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego vehicle for a name. ``None``: the recording must be opened again.
+        """Return the id of the ego vehicle for a name. ``None`` means that the recording must be opened again.
 
         Raises
         ------
@@ -707,7 +707,7 @@ class FramesTrace(MessageTrace):
         )
 
     def ego_named(self, name: str) -> str:
-        """Return the name of the ego unchanged, because frames contain only ids."""
+        """Return the name of the ego unchanged, because such frames contain no other names than ids."""
         return name
 
     @staticmethod
@@ -747,7 +747,7 @@ class FramesTrace(MessageTrace):
         raise NotImplementedError
 
     def start(self) -> None:
-        """Reset the reader, before the messages are read again from the first one.
+        """Reset the reader. It is called before the messages are read again from the first one.
 
         Only readers that combine several messages need it.
         """
@@ -768,7 +768,7 @@ class FramesTrace(MessageTrace):
         return _FramesDecoder(self, self._channels, self._ego, self.recording.window, report)
 
     def _beginning(self) -> tuple[str, list[Ref], str]:
-        """Return the ego of the first frame, the messages needed by later messages, and the road map.
+        """Return the ego of the first frame, the messages that later messages need, and the road map.
 
         The recording is read only as far as necessary.
         """
@@ -799,7 +799,7 @@ class FramesTrace(MessageTrace):
 
 
 class _FramesDecoder(MessageDecoder[FrameRows]):
-    """Decoder of messages that are complete frames, and check of the frames.
+    """Decoder for messages that are complete frames. It also checks the frames.
 
     Attributes
     ----------

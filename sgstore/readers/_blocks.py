@@ -52,32 +52,32 @@ if TYPE_CHECKING:
     Steps = tuple[Ints, Ints, Floats, Floats]
 
 Called: TypeAlias = "tuple[TypeMeaning, str]"
-"""Meaning of an entity's type, and the simulator's own name of the type."""
+"""Meaning of an entity's type, and the name of the type in the simulator."""
 
 
 Raw = TypeVar("Raw")
 
 NAN: Final = float("nan")
 FAR: Final = 1e9
-"""Greatest coordinate on earth, in any projection; m. Larger values are unusable."""
+"""Largest coordinate on earth in any map projection; m. Larger values are invalid."""
 
 UPRIGHT: Final = 1 - 1e-13
-"""Sine of the pitch above which rounding makes heading and roll indistinguishable."""
+"""Sine of the pitch above which heading and roll cannot be separated, because of rounding."""
 
 EXACT: Final = Noise()
-"""No noise: the positions of a simulator."""
+"""Noise value for exact positions, as from a simulator."""
 
 NEAR_REFS: Final = 250_000
-"""Maximum number of message references after a frame, and before the next one."""
+"""Largest number of message positions that are kept after a frame, and before the next frame."""
 
 MOST_EVENTS: Final = 10_000
-"""Maximum number of events in a report. Blocks contain all: a vehicle at a wall collides in every frame."""
+"""Largest number of events in a report. A vehicle at a wall collides in every frame, so they can be many."""
 
 _X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = 0, 3, 6, 9, 12
 
 
 NO_INPUTS: Final = (NAN,) * len(INPUTS)
-"""Control inputs of an entity without recorded ones."""
+"""Control inputs of an entity for which the recording has none."""
 
 
 @dataclass(slots=True)
@@ -263,7 +263,7 @@ class EntityTable:
         return before + len(self._returned) - 1
 
     def turn(self, number: int, lifetime: int, seq: int) -> None:
-        """Record that an id refers to a certain object (lifetime number) from a frame on."""
+        """Record which object (lifetime number) an id refers to from a frame on."""
         self._turns.setdefault(self._rows[number].ident, []).append((seq, lifetime))
 
     @property
@@ -544,7 +544,7 @@ def assemble(
 
 
 class _BlockMaker(Generic[Raw]):
-    """Frames that wait for the frames after them, and the blocks that they make.
+    """Builder of blocks. It holds frames back until the later frames that they depend on are complete.
 
     Parameters
     ----------
@@ -582,23 +582,23 @@ class _BlockMaker(Generic[Raw]):
         return self._count > 0 and self._count % self._size == 0
 
     def start_block(self, before: list[MessageRefs], same: list[MessageRefs], known: int) -> None:
-        """End a block before the next frame; ``known``: number of entities before this frame."""
+        """End the current block before the next frame. ``known``: number of entities before that frame."""
         self._borders.append((self._refs + before, known))
         self._refs = same
 
     def add(self, frame: Raw, refs: list[MessageRefs]) -> None:
-        """Add a frame, and the messages before it."""
+        """Add a frame and the positions of the messages before it."""
         self._raw.append(frame)
         self._refs += refs
         self._count += 1
 
     @property
     def left(self) -> int:
-        """Number of frames that are in no block yet."""
+        """Number of frames that are not in a block yet."""
         return self._count - self._first
 
     def ready(self, known: int) -> Iterator[FrameBlock]:
-        """Yield the next block if all frames that it depends on are complete.
+        """Yield the next block as soon as all frames that it depends on are complete.
 
         ``known``: number of entities of the frames so far.
         """
@@ -609,7 +609,7 @@ class _BlockMaker(Generic[Raw]):
             yield self.block(self._size)
 
     def finish(self, refs: list[MessageRefs]) -> None:
-        """End the last block; ``refs``: the messages after the last frame."""
+        """End the last block. ``refs`` are the messages after the last frame."""
         self._sizes.append(self._decoder.roster.size)
         self._complete()
         self._borders.append((self._refs + refs, self._decoder.roster.size))
@@ -640,7 +640,7 @@ class _BlockMaker(Generic[Raw]):
 
 @dataclass(slots=True)
 class _Between:
-    """Buffer of message positions between two frames. Of very many, only the first and last are kept.
+    """Buffer for the positions of messages between two frames. If it is full, it keeps the first and last ones.
 
     A recording may contain hours of pictures without ground truth. Messages far from every frame are not
     needed.
@@ -749,7 +749,7 @@ def _block(
 
 
 def _columns(window: list[FrameRows], seconds: Floats) -> tuple[Ints, Ints, Floats, Floats, Bools]:
-    """Return node, frame, time steps, values and fixed rows of frames, as :func:`derive` needs them."""
+    """Return nodes, frames, time steps, values, and a mask of fixed objects, as arguments of :func:`derive`."""
     return (
         np.concatenate([frame.node for frame in window]),
         np.repeat(np.arange(len(window)), [len(frame) for frame in window]),
@@ -782,7 +782,7 @@ def lacks_velocity(decoder: MessageDecoder[Raw], raw: list[Raw]) -> bool:
 
 
 FIRST_STEPS: Final = 64
-"""Number of clock steps; their median is the current period of a recording."""
+"""Number of recent time steps whose median is the period of a recording."""
 
 
 class LifetimeTracker:
@@ -803,7 +803,7 @@ class LifetimeTracker:
     """
 
     MOST: ClassVar[int] = 20
-    """Maximum number of reused ids listed in a report."""
+    """Largest number of reused ids that a report lists."""
 
     def __init__(
         self, roster: EntityTable, first_steps: Iterable[int], *, sure_kinds: bool = True
@@ -870,7 +870,7 @@ class LifetimeTracker:
         return step / 1e9 if joined else NAN
 
     def _earlier(self, frames: list[FrameRows], runs: list[int]) -> list[dict[int, Sight | None]]:
-        """Return, for each frame, the rows whose id may now be another object, with its last position.
+        """Return the rows whose id may now belong to another object, with its last position, for each frame.
 
         These are ids with a jump, and ids with a different kind in some frame.
         """
@@ -979,7 +979,7 @@ class LifetimeTracker:
 
 
 def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
-    """Replace impossible values of frames (too large numbers) by NaN, and count them."""
+    """Replace impossible values (too large numbers) in frames by NaN, and count them."""
     values = np.concatenate([frame.values for frame in frames] or [np.zeros((0, len(POSE)))])
     absurd = np.abs(values) >= FAR
     if absurd.any():
@@ -1015,7 +1015,7 @@ def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> 
 
 
 def _own(frames: list[FrameRows]) -> NDArray[np.object_]:
-    """Return the attributes without a column, one mapping or ``None`` per row of the frames."""
+    """Return the attributes without a column: for each row of the frames, a mapping or ``None``."""
     column = np.full(sum(map(len, frames)), None, object)
     start = 0
     for frame in frames:
@@ -1091,7 +1091,7 @@ def derive(
 
 
 def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
-    """Return the rows of the same node in the previous and next frame, and the time steps; s (NaN: absent)."""
+    """Return the rows of the same node in the previous and next frame, and the time steps; s. NaN: none."""
     span = int(node.max()) + 1
     keys = frame * span + node
     order = np.argsort(keys)
@@ -1109,7 +1109,7 @@ def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
 
 
 def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
-    """Return the time steps without implausible speeds between positions, and a mask of the changed rows."""
+    """Return the time steps without those of impossible speed, and a mask of the changed rows."""
     before, behind, since, until = steps
     position = values[:, _X : _X + 3]
     lost = np.zeros(len(since), np.bool_)

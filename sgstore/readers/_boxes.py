@@ -1,4 +1,4 @@
-"""Annotated boxes of a log, frame by frame: poses as quaternions, messages as JSON, and the reader of messages.
+"""Logs of annotated boxes: poses as quaternions, frames as JSON messages, and the base class of their readers.
 
 A message has a time, the id of the ego, and boxes with the arguments of :meth:`sgstore.Frame.add`.
 """
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 EGO: Final = "ego"
-"""Id of an ego that a log does not name."""
+"""Id of the ego in logs that have no id for it."""
 EGO_TYPE: Final = "EGO_VEHICLE"
-"""Type of the ego in logs of Argoverse 2 and 123D."""
+"""Type name of the ego in logs of Argoverse 2 and 123D."""
 NAME, NOTE, ORIGIN = "name", "note", "dataset"
-"""Keys of the metadata of a channel: name of the log, remark, and data set."""
+"""Metadata keys of a channel: name of the log, remark, and name of the data set."""
 
 _NUMBERS: Final = (
     *("x", "y", "z", "heading", "pitch", "roll", "length", "width", "height"),
@@ -59,7 +59,7 @@ class Boxes:
     motion: Floats | None = None
 
     def message(self, time_ns: int, ego: str, rows: list[int], **more: Any) -> bytes:
-        """Return the frame of some rows as JSON text. Unknown numbers are left out."""
+        """Return one frame as JSON text, made of some rows. Unknown numbers are left out."""
         values = np.hstack(
             [self.centre[rows], np.degrees(angles_of(self.turn[rows])), self.size[rows]]
         )
@@ -85,7 +85,7 @@ def turned(turn: Floats, vectors: Floats) -> Floats:
 
 
 def joined(first: Floats, then: Floats) -> Floats:
-    """Multiply quaternions (n, 4), scalar first: the rotation ``then`` in the axes of ``first``."""
+    """Multiply quaternions (n, 4), scalar first: rotation ``first``, then ``then`` in the rotated axes."""
     w = first[:, :1] * then[:, :1] - (first[:, 1:] * then[:, 1:]).sum(axis=1, keepdims=True)
     axis = first[:, :1] * then[:, 1:] + then[:, :1] * first[:, 1:]
     return np.hstack([w, axis + np.cross(first[:, 1:], then[:, 1:])])
@@ -132,14 +132,14 @@ def interpolated(times: Any, poses: Floats, at: Any, furthest: float) -> Floats:
 
 
 def steps_of(times: Any) -> list[Any]:
-    """Return the rows of each time, in order of time. A time below 0 is damage."""
+    """Return the rows of each time in ascending order. A time below 0 counts as damage."""
     order = np.argsort(times, kind="stable")
     order = order[times[order] >= 0]
     return np.split(order, np.flatnonzero(np.diff(times[order])) + 1) if len(order) else []
 
 
 class BoxesTrace(FramesTrace):
-    """Base class of readers of logs of annotated boxes. The metadata of a channel have the name of the log.
+    """Base class for readers of logs with annotated boxes. The channel metadata contain the name of the log.
 
     Attributes
     ----------
@@ -180,4 +180,4 @@ class BoxesTrace(FramesTrace):
         return next(filter(None, known), TypeMeaning("unknown"))
 
     def add_lights(self, frame: Frame, told: dict[str, Any]) -> None:
-        """Add the traffic lights of a message to a frame, if such logs have them."""
+        """Add the traffic lights of a message to a frame. This base class adds none."""

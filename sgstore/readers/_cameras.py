@@ -1,4 +1,4 @@
-"""Camera pictures of the latest frames, from a recording or a running simulator."""
+"""Camera pictures of recent frames, from a recording or from a running simulator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sgstore.readers.carla._live import Sensor, SensorPicture, Sensors
 
 KEPT: Final = 3000
-"""Number of recent frames with available pictures."""
+"""Number of recent frames whose pictures are available."""
 
 MOST_BYTES: Final = 64 << 20
 """Maximum size of the stored pictures of a running simulator; bytes."""

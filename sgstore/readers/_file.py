@@ -1,4 +1,4 @@
-"""Base class of files in other formats, which offers their content like an MCAP file (log of messages)."""
+"""Base class for files in other formats. They offer the interface of an MCAP file (log of messages)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 RUN_BYTES: Final = 1 << 20
-"""Approximate maximum size of a run of messages; bytes."""
+"""Approximate largest size of a group of messages; bytes."""
 
 
 def first_bytes(
@@ -95,7 +95,7 @@ class MessageFile:
         self.close()
 
     def close(self) -> None:
-        """Do nothing, because the file object keeps no file open."""
+        """Do nothing: this object keeps no file open."""
 
     def walk(
         self,
@@ -120,17 +120,17 @@ class MessageFile:
         raise NotImplementedError
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Do nothing, because the message order of such a file is fixed."""
+        """Do nothing: the order of messages in such a file is fixed."""
         del rank
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
-        """Return an empty iterator, because files of this format have no attachments."""
+        """Return an empty iterator: files in this format have no attachments."""
         del place
         return iter(())
 
 
 class NumberedFile(MessageFile):
-    """File of another format whose messages are made on request: 0 is the road map, others are time steps.
+    """File whose messages are made on request, by number: 0 is the road map, other numbers are time steps.
 
     A subclass calls :meth:`add_channels`, and defines :meth:`message` and :meth:`time_of`.
 
@@ -143,7 +143,7 @@ class NumberedFile(MessageFile):
     """
 
     RUN: ClassVar[int] = 256
-    """Maximum number of messages in a run."""
+    """Largest number of messages in a group."""
 
     def add_channels(
         self, named: dict[str, str], steps: int, about: dict[str, str], schemas: dict[str, bytes]
@@ -199,7 +199,7 @@ class NumberedFile(MessageFile):
 def read_numbered(
     opened: Callable[[Path], Any], path: Path, places: Iterable[tuple[int, int, int]]
 ) -> Iterator[bytes]:
-    """Yield the bytes of messages of a file, by their numbers and lengths.
+    """Yield the bytes of the messages that places refer to by number and length.
 
     ``opened``: class of the file, with a method ``message``.
 
@@ -223,7 +223,7 @@ def read_numbered(
 def grouped(
     messages: Iterable[tuple[int, int, bytes]],
 ) -> Iterator[tuple[dict[int, bytes], list[int]]]:
-    """Yield messages (offset, time, bytes) in groups for a run: bytes by offset, and times."""
+    """Yield messages (offset, time, bytes) in groups: bytes by offset, and times."""
     held: dict[int, bytes] = {}
     times: list[int] = []
     size = 0
@@ -239,7 +239,7 @@ def grouped(
 
 
 def numbered_runs(messages: Iterable[tuple[int, int, bytes]], channel: int) -> Iterator[Messages]:
-    """Yield the messages (offset, time, bytes) of one channel in runs, with their numbers as sequence."""
+    """Yield the messages (offset, time, bytes) of one channel in groups. Their sequence is their number."""
     first = 0
     for held, times in grouped(messages):
         sequence = range(first, first + len(held))

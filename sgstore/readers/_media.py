@@ -56,9 +56,9 @@ if TYPE_CHECKING:
 
 
 MAX_RUN: Final = 10_000
-"""Maximum number of messages searched for a key frame: minutes of video."""
+"""Largest number of messages that are searched for a key frame: minutes of video."""
 MAX_RUN_BYTES: Final = 256 << 20
-"""Maximum size of a run of video; bytes."""
+"""Largest size of the video data from a key frame on; bytes."""
 
 _PICTURES: Final = {
     "jpeg": rb"\xff\xd8\xff",
@@ -67,7 +67,7 @@ _PICTURES: Final = {
     "tiff": rb"II\*\x00|MM\x00\*",
     "bmp": rb"BM",
 }
-"""First bytes of picture files."""
+"""First bytes of picture files → format."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +91,10 @@ _CODECS: Final = (
         frozenset({32, 33, 34}),
     ),
 )
-"""Key frames: IDR of H.264; BLA, IDR and CRA of H.265. Parameter sets: SPS and PPS, and VPS of H.265."""
+"""Codecs with key frames (IDR of H.264; BLA, IDR, CRA of H.265) and parameter sets (SPS and PPS; and VPS)."""
 
 _UNIT: Final = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
-"""A start code of annex B and the first byte of its unit. Start codes never occur inside units."""
+"""Regular expression: start code (annex B) and first byte of a unit. Start codes never occur inside units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,10 +240,10 @@ _PIXELS: Final = {
     "CHANNEL_FORMAT_RGB_U8_LIN": (3, "u1"),
     "CHANNEL_FORMAT_RGB_U16_LIN": (3, "<u2"),
 }
-"""Format of the channels → number of channels, and type of their numbers."""
+"""Pixel format of OSI → numbers per pixel, and type of the numbers."""
 _RIGHT_TO_LEFT, _BOTTOM_TO_TOP = 2, 3
 MAX_SIDE: Final = 1 << 16
-"""Maximum width or height of a picture, more than any camera has; pixels."""
+"""Largest width or height of a picture; pixels. No camera exceeds it."""
 
 
 def _of_sensor_view(made: type[Any], message: bytes) -> Mapping[str, Any] | None:
@@ -376,11 +376,11 @@ def _parameters(codec: _Codec, data: bytes) -> dict[int, bytes]:
 # these are the chunk of the message and the chunks directly before it.
 
 _Row = tuple[int, int, int, "Callable[[], bytes]"]
-"""Log time; offset of the chunk or, outside chunks, of the message; offset; data. Sorted by the first three."""
+"""Log time; offset of the chunk or message; offset; function for the data. Sorted by the first three."""
 
 
 def _rows(path: Path, base: int, channel: int, chunk: int) -> list[_Row]:
-    """Return time and position of each video message in a chunk of a file, or outside chunks (-1).
+    """Return the video messages in a chunk of a file, or outside all chunks (-1), with time and position.
 
     ``base`` is the position of the file in its bag.
     """

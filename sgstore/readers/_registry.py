@@ -48,7 +48,7 @@ ENDINGS: Final = (
     *(".mcap", *_OSI_ENDINGS, *_LOG_ENDINGS, *_BAG_ENDINGS),
     *dict.fromkeys((*_SCENARIO_ENDINGS, *_SUMO_ENDINGS)),  # Both have the suffix .xml.
 )
-"""Suffixes of recordings, for the search in a folder; see :func:`is_recording`."""
+"""File suffixes of recordings, for the search in a folder; see :func:`is_recording`."""
 
 
 RecordingFile = (
@@ -61,7 +61,7 @@ RecordingFile = (
     | RosbagFile
     | Py123dFile
 )
-"""A file of messages in any format."""
+"""File of messages in any supported format."""
 
 
 class RecordingReader(Protocol):
@@ -84,7 +84,7 @@ class RecordingReader(Protocol):
 READERS: Final[tuple[RecordingReader, ...]] = tuple(
     plugins.READERS.load(name) for name in plugins.READERS.own
 )
-"""Readers, in the order of their tests."""
+"""Readers of sgstore. The first one that recognises a recording reads it."""
 
 
 def readers() -> Iterator[RecordingReader]:
@@ -201,7 +201,7 @@ def _format_of(
 
 
 _FOLDERS: Final[dict[str, Any]] = {METADATA: RosbagFile, "sync.arrow": Py123dFile}
-"""First file of a folder → class of the recording."""
+"""Name of a file in a folder → class of the recording that such a folder contains."""
 
 
 def _numbered(opened: Any) -> tuple[Any, Any]:
@@ -264,7 +264,7 @@ _LOOKS: Final = (
     (re.compile(r"osi3\."), "OSI recording"),
     (re.compile(r"\w+/(msg/)?[A-Z]\w*$"), "ROS recording"),
 )
-"""Prefix of a schema name → probable format of the recording; the first match counts."""
+"""Regular expression of a schema name → probable format of the recording. The first match counts."""
 _TELLS_OBJECTS: Final = re.compile(
     r"object|track|detect|obstacle|truth|actor|entit|marker|scene", re.IGNORECASE
 )

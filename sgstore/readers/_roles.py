@@ -1,4 +1,4 @@
-"""Reading order of messages with equal times: the rank of the channel decides.
+"""Reading order of messages with equal times, given by the rank of their channels.
 
 A frame needs the map, static entities, transforms and signals of its instant first. Messages that refer to a
 frame, such as the controls of the ego, come after it.
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from sgstore.mcap import Recording
 
 LOOSE, MAP, STATIC, TRANSFORMS, LIGHTS, STATES, EGO, CONTROLS = range(-1, 7)
-"""Ranks of channels. ``LOOSE``: the order does not matter. This applies to payloads, which frames find by time,
-and to road maps, which are read before all frames."""
+"""Ranks of channels in reading order. ``LOOSE`` means any order: payloads, which frames find by time, and road
+maps, which are read before all frames."""
 
 _SCHEMAS: Final = {
     "osi3.MapAsamOpenDrive": LOOSE,
@@ -65,15 +65,15 @@ _SCHEMAS: Final = {
         }.items()
     },
 }
-"""Schema → rank of its channels."""
+"""Name of a message schema → rank of its channels."""
 _ROLES: Final = {"map": MAP, "ground_truth": STATES}
-"""Role of a channel in a reader of another package → its rank."""
+"""Role of a channel in a reader of another package → rank of the channel."""
 
 
 def channel_rank(
     recording: Recording, roles: Mapping[int, str] | None = None
 ) -> Callable[[int], int]:
-    """Return a function: channel id → rank. Of messages with equal times, lower ranks are read first.
+    """Return a function: channel id → rank. Of messages with equal times, the lowest rank is read first.
 
     ``roles``: role by channel id, for channels whose schema has no rank.
     """

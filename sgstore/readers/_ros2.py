@@ -38,15 +38,15 @@ MAX_TYPES: Final = 512
 MAX_DEPTH: Final = 32
 """Maximum nesting depth of types."""
 MAX_MEMBERS: Final = 4096
-"""Maximum number of values in a message on all levels, without its sequences."""
+"""Largest number of values in a message, on all levels, without the content of its sequences."""
 MAX_ARRAY: Final = 1 << 20
 """Maximum length of a fixed-size array."""
 
 MAX_IDENT: Final = 1 << 53
-"""Upper limit of ids, up to which a double is exact."""
+"""Largest id for which floating-point numbers are exact."""
 
 LENGTH: Final = 4
-"""Size of the length before a string or sequence; bytes."""
+"""Size of the length field before a string or sequence; bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,15 +127,15 @@ NUMBERS: Final[Mapping[str, Number]] = {
     "float32": Number("f", 4),
     "float64": Number("d", 8),
 }
-"""Built-in types; ``char`` is uint8 according to the documentation."""
+"""Built-in number types by name. ``char`` is uint8, as documented by ROS."""
 
 _EMPTY: Final = (("structure_needs_at_least_one_member", NUMBERS["uint8"]),)
-"""Field that ROS 2 adds to an empty message, because IDL does not allow empty structures."""
+"""Field name that ROS 2 adds to an empty message, because IDL does not allow empty structures."""
 _BUILT_IN: Final = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
     "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
 }
-"""Definitions that some writers omit."""
+"""Definitions of common types, which some writers omit."""
 _SEPARATOR: Final = re.compile(r"={3,}")
 _NAMED: Final = re.compile(r"MSG:\s*([\w/]{1,200})")
 _LINE: Final = re.compile(
@@ -345,18 +345,18 @@ def _alignment(kind: Type) -> int:
 Data = bytes | bytearray | memoryview
 
 HEAD: Final = 4
-"""Size of the head: the encoding, and options that plain CDR does not use; bytes."""
+"""Size of the header of a message; bytes. It contains the encoding and unused options."""
 MAX_VALUES: Final = 1_000_000
-"""Maximum number of values decoded one by one in a message, without numbers in arrays."""
+"""Largest number of values in a message that are decoded one by one, without numbers in arrays."""
 MAX_ROWS: Final = 100_000
 """Maximum number of elements in a sequence decoded as columns."""
 
 _ORDERS: Final = {0: ">", 1: "<"}
 """First two bytes of a message → byte order of its numbers."""
 _MAX_LAYOUTS: Final = 16
-"""Maximum number of stored layouts per alignment; the oldest is dropped."""
+"""Largest number of cached layouts for each alignment. The oldest one is dropped."""
 _MAX_PREFIXES: Final = 64
-"""Maximum number of lengths in an element with a stored layout."""
+"""Largest number of length fields in an element whose layout is cached."""
 
 
 def decode(kind: Struct, data: Data) -> dict[str, Any]:
@@ -448,7 +448,7 @@ class MessageReader:
         return _unpacker(self.order + kind.code)(self.values, start)[0]
 
     def length(self, least_size: int, bound: int, what: str) -> int:
-        """Read the length of a sequence or string, and check that the message is long enough.
+        """Read the length of a sequence or string. Raise an error if the message is too short for it.
 
         Each element has at least ``least_size`` bytes.
         """
@@ -461,7 +461,7 @@ class MessageReader:
         return count
 
     def prefix(self, start: int) -> tuple[int, int]:
-        """Return the position and the value of the length of a string or sequence that has been read."""
+        """Return the position and the value of a length field that was read before."""
         place = start + -start % LENGTH
         return place, _unpacker(self.order + "I")(self.values, place)[0]
 
@@ -519,7 +519,7 @@ def dtype_of(order: str, code: str) -> np.dtype[Any]:
 
 @dataclass(slots=True)
 class _StructLayout:
-    """Byte positions of the numbers in one element of a ROS sequence.
+    """Byte positions of the numbers within one element of a ROS sequence.
 
     ``size``: bytes from its start to the next element; ``prefixes``: position and value of each length in it;
     ``runs``: first column, position, number and type of adjacent numbers.
@@ -530,7 +530,7 @@ class _StructLayout:
     runs: list[tuple[int, int, int, np.dtype[Any]]]
 
     def agreeing(self, values: memoryview, order: str, place: int, most: int) -> int:
-        """Return the number of consecutive sequence elements that have the same byte positions of numbers."""
+        """Return how many consecutive elements of the sequence have this layout of numbers."""
         for offset, expected in self.prefixes:
             if most < 1:
                 break
@@ -621,7 +621,7 @@ class ColumnReader:
         return head, numbers
 
     def _some(self, reader: MessageReader, to: Floats) -> int:
-        """Read the next element and all following ones with equal byte positions. Return their number."""
+        """Read the next element and all following elements with the same layout. Return their number."""
         values, order, place = reader.values, reader.order, reader.place
         layouts = self._layouts.setdefault((order, place % self._align), [])
         for layout in layouts:
@@ -704,7 +704,7 @@ class _ElementWalk:
 def _side_by_side(
     found: dict[int, tuple[int, np.dtype[Any]]],
 ) -> list[tuple[int, int, int, np.dtype[Any]]]:
-    """Group numbers that are adjacent both in the output columns and in the message bytes."""
+    """Group the numbers that are adjacent in the output columns and also in the message."""
     runs: list[tuple[int, int, int, np.dtype[Any]]] = []
     for column, (place, dtype) in sorted(found.items()):
         if runs:

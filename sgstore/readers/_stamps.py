@@ -18,27 +18,27 @@ from dataclasses import dataclass, field
 from typing import Final
 
 NEAR: Final = 1_000_000_000
-"""Limit for a stamp near 0, or three periods of its channel if that is more; ns."""
+"""Time up to which a stamp counts as near 0, or three periods of its channel if that is longer; ns."""
 AT_ZERO: Final = 100_000_000
-"""Maximum distance from 0, by log time, for a stamp of 0 in another channel to be a time; ns."""
+"""Largest expected time at which a stamp of 0 in another channel is accepted as a real time; ns."""
 OTHER_CLOCK: Final = 86_400_000_000_000
-"""Minimum distance of stamps of two different clocks; ns."""
+"""Smallest difference between the stamps of two different clocks; ns."""
 MOST_RUNS: Final = 100_000
-"""Maximum number of stored runs of messages without a stamp. Messages of further runs are losses."""
+"""Largest number of stored groups of messages without a stamp. Messages of further groups are lost."""
 LATEST_NS: Final = 1 << 62
-"""Limit of valid time stamps, so that differences of two fit into 64 bits; ns."""
+"""Limit of valid time stamps; ns. Differences of two such stamps fit into 64 bits."""
 NO_TIME: Final = "a message has no time, and it cannot be derived"
-"""Reason of the loss of such a message."""
+"""Reason for the loss of a message without a time."""
 _STEPS: Final = 99
-"""Number of steps of a clock; their median is its period."""
+"""Number of recent time steps whose median is the period of a clock."""
 
 Known = tuple[int, int]
-"""Log time and stamp of a message."""
+"""Log time of a message, and its time stamp."""
 
 
 @dataclass(slots=True)
 class _Unstamped:
-    """Consecutive messages without a time stamp, and the nearest messages with one."""
+    """Consecutive messages without a time stamp, and the nearest messages with a stamp on both sides."""
 
     first: int
     last: int
@@ -156,7 +156,7 @@ class StampReader:
         return time_ns
 
     def beside(self, log_time_ns: int, stamp_ns: int | None) -> int:
-        """Return the simulation time of a message on another channel; ns."""
+        """Return the simulation time of a message that belongs to another channel; ns."""
         expected, stamp_ns = log_time_ns - self._offset, _valid(stamp_ns)
         if self._clock is None:
             return log_time_ns
@@ -182,7 +182,7 @@ class StampReader:
         return _between(log_time_ns, before, behind)
 
     def _placed(self, run: _Unstamped, log_time_ns: int) -> int | None:
-        """Return the time of a message between two stamps, by its position in a file without log times."""
+        """Return the time of a message between two stamps, from its position in a file without log times."""
         before, behind = run.before, run.behind
         if before is None:
             return None
@@ -215,7 +215,7 @@ def _valid(stamp_ns: int | None) -> int | None:
 
 
 def _between(log_time_ns: int, before: Known | None, behind: Known | None) -> int:
-    """Convert a log time to a simulation time by the time stamps of neighbouring messages; ns."""
+    """Return the simulation time for a log time, from the time stamps before and after it; ns."""
     log, stamp = before or behind or (log_time_ns, log_time_ns)
     time_ns = log_time_ns - (log - stamp)
     if before is None or behind is None or before[1] <= time_ns <= behind[1]:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     Part = tuple[NDArray[np.intp], Column]
 
 MAX_LAYOUTS: Final = 256
-"""Largest number of layouts of messages of one size that are decoded in groups."""
+"""Largest number of layouts for which messages of equal size are decoded in groups."""
 
 _DECLARED: Final = {
     "?": "BOOLEAN",
@@ -63,7 +63,7 @@ _DECLARED: Final = {
 
 
 def _declared(kind: Type) -> str:
-    """Return the database type of a leaf of a ROS message type."""
+    """Return the database type for a field type of a ROS message."""
     match kind:
         case Number(code=code):
             return _DECLARED[code]
@@ -80,7 +80,7 @@ def _declared(kind: Type) -> str:
 
 
 def _leaves(kind: Struct, path: str = "", depth: int = 1) -> Iterator[tuple[str, Type]]:
-    """Yield the fields of a structure type with their paths. Deep structures are one field."""
+    """Yield the fields of a structure type with their paths. Structures nested too deeply are one field."""
     for name, inner in kind.fields:
         at = f"{path}.{name}" if path else name
         if isinstance(inner, Struct) and depth < MAX_DEPTH:
@@ -122,7 +122,7 @@ class CdrColumns:
     def columns(
         self, data: bytes, lengths: NDArray[np.int64], losses: Losses
     ) -> tuple[dict[str, tuple[str, Column]], NDArray[np.intp]]:
-        """Decode messages that follow one another.
+        """Decode messages that follow one another directly in ``data``. Return their columns.
 
         Returns
         -------
@@ -160,7 +160,7 @@ class CdrColumns:
     def _alike(
         self, data: bytes, size: int, count: int, losses: Losses
     ) -> Iterator[tuple[NDArray[np.intp], dict[str, Column]]]:
-        """Yield messages of one size in groups of equal layout: row numbers and columns.
+        """Divide messages of one size into groups with the same layout. Yield row numbers and columns.
 
         After :data:`MAX_LAYOUTS` groups, the rest is decoded one by one. Otherwise, time would grow with the
         square of the number of layouts.
@@ -211,7 +211,7 @@ class CdrColumns:
 
 
 def _is_flat(kind: Type) -> bool:
-    """True if the layout of a field follows from at most one length."""
+    """True if the byte positions in a field depend on at most one length."""
     return isinstance(kind.element if isinstance(kind, Sequence) else kind, Number) or isinstance(
         kind, Text
     )
@@ -277,7 +277,7 @@ class _MessageLayout:
         return size
 
     def agreeing(self, data: bytes, size: int, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return which of some messages have this layout."""
+        """Return a mask of the messages that have this layout."""
         count = len(data) // size
         heads = np.ndarray((count,), f"V{HEAD}", data, 0, (size,))[rows]
         found = heads.view(np.uint32) == np.frombuffer(self.head, np.uint32)[0]
@@ -315,7 +315,7 @@ class _MessageLayout:
 def _texts(
     data: bytes, size: int, place: int, length: int, rows: NDArray[np.intp], losses: Losses
 ) -> Column:
-    """Return texts of equal size at equal places of some messages."""
+    """Return texts of equal length that are at the same position in all given messages."""
     column = np.full(len(rows), "", object)
     if length > MAX_TEXT:
         losses.values += len(rows)

@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Column = NDArray[Any]
-    """Values of a field: numbers (masked where they are missing), lists of numbers (n, length), or texts."""
+    """Values of a field: numbers (masked if missing), lists of numbers (n, length), or texts."""
 
 
 MAX_FIELDS: Final = 2048
-"""Maximum number of fields of a topic."""
+"""Largest number of fields in a topic."""
 MAX_DEPTH: Final = 12
-"""Maximum nesting depth of a field. Deeper values are JSON."""
+"""Largest nesting depth of a field. Deeper values become JSON."""
 MAX_VALUE: Final = 1 << 16
-"""Maximum size of bytes, or of a list; bytes, or elements."""
+"""Largest size of a value: number of bytes, or of elements of a list."""
 MAX_TEXT: Final = 1 << 20
-"""Maximum size of a text, or of nested lists as JSON; characters."""
+"""Largest length of a text, also of nested lists as JSON; characters."""
 OWN: Final = ("trace", "t", "log_time_ns", "publish_time_ns")
-"""Columns of each topic beside its fields."""
+"""Columns that every topic has, in addition to its fields."""
 
 NUMPY: Final[Mapping[str, type[np.generic]]] = {
     "BOOLEAN": np.bool_,
@@ -46,7 +46,7 @@ NUMPY: Final[Mapping[str, type[np.generic]]] = {
     "FLOAT": np.float32,
     "DOUBLE": np.float64,
 }
-"""Database type → type of the array."""
+"""Database type → numpy type of the array."""
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
@@ -158,7 +158,7 @@ def _text(declared: str, value: Any, losses: Losses) -> str | None:
 
 
 def _without_nan(numbers: str) -> str:
-    """Return the text of a list in which NaN is missing, as in a column of numbers."""
+    """Return the text of a list with NaN replaced by missing values, as in a column of numbers."""
     return numbers.replace("NaN", "null")
 
 
@@ -183,7 +183,7 @@ def _json_value(value: Any) -> Any:
 
 
 def list_column(declared: str, rows: Column, losses: Losses) -> Column:
-    """Return lists of numbers (n, length) as texts, if a list is long or the field is of bytes."""
+    """Return lists of numbers (n, length) as texts, if the lists are long or the field contains bytes."""
     if rows.shape[1] > MAX_VALUE:
         losses.values += len(rows)
         return np.full(len(rows), None, object)
@@ -198,7 +198,7 @@ def list_column(declared: str, rows: Column, losses: Losses) -> Column:
 def joined_columns(
     declared: str, count: int, parts: Iterable[tuple[NDArray[np.intp], Column]], losses: Losses
 ) -> Column:
-    """Return one column from parts that have all of its rows, with their row numbers.
+    """Return one column that is joined from parts, each with its row numbers.
 
     Lists of different lengths become texts.
     """
@@ -217,7 +217,7 @@ def joined_columns(
 
 
 MAX_LISTED: Final = 64
-"""Maximum length of lists that go to the database as arrays."""
+"""Largest length of lists that the database receives as arrays."""
 
 
 def _is_short(declared: str, values: Column) -> bool:
@@ -243,7 +243,7 @@ _OF_LISTS: Final = {"", "BOOLEAN", "BIGINT", "DOUBLE", "VARCHAR"}
 
 
 def wider(kinds: Iterable[str]) -> str:
-    """Return the database type for JSON values of several types. An empty list has the type ``[]``."""
+    """Return the common database type for JSON values of several types. An empty list has the type ``[]``."""
     found = {*kinds}
     if len(found) == 1:
         return found.pop()
@@ -258,7 +258,7 @@ def wider(kinds: Iterable[str]) -> str:
 
 
 def as_number(value: Any) -> Any:
-    """Return a JSON number that fits a double; too large integers are infinite."""
+    """Return a JSON number that fits into a double. Too large integers become infinite."""
     try:
         return float(value)
     except OverflowError:

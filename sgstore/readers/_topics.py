@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 BATCH_ROWS: Final = 50_000
 """Maximum number of messages of a batch."""
 BATCH_BYTES: Final = 2 << 20
-"""Approximate maximum size of the messages of a batch; bytes. Nested messages need many times more memory."""
+"""Approximate largest size of the messages in a batch; bytes. Decoded nested messages need much more memory."""
 FLAT_BYTES: Final = 24 << 20
-"""The same of messages with numbers and texts only."""
+"""Approximate largest size of a batch whose messages contain only numbers and texts; bytes."""
 MAX_MESSAGE: Final = 8 << 20
 """Maximum size of a protobuf or JSON message; bytes."""
 
@@ -91,7 +91,7 @@ class TopicBatch:
     columns: Columns
 
     def take(self, rows: NDArray[np.intp]) -> TopicBatch:
-        """Return some messages of the batch."""
+        """Return the batch reduced to the given rows."""
         columns = {name: (kind, values[rows]) for name, (kind, values) in self.columns.items()}
         stamps = self.number[rows], self.log_time_ns[rows], self.publish_time_ns[rows]
         return TopicBatch(self.topic, *stamps, columns)
@@ -205,7 +205,7 @@ _KINDS: Final = (
     ),
     *("JSON", "JSON", "BLOB", "UINTEGER", "VARCHAR", "INTEGER", "BIGINT", "INTEGER", "BIGINT"),
 )
-"""Database type of each type of a protobuf field, by its number."""
+"""Number of a protobuf field type → database type."""
 
 
 def _declared(one: FieldDescriptor) -> str:
@@ -221,7 +221,7 @@ def _is_repeated(one: FieldDescriptor) -> bool:
 
 
 _REPEATED: Final = 3
-"""Label of a repeated field in protobuf."""
+"""Number of the label for repeated fields in protobuf."""
 
 
 def _plain(one: FieldDescriptor, value: Any) -> Any:
@@ -379,7 +379,7 @@ def _check_size(data: memoryview) -> None:
 
 @dataclass(slots=True)
 class _Waiting:
-    """Messages of a topic that wait for their batch."""
+    """Messages of a topic that are collected for the next batch."""
 
     data: list[bytes] = field(default_factory=list[bytes])
     stamps: list[Ints] = field(default_factory=list["Ints"])
@@ -517,7 +517,7 @@ def _hold(held: _Waiting, run: Messages, rows: NDArray[np.intp]) -> None:
 
 
 def _joined(run: Messages, rows: NDArray[np.intp]) -> bytes:
-    """Return the data of some messages, one after another."""
+    """Return the data of the given messages as one sequence of bytes."""
     if type(run) is not Messages or run.chunk_offset < 0:
         return b"".join(map(run.data, rows.tolist()))
     starts = run.offset[rows] + MESSAGE_HEAD.itemsize

@@ -44,7 +44,7 @@ INDICATORS: Final = "indicators"
 HAZARDS: Final = "hazards"
 
 _PACKAGES: Final = ("autoware_", "autoware_auto_")
-"""Prefixes of package names; the second one is for releases before 2024."""
+"""Regular expression of package names of messages. The second prefix is for releases before 2024."""
 _NAMES: Final = {
     "perception_msgs/TrackedObjects": OBJECTS,
     "perception_msgs/PredictedObjects": OBJECTS,
@@ -61,25 +61,25 @@ CONTENTS: Final = {
     "nav_msgs/Odometry": POSE_OF_EGO,
     "tf2_msgs/TFMessage": TRANSFORMS,
 }
-"""Schema → content type of its messages."""
+"""Schema name → type of content."""
 RANK: Final = {"DetectedObjects": 1, "PredictedObjects": 2, "TrackedObjects": 3}
-"""Priorities of the list types; the non-empty list with the highest priority leads."""
+"""List type → priority. The frames come from the non-empty list with the highest priority."""
 
 EGO: Final = "ego"
-"""Id of the ego."""
+"""Id of the ego in Autoware recordings."""
 STATIC: Final = "tf_static"
 """Last part of the topic of static transforms, which is fixed in ROS."""
 MAP: Final = "map"
 _MOST_CLASSES: Final = 4
 _MOST_OBJECTS: Final = 100_000
-"""Maximum number of objects with counted classes. Later objects keep their first class."""
+"""Largest number of objects whose classes are counted. Later objects keep their first class."""
 _MOST_AXES: Final = 1000
-"""Maximum number of axes with stored parents."""
+"""Largest number of coordinate axes whose parents are stored."""
 LABELS: Final = (
     *("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian"),
     *("animal", "hazard", "over_drivable", "under_drivable"),
 )
-"""``ObjectClassification.label``."""
+"""Names of the values of ``ObjectClassification.label``, by number."""
 _UUID: Final = tuple(f"object_id.uuid[{i}]" for i in range(16))
 _CLASSES: Final = tuple(
     f"classification[{i}].{field}"

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 SAMPLE_VEHICLE: Final = Ego(
     type="sample_vehicle", length=4.89, width=1.896, height=2.5, offset=(1.345, 0.0, 1.25)
 )
-"""Wheel base 2.79, overhangs 1.0 (front), 1.1 (rear), 0.128 (sides), tread 1.64, height 2.5; m."""
+"""Wheel base 2.79; overhangs 1.0 (front), 1.1 (rear), 0.128 (sides); tread 1.64; height 2.5; m."""
 
 _VECTOR: Final = ("x", "y", "z")
 _TOLD: Final = ("kinematics.pose_with_covariance", "kinematics.initial_pose_with_covariance")
@@ -73,12 +73,12 @@ _PUSHED: Final = ("acceleration_with_covariance", "initial_acceleration_with_cov
 _BOX_BEGINS: Final = len(CLASS_COLUMNS)
 
 _HOLDS_NS: Final = 500_000_000
-"""Maximum extrapolation of the ego's motion; ns."""
+"""Longest time over which the ego's motion is extrapolated; ns."""
 _LIT_NS: Final = 2_000_000_000
-"""Validity of light states and vehicle reports; ns."""
+"""Time for which a light state or vehicle report stays valid; ns."""
 _MOST_KEPT: Final = 4096
 _REMEMBERED_NS: Final = 20_000_000_000
-"""Time span of stored poses; ns."""
+"""Time for which poses are stored; ns."""
 _POLYGON: Final = 2
 _NO_HEADING, _NO_SIGN = 0, 1
 _NEAR: Final = 2.0
@@ -115,11 +115,11 @@ _COVARIANCES: Final = {
     "covariance_y": 7,
     "covariance_heading": 35,
 }
-"""Attributes with covariances of the pose in the axes of the objects, and their places; m², rad²."""
+"""Attribute → index in the covariance matrix of the pose, in the axes of the objects; m², rad²."""
 
 
 def _perceived(objects: Floats) -> list[dict[str, float]]:
-    """Return existence probability and covariances of each object. Zeros are unknown."""
+    """Return existence probability and covariances of each object. A zero counts as unknown."""
     names = ("existence_probability", *_COVARIANCES)
     rows = objects[:, -len(names) :].tolist()
     return [{name: value for name, value in zip(names, row, strict=True) if value} for row in rows]
@@ -165,7 +165,7 @@ class AutowareRawFrame:
 
 @dataclass(slots=True)
 class _Detection:
-    """Detected object without an id, from the previous list of objects."""
+    """Detected object of the previous list that has no id of its own."""
 
     ident: str
     label: str
@@ -389,7 +389,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return state if abs(stamp - told) <= _LIT_NS else LIGHT_STATE_CODE["unknown"]
 
     def _reported(self, stamp: int) -> tuple[int, float]:
-        """Return the light mask and the gear of the ego at a time, from recent vehicle messages."""
+        """Return the lights (mask) and gear of the ego at a time, from recent vehicle messages."""
         now = {
             what: value
             for what, (told, value) in self._reports.items()
@@ -404,7 +404,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return mask, _gear_of(now.get(GEAR, 0))
 
     def _follow(self, stamp: int, labels: list[str], table: Floats, told: list[str]) -> list[str]:
-        """Return ids for detections without ids: that of the nearest previous detection, else a new id."""
+        """Return ids for detections without ids: the id of the nearest previous detection, or a new id."""
         before_ns, before = self._seen
         lapse = min(max(stamp - before_ns, 0), _LIT_NS) / 1e9
         places = table[:, _BOX_BEGINS : _BOX_BEGINS + 2]

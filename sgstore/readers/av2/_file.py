@@ -37,14 +37,14 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 FRAME, MAP = "av2.Frame", "av2.Map"
-"""Schemas of the messages."""
+"""Names of the message schemas of frames and of the map."""
 POSES: Final = "city_SE3_egovehicle.feather"
 EGO_SIZE: Final = (4.877, 2.0, 1.473)
-"""Assumed length, width and height of the ego; m."""
+"""Length, width and height that the reader assumes for the ego; m."""
 EGO_CENTRE: Final = (1.4, 0.0, 0.7365)
-"""Assumed centre of the ego, seen from the ground below its rear axle; m."""
+"""Position of the ego's centre, relative to the ground below its rear axle; m."""
 FURTHEST: Final = 500_000_000
-"""Maximum time between two poses of the ego for an interpolation; ns."""
+"""Largest time between two poses of the ego that are interpolated; ns."""
 
 _ASSUMED: Final = "the log does not contain the box of the ego; a car of 4.877 m by 2 m is assumed"
 _TURN: Final = ("qw", "qx", "qy", "qz")
@@ -95,7 +95,7 @@ class Av2File(NumberedFile):
         self.losses += lost
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of a message by number: 0 is the map, followed by the sweeps."""
+        """Return the bytes of a message by number: 0 is the map, 1 and higher are the sweeps."""
         if number == 0:
             return self._map
         rows = self._steps[number - 1].tolist()
@@ -134,7 +134,7 @@ def _read_boxes(annotations: Path, poses: Path, lost: list[str]) -> tuple[str, B
 
 
 def _usable(boxes: Boxes, times: Any, usable: Any, lost: list[str]) -> tuple[Boxes, Any]:
-    """Return the usable boxes. The others are lost."""
+    """Return the boxes and times in the mask ``usable``. Report the other boxes as lost."""
     rows = np.flatnonzero(usable).tolist()
     if len(rows) < len(usable):
         count = len(usable) - len(rows)
@@ -145,7 +145,7 @@ def _usable(boxes: Boxes, times: Any, usable: Any, lost: list[str]) -> tuple[Box
 
 
 def _first_of_its_frame(times: Any, ident: list[str]) -> Any:
-    """Return a mask of the first row of each object in each frame."""
+    """Return a mask that is True at the first row of each object in each frame."""
     first = dict[tuple[int, str], int]()
     for row, key in enumerate(zip(times.tolist(), ident, strict=True)):
         first.setdefault(key, row)
@@ -155,7 +155,7 @@ def _first_of_its_frame(times: Any, ident: list[str]) -> Any:
 
 
 def _poses_at(path: Path, times: Any, lost: list[str]) -> Floats:
-    """Return the pose of the ego at each time: place and quaternion, NaN if unknown."""
+    """Return the pose of the ego at each time: position and quaternion. NaN means unknown."""
     table = read_arrow_file(path, ("timestamp_ns", *_TURN, *_PLACE), lost.append)
     told, at = numbers(table, (*_PLACE, *_TURN)), _times_of(table)
     told[:, 3:] = unit(told[:, 3:])
@@ -172,7 +172,7 @@ def _times_of(table: Any) -> Any:
 
 
 def _read_map(path: Path, lost: list[str]) -> bytes:
-    """Return the road map as a text of lanes. A damaged map is lost."""
+    """Return the road map as a text of lanes. A damaged map is reported as lost."""
     try:
         return map_text(json.loads(path.read_bytes())).encode()
     except (

@@ -57,7 +57,7 @@ def map_text(told: dict[str, Any]) -> str:
 
 
 def _polyline(told: list[dict[str, float]]) -> Any:
-    """Return the points of a border (n, 3), each once."""
+    """Return the points of a border (n, 3), without repeated points."""
     line = np.array([[one["x"], one["y"], one["z"]] for one in told], np.float64).reshape(-1, 3)
     if not (np.abs(line) < 1e8).all():
         raise MapError("a border has an impossible point")
@@ -86,7 +86,7 @@ def _line(segments: dict[str, Any], one: dict[str, Any], left: Any, right: Any) 
 
 
 def _known(segments: dict[str, Any], idents: Any) -> list[str]:
-    """Return the ids that are segments of this map; maps are cut around a log."""
+    """Return the ids that exist in this map. A map contains only the surroundings of a log."""
     return [str(ident) for ident in idents or () if str(ident) in segments]
 
 
@@ -107,7 +107,7 @@ def _crossed(mark: str) -> tuple[bool | None, bool | None]:
 
 
 def _crosswalk(one: dict[str, Any]) -> PlainCrosswalk:
-    """Return a crosswalk between its two edges, which can run in opposite directions."""
+    """Return a crosswalk from its two edges, even if their directions are opposite."""
     first, last = _polyline(one["edge1"]), _polyline(one["edge2"])
     if np.dot(first[-1, :2] - first[0, :2], last[-1, :2] - last[0, :2]) > 0:
         last = last[::-1]

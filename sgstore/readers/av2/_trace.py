@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Av2Trace(BoxesTrace):
-    """Log of Argoverse 2, or a clip of one, which yields frames."""
+    """Log of Argoverse 2, or a clip of such a log, which yields frames."""
 
     name = "av2"
     tables = ("av2",)

@@ -57,7 +57,7 @@ ENTITIES: Final = ("vehicle.", "walker.", "traffic.", "static.")
 """Prefixes of actor types that are entities. Others are sensors, controllers and the spectator."""
 
 MOVING: Final = (*VEHICLES, "person", "animal")
-"""Kinds that can move. A parked car of the level therefore has a state in every frame."""
+"""Kinds of objects that can move. A parked car in the level therefore has a state in every frame."""
 
 LIGHTS: Final = (
     (0x20, "light_left"),
@@ -313,7 +313,7 @@ class LiveWorld:
         return frozenset(nodes.name[row] for row in rows)
 
     def _add_scenery(self, frame: Frame) -> None:
-        """Add the objects of the CARLA level to a frame: static ones once, vehicles and people always."""
+        """Add the objects of the CARLA level to a frame. Static ones are added only once."""
         for ident, kind, place, more in self._level:
             moves = kind in MOVING
             if moves or not self._told:
@@ -501,7 +501,7 @@ SEMANTIC_LIDAR: Final = np.dtype(
     ]
 )
 RADAR: Final = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("velocity", "<f4")])
-"""Points of the sensors, in the sensor's own axes: x ahead, y to the left, z up; m, m/s (away)."""
+"""Columns of the points of each sensor, in its axes: x ahead, y to the left, z up; m, m/s (radial)."""
 
 _POSE: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
@@ -774,7 +774,7 @@ def _values(data: Any) -> dict[str, Any]:
 
 
 def _vector(name: str, value: Any) -> dict[str, float]:
-    """Convert a vector from CARLA's left-handed axes into right-handed axes."""
+    """Convert a vector from CARLA's left-handed axes into right-handed axes: name of the axis → value."""
     if "gyroscope" in name:
         return {"x": 0.0 - value.x, "y": value.y, "z": 0.0 - value.z}
     return {"x": value.x, "y": 0.0 - value.y, "z": value.z}

@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from sgstore.model.world import Channel
 
 ORIGINS: Final = "carla_origins"
-"""Mapping that keeps the origins of actors as positions."""
+"""Mapping file that uses the origins of actors as their positions."""
 HIDDEN_BELOW: Final = 100.0
-"""Depth below the ego, or else below 0, at which an actor is hidden; m."""
+"""Depth below the ego (without an ego: below 0) at which an actor counts as hidden; m."""
 
 _STILL: Final = dict.fromkeys(("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"), 0.0)
 
 
 class CarlaRecorderTrace(FramesTrace):
-    """Log of CARLA's recorder, or a clip of one, which yields frames.
+    """Log of CARLA's recorder, or a clip of such a log, which yields frames.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class CarlaRecorderTrace(FramesTrace):
         return "ground_truth" if channel.schema == FRAME else "payload"
 
     def on_map(self, road_map: RoadMap | None) -> None:
-        """Find the signals of the traffic lights and the signs in the road map."""
+        """Find the map signals that belong to the traffic lights and signs of the log."""
         self._road_map = road_map
         if road_map is not None and self._places:
             self._signals = signals_of(self._places, road_map)
@@ -163,7 +163,7 @@ class CarlaRecorderTrace(FramesTrace):
             frame.entities.append(entity._replace(own={**(entity.own or {}), **own}))
 
     def _add_light(self, frame: Frame, one: dict[str, Any]) -> None:
-        """Add a traffic light to a frame. Its box is an area on the road, and is left out."""
+        """Add a traffic light to a frame. Its box is not added, because the box is an area on the road."""
         ident, (x, y, z), yaw = one["id"], one["location"], one["rotation"][2]
         self._places.setdefault(ident, Light(x, -y, z, math.radians(-yaw)))
         bare = {key: value for key, value in one.items() if key != "box"}
@@ -186,7 +186,7 @@ def _transform(one: dict[str, Any]) -> Any:
 
 
 def _motion(one: dict[str, Any]) -> dict[str, float]:
-    """Return velocity and yaw rate of an actor; missing ones are derived later."""
+    """Return the recorded velocity and yaw rate of an actor. Missing values are derived later."""
     if "velocity" not in one:
         return {}
     x, y, z = one["velocity"]

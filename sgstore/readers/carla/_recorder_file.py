@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from sgstore.mcap import Findings, Messages
 
 FRAME: Final = "carla.RecorderFrame"
-"""Schema of the messages."""
+"""Name of the message schema of frames."""
 TOWN: Final = "town"
-"""Key of the map name in the metadata of the channel."""
+"""Metadata key for the name of the map."""
 ENDINGS: Final = (".log",)
-"""Suffix of such files; :func:`is_recorder_log` checks the contents."""
+"""Suffix of recorder logs. :func:`is_recorder_log` also checks their content."""
 MAX_PACKET: Final = 64 << 20
-"""Maximum size of a packet; bytes. One with the poses of 100,000 actors has 3 MB."""
+"""Maximum size of a packet; bytes. A packet with the poses of 100,000 actors has 3 MB."""
 MAX_ACTORS: Final = 100_000
 """Maximum number of actors that exist at one time."""
 
@@ -47,7 +47,7 @@ _VEHICLES, _WALKERS, _VEHICLE_LIGHTS, _MOTION, _BOXES = 8, 9, 10, 12, 13
 _MARK: Final = _HEAD.pack(_BEGIN, 24)
 _PIECE: Final = 1 << 20
 _FURTHEST: Final = 1_000_000
-"""Maximum number of missing frames at a damaged place."""
+"""Largest number of frames that can be missing after a damaged part."""
 _SIX: Final = np.dtype([("id", "<u4"), ("of", "<f4", 6)])
 _TABLES: Final = {
     _REMOVED: np.dtype([("id", "<u4")]),
@@ -59,7 +59,7 @@ _TABLES: Final = {
     _MOTION: _SIX,
     _BOXES: _SIX,
 }
-"""Packet → layout of its records."""
+"""Number of a packet type → layout of its records."""
 _MOVING: Final = ("vehicle.", "walker.")
 _STANDING: Final = ("traffic.", "static.")
 _LIGHT: Final = "traffic.traffic_light"
@@ -71,7 +71,7 @@ def is_recorder_log(path: Path) -> bool:
 
 
 class CarlaRecorderFile(MessageFile):
-    """Log of CARLA's recorder with the interface of an MCAP file (log of messages).
+    """Log of CARLA's recorder, with the interface of an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class CarlaRecorderFile(MessageFile):
         self._file.close()
 
     def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
-        """Yield all frames of the log as messages. ``offset`` of a message is its position in the file."""
+        """Yield all frames of the log as messages. The ``offset`` of a message is its position in the file."""
         if not wanted(-1):
             return
         moments = _moments(self._file, report)
@@ -148,7 +148,7 @@ def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterato
 
 
 def _town(file: BufferedReader) -> str:
-    """Return the name of the map in the head of a log. The file is then at the first packet."""
+    """Read the head of a log, and return the name of the map. The file is then at the first packet."""
     file.seek(0)
     head = file.read(len(_MAGIC) + 10)
     if not head.startswith(_MAGIC):
@@ -161,7 +161,7 @@ def _town(file: BufferedReader) -> str:
 
 
 class _LoggedActor(NamedTuple):
-    """Type and role of an actor, and its first pose (cm, degrees): the only one of lights and signs."""
+    """Type and role of an actor, and its first pose (cm, degrees). Lights and signs have no other pose."""
 
     type_name: str
     role: str
@@ -170,7 +170,7 @@ class _LoggedActor(NamedTuple):
 
 @dataclass(slots=True)
 class _LoggedWorld:
-    """Actors that exist, with their boxes, and the ids of those that earlier messages have.
+    """Actors at one moment of a log, with their boxes, and the ids that earlier messages have described.
 
     ``others``: ids of sensors and the spectator; ``unknown``: ids without a description.
     """
@@ -184,7 +184,7 @@ class _LoggedWorld:
 
 @dataclass(slots=True)
 class _Moment:
-    """Packets of one frame, and the world at that time.
+    """All packets of one frame, with the actors that exist at that time.
 
     Attributes
     ----------
@@ -206,7 +206,7 @@ class _Moment:
         return round(self.elapsed * 1e9)
 
     def message(self) -> bytes:
-        """Return the frame as JSON text. Values that are not finite are left out."""
+        """Return the frame as JSON text, without infinite and undefined numbers."""
         world, about = self.world, {packet: _by_id(rows) for packet, rows in self.tables.items()}
         told: dict[str, Any] = {"frame": self.number, "elapsed": self.elapsed}
         told |= {"actors": [], "traffic_lights": [], "standing": []}
@@ -262,7 +262,7 @@ def _motion(ident: int, about: dict[int, dict[int, Any]]) -> dict[str, Any]:
 
 
 class _PacketReader:
-    """Reader of the packets of a log, which looks for the next frame after damage."""
+    """Reader of the packets in a log. After a damaged part, it searches for the next frame."""
 
     def __init__(self, file: BufferedReader, report: Findings) -> None:
         self.file, self.report = file, report
@@ -283,7 +283,7 @@ class _PacketReader:
         return place, ident, data
 
     def resync(self, after: int, last: int) -> bool:
-        """Move to the next frame after a position. The number of that frame is above ``last``."""
+        """Move to the next frame after a position in the file. Its frame number must be above ``last``."""
         self.file.seek(after)
         rest, place = b"", after
         while piece := self.file.read(_PIECE):
@@ -304,7 +304,7 @@ class _PacketReader:
 
 
 def _moments(file: BufferedReader, report: Findings) -> Iterator[_Moment]:
-    """Yield the frames of a log in order. The file is at its first packet, or anywhere after its head."""
+    """Yield the frames of a log in order, also after damaged parts."""
     _town(file)
     reader, world = _PacketReader(file, report), _LoggedWorld()
     moment: _Moment | None = None
@@ -337,13 +337,13 @@ def _moments(file: BufferedReader, report: Findings) -> Iterator[_Moment]:
 
 
 def _follows(data: bytes, last: int) -> bool:
-    """Return True if a frame can be the next one after the frame with the number ``last``."""
+    """Return True if the data can be the frame after frame number ``last``."""
     number, _, elapsed = struct.unpack("<Qdd", data)
     return last < number <= last + _FURTHEST and 0 <= elapsed < 1e9
 
 
 def _whole(moment: _Moment | None, report: Findings) -> Iterator[_Moment]:
-    """Yield a frame if it has positions; otherwise count it as lost. Then update its world."""
+    """Yield a frame if it has the positions of actors. Otherwise, count it as lost."""
     if moment is None:
         return
     if _POSES not in moment.tables:
@@ -387,7 +387,7 @@ def _rows(data: bytes, layout: Any) -> Any:
 
 
 def _pairs(data: bytes) -> list[list[int]]:
-    """Return the ids of the actors of each collision, each pair once. The size of a record depends on CARLA."""
+    """Return the pairs of actor ids that collide, without duplicates. Record sizes depend on the version."""
     (count,) = struct.unpack_from("<H", data)
     size = (len(data) - 2) // count if count else 12
     if size < 12 or len(data) != 2 + count * size:

@@ -51,31 +51,31 @@ if TYPE_CHECKING:
 
 
 FORWARD: Final = 0.25
-"""Distance of a CARLA light in front of its map signal; m."""
+"""Distance between a CARLA light and its map signal, measured ahead of the signal; m."""
 SAME_SPOT: Final = 0.1
-"""Tolerance of this position; m."""
+"""Tolerance for a light at the expected position in front of its signal; m."""
 SAME_PLACE: Final = 1.0
-"""Maximum distance of a light or sign from a free signal; m."""
+"""Largest distance between a light or sign and an unassigned signal; m."""
 ASIDE: Final = 10.0
-"""Maximum sideways offset of a light in CARLA: ten times a fifth of a lane of 5 m; m."""
+"""Largest sideways offset of a light in CARLA: ten times a fifth of a lane of 5 m; m."""
 SAME_WAY: Final = math.pi / 4
-"""Maximum difference of the headings of a light and its signal; rad."""
+"""Largest angle between the headings of a light and its signal; rad."""
 TURNS: Final = (0.0, -math.pi / 2)
-"""Possible rotations of a light relative to its signal: of landmarks, and of CARLA actors; rad."""
+"""Possible rotations of a light relative to its signal, for landmarks and for CARLA actors; rad."""
 LEARNT_FROM: Final = 3
-"""Minimum number of lights for a learned offset."""
+"""Smallest number of lights from which a usual offset is computed."""
 LEARNT_WITHIN: Final = 5.0
-"""Maximum distance of these lights from their signals; m."""
+"""Largest distance between such a light and its signal; m."""
 
 MOST_NAMED: Final = 5
-"""Maximum number of lights or lanes in a warning."""
+"""Largest number of lights or lanes that a warning names."""
 
 _MOST_TOGETHER: Final = 300
-"""Maximum number of lights per group for the optimal assignment. Larger groups use the nearest signals."""
+"""Largest group of lights with an optimal assignment. In a larger group, each light gets the nearest signal."""
 _AT_ONCE: Final = 1 << 20
-"""Maximum product of lights and signals processed at once."""
+"""Largest product of lights and signals that are compared at once."""
 _OF_HEIGHT: Final = 1e-3
-"""Weight of a height difference against one in the plane, to separate signals at one position."""
+"""Weight of a height difference, relative to a horizontal one. It separates signals at the same position."""
 _DRIVING: Final = "driving"
 _RED, _GREEN = LIGHT_STATE_CODE["red"], LIGHT_STATE_CODE["green"]
 
@@ -102,7 +102,7 @@ class Light:
 def signals_of(
     lights: Mapping[int, Light], road_map: RoadMap, told: Mapping[int, str] | None = None
 ) -> dict[int, str]:
-    """Return the map signal of each traffic light: light id → signal name, or names of lanes without a signal.
+    """Return the map signal of each traffic light by id. Without a signal, the names of its lanes.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def sign_at(road_map: RoadMap, x: float, y: float) -> str:
 
 
 class _Rule(NamedTuple):
-    """Usual pose of a traffic light relative to its map signal: rotation and offset."""
+    """Usual pose of a traffic light relative to its map signal: rotation, and offset ahead and to the left."""
 
     turn: float
     ahead: float
@@ -240,12 +240,12 @@ def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, in
 
 
 def _only(rows: Rows) -> Bools:
-    """Return a mask of the array values that occur once."""
+    """Return a mask of the values that occur exactly once."""
     return np.bincount(rows)[rows] == 1 if len(rows) else np.zeros(0, np.bool_)
 
 
 def _assigned(near: _Near) -> dict[int, int]:
-    """Assign the maximum number of traffic lights to map signals, with minimal sum of squared distances."""
+    """Assign the largest possible number of traffic lights to map signals, with the least squared distances."""
     cost = near.ahead**2 + near.left**2 + (_OF_HEIGHT * near.up) ** 2
     found: dict[int, int] = {}
     for rows in _heaps(near):
@@ -270,7 +270,7 @@ def _assigned(near: _Near) -> dict[int, int]:
 
 
 def _heaps(near: _Near) -> Iterator[Rows]:
-    """Yield groups of candidate pairs. A light or signal of one group occurs in no other group."""
+    """Yield groups of candidate pairs that have no light and no signal in common with other groups."""
     if not len(near.light):
         return
     lights = int(near.light.max()) + 1
@@ -292,7 +292,7 @@ def _nearest_in_turn(near: _Near, rows: Rows) -> dict[int, int]:
 
 
 def least_sum(cost: Floats) -> Rows:
-    """Return a different column of a cost matrix for each row, so that the sum of costs is minimal.
+    """Assign a different column to each row of a cost matrix, so that the total cost is minimal.
 
     Parameters
     ----------
@@ -344,7 +344,7 @@ def least_sum(cost: Floats) -> Rows:
 def _by_boxes(
     lights: Mapping[int, Light], road_map: RoadMap, columns: Iterable[int]
 ) -> dict[int, str]:
-    """Assign the remaining map signals to traffic lights, by the lanes through the trigger boxes of the lights.
+    """Assign the remaining map signals to traffic lights whose trigger boxes lie on the lanes of the signal.
 
     Of several signals, the one with the most of these lanes is used, then the nearest. Without a free signal,
     the lanes of the boxes are returned by name.
@@ -388,7 +388,7 @@ def _lanes_after(road_map: RoadMap) -> dict[int, set[int]]:
 
 
 def _lanes_of_boxes(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int, set[int]]:
-    """Return the driving lanes in the trigger boxes of each traffic light: light id → node ids."""
+    """Return the driving lanes inside the trigger boxes of each traffic light: light id → node ids."""
     told = [(ident, box) for ident, light in lights.items() for box in light.boxes]
     boxes = np.array([box for _, box in told], np.float64).reshape(-1, 6)
     hits = road_map.lanes_of(boxes[:, [0, 1, 3, 4, 5]], np.full(len(boxes), np.nan))
@@ -402,7 +402,7 @@ def _lanes_of_boxes(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int,
 
 
 def _through(hits: Any, boxes: Floats) -> Bools:
-    """Return a mask of the lanes whose centre line passes through a trigger box."""
+    """Return a mask of the lanes whose centre line crosses a trigger box."""
     error, box = hits.heading_error, boxes[hits.row]
     reach = (np.abs(np.sin(error)) * box[:, 4] + np.abs(np.cos(error)) * box[:, 5]) / 2
     return np.abs(hits.offset) <= reach
@@ -425,7 +425,7 @@ def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
 
 
 class AtOnce:
-    """Detector of lanes with red and green lights at the same time, a sign of wrongly assigned lights.
+    """Detector of lanes that have a red and a green light at the same time, because of a wrong assignment.
 
     Parameters
     ----------
@@ -490,7 +490,7 @@ class AtOnce:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about contradictions, one for each pair of a red and a green light."""
+        """Warnings about lanes with contradictory lights: one for each pair of a red and a green light."""
         by_lights: dict[tuple[int, int], list[str]] = {}
         for lane, who in sorted(self.who.items()):
             by_lights.setdefault(who, []).append(lane)
@@ -589,12 +589,12 @@ class Lights:
 
     @property
     def unplaced(self) -> int:
-        """Number of traffic lights with a state but without a position."""
+        """Number of traffic lights that have a state, but no position."""
         return len(self._unplaced)
 
     @property
     def aimless(self) -> int:
-        """Number of traffic lights without known lanes."""
+        """Number of traffic lights whose lanes are unknown."""
         return len(self._row.keys() - self._signals.keys())
 
     @property
@@ -611,7 +611,7 @@ class Lights:
         return self._states
 
     def update(self, message: dict[str, Any]) -> None:
-        """Update the states of traffic lights from a CARLA message. Other lights keep their states."""
+        """Update the light states from a CARLA message. Lights that are not in the message keep their state."""
         states = self._states.copy()  # Frames share the old array.
         for told in records(message, "traffic_lights"):
             ident, state = ident_of(told, "id"), ident_of(told, "state")

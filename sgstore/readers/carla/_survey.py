@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 EGO_ROLES: Final = ("hero", "ego_vehicle", *(f"hero{i}" for i in range(10)))
-"""Role names of the bridge for a vehicle under test, in the order of their priority."""
+"""Role names that CARLA's ROS bridge gives to a vehicle under test, highest priority first."""
 
 _CLASSES: Final = {
     4: "person",
@@ -56,7 +56,7 @@ _CLASSES: Final = {
     10: "barrier",
     11: "sign",
 }
-"""``derived_object_msgs/Object.classification`` → kind."""
+"""Number in ``derived_object_msgs/Object.classification`` → kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Actor:
 
 
 def meaning_of(type_name: str) -> TypeMeaning:
-    """Return kind and subkind for a CARLA blueprint id, such as ``vehicle.audi.tt``.
+    """Return kind and subkind of a CARLA blueprint, such as ``vehicle.audi.tt``.
 
     An unmapped vehicle has the general kind ``vehicle``.
     """
@@ -90,7 +90,7 @@ def meaning_of(type_name: str) -> TypeMeaning:
 
 
 def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning:
-    """Return kind and subkind of a CARLA object, from its blueprint, else from its class number.
+    """Return kind and subkind of a CARLA object from its blueprint; without one, from its class number.
 
     The class ``car`` is the bridge's default, so it is ignored for an unmapped blueprint.
     """
@@ -225,16 +225,16 @@ CONTENTS: Final = {
 """Schema → content type of its messages."""
 
 LASTING: Final = frozenset({ACTORS, LIGHT_PLACES, LIGHT_STATES, WORLD, VEHICLE})
-"""Content types with lasting facts, valid until the next message."""
+"""Content types whose facts stay valid until the next message of the type."""
 
 OF_ONE_VEHICLE: Final = frozenset({STATUS, COMMANDS, VEHICLE, ODOMETRY, COLLISION, LANE_INVASION})
-"""Content types that the bridge publishes under the role name of a vehicle."""
+"""Content types whose topics contain the role name of a vehicle."""
 
 FOR_FRAMES: Final = (OF_ONE_VEHICLE - {VEHICLE}) | {OBJECTS, LIGHT_STATES, VEHICLE_LIGHTS}
-"""Content types that are read with the frames."""
+"""Content types that the second pass reads together with the frames."""
 
 NEVER: Final = -(1 << 62)
-"""Time value for missing messages; ns."""
+"""Time that stands for a missing message; ns."""
 _MAX_SECONDS: Final = 1 << 32
 
 
@@ -285,7 +285,7 @@ def stamp_from(told: Floats | list[float]) -> int | None:
 # Source: ros-carla-msgs, CarlaCollisionEvent and CarlaLaneInvasionEvent.
 
 EVENTS: Final = frozenset({COLLISION, LANE_INVASION})
-"""Content types with events."""
+"""Content types of messages that describe events."""
 _MARKINGS: Final = {0: "other", 1: "broken", 2: "solid"}
 
 
@@ -315,9 +315,9 @@ def event_of(
 # First reading.
 
 SAME_TICK: Final = 1_000_000
-"""Maximum difference of stamps of one instant, which the bridge rounds differently; ns."""
+"""Largest difference between two stamps of the same instant, because the bridge rounds them differently; ns."""
 SAME_PLACE: Final = 0.01
-"""Maximum distance of an object from the odometry of its vehicle; m."""
+"""Largest distance between an object and the odometry position of its vehicle; m."""
 
 _PLACES: Final = ("id", "pose.position.x", "pose.position.y", "pose.position.z")
 _ODOMETRY: Final = tuple(f"pose.{path}" for path in _PLACES[1:])
@@ -373,7 +373,7 @@ class CarlaSurvey(Survey[Lead]):
         }
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego for a name. ``None`` means that a new pass may find it."""
+        """Return the id of the ego for a name. ``None`` means that only a new first pass can find it."""
         egos = self.egos
         if name.isdecimal() and int(name) not in egos.actors.keys() | egos.seen:
             return None
@@ -410,7 +410,7 @@ class CarlaSurvey(Survey[Lead]):
         return self._content(channel) in FOR_FRAMES
 
     def _content(self, channel: int) -> str:
-        """Return the content type of a CARLA channel (such as objects); empty if it is not needed."""
+        """Return the content type of a CARLA channel, such as objects. Empty if the channel is not needed."""
         if channel not in self.contents:
             self.contents[channel] = content = content_of(self.recording, channel)
             try:
@@ -469,7 +469,7 @@ class CarlaSurvey(Survey[Lead]):
 
     @property
     def _take(self) -> dict[str, Callable[[dict[str, Any]], bool]]:
-        """Functions that collect facts from a message, by content type. They return True for new facts."""
+        """Functions by content type that collect facts from a message. They return True if a fact is new."""
         return {
             ACTORS: self._take_actors,
             LIGHT_PLACES: self._take_lights,
@@ -522,13 +522,13 @@ class CarlaSurvey(Survey[Lead]):
         return True
 
     def _note(self, note: str) -> None:
-        """Add a warning to the report once, up to the maximum number of warnings."""
+        """Add a warning to the report, unless it is a duplicate or one too many."""
         if note not in self.notes and len(self.notes) <= _MOST_NOTES:
             more = "and more that is as odd"
             self.notes.append(note if len(self.notes) < _MOST_NOTES else more)
 
     def _is_lost(self, channel: int) -> bool:
-        """Return True if the vehicle of an odometry channel (own position) is unknown."""
+        """Return True if the vehicle of an odometry channel (own position of a vehicle) is not known yet."""
         role = role_in(self.topic(channel))
         tried = self._tries >= _MOST_TRIES
         return bool(role) and not tried and self.egos.id_of(role) is None
@@ -545,7 +545,7 @@ class CarlaSurvey(Survey[Lead]):
             self._find_egos()
 
     def _find_egos(self) -> None:
-        """Find the vehicle of each role name: the only object at the position of its odometry."""
+        """Find the vehicle of each role name: the only object at the position that its odometry reports."""
         stamp, table = self._objects
         self._tries += 1
         for role, (when, place) in self._odometry.items():

@@ -1,4 +1,4 @@
-"""Reader of recordings of CARLA's ROS bridge: decoder of the messages into frames.
+"""Reader of recordings of CARLA's ROS bridge. It decodes the messages into frames.
 
 They are recorded with ``ros2 bag record -s mcap``, and recognised only by the schema of a channel. A frame is
 one list of objects, in file order; its time is the simulation time. The road map is the OpenDRIVE text of
@@ -80,7 +80,7 @@ COLUMNS: Final = (
     *(f"shape.dimensions[{i}]" for i in range(3)),
     *(f"twist.angular.{axis}" for axis in "xy"),
 )
-"""Used numbers of ``derived_object_msgs/Object``."""
+"""Fields of ``derived_object_msgs/Object`` with the numbers that the reader uses."""
 STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
 CONTROLS: Final = (
     *("steer", "throttle", "brake", "gear", "hand_brake", "reverse", "manual_gear_shift"),
@@ -91,20 +91,20 @@ ODOMETRY_COLUMNS: Final = (
     *(f"twist.twist.linear.{axis}" for axis in "xyz"),
     *(f"twist.twist.angular.{axis}" for axis in "zxy"),
 )
-"""Used numbers of ``nav_msgs/Odometry``; its velocity is in the axes of the vehicle."""
+"""Fields of ``nav_msgs/Odometry`` that the reader uses. The velocity is in the axes of the vehicle."""
 
 HOLDS: Final = 500_000_000
-"""Validity of controls after their last message; ns."""
+"""Time for which controls are valid after their message; ns."""
 MAX_JSON: Final = 1 << 20
 """Maximum size of a JSON message; bytes."""
 
 _ID, _CLASS, _SHAPE, _POSITION, _TURN, _MOTION, _SIZE, _SPIN = 0, 1, 2, 3, 6, 10, 17, 20
 _SPHERE, _CYLINDER, _CONE = 2, 3, 4
 _CARLA_LIGHTS: Final = (5, 4, 3, 6, 0, 1, 2, 7, 8, 9, 10)
-"""Bit in ``VEHICLE_LIGHTS`` → bit of ``carla.VehicleLightState``. These are: position 0,
-low beam 1, high beam 2, brake 3, right 4, left 5, reverse 6, fog 7, interior 8, special 9 and 10."""
+"""Bit in ``VEHICLE_LIGHTS`` → bit of ``carla.VehicleLightState``: position 0, low beam 1, high beam 2, brake 3,
+right 4, left 5, reverse 6, fog 7, interior 8, special 9 and 10."""
 Controls = tuple[float, ...]
-""":data:`sgstore.model.world.INPUTS`; NaN means unknown."""
+"""Control inputs of a vehicle in the order of :data:`sgstore.model.world.INPUTS`. NaN means unknown."""
 
 
 @dataclass(slots=True)
@@ -255,7 +255,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return frame
 
     def _add_controls(self, frame: CarlaRawFrame) -> None:
-        """Add the latest controls to a frame, if they are recent."""
+        """Add the latest controls to a frame, if they are still valid."""
         for ident, (stamp, controls) in self._controls.items():
             if -SAME_TICK <= frame.time_ns - stamp <= HOLDS:
                 frame.controls[ident] = controls
@@ -278,7 +278,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
             self._people.add(node)
 
     def _other(self, ident: int, classification: float) -> dict[int, Called]:
-        """Return the new kind of an object whose class differs from its first class: node id → kind."""
+        """Return the kind of an object whose class is not its first class: node id → kind. Otherwise empty."""
         node = self._nodes[ident]
         if np.isnan(self._classes[ident]):
             self._classes[ident] = classification
@@ -447,7 +447,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._see_odometry()
 
     def _see_odometry(self) -> None:
-        """Set the ego position of a frame from the ego's odometry, if the ego is not among the objects."""
+        """Use the ego's odometry for a frame in which the ego is not among the objects."""
         frame, (stamp, numbers), ego = self._frame, self._odometry, self._ego
         if frame is None or numbers is None or ego is None:
             return
@@ -491,7 +491,7 @@ def _numbers(objects: Floats, lifted: Bools) -> tuple[Floats, Bools]:
 
 
 def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
-    """Convert quaternions (x, y, z, w) to heading, pitch and roll, and vertical axes; NaN if invalid.
+    """Convert quaternions (x, y, z, w) to heading, pitch and roll, and to vertical axes. NaN if invalid.
 
     The length of a quaternion may differ slightly from 1. At a pitch of ±90°, heading and roll have the same
     axis; the roll is then 0.
@@ -511,7 +511,7 @@ def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
 
 
 def _boxes(shape: Floats, size: Floats) -> Floats:
-    """Return length, width and height of object shapes. Round shapes have a radius."""
+    """Return length, width and height of the shapes of objects. Round shapes have a radius instead."""
     boxes = size.copy()
     sphere = shape == _SPHERE
     boxes[sphere] = 2 * size[sphere, :1]
@@ -521,7 +521,7 @@ def _boxes(shape: Floats, size: Floats) -> Floats:
 
 
 def _pose_of(odometry: Floats) -> Floats:
-    """Return pose columns from an odometry message: the vehicle's origin, because its box is unknown."""
+    """Return pose columns from an odometry message. They describe the origin of the vehicle, not its centre."""
     values = np.full(len(POSE), np.nan)
     angles, _ = _turned(odometry[None, 3:7])
     values[:3], values[3:6] = odometry[:3], angles[0]
@@ -624,7 +624,7 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
 
 
 def _own_inputs(told: Sequence[float], *, applied: bool) -> dict[str, Any]:
-    """Return attributes without a column from CARLA's vehicle controls.
+    """Return user-defined attributes from CARLA's vehicle controls, such as the gear.
 
     Of an applied control, only the mode of the gear has no column. A requested control has none at all.
     """

@@ -25,15 +25,15 @@ MAX_BYTES: Final = 256 << 20
 """Maximum size of a file; bytes."""
 MAX_ELEMENTS: Final = 20_000_000
 MAX_PART: Final = 4_000_000
-"""Maximum number of elements in a part of a document, such as an obstacle or a lanelet."""
+"""Maximum number of elements in one part of a document, such as an obstacle or a lanelet."""
 MAX_STATES: Final = 2_000_000
 """Maximum number of states of all obstacles together."""
 MAX_TEXT: Final = 1000
-"""Maximum number of characters in an element; a number has about 20."""
+"""Maximum number of characters in an element. A number has about 20."""
 MAX_NAME: Final = 100
 MAX_STEP: Final = 10_000_000
 MAX_LOST: Final = 1000
-"""Maximum number of listed losses; further ones are only counted."""
+"""Maximum number of losses that are listed. Further losses are only counted."""
 _FAR: Final = 1e8
 """Maximum distance of a point from the origin; m."""
 
@@ -133,9 +133,9 @@ class Lanelet:
     lights: tuple[str, ...]
     speed_limit: float = math.nan
     stop_line: tuple[Place, ...] | None = None
-    """Points of the stop line; empty: it is at the end of the lanelet."""
+    """Points of the stop line. Empty means at the end of the lanelet; ``None`` means no stop line."""
     directions: tuple[str, str] = ("", "")
-    """``same`` or ``opposite`` for the left and right neighbour; empty: unknown."""
+    """``same`` or ``opposite`` direction of the left and of the right neighbour. Empty means unknown."""
 
 
 @dataclass(slots=True)
@@ -289,7 +289,7 @@ def _begin(scenario: TrafficScenario, root: _Node) -> None:
 
 
 def _take(scenario: TrafficScenario, node: _Node) -> None:
-    """Read one obstacle, light, sign or lanelet of a scenario. An invalid one is reported as lost."""
+    """Read one obstacle, light, sign or lanelet of a scenario. Report an invalid one as lost."""
     if node.tag not in _PARTS:
         return
     try:
@@ -320,7 +320,7 @@ def _whole(text: str, what: str) -> int:
 
 
 def _value(node: _Node | None) -> float:
-    """Return the number in an XML element, or the middle of its interval; NaN if it is missing."""
+    """Return the number in an XML element, or the middle of an interval. NaN if it is missing."""
     if node is None:
         return math.nan
     if node.get("exact"):
@@ -357,7 +357,7 @@ def _position(node: _Node | None) -> Place | None:
 
 
 def _corners(shapes: _Node) -> Iterator[tuple[float, float]]:
-    """Yield points whose bounding box contains all shapes of an XML element."""
+    """Yield points whose bounding box contains all shapes in an XML element."""
     for shape in shapes.children:
         if shape.tag == "polygon":
             yield from (_point(point)[:2] for point in shape.all("point"))
@@ -419,11 +419,11 @@ _LIGHTS: Final = {
     "brakingLights": ("light_brake",),
     "flashingBlueLights": ("light_special1",),
 }
-"""Element of a ``signalState`` → light of a vehicle; the horn is ignored."""
+"""Name of a ``signalState`` element → light of a vehicle. The horn is ignored."""
 
 
 def _state(node: _Node) -> State | None:
-    """Read the state of an obstacle from XML. ``None`` means without a position."""
+    """Read the state of an obstacle from XML. ``None`` means that it has no position."""
     place = _position(node.get("position"))
     if place is None:
         return None
@@ -467,7 +467,7 @@ def _obstacle(scenario: TrafficScenario, node: _Node) -> None:
 
 
 def _follow(scenario: TrafficScenario, node: _Node, found: Obstacle) -> None:
-    """Add the states of a trajectory to an obstacle. Invalid states are reported as lost."""
+    """Add the states of a trajectory to an obstacle. Report invalid states as lost."""
     trajectory = node.get("trajectory")
     if node.get("occupancySet") is not None:
         told = "it has a set of places where it may be, and no trajectory: its first state counts"
@@ -499,7 +499,7 @@ def _signal(node: _Node, found: Obstacle) -> None:
 
 
 def _surroundings(scenario: TrafficScenario, node: _Node) -> None:
-    """Add an environment obstacle (such as a building), defined only by its shape in map axes."""
+    """Add an obstacle of the environment (such as a building), which has only a shape in map axes."""
     ident = _ident(node)
     if ident in scenario.obstacles:
         raise ValueError("there are two of this id; the first one counts")
@@ -598,4 +598,4 @@ _PARTS: Final[dict[str, Callable[[TrafficScenario, _Node], Any]]] = {
     "trafficSign": _sign,
     "intersection": _intersection,
 }
-"""Parts of a document that are read. Planning problems are not part of a recording."""
+"""Tags of the parts that are read → function for the part. Planning problems are ignored."""

@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 ENDINGS: Final = (".xml",)
-"""Suffixes of such files; :func:`is_scenario` checks the contents."""
+"""Suffixes of scenario files. :func:`is_scenario` also checks their content."""
 MAP: Final = "commonroad.Map"
 STEP: Final = "commonroad.Step"
-"""Schemas of the messages."""
+"""Names of the message schemas of time steps and of the map."""
 NAME: Final = "scenario"
-"""Key of the scenario name in the metadata of a channel."""
+"""Metadata key for the name of the scenario."""
 
 _HEAD: Final = 4096
 
@@ -93,7 +93,7 @@ class CommonRoadFile(NumberedFile):
             self.losses.append(f"{self._scenario.more_lost} more of the same kinds")
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of a message by number: 0 is the map, followed by the time steps.
+        """Return the bytes of a message by number: 0 is the map, 1 and higher are the time steps.
 
         Raises
         ------

@@ -52,7 +52,7 @@ _TYPES: Final = {
     "restricted": "restricted",
     "busStop": "stop",
 }
-"""``laneletType`` → OpenDRIVE lane type; others are ``driving``."""
+"""Name in ``laneletType`` → OpenDRIVE lane type. Other names mean ``driving``."""
 
 _CROSSWALK: Final = "crosswalk"
 _ON_FOOT: Final = {"pedestrian"}
@@ -61,7 +61,7 @@ _CROSSED: Final = {
     **dict.fromkeys(("dashed", "broad_dashed", "no_marking"), True),
     **dict.fromkeys(("solid", "broad_solid", "curb", "lowered_curb"), False),
 }
-"""Marking → permission to cross it."""
+"""Marking of a lane border → True if vehicles may cross it."""
 
 _BROAD: Final = {"broad_dashed", "broad_solid"}
 
@@ -90,7 +90,7 @@ class SignMeaning:
 
 
 def meaning_of(sign: ScenarioSign) -> SignMeaning:
-    """Return the meaning of a traffic sign, from its first plate of a known kind, else from its codes."""
+    """Return the meaning of a traffic sign: that of its first known plate, otherwise a text of its codes."""
     for code, value in sign.plates:
         kind = _CODES.get(code)
         if kind == "speed_limit" and 0 < value < 200:
@@ -158,7 +158,7 @@ def map_text(scenario: TrafficScenario) -> str:
 
 
 def _contradictions(scenario: TrafficScenario) -> Iterator[str]:
-    """Yield references to missing parts, and neighbours in another direction than declared."""
+    """Yield texts about references to missing parts, and about neighbours in the wrong direction."""
     used: set[str] = set()
     for lanelet in scenario.lanelets.values():
         used |= {*lanelet.lights}
@@ -196,7 +196,7 @@ def _way(lanelet: Lanelet) -> Floats:
 
 
 def _evened(left: Floats, right: Floats) -> tuple[Floats, Floats]:
-    """Return both borders of a lanelet with the same number of evenly spaced points."""
+    """Return both borders of a lanelet with the same number of points, at even distances."""
     count = max(len(left), len(right))
     shares = np.linspace(0.0, 1.0, count)
 

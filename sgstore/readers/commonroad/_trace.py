@@ -52,7 +52,7 @@ class CommonRoadTrace(FramesTrace):
         return {STEP: "ground_truth", MAP: "map"}.get(channel.schema, "payload")
 
     def frame(self, message: TraceMessage) -> Frame:
-        """Return the frame of a time step, without an ego because scenarios do not define one."""
+        """Return the frame of a time step. It has no ego, because scenarios do not define an ego."""
         told = json.loads(message.data)
         frame = Frame(round(told["time"] * 1e9))
         for one in told["obstacles"]:

@@ -1,4 +1,4 @@
-"""Mapping of a Foxglove scene: a TOML file with the names of the fields for kind, id, speed and ego.
+"""Reader of mapping files for Foxglove scenes. A mapping names the fields for kind, id, speed and ego.
 
 A ``foxglove.SceneUpdate`` is made for drawing. Its boxes lack types, speeds and the ego. Every producer stores
 these facts in its own way, so a mapping describes them. ``docs/source_foxglove.md`` explains the file. The
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 MAX_MAPPING_BYTES: Final = 1 << 20
 PREFIX: Final = "foxglove_"
-"""Prefix of the files of included mappings."""
+"""Prefix of the names of mappings that sgstore includes."""
 METADATA: Final = "metadata."
-"""Prefix of a metadata key in the places of a mapping."""
+"""Prefix of a field in a mapping that is a metadata key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class EntityMapping:
     light_state: str = ""
 
     def ident_of(self, box: Box) -> str:
-        """Return the id of an object from its mapped field, else from the scene message."""
+        """Return the id of an object from its mapped field; without one, the id in the scene message."""
         return _text(self.id, box) or box.id
 
     def type_of(self, box: Box) -> str:
@@ -111,13 +111,13 @@ class EntityMapping:
             return math.nan
 
     def shown(self, box: Box) -> str:
-        """Return the state of a traffic light, as a text from its mapped field; empty if missing."""
+        """Return the state of a traffic light as text, from its mapped field. Empty if it is missing."""
         return _text(self.light_state, box)
 
 
 @dataclass(frozen=True, slots=True)
 class Ego:
-    """Choice of the ego in a mapping file: an object of the scene, or moving coordinate axes with a box.
+    """Choice of the ego in a mapping file: a scene object, or moving coordinate axes with a box.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class Mapping:
     types: Map[str, TypeMeaning] = field(default_factory=dict[str, TypeMeaning])
 
     def meaning(self, type_name: str) -> TypeMeaning:
-        """Return the kind for an object's type name; ``unknown`` or ``vehicle`` without a mapping."""
+        """Return the kind for the type name of an object. Unmapped types are ``unknown`` or ``vehicle``."""
         name = type_name.lower()
         if name in self.types:
             return self.types[name]
@@ -179,10 +179,10 @@ _ALIASES: Final = {
     "cyclist": "bicycle",
     "ego": "car",
 }
-"""Producer's words for kinds; an entity named only as the ego is a car."""
+"""Names of kinds in other tools → kind. An object that is only named as the ego counts as a car."""
 _GENERAL: Final = Mapping(entity=EntityMapping(type="metadata.type"))
 _TYPE_KEYS: Final = ("type", "class", "category", "label", "kind", "classification")
-"""Metadata keys of the type, without a mapping."""
+"""Metadata keys that can contain the type of an object if no mapping is used."""
 _SECTIONS: Final[dict[str, type[Any]]] = {
     "recognise": Recognise,
     "scene": SceneMapping,
@@ -209,7 +209,7 @@ def shipped() -> Map[str, Mapping]:
 
 
 def mapping_for(given: str | Path, topics: Iterable[str]) -> Mapping:
-    """Return the requested mapping file, or the shipped one that fits the topics of a recording.
+    """Return the requested mapping, or the included mapping that fits the topics of a recording.
 
     Parameters
     ----------

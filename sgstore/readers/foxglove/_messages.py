@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 
 MAX_AXES: Final = 10_000
-"""Maximum number of axes in a recording; further ones are ignored."""
+"""Maximum number of coordinate axes in a recording. Further axes are ignored."""
 MAX_DEPTH: Final = 64
-"""Maximum number of transforms from any axes to the fixed axes."""
+"""Maximum number of transforms between any coordinate axes and the fixed axes."""
 MAX_KEPT: Final = 4096
-"""Maximum number of stored transforms per pair of axes."""
+"""Maximum number of stored transforms between two coordinate axes."""
 
 Pose = tuple["Floats", "Floats"]
-"""Position (3,) and rotation (4,), a quaternion x, y, z, w of length 1."""
+"""Position (3,) and rotation (4,). The rotation is a quaternion x, y, z, w of length 1."""
 
 STILL: Final = np.array([0.0, 0.0, 0.0, 1.0])
 ORIGIN: Final = np.zeros(3)
@@ -111,12 +111,12 @@ class Axes:
         return None
 
     def root(self) -> str:
-        """Return the name of the only coordinate axes without parent axes; empty without exactly one."""
+        """Return the name of the only coordinate axes without parent axes; otherwise an empty text."""
         roots = set(self.parents.values()) - set(self.parents)
         return roots.pop() if len(roots) == 1 else ""
 
     def forget(self, before_ns: int) -> None:
-        """Delete old poses that are not needed for times from ``before_ns`` on."""
+        """Delete the old poses that times from ``before_ns`` on do not need."""
         for track in self._tracks.values():
             keep = bisect_right(track.times, before_ns) - 1
             if keep > 0:
@@ -203,7 +203,7 @@ _SCENE_FIELDS: Final[dict[str, Any]] = {
         **dict.fromkeys(("cubes", "cylinders", "spheres", "models"), _SOLID),
     },
 }
-"""Used fields of a scene; lines, triangles and texts stay bytes."""
+"""Fields of a scene message that are decoded. Lines, triangles and texts remain bytes."""
 ERRORS: Final = (*DECODE_ERRORS, RecursionError)
 """Exceptions for a malformed message."""
 _DELETE_ALL: Final = 1
@@ -242,7 +242,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Deletion:
-    """Foxglove message part that deletes one or all objects that are older than a given time.
+    """Part of a Foxglove message that deletes objects older than a given time: one object, or all.
 
     ``time_ns`` is ``None`` for a deletion without a time, which applies to any age.
     """
@@ -274,7 +274,7 @@ class Transform:
 
 
 DERIVED: Final = {"sgstore": "derived"}
-"""Metadata of channels added by an export, such as drawn scene graphs."""
+"""Metadata that mark channels which an export of sgstore has added, such as drawn scene graphs."""
 
 
 def encoding_of(recording: Recording, channel: int) -> str:
@@ -403,7 +403,7 @@ def _box(entity: Any) -> Box | None:
 
 
 def _body(entity: Any) -> tuple[Pose | None, tuple[float, float, float]] | None:
-    """Return the pose and size of a scene object: its largest box, else another solid, else a model."""
+    """Return pose and size of a scene object: of its largest box, or of another solid or model."""
     for name in ("cubes", "cylinders", "spheres"):
         solids = _list(entity, name)
         if solids:
@@ -444,7 +444,7 @@ def _deletion(gone: Any) -> Deletion:
 
 
 def _time(part: Any) -> int | None:
-    """Return a timestamp or duration of a Foxglove message, in any range; ns. ``None`` means missing.
+    """Return a timestamp or duration of a Foxglove message; ns. ``None`` if it is missing.
 
     Protobuf has ``seconds`` and ``nanos``, JSON ``sec`` and ``nsec``.
     """

@@ -63,16 +63,16 @@ if TYPE_CHECKING:
 
 
 MAX_STANDING: Final = 100_000
-"""Maximum number of entities that stay between messages."""
+"""Maximum number of entities that stay valid between messages."""
 REMEMBERED: Final = 10_000_000_000
-"""Time span of stored transforms; ns."""
+"""Time for which transforms are stored; ns."""
 NO_EGO: Final = "no entity is the ego: none is named, and the mapping names none that is there"
 
-"""Maximum number of entities listed in an error."""
+"""Maximum number of entities that the error for a missing ego lists."""
 EGO_NAMES: Final = frozenset({"ego", "hero", "host", "ego_vehicle", "ego-vehicle", "vehicle.ego"})
-"""Ids and types of the ego in lower case, without a mapping."""
+"""Ids and types of the ego in lower case, if no mapping is used."""
 EGO_AXES: Final = ("base_link", "ego_vehicle", "ego", "hero")
-"""Names of the ego's axes, without a mapping."""
+"""Names of the ego's coordinate axes, if no mapping is used."""
 
 _HEADING, _VELOCITY, _ACCELERATION, _SIZE = 3, 6, 9, 13
 
@@ -152,7 +152,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return "", axes
 
     def context(self) -> list[Ref]:
-        """Return the file positions of messages with objects that stay valid, which later messages need."""
+        """Return the positions of messages with objects that stay valid, because later messages need them."""
         lasting = self._transforms
         if not self.mapping.scene.snapshot:
             lasting = self._entities | self._transforms
@@ -207,7 +207,7 @@ class FoxgloveSurvey(Survey[Lead]):
 
 
 def time_of(scene: SceneUpdate) -> int | None:
-    """Return the time of a Foxglove scene message: that of its latest object; ``None`` without a time."""
+    """Return the time of a Foxglove scene message: the time of its newest object. ``None`` without a time."""
     times = [box.time_ns for box in scene.boxes if box.time_ns is not None]
     return max((one for one in times if abs(one) < LATEST_NS), default=max(times, default=None))
 
@@ -348,7 +348,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
     def _take_scene(
         self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int, *, goes_on: bool
     ) -> None:
-        """Add, change and delete the current scene objects, as a scene message describes.
+        """Add, change and delete the current scene objects according to a scene message.
 
         With ``goes_on``, the message adds to a message of another channel.
         """
@@ -379,14 +379,14 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
             standing[ident] = (told, box)
 
     def _delete(self, standing: dict[str, tuple[int, Box]], gone: Deletion, log_time: int) -> None:
-        """Delete the scene objects that are older than a deletion message."""
+        """Delete the scene objects that a deletion message refers to: the older ones."""
         before = None if gone.time_ns is None else self._stamps.beside(log_time, gone.time_ns)
         for ident in [*standing] if gone.id is None else [gone.id]:
             if ident in standing and (before is None or standing[ident][0] < before):
                 del standing[ident]
 
     def _see_kind(self, node: int, box: Box) -> None:
-        """Record the current type of a scene object, if its kind differs from the first one."""
+        """Record the current type of a scene object if its kind differs from its first kind."""
         first, type_name = self.roster.entered(node), self._mapping.entity.type_of(box)
         self._kinds.pop(node, None)
         if type_name != first.type_name:

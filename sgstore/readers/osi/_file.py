@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 PREFIX: Final = struct.Struct("<I")
-"""Head of every message: the number of following bytes."""
+"""Size field before each message: the number of bytes that follow."""
 MAX_MESSAGE: Final = 64 << 20
 """Maximum size of a message; bytes."""
 MAX_RATIO: Final = 2000
@@ -62,10 +62,10 @@ MAX_WINDOW: Final = 128 << 20
 
 ZSTD: Final = b"\x28\xb5\x2f\xfd"
 _ALWAYS: Final = 64 << 20
-"""Decompressed size that is always allowed; bytes."""
+"""Decompressed size that is allowed for every compression ratio; bytes."""
 _PIECE: Final = 1 << 20
 _FRAME_HEAD: Final = 18
-"""Maximum length of the head of a zstd frame; bytes."""
+"""Maximum length of the header of a zstd frame; bytes."""
 _SKIPPABLE: Final = range(0x184D2A50, 0x184D2A60)
 _LITERAL, _REPEATED, _COMPRESSED = 0, 1, 2
 
@@ -119,7 +119,7 @@ def pieces(file: BinaryIO, start: int = -1) -> Iterator[tuple[int, bytes]]:
 
 
 def _frame(file: BinaryIO, place: int) -> Iterator[bytes]:
-    """Decompress one zstd frame block by block. A truncated frame gives its complete blocks."""
+    """Decompress one zstd frame block by block. A truncated frame yields only its complete blocks."""
     file.seek(place)
     head = file.read(_FRAME_HEAD)
     try:
@@ -186,7 +186,7 @@ def _message_at(path: Path, chunk_offset: int, offset: int, length: int) -> byte
 
 
 def _cut(content: Iterator[tuple[int, bytes]], offset: int, length: int) -> bytes:
-    """Return ``length`` bytes from ``offset`` on, from file content that arrives in pieces."""
+    """Return ``length`` bytes from ``offset`` on. The content of the file arrives in pieces."""
     found = bytearray()
     position = 0
     for _, piece in content:
@@ -207,14 +207,14 @@ def _cut(content: Iterator[tuple[int, bytes]], offset: int, length: int) -> byte
 # Source: open-simulation-interface 3.8.0, trace_file_formats.adoc (single-channel binary trace files).
 
 ENDINGS: Final = (".osi", ".osi.zst")
-"""Suffixes of such files. Their contents do not identify the format."""
+"""Suffixes of OSI files. The content alone does not identify the format."""
 CHANNEL: Final = 1
-"""Id of the only channel."""
+"""Id of the only channel in such a file."""
 RUN_BYTES: Final = 4 << 20
 """Approximate maximum size of a run of messages; bytes."""
 
 _ENOUGH, _TRIED = 8, 1000
-"""Number of messages decoded to find their type: enough if they are not empty, and the maximum."""
+"""Numbers of messages from which the message type is determined: sufficient if not empty, and at most."""
 _VERSION, _TIMESTAMP = 1, 2
 
 
@@ -280,7 +280,7 @@ class OsiFile(MessageFile):
             yield run.messages()
 
     def _recognise(self) -> str:
-        """Return the OSI message type of the file, and store the first bytes common to all messages."""
+        """Return the OSI message type of the file. Also store the first bytes that all messages share."""
         report = Findings()
         likeness = dict.fromkeys((GROUND_TRUTH, SENSOR_VIEW), 0)
         tried = 0
@@ -394,7 +394,7 @@ class _Stream:
             del self._frames[0]
 
     def _overruns(self, at: int, stop: int) -> bool:
-        """Return True if a message's length seems wrong: another message starts inside, none at its end."""
+        """Return True if a message's length seems wrong: a message starts inside it, but none at its end."""
         following = self._buffer[stop + PREFIX.size : stop + PREFIX.size + len(self._mark)]
         if self._mark.startswith(following):
             return False
@@ -442,7 +442,7 @@ def _lose(report: Findings, loss: Loss) -> None:
 
 
 def _beginning(data: bytes) -> bytes:
-    """Return the first bytes common to all messages of an OSI file; empty without an OSI version."""
+    """Return the first bytes that all messages of an OSI file share. Empty without an OSI version."""
     try:
         number, wire, _start, stop = next(fields_of(data, 0, len(data)))
     except (ValueError, StopIteration):
@@ -451,7 +451,7 @@ def _beginning(data: bytes) -> bytes:
 
 
 def _likeness(name: str, data: bytes) -> int:
-    """Return a score for a guessed OSI message type: the number of plausible objects; -1 if invalid.
+    """Return a score for a possible OSI message type: the number of plausible objects, or -1 if invalid.
 
     A ground truth decoded as a sensor view, or the other way round, is malformed or empty.
     """

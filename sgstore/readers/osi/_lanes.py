@@ -59,13 +59,13 @@ if TYPE_CHECKING:
 
 
 FIELDS: Final = ("lane", "lane_boundary", "logical_lane", "logical_lane_boundary")
-"""Fields of a ground truth that define the map."""
+"""Fields of a ground truth message from which the map is made."""
 
 OWN: Final = "osi:"
-"""Prefix of the OSI id of a light or sign without a map reference, as its name in the map."""
+"""Prefix of the map name of a light or sign that has an OSI id, but no map reference."""
 
 _MAY_LACK: Final = {"subtype", "source_reference", "physical_lane_reference"}
-"""Optional fields of a lane, missing in older versions of OSI."""
+"""Fields of a lane that older versions of OSI do not have."""
 
 _TYPES: Final = {
     "NORMAL": "driving",
@@ -80,10 +80,10 @@ _TYPES: Final = {
         )
     },
 }
-"""Values of ``Lane.Classification.Subtype`` and ``LogicalLane.Type`` → OpenDRIVE lane types."""
+"""Name in ``Lane.Classification.Subtype`` or ``LogicalLane.Type`` → OpenDRIVE lane type."""
 
 _CROSSED: Final = {"TYPE_NO_LINE", "TYPE_DASHED_LINE", "TYPE_BOTTS_DOTS"}
-"""Types of boundaries that traffic may cross."""
+"""Types of lane boundaries that vehicles may cross."""
 _UNKNOWN: Final = {"TYPE_UNKNOWN", "TYPE_OTHER"}
 _RULES: Final = {
     "PASSING_RULE_NONE_ALLOWED": (False, False),
@@ -91,14 +91,14 @@ _RULES: Final = {
     "PASSING_RULE_DECREASING_T": (False, True),
     "PASSING_RULE_BOTH_ALLOWED": (True, True),
 }
-"""Rule → permission to cross from right to left, and from left to right, along the reference line."""
+"""Passing rule → True if crossing is allowed: from right to left, and from left to right of the boundary."""
 
 _LONGEST: Final = 100
-"""Maximum length of a road name; characters."""
+"""Maximum number of characters in a road name."""
 _BEYOND: Final = 1.0
-"""Greatest length of a lane beyond its boundaries that is no contradiction; m."""
+"""Length by which a lane may extend beyond its boundaries without a warning; m."""
 _JUMP: Final = 1e-3
-"""Minimum distance of a jump in a border; m."""
+"""Smallest distance between two points of a border that counts as a jump; m."""
 _FAR: Final = 1e8
 """Maximum distance of a point from the origin; m."""
 
@@ -229,7 +229,7 @@ class OsiLanes:
         return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
 
     def _missing(self, signals: Iterable[LaneSignal], borders: _LaneBoundaries) -> Iterator[str]:
-        """Yield lanes that contradict their boundaries, and missing boundaries and lanes."""
+        """Yield texts about lanes that contradict their boundaries, and about missing lanes and boundaries."""
         yield from borders.notes
         if borders.missing:
             yield f"boundaries of lanes are missing: {', '.join(borders.missing)}"
@@ -326,7 +326,7 @@ class _LaneBoundaries:
         return None if kind in _UNKNOWN else kind in _CROSSED
 
     def logical(self, idents: Iterable[Any]) -> tuple[Floats, Floats, tuple[Border, ...]]:
-        """Return points, s positions and borders for consecutive logical OSI lane boundaries."""
+        """Return points, s coordinates and borders of consecutive logical OSI lane boundaries."""
         lines: list[Floats] = [np.zeros((0, 3))]
         places: list[Floats] = [np.zeros(0)]
         borders: list[Border] = []
@@ -379,7 +379,7 @@ def _is_area(lane: Any) -> bool:
 
 
 def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
-    """Convert an OSI intersection to a map area with lanes through it."""
+    """Convert an OSI intersection to an area of the map with the lanes through it."""
     return Area(
         str(lane.id.value),
         tuple(
@@ -542,7 +542,7 @@ def _source(lane: Any) -> dict[str, Any]:
 
 
 def _sections_numbered(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Return lanes with named roads, and with sections numbered from 0 in each road."""
+    """Return the lanes with road names added, and with sections numbered from 0 in each road."""
     starts: dict[str, set[float]] = {}
     for line in lines:
         if line.road:

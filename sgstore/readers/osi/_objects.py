@@ -67,11 +67,11 @@ BASE: Final = {
     "orientation_rate": {"yaw": "yaw_rate"},
     "dimension": {name: name for name in ("length", "width", "height")},
 }
-"""Sub-messages of ``BaseMoving``: their used fields → columns of a pose."""
+"""Part of ``BaseMoving`` → used field → column of a pose."""
 _INDICATORS: Final = {3: 0b01, 4: 0b10, 5: 0b11}
-"""``IndicatorState`` LEFT, RIGHT, WARNING → bits ``light_left`` and ``light_right``."""
+"""Name of an ``IndicatorState`` → bits of ``light_left`` and ``light_right``."""
 _LIT: Final = 3
-"""Minimum value of ``BrakeLightState`` and ``GenericLightState`` for an active light."""
+"""Smallest value of ``BrakeLightState`` and ``GenericLightState`` that means an active light."""
 _LIGHTS: Final = {
     "indicator_state": 0,
     "brake_light_state": 2,
@@ -83,23 +83,22 @@ _LIGHTS: Final = {
     "emergency_vehicle_illumination": 9,
     "service_vehicle_illumination": 10,
 }
-"""Fields of ``LightState`` → bit in :data:`sgstore.model.vocabulary.VEHICLE_LIGHTS`."""
+"""Field of ``LightState`` → bit in :data:`sgstore.model.vocabulary.VEHICLE_LIGHTS`."""
 _STATES: Final = 64
-"""Upper limit of light states. Greater states are unknown to the recording's version of OSI."""
+"""Number of light states that are looked up. The OSI version of the recording has no higher values."""
 
 _DOUBLE: Final = 9
-"""Size of a double and its tag, which has one byte for fields up to 15; bytes."""
+"""Size of a double with its field tag; bytes. The tag has one byte for fields up to 15."""
 _VARINT, _FIXED64, _BYTES, _GROUP, _GROUP_END = 0, 1, 2, 3, 4
 _ROUNDS: Final = 64
-"""Maximum number of layouts tried per object length in a block. The remaining objects are read one by one."""
+"""Largest number of layouts tried for objects of one length. The others are decoded one by one."""
 _MOST_LAYOUTS: Final = 256
-"""Maximum number of stored layouts per object length. Then all are dropped and learned again."""
+"""Maximum number of cached layouts for objects of one length. After that, the cache is emptied."""
 
 Tree = dict[int, "Tree | int | str | NDArray[np.int64]"]
-"""Used fields: number → its fields, the column of a double, the meanings of light states, or ``type`` and
-``vehicle``, the two fields with the type of the object."""
+"""Fields by number: nested fields, column of a double, light states, or the word ``type`` or ``vehicle``."""
 TYPES: Final = 1 << 10
-"""Upper limit of vehicle types. The code of an object is its type times this, plus the vehicle type."""
+"""Number of vehicle types. The code of an object is its type times this number, plus its vehicle type."""
 
 
 @dataclass(slots=True)
@@ -154,7 +153,7 @@ class MovingObjects:
         self._layouts: dict[int, list[_ObjectLayout]] = {}
 
     def read(self, objects: list[bytes]) -> tuple[Floats, Bools, Ints, Ints]:
-        """Decode serialised OSI moving objects into columns: poses, usable mask, lights and types.
+        """Decode serialised OSI moving objects into columns: poses, mask of usable objects, lights and types.
 
         Returns
         -------
@@ -186,7 +185,7 @@ class MovingObjects:
     def _read_alike(
         self, rows: NDArray[np.intp], content: Bytes, columns: tuple[Floats, Bools, Ints, Ints]
     ) -> list[int]:
-        """Decode objects with equal byte length and field positions. Return the rows not decoded."""
+        """Decode objects of equal length and layout. Return the rows that have another layout."""
         values, usable, lights, codes = columns
         odd: list[int] = []
         for _ in range(_ROUNDS):
@@ -451,10 +450,10 @@ _FIELDS: Final = {
     "stationary_object": ("stationary", "unknown"),
     "traffic_sign": ("sign", "sign"),
 }
-"""Field of a ground truth → prefix of its types in ``vocabulary.toml``, and kind of unmapped types."""
+"""Field of a ground truth → prefix of its types in ``vocabulary.toml``, and kind for other types."""
 UNTOLD: Final = frozenset({"TYPE_UNKNOWN", "TYPE_OTHER"})
 _UNITS: Final = {"UNIT_MILE_PER_HOUR": " mph"}
-"""Text after the value of a speed limit, by unit; km/h has none."""
+"""Unit of a speed limit → text after its value. It is empty for km/h."""
 _MAP_OBJECT: Final = re.compile(r"<object\s([^<>]*)>")
 _MAP_ATTRIBUTE: Final = re.compile(r"""(\w+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 
@@ -497,7 +496,7 @@ class Statics:
                     self.unplaced.setdefault(words, log_time_ns)
 
     def enter(self, roster: EntityTable, map_text: str) -> None:
-        """Add all static objects to the object table. An object without a kind gets the kind in the map."""
+        """Add all static objects to the object table. An object of unknown kind gets its kind from the map."""
         kinds: dict[str, str] | None = None
         for thing in self._found.values():
             meaning = thing.meaning
@@ -574,7 +573,7 @@ def kinds_of_map(text: str) -> dict[str, str]:
 # Source: open-simulation-interface 3.8.0, osi_trafficlight.proto (the numbers of colours and modes).
 
 SAME_PLACE: Final = 0.01
-"""Maximum distance in each axis, and maximum rotation, between the bulbs of one head; m, rad."""
+"""Maximum distance in each axis, and maximum rotation, between bulbs of the same traffic light; m, rad."""
 
 _RED, _YELLOW, _GREEN, _FLASHING, _OTHER = 1, 2, 4, 8, 16
 _COLOUR: Final = {2: _RED, 3: _YELLOW, 4: _GREEN}
@@ -636,7 +635,7 @@ class _Head:
     top: float = -math.inf
 
     def join(self, pose: tuple[float, ...]) -> None:
-        """Extend the position and size of a traffic light by another bulb."""
+        """Extend the position and size of this traffic light by another bulb."""
         _x, _y, z, *rest = pose
         if math.isnan(z):
             return
@@ -650,7 +649,7 @@ class _Head:
 
 
 class TrafficLights:
-    """Traffic lights of an OSI trace. OSI describes each bulb; bulbs at one place form a light.
+    """Traffic lights of an OSI trace. OSI describes single bulbs. Bulbs at one place form a traffic light.
 
     Parameters
     ----------
@@ -689,11 +688,11 @@ class TrafficLights:
 
     @property
     def unplaced(self) -> int:
-        """Number of traffic lights without a position and without a map reference."""
+        """Number of traffic lights that have no position and no map reference."""
         return len(self._heads) - len(self._rows[0])
 
     def update(self, words: list[bytes]) -> None:
-        """Update bulb states from an OSI ground truth message. Other bulbs keep their states."""
+        """Update bulb states from an OSI ground truth message. Bulbs that are not in it keep their states."""
         if words == self._words or self._class is None:
             return
         news = set(words).difference(self._words)
@@ -740,7 +739,7 @@ class TrafficLights:
         )
 
     def _enter(self, bulb: Any) -> _Head:
-        """Return the traffic light that a bulb belongs to, added if it is new."""
+        """Return the traffic light of a bulb. Add a new light if the bulb belongs to no known one."""
         ident = bulb.id.value
         pose = static_pose(bulb.base) or (NAN,) * 16
         ref, lanes = map_ref(bulb), assigned_lanes(bulb.classification)
@@ -761,7 +760,7 @@ class TrafficLights:
         return head
 
     def _beside(self, pose: tuple[float, ...]) -> _Head | None:
-        """Return the traffic light at the position of a bulb, or ``None``."""
+        """Return the known traffic light at the position of a bulb, or ``None``."""
         if math.isnan(pose[0]):
             return None
         column, line = _cell(pose)

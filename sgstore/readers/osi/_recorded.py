@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Channel
 
 FRAME: Final = "sgstore.Frame"
-"""Schema of exact frames."""
+"""Name of the message schema of exact frames."""
 
 
 class RecordedTrace(FramesTrace):

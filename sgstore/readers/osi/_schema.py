@@ -33,22 +33,21 @@ MAX_GROUND_TRUTH: Final = 32 << 20
 MAX_OBJECTS: Final = 100_000
 """Maximum number of objects (vehicles, lights, lanes, …) in a ground truth."""
 MAX_STATICS: Final = 16 << 20
-"""Maximum total size of the stationary objects, signs and lights in a ground truth; bytes. They are parsed
-completely, and a part may have only two bytes."""
+"""Maximum total size of stationary objects, signs and lights in a ground truth; bytes."""
 MAX_OBJECT: Final = 4 << 20
 """Maximum size of a moving object; bytes."""
 MAX_REFERENCES: Final = 1000
 """Maximum number of source references of an object, and of identifiers in a reference."""
 SMALL: Final = 64 << 10
-"""Messages up to this size need no check of the number of objects; bytes."""
+"""Size up to which a message is parsed without a check of its number of objects; bytes."""
 
 OPAQUE: Final = "opaque"
-"""Mark of a message field that is read as bytes, one item per message."""
+"""Value that marks a message field which is read as bytes, one item for each message."""
 
 
 @cache
 def fields_read() -> dict[str, Any]:
-    """Return the tables of ``osi_fields.toml``: the fields that are read, with the fields of their messages."""
+    """Return the content of ``osi_fields.toml``: message types with the fields that the reader uses."""
     text = resources.files("sgstore.readers").joinpath("osi_fields.toml").read_text("utf-8")
     return tomllib.loads(text)
 
@@ -142,7 +141,7 @@ def _check_objects(fields: Iterator[tuple[int, int, int, int]]) -> None:
 
 _MOVING: Final = 5
 _STATICS: Final = frozenset({4, 6, 7})
-"""Numbers of ``stationary_object``, ``traffic_sign``, ``traffic_light``, in every version of OSI."""
+"""Field numbers of ``stationary_object``, ``traffic_sign`` and ``traffic_light`` in every OSI version."""
 
 
 def fields_of(data: bytes, position: int, stop: int) -> Iterator[tuple[int, int, int, int]]:
@@ -180,7 +179,7 @@ def fields_of(data: bytes, position: int, stop: int) -> Iterator[tuple[int, int,
 
 
 _WIDTHS: Final = {1: 8, 3: 0, 4: 0, 5: 4}
-"""Size of a content by wire type; bytes. The parts of a group are separate fields."""
+"""Wire type → size of the content; bytes. The parts of a group are separate fields."""
 
 
 def _varint(data: bytes, position: int, stop: int) -> tuple[int, int]:
@@ -294,7 +293,7 @@ CONDITIONS: Final = "osi3.EnvironmentalConditions"
 ROAD_MAP: Final = "osi3.MapAsamOpenDrive"
 
 MAX_DESCRIPTORS: Final = 4 << 20
-"""Maximum size of the descriptors of a message type; bytes. Those of OSI 3.8 have 60 kB."""
+"""Maximum size of the descriptors of a message type; bytes. The descriptors of OSI 3.8 have 60 kB."""
 
 DECODE_ERRORS: Final = (
     DecodeError,
@@ -310,7 +309,7 @@ DECODE_ERRORS: Final = (
 
 NO_VECTOR: Final = (NAN, NAN, NAN)
 LATEST_NS: Final = 1 << 62
-"""Limit of valid times; ns."""
+"""Limit of valid time stamps; ns."""
 _GROUND_TRUTH_NEEDS: Final = ("timestamp.seconds", "moving_object")
 _STATIC_NEEDS: Final = (
     "id.value",
@@ -405,7 +404,7 @@ def _require(found: Descriptor, paths: tuple[str, ...]) -> None:
 
 
 def object_class(message: type[Any]) -> type[Any]:
-    """Return the protobuf class of moving objects for an OSI message class.
+    """Return the protobuf class of moving objects that belongs to an OSI message class.
 
     Messages contain these objects as bytes.
 
@@ -440,7 +439,7 @@ def _class_beside(message: type[Any], name: str, needs: tuple[str, ...]) -> type
 
 
 def lights_of(ground: Any) -> list[bytes]:
-    """Return the serialised traffic lights of an OSI ground truth message."""
+    """Return the traffic lights of an OSI ground truth message in serialised form."""
     return list(getattr(ground, "traffic_light", ()))
 
 

@@ -53,7 +53,7 @@ EGO_NAMES: Final = frozenset({"ego", "hero", "host", "ego_vehicle", "host_vehicl
 """Usual names of the ego in lower case, for recordings without a host vehicle id."""
 
 _SORTS: Final = frozenset({"Vehicle", "Pedestrian", "MiscObject", "ExternalObjectReference"})
-"""Entity types of OpenSCENARIO, which are not names (ASAM OpenSCENARIO XML 1.3, ``EntityObject``)."""
+"""Entity types of OpenSCENARIO, not names of entities (ASAM OpenSCENARIO XML 1.3, ``EntityObject``)."""
 _MOST_HOSTS: Final = 100
 
 
@@ -82,7 +82,7 @@ def hosts_of(message: Any) -> list[int]:
 
 
 def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
-    """Return the first bytes of each serialised OSI object, which contain its id.
+    """Return the first bytes of each serialised OSI object. They contain the object's id.
 
     If the objects match ``last``, an earlier result of this function, the same list is returned.
     """
@@ -149,7 +149,7 @@ class Cast:
                 self._keys.add(key)
 
     def idents(self) -> dict[int, str]:
-        """Return the name of each moving object if the name is unique, else the object's number."""
+        """Return the name of each moving object if the name is unique, otherwise its number."""
         numbers = {str(number) for number in self.names}
         bearers = Counter(names[0] for names in self.names.values() if names)
         return {
@@ -229,7 +229,7 @@ STATIC_FIELDS: Final = (
 
 @dataclass(slots=True)
 class _Latch:
-    """Messages with lanes that are recorded only once, so that later messages need them.
+    """Collector of the messages with lanes that are recorded only once. Later messages need them.
 
     A static object is defined by the first message that contains it. If all later messages contain it, too,
     none depends on the first. A light's state is defined by the last message before one without the light.
@@ -359,7 +359,7 @@ class OsiSurvey(Survey[OsiLead]):
         return f"no ground truth message can be read from {where}"
 
     def find_ego(self) -> str:
-        """Find the ego among the moving objects, and return its id text."""
+        """Find the ego among the moving objects, and return its id as text."""
         self.ego = self.cast.ego(self.wanted, self.about_ego)
         self.follows = not self.wanted and self.ego in self.cast.hosts
         return "" if self.ego is None else self.cast.idents()[self.ego]
@@ -464,7 +464,7 @@ class OsiSurvey(Survey[OsiLead]):
         self.count(run, row, len(objects) > 0)
 
     def _make_map_of_lanes(self, leading: int) -> None:
-        """Make a road map from the OSI lanes. Lanes of the frame channel have priority."""
+        """Make a road map from the OSI lanes. Lanes from the channel of the frames have priority."""
         for _, lead in sorted(self.leads.items(), key=lambda item: item[0] != leading):
             if lead.lanes is None:
                 continue

@@ -1,4 +1,4 @@
-"""Reader of ASAM OSI recordings: decoder of ground truth messages into frames.
+"""Reader of ASAM OSI recordings. It decodes ground truth messages into frames.
 
 A recording is recognised only by the schemas of its channels: topics are arbitrary, and most files lack the
 standard metadata. A frame is one message of the leading channel, in file order. The road map is that of an
@@ -58,7 +58,7 @@ _CLASSES: Final = (
     ("fog", "fog"),
     ("illumination", "ambient_illumination"),
 )
-"""Name in an event → field with its class."""
+"""Pairs: name in an event, and OSI field with its class."""
 
 
 class Environment:
@@ -153,15 +153,15 @@ def _class(message: Any, field: str) -> str:
 # Source: open-simulation-interface 3.8.0 (osi_object.proto, osi_hostvehicledata.proto).
 
 NO_EGO: Final = "the moving objects contain no host vehicle; name one as the ego"
-"""Warning in a report without an ego."""
+"""Warning for a report on a trace without an ego."""
 
 _VEHICLE: Final = 2
-"""``MovingObject.TYPE_VEHICLE``; ``vehicle_classification.type`` contains the vehicle type."""
+"""Number of the type vehicle. Then ``vehicle_classification.type`` contains the vehicle type."""
 _UNSET: Final = "TYPE_UNKNOWN"
 _HEADING: Final = POSE.index("heading")
 _UNKNOWN: Final = -2
 _MOST_AHEAD: Final = 16
-"""Maximum number of buffered times of other channels that are ahead of the leading channel."""
+"""Largest number of times for which objects of other channels wait for their frame."""
 
 
 @dataclass(slots=True)
@@ -325,7 +325,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _other_kinds(
         self, frames: list[OsiRawFrame], node: Ints, codes: Ints, objects: list[bytes]
     ) -> dict[int, dict[int, Called]]:
-        """Return the objects whose kind differs from their first one: frame → node id → kind."""
+        """Return the objects whose kind differs from their first kind: frame → node id → kind."""
         entered = np.full(self.roster.size, -1, np.int64)
         entered[[*self._codes]] = [*self._codes.values()]
         rows = np.flatnonzero((codes >= 0) & (codes != entered[node]))
@@ -374,7 +374,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _join(
         self, frame: OsiRawFrame, message: Any, nodes: list[int], objects: list[bytes]
     ) -> None:
-        """Add the objects and vehicle controls of a message to a frame that lacks them."""
+        """Add the objects and vehicle controls of a message to a frame that has none."""
         if not frame.nodes:
             frame.nodes, frame.objects = nodes, objects
         else:
@@ -398,7 +398,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         )
 
     def _take_controls(self, data: Any, log_time: int) -> None:
-        """Store the vehicle controls of the ego. With equal log time, they belong to the last frame."""
+        """Store the vehicle controls of the ego. If the log time is equal, add them to the last frame."""
         self._controls = told = controls_of(data)
         last = self._open
         if last is not None and log_time == last.log_time_ns:
@@ -429,7 +429,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
                 self._aside[ident] = self._aside.get(ident, 0) + 1
 
     def _met(self, objects: list[bytes], log_time: int) -> tuple[list[int], list[bytes]]:
-        """Return node ids and bytes of serialised objects, without unreadable and duplicate ones."""
+        """Return node ids and bytes of the serialised objects, without unreadable objects and duplicates."""
         keys = keys_of(objects, self._last_keys)
         if keys is self._last_keys:  # The same objects as in the last frame, in the same order.
             return self._last_nodes.copy(), objects

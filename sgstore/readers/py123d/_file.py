@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 FRAME, MAP = "py123d.Frame", "py123d.Map"
-"""Schemas of the messages."""
+"""Names of the message schemas of frames and of the map."""
 FURTHEST: Final = 1_000_000_000
-"""Maximum time between two states of the ego for an interpolation, and the age of a light; ns."""
+"""Largest time between two interpolated states of the ego, and largest age of a light state; ns."""
 
 _BOX_KEY, _EGO_KEY, _LIGHT_KEY = "box_detections_se3", "ego_state_se3", "traffic_light_detections"
 _STATES: Final = ("green", "yellow", "red", "off", "unknown")
@@ -101,7 +101,7 @@ class Py123dFile(NumberedFile):
         self.losses += lost
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of a message by number: 0 is the map, followed by the frames."""
+        """Return the bytes of a message by number: 0 is the map, 1 and higher are the frames."""
         if number == 0:
             return self._map.text
         time = self.time_of(number)
@@ -206,7 +206,7 @@ def _numbers(told: Any, count: int) -> list[float]:
 
 
 def _ego_states(path: Path, frames: Any, lost: list[str]) -> tuple[Any, Floats]:
-    """Return times of frames, and the state of the ego at each: box, velocity, acceleration, yaw rate.
+    """Return the times of the frames, and the ego's box, velocity, acceleration and yaw rate at each time.
 
     Without times of boxes, the frames are those of the ego.
     """
@@ -246,7 +246,7 @@ def _number(value: Any) -> float:
 
 
 class _Lights:
-    """States of traffic lights by lane, over time. A state is valid for a second."""
+    """States of traffic lights by lane, over time. A state is valid for one second."""
 
     def __init__(self, path: Path | None, lost: list[str]) -> None:
         self._times: Any = np.zeros(0, np.int64)
@@ -284,13 +284,13 @@ def _label_sets() -> dict[str, list[str]]:
 
 
 def _labels(about: dict[str, Any]) -> dict[int, str]:
-    """Return the names of the labels of a data set by number, from the metadata of its boxes."""
+    """Return the label names of a data set by number, from the metadata of its boxes."""
     name = str(about.get("box_detection_label_class", "")).rpartition(".")[2]
     return dict(enumerate(_label_sets().get(name, [])))
 
 
 def _map_of(path: Path, files: dict[str, Path], about: dict[str, Any], lost: list[str]) -> Lanes:
-    """Return the road map of a log; empty without one. A damaged map is lost."""
+    """Return the road map of a log. It is empty without a map. A damaged map is reported as lost."""
     file = files.get("map")
     dataset, location = (str(about.get(key) or "") for key in ("dataset", "location"))
     if file is None and dataset and location and "/" not in dataset + location:

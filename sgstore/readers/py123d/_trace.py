@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Py123dTrace(BoxesTrace):
-    """Log of 123D, or a clip of one, which yields frames."""
+    """Log of 123D, or a clip of such a log, which yields frames."""
 
     name = "py123d"
     tables = ("py123d", "av2")
@@ -24,7 +24,7 @@ class Py123dTrace(BoxesTrace):
         return {FRAME: "ground_truth", MAP: "map"}.get(channel.schema, "payload")
 
     def add_lights(self, frame: Frame, told: dict[str, Any]) -> None:
-        """Add the traffic lights of lanes, at the starts of the lanes."""
+        """Add the traffic lights of the lanes. Each is placed at the start of its lane."""
         still = dict.fromkeys(("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"), 0.0)
         for one in told.get("lights", ()):
             place = one["x"], one["y"], one["z"]

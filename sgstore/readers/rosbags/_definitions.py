@@ -1,4 +1,4 @@
-"""Texts of message definitions, for bags without them, and conversion of ROS 1 messages into CDR.
+"""Definitions of message types for bags without them, and conversion of ROS 1 messages into CDR.
 
 Older bags of rosbag2 (up to Humble) have no definitions. They are taken from the package ``rosbags`` (standard
 types) or from a ROS installation (``AMENT_PREFIX_PATH``). A bag of ROS 1 has definitions, and the package
@@ -32,11 +32,11 @@ _BUILT_IN: Final = {
     "builtin_interfaces/msg/Duration": "int32 sec\nuint32 nanosec",
     "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id",
 }
-"""Types of ROS 1 that differ in ROS 2."""
+"""Definitions of ROS 1 types that differ from those of ROS 2."""
 
 
 class Definitions:
-    """Texts of the definitions of the types of a bag.
+    """Definitions of the message types of a bag, as text.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Definitions:
                 self._register(told, name)
 
     def text(self, topic: Topic) -> str:
-        """Return the definition of a topic's type as ``ros2msg``; empty if it is unknown."""
+        """Return the definition of a topic's type in the format ``ros2msg``. Empty if it is unknown."""
         name = topic.type
         if not _NAME.fullmatch(name):
             return ""
@@ -88,7 +88,7 @@ class Definitions:
         return convert
 
     def _registered(self, topic: Topic) -> str:
-        """Register the definition of a type of ROS 1, and return it as ``ros2msg``."""
+        """Register the definition of a ROS 1 type, and return it in the format ``ros2msg``."""
         if len(topic.definition) > MAX_TEXT:
             return self._without(topic.type, "the definition is too long")
         name = _full(topic.type)
@@ -122,7 +122,7 @@ def _parsed(text: str, name: str) -> Any:
 
 
 def _full(name: str) -> str:
-    """Return ``package/msg/Name`` for ``package/Name``."""
+    """Return the full name ``package/msg/Name`` for ``package/Name``."""
     return name.replace("/", "/msg/") if name.count("/") == 1 else name
 
 
@@ -137,7 +137,7 @@ def _store(name: str) -> Any:
 
 
 def _installed(name: str) -> str:
-    """Return the definition of a type, and of all types in it, from a ROS installation; empty if absent."""
+    """Return the definition of a type, with all types in it, from a ROS installation. Empty if not found."""
     wanted, text = [_full(name)], ""
     for part in wanted:
         package, _, short = part.split("/")

@@ -1,4 +1,4 @@
-"""ROS bags with the interface of an MCAP file: messages in CDR, with the texts of their definitions.
+"""ROS bags with the interface of an MCAP file: CDR messages with the definitions of their types.
 
 The readers of ROS flavours therefore read these containers, too. A place in a bag is the number of a message in
 the container.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sgstore.readers.rosbags._sqlite import Topic
 
 ENDINGS = (".db3", ".bag")
-"""Suffixes of such files."""
+"""File suffixes of ROS bags."""
 
 
 class RosbagFile(MessageFile):
@@ -111,7 +111,7 @@ class RosbagFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """Yield all messages by log time, then the rank of their channels, then topic."""
+        """Yield all messages in order of log time, then of the rank of their channels, then of topic."""
         del keep
         for reason in self._losses:
             report.lose(Loss(reason, bytes=0))
@@ -130,7 +130,7 @@ class RosbagFile(MessageFile):
             yield held_messages(held, log_times, channel=channel[rows].tolist(), sequence=rows)
 
     def _readable(self, rows: list[int], report: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """Yield number, time and bytes of the readable messages. The others are added to a report."""
+        """Yield number, time and bytes of each readable message. Report the others as lost."""
         for number in rows:
             time_ns = int(self._bag.times[number])
             try:

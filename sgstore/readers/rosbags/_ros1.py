@@ -1,4 +1,4 @@
-"""Messages of a bag of ROS 1 (format 2.0), read record by record, also after damage or without an index.
+"""Reader of ROS 1 bags (format 2.0), record by record. It also reads damaged bags and bags without an index.
 
 Source: ROS wiki, "Bags/Format/2.0".
 """
@@ -96,7 +96,7 @@ class Ros1Bag:
         self._file.close()
 
     def data(self, number: int) -> bytes:
-        """Return the bytes of a message as ROS 1 wrote them."""
+        """Return the bytes of a message in the encoding of ROS 1."""
         return self._bytes(*self._places[number])
 
     def _bytes(self, chunk: int, place: int, length: int) -> bytes:
@@ -202,7 +202,7 @@ def _header(file: BufferedReader) -> dict[str, bytes]:
 
 
 def _fields(data: bytes, length: int) -> dict[str, bytes]:
-    """Return the fields of a header by name; ``raw``: the header itself."""
+    """Return the fields of a record header by name. The entry ``raw`` is the header itself."""
     if len(data) != length:
         raise ValueError("a header is cut off")
     told, at = {"raw": data}, 0
@@ -221,7 +221,7 @@ def _whole(value: bytes | None) -> int:
 
 
 def _topic(header: dict[str, bytes], data: bytes) -> Topic:
-    """Return the topic of a connection record."""
+    """Return the topic that a connection record describes."""
     try:
         told = _fields(data, len(data))
     except _FAULTS:

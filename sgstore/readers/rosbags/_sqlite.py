@@ -1,4 +1,4 @@
-"""Messages of rosbag2's SQLite files (``.db3``), also compressed as a whole or message by message.
+"""Reader of rosbag2's SQLite files (``.db3``), also if the files or the messages are compressed.
 
 Source: rosbag2, ``rosbag2_storage_sqlite3/README.md`` (tables of all versions of the schema).
 """
@@ -26,7 +26,7 @@ MAX_MESSAGE: Final = 256 << 20
 """Maximum size of a message; bytes."""
 MAX_TOPICS: Final = 10_000
 MAX_TORN: Final = 1_000
-"""Maximum number of damaged parts of a table."""
+"""Maximum number of damaged parts in a table."""
 MAX_ROW: Final = 1 << 60
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"
 _FAULTS: Final = (sqlite3.Error, zstandard.ZstdError, OSError, OverflowError, UnicodeDecodeError)
@@ -99,7 +99,7 @@ class SqliteBag:
             connection.close()
 
     def data(self, number: int) -> bytes:
-        """Return the bytes of a message. A damaged message is a ``TraceError``."""
+        """Return the bytes of a message. A damaged message raises a ``TraceError``."""
         row = self._rows[number]
         at = bisect_right(self._files, number, key=lambda one: one[0]) - 1
         try:
@@ -140,7 +140,7 @@ class SqliteBag:
             lose(f"{file.name}: {odd} messages without a topic or a time")
 
     def _read_topics(self, connection: sqlite3.Connection) -> dict[int, int]:
-        """Return the number of each topic of a file by its id."""
+        """Read the topics of a file. Return the number of each topic by its id."""
         texts: dict[str, tuple[str, str]] = {}
         known = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
         if "message_definitions" in known:
@@ -164,7 +164,7 @@ class SqliteBag:
 def _rows(
     connection: sqlite3.Connection, columns: str, table: str, torn: list[str]
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the readable rows of a table in order of their numbers; the faults are added to ``torn``."""
+    """Yield the readable rows of a table in order of their numbers. Add the faults to ``torn``."""
     start = 0
     while len(torn) < MAX_TORN:
         query = f"SELECT rowid, {columns} FROM {table} WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
@@ -184,7 +184,7 @@ def _rows(
 
 
 def _next_readable(connection: sqlite3.Connection, table: str, start: int) -> int:
-    """Return the first row number after a damaged part from which rows can be read; -1: none."""
+    """Return the first row number after a damaged part at which rows are readable again, or -1."""
 
     def fails(number: int) -> bool:
         query = f"SELECT rowid FROM {table} WHERE rowid >= ? ORDER BY rowid LIMIT 1"  # noqa: S608

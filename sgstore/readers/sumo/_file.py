@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from sgstore.mcap import Findings, Messages
 
 STEP: Final = "sumo.Timestep"
-"""Schema of the messages."""
+"""Name of the message schema of time steps."""
 MAX_STEP: Final = 64 << 20
-"""Maximum size of a time step; bytes. One with 100,000 vehicles has 20 MB."""
+"""Maximum size of a time step; bytes. A step with 100,000 vehicles has 20 MB."""
 
 ENDINGS: Final = (".xml", ".xml.gz")
 """Suffixes of SUMO files."""
@@ -95,7 +95,7 @@ class _Unpacked(gzip.GzipFile):
 
 
 def time_ns(step: bytes) -> int | None:
-    """Return the time of a SUMO time step; ns. ``None`` means missing. SUMO writes seconds or ``h:m:s``."""
+    """Return the time of a SUMO time step (in seconds or ``h:m:s``); ns. ``None`` if it is missing."""
     found = _TIME.search(step[:1000])
     seconds = seconds_of(found and found[1].decode())
     return None if math.isnan(seconds) else round(seconds * 1e9)
@@ -191,7 +191,7 @@ def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterato
 
 
 def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
-    """Yield the bytes of a SUMO file in pieces, and an empty piece at an undamaged end."""
+    """Yield the bytes of a SUMO file in pieces. An empty piece marks the end of an undamaged file."""
     while True:
         try:
             piece = file.read1(_PIECE)

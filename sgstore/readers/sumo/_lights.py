@@ -30,7 +30,7 @@ _STATES: Final = {
     "o": "flashing",
     "O": "off",
 }
-"""Letter of a link → state of its light; ``s``: red, with an arrow to the right."""
+"""Letter of a signal state → state of the light. ``s`` means red with an arrow to the right."""
 
 
 def lights_beside(path: Path) -> Path | None:

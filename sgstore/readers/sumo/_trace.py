@@ -44,7 +44,7 @@ SIZES: Final = {
     "train": (22.0, 2.4, 3.2),
     "person": (0.215, 0.478, 1.719),
 }
-"""SUMO's default length, width and height by kind; m."""
+"""Kind → default length, width and height in SUMO; m."""
 
 _WORDS: Final = (
     *((word, "person") for word in ("pedestrian", "pedtype", "person", "walker")),
@@ -57,7 +57,7 @@ _WORDS: Final = (
     *((word, "van") for word in ("delivery", "van")),
     *((word, "car") for word in ("passenger", "taxi", "car", "default_vehtype", "vehtype")),
 )
-"""Part of a type name → kind; the first match counts."""
+"""Regular expression for a type name → kind. The first match counts."""
 _SIZE: Final = ("length", "width", "height")
 _SIGNALS: Final = {"light_right": 0x1, "light_left": 0x2, "light_brake": 0x8}
 _BACK: Final = 0x80
@@ -65,7 +65,7 @@ _SPECIAL: Final = (("emergency", "emergency"), ("police", "emergency"), ("taxi",
 
 
 def meaning_of(type_name: str, *, walks: bool) -> TypeMeaning:
-    """Return the kind for a SUMO vehicle type: from a known type name, else from words in the name."""
+    """Return the kind of a SUMO vehicle type: for a known type name, otherwise from words in the name."""
     name = type_name.lower().partition("@")[0]
     known = type_meanings().get(name)
     if known is not None:
@@ -98,7 +98,7 @@ class SumoTrace(FramesTrace):
         self._guessed: set[str] = set()
 
     def decoder(self, report: TraceReport) -> Any:
-        """Return a new decoder. It reports the vehicle types without a size."""
+        """Return a new decoder of frames, and report vehicle types without a size."""
         found = super().decoder(report)
         self._warnings = report.warnings
         return found
