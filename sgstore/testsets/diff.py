@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 
 REASONS: Final = ("reason_a", "reason_b")
-"""Columns with the reasons for unknown verdicts."""
+"""Names of the columns with reasons for unknown verdicts."""
 APPEARED, VANISHED, CHANGED, SAME = "appeared", "vanished", "changed", "same"
 
 _CHECK: Final = re.compile(r"(?:^|[;\n])\s*CHECK\b", re.IGNORECASE)
 
 
 def sources(a: Store | Collection, b: Store | Collection) -> list[str]:
-    """Return the differences of two stores that no scene causes: settings, road maps and versions of sgstore.
+    """Return the differences of two stores in settings, road maps and versions of sgstore, as texts.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def sources(a: Store | Collection, b: Store | Collection) -> list[str]:
 
 
 def _values_of(store: Store | Collection) -> dict[str, set[str]]:
-    """Return the values of settings, maps and versions that a store has, by name."""
+    """Return the settings, maps and versions of a store: name → different values."""
     if not isinstance(store, Store):
         return {"map": {row["map"] for row in store.traces()}}
     found: dict[str, set[str]] = {}
@@ -63,7 +63,7 @@ def _values_of(store: Store | Collection) -> dict[str, set[str]]:
 
 
 def _leaves(settings: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    """Yield each setting with its dotted name."""
+    """Yield each single setting with its dotted name and its value."""
     for name, value in settings.items():
         if isinstance(value, dict):
             yield from _leaves(cast("dict[str, Any]", value), f"{prefix}{name}.")

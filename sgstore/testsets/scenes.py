@@ -1,4 +1,4 @@
-"""Phrases for scenes, such as ``ego, 2 cars near, 1 lane``."""
+"""Short texts that describe scenes, such as ``ego, 2 cars near, 1 lane``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sgstore.testsets.coverage import ReportTable
 
 MOST: Final = 200
-"""Largest number of rows of a table with a phrase."""
+"""Largest number of table rows that get a description of the scene."""
 
 _SCENES: Final = """
 SELECT w.place, e.dst_kind::VARCHAR AS kind, e.relation = 'isIn' AS inside, count(DISTINCT e.dst) AS number
@@ -30,7 +30,7 @@ WHERE f.ego IS NOT NULL GROUP BY ALL ORDER BY inside, number DESC, kind
 
 
 def phrases(store: Store, frames: Sequence[str]) -> list[str]:
-    """Return a phrase for each frame: the entities near the ego, and the parts of the map that it is in.
+    """Return a short text for each frame: the entities near the ego, and the parts of the map below it.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def phrases(store: Store, frames: Sequence[str]) -> list[str]:
 def with_scenes(
     table: ReportTable, store: Store | Collection, vanished_from: Store | Collection | None = None
 ) -> ReportTable:
-    """Return a table with a column ``scene``: the phrase of the frame of each row.
+    """Return a table with a column ``scene``, which describes the frame of each row in words.
 
     Parameters
     ----------

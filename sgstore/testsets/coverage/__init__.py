@@ -1,4 +1,4 @@
-"""Coverage: the kinds of scenes that a data set contains or lacks, also compared with another data set.
+"""Coverage: the kinds of scenes that a data set contains or lacks, also in comparison with another data set.
 
 ``_frames`` defines selections of frames and result tables. ``_classes`` assigns a class to each
 frame or window. ``_compare`` counts classes, coverage, novelty, common classes and growth,

@@ -86,7 +86,7 @@ class ChosenFrames:
         raise one_store_needed(self.store.place.url)
 
     def joined(self, tables: Mapping[str, Path]) -> ChosenFrames:
-        """Return the same frames of a store that has additional user tables for queries."""
+        """Return the same frames of the store, with more user tables for queries."""
         if not tables:
             return self
         if isinstance(self.store, Store):
@@ -110,7 +110,7 @@ class ChosenFrames:
         return self.store.file.snapshot()
 
     def rows_of(self, frame_id: Ints) -> Ints:
-        """Return the indices of the selected frames in an ascending array of frame ids."""
+        """Return the indices at which the selected frames are in an ascending array of frame ids."""
         if self.frame_id is None:
             return np.arange(len(frame_id))
         at = np.searchsorted(frame_id, self.frame_id)
@@ -122,7 +122,7 @@ class ChosenFrames:
 def selection_of(
     text: str, *, max_spill: int = 0, engine: str = "local", partial: bool = False
 ) -> ChosenFrames:
-    """Return the frames that a text selects: of a store, of a store with a query, or of a lock file.
+    """Return the frames that a text selects: a store, a store with a query, or a lock file.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def _is_collection(place: str) -> bool:
 
 
 _BEFORE_QUERY: Final = re.compile(r":(?![/\d])")
-"""Colon before a query, but not one inside a URL."""
+"""Regular expression of the colon before a query. A colon inside a URL does not match."""
 
 
 def _opened(

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 
 UNKNOWN: Final = -1
-"""Code of a frame with an unknown class."""
+"""Class number of a frame whose class is unknown."""
 LONGEST_WINDOW: Final = 10_000
-"""Greatest number of frames of a window: minutes of a recording, to bound memory and time."""
+"""Largest number of frames in a window. It limits memory and time, and equals minutes of a recording."""
 
 
 Missing = Literal["equal", "distinct", "drop"]
@@ -37,7 +37,7 @@ nothing, so every such window is its own class; ``drop``: such windows do not co
 """
 
 CountedUnit = Literal["frame", "run", "trace"]
-"""Counted unit: frames, runs of consecutive frames of one class, or traces with the class."""
+"""Unit that is counted: frames, runs of consecutive frames of one class, or traces with the class."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Classed:
         return int((self.code == UNKNOWN).sum())
 
     def sizes(self, unit: CountedUnit = "frame") -> Ints:
-        """Return the number of frames (or of runs or traces) with each class, (len(names),)."""
+        """Return the number of units (frames, runs or traces) of each class, (len(names),)."""
         code = self.code[self._units(unit)]
         return np.bincount(code, minlength=len(self.names)).astype(np.int64)
 
@@ -80,7 +80,7 @@ class Classed:
         return len(np.unique(trace_of(self.frame_id))) if unit == "trace" else 0
 
     def _units(self, unit: CountedUnit) -> Ints:
-        """Return the indices of the frames to count: all, or for each class one per run or trace."""
+        """Return the indices of the frames that count: all frames, or one for each class and run or trace."""
         rows = np.flatnonzero(self.known)
         if unit == "frame" or not len(rows):
             return rows
@@ -159,7 +159,7 @@ def classed(
 
 
 def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
-    """Return frames with the classes of windows (each frame with the frames before it)."""
+    """Return the frames with the class of the window that ends there: the frame and the frames before it."""
     frame_id, code = whole.frame_id, whole.code
     ids, time_ns = whole.chosen.abstracted.times()
     time_ns = time_ns[np.searchsorted(ids, frame_id)]
@@ -193,7 +193,7 @@ def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
 
 
 def _numbered(parts: Sequence[Ints]) -> tuple[Ints, Ints]:
-    """Return one number per tuple of values, equal for equal tuples; and one index per distinct number."""
+    """Return a number for each tuple of values (equal for equal tuples), and an index for each number."""
     key = parts[0]
     for part in parts[1:]:
         key = np.unique(key * (int(part.max(initial=0)) + 1) + part, return_inverse=True)[1]

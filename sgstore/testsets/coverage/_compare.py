@@ -137,7 +137,7 @@ def expected_classes(
 # Comparison of two selections: covered, new and common classes; and growth of one selection.
 
 POINTS = 40
-"""Number of rows of a growth curve."""
+"""Default number of rows of a growth curve."""
 
 
 def classes(a: Classed, unit: CountedUnit = "frame") -> ReportTable:
@@ -253,7 +253,7 @@ def novel(a: Classed, than: Classed) -> ReportTable:
 
 
 def novel_frames(a: Classed, than: Classed) -> ReportTable:
-    """Return a table of the frames with classes that another selection lacks, the rarest class first.
+    """Return a table of the frames whose class another selection lacks, the rarest class first.
 
     Returns
     -------
@@ -272,7 +272,7 @@ def novel_frames(a: Classed, than: Classed) -> ReportTable:
 
 
 def novel_clips(a: Classed, than: Classed) -> ReportTable:
-    """Return a table of clips with classes that another selection lacks, the longest clip first.
+    """Return a table of the clips whose classes another selection lacks, the longest clip first.
 
     Returns
     -------
@@ -323,7 +323,7 @@ def venn(a: Classed, b: Classed) -> ReportTable:
 
 
 def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> ReportTable:
-    """Return a table with the number of distinct classes in the first n frames (or runs or traces).
+    """Return a table with the number of distinct classes in the first n frames (or runs, or traces).
 
     Returns
     -------

@@ -24,10 +24,10 @@ DEPTH: Final = 4
 """Greatest depth of the tree."""
 
 SMALLEST: Final = 5
-"""Least weight of each branch: in classes, or in frames."""
+"""Smallest weight of a branch, in classes or in frames."""
 
 _THRESHOLDS: Final = (0, 1, 2, 3)
-"""Thresholds for the number of occurrences; a greater number means yes."""
+"""Thresholds for the number of occurrences of a feature. A larger number means yes."""
 
 
 def tree(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 # coverage could predict.
 
 S3C_THRESHOLD: Final = 5 / 140
-"""Error threshold of S3C's code for a steering angle, -1 … 1 for ±70°: 2.5°, although its paper states 5°."""
+"""Error of the steering angle (-1 … 1 for ±70°) that S3C counts as failure: 2.5° in code, 5° in the paper."""
 
 _ID: Final = re.compile(r"[0-9]{1,19}")
 
@@ -67,7 +67,7 @@ def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[st
 def told_outcomes(
     outcomes: Mapping[str, bool], chosen: ChosenFrames, frame_id: Ints
 ) -> tuple[Bools, Bools]:
-    """Return two masks (N,) of frames: those with a failure, and those with a known test outcome."""
+    """Return two masks (N,) of frames: frames with a failure, and frames with a known test result."""
     failed, known = (np.zeros(len(frame_id), np.bool_) for _ in range(2))
     place = {int(frame): row for row, frame in enumerate(frame_id.tolist())}
     ids = chosen.abstracted.times()[0]

@@ -32,21 +32,21 @@ if TYPE_CHECKING:
 
 
 Feature = tuple[str, ...]
-"""Labels of an edge's source, edge and destination; or of a node, in abstractions without edges."""
+"""Labels of source, edge and destination of an edge; without edges in the abstraction, label of a node."""
 
 MOST: Final = 5_000_000
-"""Greatest number of combinations; more are an error, never a partial result."""
+"""Largest number of combinations. More combinations raise an error, so that a result is always complete."""
 
 LARGEST: Final = 4_000_000_000
-"""Greatest size of the features of classes; bytes."""
+"""Largest size of the feature counts of all classes; bytes."""
 
 _ROWS: Final = 8_192
-"""Classes that are multiplied at once."""
+"""Number of classes that are multiplied at once."""
 
 
 @dataclass(frozen=True)
 class ClassFeatures:
-    """Number of times that each feature occurs in each scene class.
+    """Counts of features in scene classes: how often each feature occurs in a graph of each class.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class ClassFeatures:
         return self.counts > 0
 
     def matrix(self, most: int) -> dict[str, Any]:
-        """Return the numbers of frames with each pair of the most frequent features, for a drawing.
+        """Return the numbers of frames that have both features of a pair, for the most frequent features.
 
         Features of all frames are left out, because they have no gaps; and so are relations from the ego
         where relations to it are known, because most of them are the same in the other direction.
@@ -143,7 +143,7 @@ def features(a: Classed, abstraction: str, *, of_ego: bool = False) -> ClassFeat
 
 
 def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedinteger[Any]]:
-    """Return an array of zeros for the feature counts of classes, or raise an error if it is too large.
+    """Return an array of zeros for feature counts. An array that is too large raises an error.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedint
 
 
 def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int = 0) -> Floats:
-    """Return the total weight (K, F) of the classes that have a feature more than ``more_than`` times."""
+    """Return the total weight (K, F) of the classes that have each feature more than ``more_than`` times."""
     total = np.zeros((len(weights), counts.shape[1]))
     # Integers below 2²⁴ are exact in 32 bits.
     small = np.abs(weights).sum() < 1 << 24 and (weights == np.round(weights)).all()
@@ -338,7 +338,7 @@ def combos(
 
 
 def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
-    """Return feature counts of classes with the columns of another list of features."""
+    """Return the feature counts of classes with other columns: those of the given list of features."""
     place = {name: i for i, name in enumerate(names)}
     counts = zeros((len(own.codes), len(names)), own.counts.dtype)
     for column, name in enumerate(own.names):

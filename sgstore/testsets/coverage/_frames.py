@@ -1,4 +1,4 @@
-"""Queries that find missing features or missing scene parameters (slots), and result tables.
+"""Queries for missing features or missing values of scene parameters (slots), and tables of results.
 
 Missing features and slot values are returned as queries that users can run.
 """
@@ -141,11 +141,11 @@ class ReportTable:
 
 
 SHARES = ("measure", "part", "of", "share", "denominator")
-"""Columns of a table of shares, with the denominator of each share."""
+"""Column names of a table of shares. Each row states the denominator of its share."""
 
 
 def share(measure: str, part: float, of: float, denominator: str) -> Row:
-    """Return a table row with a share: its name, both numbers, and their quotient or ``None`` for x / 0."""
+    """Return a table row with a share: name, both numbers, and their quotient (``None`` for x / 0)."""
     return measure, part, of, part / of if of else None, denominator
 
 

@@ -1,4 +1,4 @@
-"""Manoeuvres in recordings, and coverage of the sequences of k manoeuvres.
+"""Manoeuvres in recordings, and coverage of sequences of k manoeuvres.
 
 A *manoeuvre* is a named pattern. An *event* is a match of it at its moment: where it is complete,
 or, for a pattern of one frame, where it begins to hold. Its name contains the pattern and the kinds
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
 WITHIN_S: Final = 10.0
-"""Default for the greatest time from the first manoeuvre of a sequence to the last; s."""
+"""Default for the largest time between the first and the last manoeuvre of a sequence; s."""
 
 
 def manoeuvres_named(names: Sequence[str] = ()) -> dict[str, str]:
-    """Return queries of manoeuvres by name, from texts ``NAME`` (library) or ``NAME=QUERY``.
+    """Return the queries of manoeuvres by name, from ``NAME`` (of the library) or ``NAME=QUERY``.
 
     Raises
     ------
@@ -92,7 +92,7 @@ class ManoeuvreEvents:
     said: list[str]
 
     def over(self, names: tuple[str, ...]) -> ManoeuvreEvents:
-        """Return the same manoeuvre events, numbered by a longer list of names."""
+        """Return the same manoeuvre events, numbered by the positions of their names in another list."""
         place = {name: i for i, name in enumerate(names)}
         moved = np.array([place[name] for name in self.names] or [0], np.int64)
         return replace(self, names=names, code=moved[self.code])
@@ -132,7 +132,7 @@ def happenings(chosen: ChosenFrames, manoeuvres: Mapping[str, str]) -> Manoeuvre
 
 
 def _ascending(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Ints:
-    """Return frame times that never decrease: each backward jump of the clock adds a day."""
+    """Return frame times that never decrease. A day is added after each backward jump of the clock."""
     found = store.file.rows(
         "SELECT frame_id FROM (SELECT frame_id,"
         " time_ns < lag(time_ns) OVER (PARTITION BY trace_id ORDER BY frame_id) AS back FROM frames)"
@@ -150,7 +150,7 @@ def _steps(text: str) -> int:
 
 
 class _Cast:
-    """Names and kinds of the entities in the matches of a store."""
+    """Names of manoeuvre events with their entities, from the traces and entity kinds of a store."""
 
     def __init__(self, store: Store | Collection) -> None:
         self._ids = {trace.name: trace.trace_id for trace in traces_of(store)}
@@ -197,7 +197,7 @@ def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) 
 
 
 def _starts(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> dict[int, Ints]:
-    """Return the indices of the events that begin each sequence, ascending."""
+    """Return the indices of the events with which each sequence begins, ascending."""
     time_ns = np.maximum.accumulate(time_ns)  # clocks that run backwards stay constant
     following = _following(code, time_ns, names)
     latest = time_ns + np.minimum(within_ns, np.iinfo(np.int64).max - time_ns)

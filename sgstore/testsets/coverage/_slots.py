@@ -1,4 +1,4 @@
-"""Coverage of declared slots: parameters of a scene, whose values are defined by patterns.
+"""Coverage of slots, which are scene parameters. Patterns define the values of a slot.
 
 Slots are declared in a TOML file::
 
@@ -107,7 +107,7 @@ def _with_frames(query: str) -> str:
 def specification(
     chosen: ChosenFrames, query: str, declared: int = 0, reference: str | ChosenFrames = ""
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Return tables of the occurring and the missing combinations of values that a query returns.
+    """Return tables of the value combinations that a query returns: existing ones and missing ones.
 
     Parameters
     ----------
@@ -159,13 +159,13 @@ _LISTED: Final = 1_000_000
 
 
 Bits = NDArray[np.uint8]
-"""Truth values of frames, eight per byte."""
+"""Truth values of frames, packed eight per byte."""
 
 NONE: Final = "none"
-"""Value of a slot in a frame without a matching pattern."""
+"""Name of the value of a slot in frames that match none of its patterns."""
 
 MOST: Final = 2_000_000
-"""Greatest number of combinations; more are an error, never a partial result."""
+"""Largest number of combinations. More combinations raise an error, so that a result is always complete."""
 
 _MAX_FILE: Final = 8 << 20
 _MAX_SLOTS: Final = 200
@@ -192,14 +192,14 @@ class Slot:
         return (NONE, *self.values)
 
     def block(self, value: str) -> tuple[list[str], list[str]]:
-        """Return the patterns that a frame must match, and must not match, for a value of a slot."""
+        """Return the patterns that a frame must match, and must not match, for a value of the slot."""
         blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
         return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
 
 
 @dataclass(frozen=True)
 class Specification:
-    """Declared slots (parameters of a scene), with the frames and value combinations that count.
+    """Slots (scene parameters) that a file declares, with the frames and the value combinations that count.
 
     Attributes
     ----------
@@ -298,7 +298,7 @@ class Specification:
 
 
 DECLARED: Final = ("iso34503",)
-"""Included slot files, by name."""
+"""Slot files that sgstore includes, by name."""
 
 
 def _specification(path: Path, given: Any, name: str) -> Specification:
@@ -358,7 +358,7 @@ def _slot(path: Path, given: Any) -> Slot:
 
 
 class _Held:
-    """Cache of the selected frames that match each pattern."""
+    """Cache of the masks of the selected frames that match a pattern."""
 
     def __init__(self, chosen: ChosenFrames, tables: Mapping[str, Path]) -> None:
         self._chosen = chosen = chosen.joined(tables)
@@ -389,7 +389,7 @@ class _Held:
         return held
 
     def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
-        """Return the counted frames, and for each the combination of its values of scene parameters (slots)."""
+        """Return the frames that count, names of value combinations, and the combination of each frame."""
         rows = np.flatnonzero(self.of(specification.where))
         names, code = [""], np.zeros(len(rows), np.int64)
         for slot in specification.slots:
@@ -412,7 +412,7 @@ class _Held:
 
 
 def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints, list[str], Ints]:
-    """Return frames with a class for each combination of values of scene parameters (slots).
+    """Return frames, names of classes, and class numbers. A class is a combination of slot values.
 
     Returns
     -------
@@ -435,7 +435,7 @@ def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints,
 def _combined(
     specification: Specification, k: int, held: _Held
 ) -> Iterator[tuple[tuple[Slot, ...], tuple[str, ...], int]]:
-    """Yield each possible combination of values of k scene parameters (slots), with its number of frames.
+    """Yield each possible value combination of k slots (scene parameters), with its number of frames.
 
     Raises
     ------
@@ -466,7 +466,7 @@ def _combined(
 def slot_coverage(
     chosen: ChosenFrames, specifications: Sequence[Specification], k: int = 0
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Return tables of the occurring and the missing value combinations of scene parameters (slots).
+    """Return tables of the value combinations of slots: existing ones and missing ones.
 
     Parameters
     ----------

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 
 WINDOW: Final = 4_000
-"""Frames to read messages of at once."""
+"""Number of frames whose messages are read at once."""
 
 DIGEST_BYTES: Final = 16
-"""Length of the digests of messages."""
+"""Length of the digest of a message; bytes."""
 
 CasePart = tuple["Ints", "Ints", str]
-"""Frames of a future case: their ids, ascending, of one trace; their log times (ns); their split."""
+"""Frames of a test case: ascending ids of one trace, their log times (ns), and the split (such as train)."""
 
 
 def locked(trace: StoredTrace, mark: Mark) -> LockedTrace:
@@ -92,7 +92,7 @@ def lock_of(
 def _cases(
     parts: Sequence[CasePart], known: Mapping[int, StoredTrace]
 ) -> tuple[Iterator[_Fields], list[Ints]]:
-    """Return the fields of test cases without digests, and their frame ids, by trace name and first frame."""
+    """Return the fields of test cases without digests, and their frame ids, by trace and first frame."""
     if not parts:
         return iter(()), []
     ends = np.cumsum([len(frame_id) for frame_id, _, _ in parts])

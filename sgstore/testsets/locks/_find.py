@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int, str]]:
-    """Return the clips of a lock in a store: trace name, first and last log time in ns, and id.
+    """Return the clips of a lock in a store: trace name, first and last log time (ns), and id of the case.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
 
 
 def _same(trace: LockedTrace, store: Store) -> StoredTrace:
-    """Return the trace of a store with the same recording and settings as a trace of a lock file."""
+    """Return the stored trace of a lock entry. A missing trace, or other settings or map, raises an error."""
     trace_id = Identity.id_of(trace.recording, trace.ego)
     found = next((one for one in store.info() if one.trace_id == trace_id), None)
     if found is None:
@@ -84,7 +84,7 @@ def _not_there(trace: LockedTrace, place: str | Path) -> StoreError:
 def rows_of(
     cases: Sequence[LockedCase], trace_ids: Sequence[int], frame_id: Ints
 ) -> tuple[Ints, Ints]:
-    """Return the first row, and the row after the last, of each test case in ascending frame ids."""
+    """Return the row range of each test case in ascending frame ids: first row, and row after the last."""
     of = np.array(trace_ids, np.int64)
     first = frame_ids(of, np.array([case.first for case in cases], np.int64))
     last = frame_ids(of, np.array([case.last for case in cases], np.int64))
@@ -123,7 +123,7 @@ def frames_in(store: Store, lock: str) -> list[int]:
 def by_bundle(
     lock: Lock, whole: Collection, *, by_name: bool = False
 ) -> tuple[dict[str, Lock], list[LockedTrace]]:
-    """Return the parts of a lock file by bundle (store) of a collection, and the traces without a bundle."""
+    """Return the parts of a lock for each bundle (store) of a collection, and the traces in no bundle."""
     names = {row["name"]: row["bundle"] for row in whole.traces()} if by_name else {}
     home: dict[str, str] = {}
     for one in lock.traces:
@@ -141,7 +141,7 @@ def by_bundle(
 
 
 def store_beside(path: str | Path, lock: Lock) -> Path:
-    """Return the only store with all traces of a lock file, from its folder or the working folder.
+    """Return the only store with all traces of a lock, from the lock's folder or the working folder.
 
     Raises
     ------

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 Source = tuple[str, str]
-"""Digest of a recording, and its ego."""
+"""Digest of a recording, and id of the ego."""
 
 
 def union(a: Lock, b: Lock) -> Lock:
-    """Return a lock with the test cases of both locks. Of equal cases, the one of ``a`` is kept.
+    """Return a lock with the test cases of both locks. If cases are equal, the case of ``a`` is used.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def minus(a: Lock, b: Lock) -> Lock:
 
 
 def meets(a: Lock, b: Lock) -> Callable[[LockedCase], bool]:
-    """Return a function that is True for a test case of lock ``a`` with a frame that lock ``b`` also has."""
+    """Return a function: True for a test case of lock ``a`` that shares a frame with a case of lock ``b``."""
     sources = _sources(a)
     firsts: dict[Source, list[int]] = {}
     ends: dict[Source, list[int]] = {}
@@ -112,7 +112,7 @@ def _check(a: Lock, b: Lock) -> None:
 
 
 def _made(how: str, a: Lock, b: Lock, ours: list[LockedCase], theirs: list[LockedCase]) -> Lock:
-    """Return a new lock with test cases of two locks. Traces of the second lock can get another name."""
+    """Return a new lock with test cases of two locks. Traces of the second lock may be renamed."""
     traces = {(trace.recording, trace.ego): trace for trace in a.traces}
     taken = {trace.name for trace in a.traces}
     names: dict[str, str] = {}

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
 FORMAT: Final = 2
-"""Version of the text. Version 1 differs in the digests of graphs; it can be read and verified."""
+"""Version of the text format. Version 1 has other digests of graphs. It can still be read and verified."""
 
 LARGEST: Final = 1 << 30
 """Largest lock file; bytes."""
@@ -32,12 +32,12 @@ LARGEST: Final = 1 << 30
 KEY: Final = "sgstore_lock"
 
 ENDING: Final = ".lock"
-"""Ending of lock files, which distinguishes them from stores."""
+"""File suffix of locks."""
 
 
 @dataclass(frozen=True, slots=True)
 class LockedTrace:
-    """Entry of a lock (list of test cases) for a trace: name, recording, settings and digests.
+    """Entry of a lock for a trace: name, recording, settings and digests.
 
     Attributes
     ----------
@@ -250,7 +250,7 @@ def _check_names(traces: tuple[LockedTrace, ...], cases: tuple[LockedCase, ...])
 
 
 _LAST: Final = 60 * 2**18 - 1
-"""Greatest frame number in a store."""
+"""Largest possible frame number in a store."""
 
 _Row = TypeVar("_Row", LockedTrace, LockedCase)
 _NULL: Final = type(None)

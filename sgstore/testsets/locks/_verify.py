@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Ints
 
     _StoredCase = tuple[LockedCase, Ints, tuple[int, int], str]
-    """Test case; in a store, its frame ids, first and last log time (ns), and digest (empty without frames)."""
+    """Test case with its state in a store: frame ids, log times (first and last; ns), digest or empty."""
 
 
 _COMPARED = ("recording", "ego", "since", "until", "frames", "config", "map", "flavour", "version")
@@ -56,7 +56,7 @@ class Difference:
 
     @property
     def matters(self) -> bool:
-        """True if the content of a test case differs, not only the version of the software."""
+        """True if the content of a test case differs, and not only the version of the software."""
         return self.what != "version"
 
 
@@ -87,7 +87,7 @@ def verify(lock: Lock, store: Store | Collection, *, payloads: bool = True) -> I
 def _by_trace(
     lock: Lock, store: Store, *, payloads: bool
 ) -> Iterator[tuple[LockedTrace, Iterator[Difference]]]:
-    """Yield each trace of a lock, with its differences from a store and those of its test cases."""
+    """Yield each trace of a lock, with the differences of the trace and of its test cases."""
     with store.file.snapshot():
         known = {one.name: one for one in store.info()}
         known |= {one.trace_id: one for one in known.values()}
@@ -155,7 +155,7 @@ def verify_case(
 
 
 def _found(trace: LockedTrace, known: Mapping[int | str, StoredTrace]) -> StoredTrace | None:
-    """Return the trace of a lock among the traces of a store, by id or by name."""
+    """Return the stored trace that belongs to a trace of a lock, found by id or by name; or None."""
     return known.get(Identity.id_of(trace.recording, trace.ego)) or known.get(trace.name)
 
 
@@ -180,7 +180,7 @@ def _stored(
     *,
     graphs: bool = True,
 ) -> list[_StoredCase]:
-    """Return the test cases of a lock as a store has them.
+    """Return the test cases of a lock with their frames, times and digests in a store.
 
     Without ``graphs``, the digests are those of the lock.
     """

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats
 
 SHARES: Final = (0.05, 0.1, 0.2)
-"""Shares of an order for which the found failures are reported."""
+"""Shares of the test cases for which the number of found failures is reported."""
 
 _DRAWS: Final = 2_000
 
 
 @dataclass(frozen=True)
 class FaultDetection:
-    """Measures of how soon an order of test cases finds the failures (APFD).
+    """Measures (such as APFD) of how early an order of test cases finds the failures.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class FaultDetection:
 
 
 def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
-    """Return measures of how soon an order of test cases finds the failures.
+    """Return measures of how early an order of test cases finds the failures.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
 
 
 def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, float, float]]:
-    """Return points of a curve: the number of failures in the first n test cases of an order.
+    """Return points of a curve: number of failures in the first n test cases of an order.
 
     Parameters
     ----------
@@ -105,5 +105,5 @@ def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, floa
 
 
 def _drawn(left: Floats, rng: np.random.Generator) -> float:
-    """Return a bootstrap sample of the APFD: the mean over failures drawn with replacement."""
+    """Return one bootstrap sample of the APFD: the mean of randomly drawn failures."""
     return float(left[rng.integers(0, len(left), len(left))].mean())

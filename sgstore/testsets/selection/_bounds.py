@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats, Ints
 
 ROUNDING: Final = 1e-7
-"""Rounding error as a share of a cost."""
+"""Tolerance for rounding errors, as a share of a cost."""
 
 
 # Each element gets a price. If no set costs less than the prices of its elements, no cover costs
@@ -26,16 +26,16 @@ ROUNDING: Final = 1e-7
 # method for the set covering problem", Operations Research 47 (1999).
 
 ROUNDS: Final = 400
-"""Greatest number of subgradient steps."""
+"""Largest number of steps of the subgradient method."""
 
 PATIENCE: Final = 20
-"""Steps without a better bound before the step length is halved."""
+"""Number of steps without a better bound, after which the step length is halved."""
 
 TRIES: Final = 10
-"""Interval of steps after which the prices suggest a cover."""
+"""Number of steps between two attempts to make a cover from the current prices."""
 
 _MEMBERSHIPS: Final = 200_000_000
-"""Greatest number of memberships in all steps together; very large problems get fewer steps."""
+"""Largest number of memberships that all steps process together. Very large problems get fewer steps."""
 
 
 def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
@@ -88,7 +88,7 @@ def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
 
 
 def _suggested(family: SetFamily, left: Floats) -> Ints:
-    """Return a set cover made of the sets with the lowest cost in relation to their element prices."""
+    """Return a set cover from the sets whose cost is low compared with the prices of their elements."""
     order = np.lexsort((family.rank, left / np.maximum(np.diff(family.starts), 1)))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
@@ -105,17 +105,16 @@ def _suggested(family: SetFamily, left: Floats) -> Ints:
 # greedy choice and the price bound remain.
 
 NODES: Final = 2_000
-"""Branch-and-bound nodes in all parts together: counted, so that results are the same on every machine."""
+"""Largest number of branch-and-bound nodes for all parts. A count gives equal results on every machine."""
 
 LARGEST: Final = 100_000
-"""Greatest number of memberships of a part for the solver: the first relaxation of larger parts
-takes minutes."""
+"""Largest number of memberships in a part for the solver. Larger parts would take minutes."""
 
 SECONDS: Final = 20.0
-"""Time limit of a part: guards against endless relaxations; the node limit is usually reached earlier."""
+"""Time limit of the solver for one part; s. Usually, the limit of nodes is reached earlier."""
 
 _LOOK_S: Final = 0.1
-"""Interval for signal checks during solving; s."""
+"""Interval at which signals are checked while the solver runs; s."""
 
 
 def has_solver() -> bool:
@@ -168,7 +167,7 @@ def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, i
 
 
 def _silent() -> Any:
-    """Return an integer solver that prints nothing, also not its name."""
+    """Return an integer solver that prints no text."""
     import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
 
     class Silent(highspy.Highs):
@@ -180,7 +179,7 @@ def _silent() -> Any:
 
 
 def _run(solver: Any) -> None:
-    """Run an integer solver in a thread, so that a signal handler can stop it by an exception."""
+    """Run an integer solver in a thread. An exception of a signal handler stops it."""
     # All solvers of a process share one lock; an interrupted solver holds it until it stops.
     _wait(solver)
     solver.HandleUserInterrupt = True
@@ -194,7 +193,7 @@ def _run(solver: Any) -> None:
 
 
 def _wait(solver: Any) -> None:
-    """Wait for the end of an integer solver. A signal handler can raise an exception meanwhile."""
+    """Wait until an integer solver has ended. A signal handler can raise an exception during the wait."""
     while not solver.wait(_LOOK_S)[0]:
         pass
 

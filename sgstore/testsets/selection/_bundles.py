@@ -1,4 +1,4 @@
-"""Selection from a collection: each bundle reports only frames or clips that a minimal selection can need.
+"""Selection from a collection: each bundle returns only the units that a minimal selection may need.
 
 Of units with the same classes the cheapest is enough. Therefore a bundle reports one unit for each
 set of classes, with its frames, and its numbers of units and frames. The selection and its bounds

@@ -49,12 +49,12 @@ if TYPE_CHECKING:
 
 
 ROUNDING = 1 + 1e-12
-"""Tolerance for rounded sums of costs that meet a budget."""
+"""Tolerance for rounding errors in sums of costs that are compared with a budget."""
 
 
 @dataclass
 class BudgetTracker:
-    """Rest of a selection budget (time, bytes or frames), and the frames that are already paid.
+    """Remaining budget of a selection (time, bytes or frames), and the frames that are already paid.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class BudgetTracker:
         self.left -= price
 
     def fitting(self, order: Ints, most: float = np.inf) -> Ints:
-        """Return the selection units that fit into the budget, in the given order, and pay them.
+        """Return the selection units that fit into the budget, in the given order, and pay for them.
 
         Units without new frames are skipped.
         """
@@ -224,7 +224,7 @@ class SelectionSpec:
 
     @property
     def one_of_alike(self) -> bool:
-        """True if only the cheapest of several clips with the same scene classes needs to be considered."""
+        """True if only the cheapest of all clips with the same scene classes can be selected."""
         shared = self.unit is SelectionUnit.clip and (self.stride_s or math.inf) < self.clip_s
         least = self.strategy is Strategy.minimal or (
             self.strategy is Strategy.per_class and self.each == 1
@@ -342,11 +342,11 @@ def select(chosen: ChosenFrames, spec: SelectionSpec) -> Selection:
 
 
 _COARSER: Final = ("EL", "ER", "E")
-"""Abstractions with fewer classes than RSV."""
+"""Abstractions that have fewer classes than RSV."""
 
 
 def _saves_nothing(spec: SelectionSpec, units: Units) -> str:
-    """Return a note that each unit has an item of its own, with a setting that saves units if one does."""
+    """Return a note that a minimal selection needs every unit, with a setting that would need fewer."""
     said = f"--minimal saves nothing: each of the {len(units)} {spec.unit}s has an item of its own"
     if spec.sequences:
         return said
@@ -381,7 +381,7 @@ def holdings_of(spec: SelectionSpec, units: Units) -> Holdings:
 
 
 def _every(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    """Select all frames, clips or traces; with a budget, random ones until it is used up."""
+    """Select all frames, clips or traces. With a budget, select random ones until it is used up."""
     picked = np.arange(len(units))
     if spec.budget is not None:
         tracker = BudgetTracker.of(units, spec.budget.measure, spec.budget.most)
@@ -456,7 +456,7 @@ def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any
 
 
 def _met(held: Holdings, units: Units, picked: Ints) -> int:
-    """Return the number of scene classes (or combinations) that the selected clips contain."""
+    """Return the number of scene classes (or combinations) in the selected clips."""
     taken = np.zeros(len(units), np.bool_)
     taken[picked] = True
     return int(held.weight[np.unique(held.pairs[1][taken[held.pairs[0]]])].sum())
@@ -471,7 +471,7 @@ def _above(cost: float, bound: float) -> str:
 
 
 def _rarest(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
-    """Select clips for the rarest scene class first, preferring clips with many other missing classes."""
+    """Select clips for the rarest scene class first. Prefer clips with many other missing classes."""
     measure = spec.budget.measure if spec.budget else spec.objective
     tracker = BudgetTracker.of(units, measure, spec.budget.most if spec.budget else np.inf)
     family = held.family(units, tracker.cost, 1, rank)
@@ -530,7 +530,7 @@ def _stratified(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 def _allotted(
     order: Ints, stratum: Ints, tracker: BudgetTracker, shares: Floats, rank: Ints
 ) -> Ints:
-    """Select clips of each group (stratum) up to its share of the budget, then random clips for the rest."""
+    """Select clips of each group up to its share of the budget, then random clips for the rest."""
     within_share: list[Ints] = []
     used = np.zeros(len(shares))
     for number, share in enumerate(shares.tolist()):
@@ -548,7 +548,7 @@ def _allotted(
 
 
 def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
-    """Select clips in ascending order of their lowest value, within the budget. Unknown values are last."""
+    """Select clips with the lowest values first, within the budget. Unknown values come last."""
     value = least_margins(units, spec.by) if is_check(spec.by) else least_values(units, spec.by)
     order = np.lexsort((rank, np.where(np.isnan(value), np.inf, value)))
     if spec.budget is not None:
@@ -568,7 +568,7 @@ def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
-    """Return the group (stratum) of each clip, which is the most frequent value of its frames.
+    """Return the group (stratum) of each clip: the most frequent value of its frames. Also return group names.
 
     Also return the names of all groups.
     """
@@ -593,7 +593,7 @@ def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
 
 
 def _value(value: Any) -> str:
-    """Return the name of a stratum (group of clips with equal values) from its value."""
+    """Return the name of the group of clips (stratum) that have a value."""
     if value is None:
         return "unknown"
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Cheap set covers: selected clips that together contain all scene classes, with proven lower bounds.
+"""Cheap set covers: clips that together contain all scene classes, with lower bounds for the cost.
 
 Reduction removes clear decisions: required sets, and redundant elements and sets. It also splits
 the problem into independent parts.
@@ -38,17 +38,17 @@ if TYPE_CHECKING:
     from sgstore.testsets.selection._units import Holdings, Measure, Units
 
 _COMPARISONS: Final = 100_000_000
-"""Greatest number of comparison steps; redundant items found within it are removed."""
+"""Largest number of comparison steps for the search of redundant items."""
 
 _BATCH: Final = 2_000_000
-"""Pairs that are compared at once."""
+"""Number of pairs that are compared at once."""
 
 _TABLE: Final = 1 << 26
-"""Greatest size of a look-up table of memberships."""
+"""Largest size of a look-up table of memberships."""
 
 
 def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
-    """Return the sets that every cover needs, and the remaining independent subproblems."""
+    """Return the sets that every cover needs, and the remaining problem in independent parts."""
     need, alive = family.need.copy(), np.ones(len(family), np.bool_)
     forced = np.zeros(len(family), np.bool_)
     wanted = need > 0
@@ -77,7 +77,7 @@ def cheapest_alike(family: SetFamily) -> Bools:
 
 
 def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
-    """Select all sets that contain an element with no more sets than it needs."""
+    """Select all sets that are needed because an element occurs in no other sets."""
     while True:
         rows = alive[family.set_of]
         often = np.bincount(family.members[rows], minlength=len(need))
@@ -92,7 +92,7 @@ def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
 
 
 def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Bools) -> None:
-    """Keep one of several elements that are in the same sets: the one that needs most sets."""
+    """Of several elements in exactly the same sets, keep only the one that needs the most sets."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.members[rows], family.set_of[rows], len(need), len(family))
     elements = np.flatnonzero(wanted)
@@ -101,7 +101,7 @@ def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Boo
 
 
 def _drop_same_sets(family: SetFamily, alive: Bools, wanted: Bools) -> None:
-    """Keep the cheapest of several sets with equal elements."""
+    """Of several sets with the same elements, keep only the cheapest."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.set_of[rows], family.members[rows], len(family), len(wanted))
     sets = np.flatnonzero(alive)
@@ -130,7 +130,7 @@ def _repeated(*keys: Ints) -> Bools:
 def _drop_larger_elements(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools, most: int
 ) -> int:
-    """Remove elements that are covered whenever another element is covered; return the number of steps."""
+    """Remove elements that are covered whenever another element is covered. Return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -144,7 +144,7 @@ def _drop_larger_elements(
 
 
 def _drop_smaller_sets(family: SetFamily, alive: Bools, wanted: Bools, most: int) -> int:
-    """Remove sets that are part of another set of equal or lower cost; return the number of steps."""
+    """Remove sets that are contained in another set of equal or lower cost. Return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -165,7 +165,7 @@ def _contained(
     superfluous: Callable[[Ints, Ints], Ints],
     most: int,
 ) -> tuple[Bools, int]:
-    """Return a mask of redundant sets or elements, found by inclusion tests, and the number of steps.
+    """Return a mask of the sets or elements that inclusion tests show as redundant, and the number of steps.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def _contained(
 def _compared(
     one: Ints, other: Ints, sizes: tuple[int, int], done: Bools, batch: int
 ) -> tuple[Ints, tuple[Ints, Ints]]:
-    """Return the next sets for an inclusion test, the smallest first, with sets that could contain them.
+    """Return the next sets for an inclusion test, smallest first, with the sets that may contain them.
 
     A containing item has all components of the item, also its first, which is the rarest.
     """
@@ -263,7 +263,7 @@ def _holding(
 def _parts(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools
 ) -> list[tuple[SetFamily, Ints]]:
-    """Return the remaining sets split into independent subproblems without common elements."""
+    """Divide the remaining sets into independent problems, which have no elements in common."""
     rows = alive[family.set_of] & wanted[family.members]
     sets, members = family.set_of[rows], family.members[rows]
     group = _joined(sets, members, len(family), len(need))[sets]
@@ -285,7 +285,7 @@ def _parts(
 
 
 def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
-    """Return the connected component of each set, as the lowest index of its sets, (many,)."""
+    """Return the component of each set, (many,). Sets with common elements are in one component."""
     first = np.arange(many)
     while True:
         # Propagate the least set number through elements and sets.
@@ -364,7 +364,7 @@ def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Sets selected within a budget, with the amount of elements that they cover.
+    """Sets selected within a budget, and how much of the elements they cover.
 
     Attributes
     ----------
@@ -420,7 +420,7 @@ def _at_most(family: SetFamily, chosen: Ints, budget: float) -> float:
 
 @dataclass(frozen=True)
 class UnitPieces:
-    """Clips as ranges of pieces: overlapping clips share pieces, and a shared piece costs once.
+    """Clips as ranges of small pieces. Overlapping clips share pieces, and a shared piece is paid only once.
 
     Attributes
     ----------
@@ -453,7 +453,7 @@ class UnitPieces:
 
 
 def pieces(units: Units, measure: Measure) -> tuple[Units, UnitPieces]:
-    """Return clips cut into pieces at each start and end of a clip, and each clip as a range of pieces."""
+    """Cut clips at each start and end of a clip. Return the pieces, and each clip as a range of pieces."""
     cuts = np.unique(np.concatenate([units.begin, units.end]))
     parts = replace(units, begin=cuts[:-1], end=cuts[1:])
     cost = parts.summed(units.weights(measure), measure)
@@ -496,7 +496,7 @@ def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> I
     taken = np.zeros(len(spans.cost), np.bool_)
 
     def cheapened(one: int) -> Iterator[tuple[int, float]]:
-        """Yield the clips that overlap with a selected clip, with their lower prices."""
+        """Yield the clips that overlap with a selected clip, each with its new, lower price."""
         taken[spans.begin[one] : spans.end[one]] = True
         for other in spans.beside(one):
             yield other, max(spans.left(other, taken), 1e-9)
@@ -505,7 +505,7 @@ def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> I
 
 
 def _thinned(family: SetFamily, spans: UnitPieces, chosen: Ints) -> Ints:
-    """Return selected clips without redundant ones. Clips that save most are removed first."""
+    """Return the selected clips without redundant ones. The most expensive redundant clip goes first."""
     times = np.zeros(len(spans.cost) + 1, np.int64)
     np.add.at(times, spans.begin[chosen], 1)
     np.add.at(times, spans.end[chosen], -1)

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from sgstore.testsets.selection._units import Holdings, Units
 
 POINTS: Final = 60
-"""Number of rows of a curve."""
+"""Default number of rows of a curve."""
 
 ORDERS: Final = 1_000
-"""Number of random orders; fewer for units with many elements."""
+"""Largest number of random orders. Units with many elements get fewer orders."""
 
 _WORK: Final = 30_000_000
-"""Greatest number of memberships in all random orders together."""
+"""Largest number of memberships in all random orders together."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
 
 
 def _of_all_units(selection: Selection) -> Selection:
-    """Return the same selection with all units, also those that the bundles of a collection left out."""
+    """Return the selection with all units, including units that the bundles of a collection did not return."""
     spec, some = selection.spec, selection.units
     units = units_of(some.chosen, spec.unit, spec.clip_s, spec.stride_s)
     picked = np.searchsorted(units.first, some.first[selection.picked])
@@ -119,7 +119,7 @@ def _points(most: int, points: int) -> Ints:
 
 
 def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[Floats, float]:
-    """Return the number of random test cases that contain a number of classes, for several random orders.
+    """Return how many random test cases contain ``wanted`` classes, for several random orders.
 
     Returns
     -------

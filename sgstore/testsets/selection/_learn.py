@@ -34,7 +34,7 @@ _NUMBERS: Final = (
 _PARTS: Final = 5
 _THREADED: Final = 100_000
 _TOGETHER: Final = 1 << 17
-"""Cases that the plain model judges at a time."""
+"""Number of test cases that the logistic model evaluates at once."""
 
 
 def boosted() -> bool:
@@ -101,7 +101,7 @@ def _sql() -> str:
 
 
 def cross_fitted(x: Singles, failed: Bools, known: Bools, seed: int) -> Floats:
-    """Return the failure probability of each test case, (U,), by models trained on other test cases.
+    """Return the failure probability of each test case, (U,). Each model is trained on other test cases.
 
     Parameters
     ----------

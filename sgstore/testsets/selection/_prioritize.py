@@ -56,17 +56,17 @@ if TYPE_CHECKING:
     from sgstore.testsets.selection._units import Units
 
 MEASURES: Final = ("closing_time", "ttc_mild")
-"""Default measures of risk: at the closing speed, and for mild manoeuvres of both."""
+"""Default criticality measures for the order of test cases by risk."""
 
 RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql and one.worse}
-"""Measures of pairs in a frame that can rank cases."""
+"""Criticality measures of entity pairs in a frame that can order test cases."""
 
 LATER: Final = {name: one for name, one in RECORDED.items() if one.worse}
-"""Measures of the later recording that can rank cases."""
+"""Criticality measures that use later frames and can order test cases."""
 
 
 _TOLD: Final = 1 << 15
-"""Units whose reasons are made together."""
+"""Number of test cases whose reasons are computed at once."""
 
 _OWN: Final = "of its class"
 
@@ -413,21 +413,21 @@ def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> 
 
 
 def _places(total: Floats, rank: Ints) -> Ints:
-    """Return the place of each value in ascending order, (U,), from 0. Ties are ordered by ``rank``."""
+    """Return the place of each value in ascending order, (U,), from 0. ``rank`` orders equal values."""
     found = np.empty(len(total), np.int64)
     found[np.lexsort((rank, total))] = np.arange(len(total))
     return found
 
 
 def _in_rounds(order: Ints, code: Ints) -> Ints:
-    """Return test cases in rounds: the first test case of each class, then the second of each, and so on."""
+    """Return test cases in rounds. Each round has one test case of every class that still has one."""
     turn = _turns(code[order])
     turn[code[order] == UNKNOWN] = len(order) + 1  # without a class: last
     return order[np.argsort(turn, kind="stable")]
 
 
 def _turns(code: Ints) -> Ints:
-    """Return for each test case the number of test cases of its class up to and including it, (n,)."""
+    """Return the position of each test case among the test cases of its class, (n,), counted from 1."""
     order = np.argsort(code, kind="stable")
     fresh = np.append(True, np.diff(code[order]) != 0)[: len(code)]
     places = np.arange(len(code))
@@ -437,7 +437,7 @@ def _turns(code: Ints) -> Ints:
 
 
 def _together(*orders: Ints) -> Ints:
-    """Return several orders of test cases merged into one, by the sum of their places.
+    """Merge several orders of the same test cases into one order, by the sum of their places.
 
     The first order decides between equal sums.
     """
@@ -479,7 +479,7 @@ def _most_critical(units: Units, worst: Sequence[WorstValues]) -> Ints:
 
 
 def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
-    """Return the worst values of measures of whole encounters; all frames of an encounter have one value."""
+    """Return the worst values of measures that an encounter has only once, for all of its frames."""
     if not measures:
         return {}
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
@@ -586,7 +586,7 @@ def _reasons(
     who: Mapping[tuple[int, int], str],
     times: Floats,
 ) -> list[str]:
-    """Return a reason text for each test case: the worst value of a measure, its time and its entity.
+    """Return the reason for the place of each test case: its worst value, with time and entity.
 
     An unknown value gives an empty text.
     """
@@ -654,7 +654,7 @@ def locked_order(
 
 
 def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
-    """Return the known test results in the order of the test cases: True for a failure.
+    """Return the known test results in the order of the test cases. True means a failure.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Families of sets (for set covers) as integer arrays, and the greedy selection of sets.
+"""Families of sets (for set covers) as integer arrays, and a greedy selection of sets.
 
 A family has sets of elements, stored as columns.
 """
@@ -109,7 +109,7 @@ class SetFamily:
         return starts, self.set_of[order]
 
     def gains(self, open_: Bools) -> Floats:
-        """Return for each set the total weight of its elements that are not covered yet, (S,)."""
+        """Return for each set the total weight of its elements that still need to be covered, (S,)."""
         rows = open_[self.members]
         weight = self.weight[self.members[rows]].astype(np.float64)
         return np.bincount(self.set_of[rows], weight, len(self)).astype(np.float64)
@@ -121,7 +121,7 @@ class SetFamily:
         return np.bincount(self.members[taken[self.set_of]], minlength=len(self.need))
 
     def part(self, sets: Ints, wanted: Bools, need: Ints) -> SetFamily:
-        """Return a smaller family of some sets and some elements, with new element numbers."""
+        """Return a smaller family with some of the sets and elements. Elements get new numbers."""
         kept = np.zeros(len(self), np.bool_)
         kept[sets] = True
         rows = kept[self.set_of] & wanted[self.members]
@@ -219,7 +219,7 @@ def thinned(family: SetFamily, chosen: Ints, order: Ints | None = None) -> Ints:
 
 
 def ordered(family: SetFamily, chosen: Ints) -> Ints:
-    """Return the selected sets ordered by new elements per cost; sets without new elements are last."""
+    """Return the selected sets, sorted by new elements per cost. Sets without new elements come last."""
     chosen = np.sort(chosen)
     wanted = np.ones(len(family.need), np.bool_)
     need = np.minimum(family.need, family.covered(chosen))
@@ -229,12 +229,12 @@ def ordered(family: SetFamily, chosen: Ints) -> Ints:
 
 
 def met(family: SetFamily, chosen: Ints) -> int:
-    """Return the weighted amount of element needs that the selected sets cover."""
+    """Return the total weight of the element needs that the selected sets cover."""
     return int((np.minimum(family.covered(chosen), family.need) * family.weight).sum())
 
 
 def or_alone(family: SetFamily, chosen: Ints, budget: float) -> Ints:
-    """Return the selected sets, or the best single set within the budget if it covers more."""
+    """Return the selected sets, or one single set within the budget if it covers more."""
     gain = family.gains(family.need > 0)
     single = np.flatnonzero(family.cost <= budget)
     best = single[np.lexsort((family.rank[single], -gain[single]))[:1]]

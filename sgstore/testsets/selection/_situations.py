@@ -1,4 +1,4 @@
-"""Situation of the ego in a frame: the entity of its first possible conflict, its direction, and the place."""
+"""Situation of the ego in a frame: the first entity that it may collide with, its direction and place."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 _FIXED: Final = (*SIGNALS, "building", "pole", "barrier", "vegetation")
 MET: Final = f"NOT IN ({', '.join(map(literal, _FIXED))})"
-"""SQL condition for kinds that the ego could meet."""
+"""SQL condition for the kinds of entities that the ego could collide with."""
 
 OTHERS: Final = f"src_is_ego AND dst_kind {MET}"
-"""Pairs of the ego and entities that it could meet, without traffic lights, for example."""
+"""SQL condition for pairs of the ego and an entity that it could collide with."""
 
 SITUATION: Final = "situation"
-"""Name of these classes in place of an abstraction."""
+"""Name of the situation classes, used in place of an abstraction."""
 
 NOBODY: Final = "nobody"
-"""Situation without other entities."""
+"""Name of the situation in which there are no other entities."""
 
 _NOBODY: Final = -1
 
 _FRAMES: Final = 1 << 17
-"""Frames whose pairs are read together."""
+"""Number of frames whose pairs are read at once."""
 
 _DIRECTIONS: Final = ("", " of the same direction", " that crosses", " that comes towards it")
 _WAYS: Final = ("", " in its way", " beside its way")
@@ -45,7 +45,7 @@ WHO: Final = """
     + CASE WHEN lat_gap <= 0 THEN 4 WHEN lat_gap > 0 THEN 8 ELSE 0 END
     + CASE WHEN lon > 0 THEN 1 WHEN lon <= 0 THEN 2 ELSE 0 END))[4] AS situation
 """
-"""SQL of the situation of a frame as a number, from the pairs of :data:`OTHERS`."""
+"""SQL that computes the situation of a frame as a number, from the pairs that :data:`OTHERS` selects."""
 
 _SQL: Final = f"""
   SELECT frame_id, {WHO} FROM world_criticality WHERE {OTHERS} AND frame_id BETWEEN ? AND ? GROUP BY frame_id
@@ -53,7 +53,7 @@ _SQL: Final = f"""
 
 
 def frames_in_parts(frames: Ints) -> Iterator[tuple[int, Ints]]:
-    """Yield chunks of ascending frame ids, each with the index of its first frame."""
+    """Yield groups of ascending frame ids, each with the index of its first frame."""
     for start in range(0, len(frames), _FRAMES):
         yield start, frames[start : start + _FRAMES]
 

@@ -1,4 +1,4 @@
-"""Value of an expression in each frame, and its lowest value in each test case."""
+"""Values of an expression in each frame, and the lowest value in each test case."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def frame_values(units: Units, text: str) -> tuple[Ints, Floats]:
 
 
 def _condition_in(text: str) -> str | None:
-    """Return the condition of an expression ``robustness(…)``; ``None`` for any other expression."""
+    """Return the condition inside ``robustness(…)``. ``None`` means another expression."""
     prefix = "MATCH () RETURN "
     try:
         match = parse(prefix + text)[-1]

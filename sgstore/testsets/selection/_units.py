@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 
 MOST: Final = 150_000_000
-"""Greatest number of memberships in memory; more are an error, never a partial result."""
+"""Largest number of memberships in memory. More raise an error, so that a result is always complete."""
 
 _CELLS: Final = 50_000_000
-"""Truth values that are processed together."""
+"""Number of truth values that are processed at once."""
 
 
 class SelectionUnit(StrEnum):
@@ -50,7 +50,7 @@ class SelectionUnit(StrEnum):
 
 
 Measure = Literal["units", "frames", "seconds", "bytes"]
-"""Measure of the cost of a selection."""
+"""Unit in which the cost of a selection is measured."""
 
 
 @dataclass(frozen=True)
@@ -161,13 +161,13 @@ class Units:
         return self.frame_id[self.end - 1]
 
     def codes(self, of: Classed) -> Ints:
-        """Return the scene class of each frame, (N,). Frames that the query did not select have none."""
+        """Return the scene class of each frame, (N,). Frames outside the query have no class."""
         place = np.searchsorted(of.frame_id, self.frame_id)
         there = np.append(of.frame_id, -1)[place] == self.frame_id
         return np.where(there, np.append(of.code, UNKNOWN)[place], UNKNOWN)
 
     def rows_of(self, picked: Ints) -> Ints:
-        """Return the indices of all frames in the given clips or traces, ascending, each once."""
+        """Return the indices of all frames in the given clips or traces, ascending and without duplicates."""
         step = np.zeros(len(self.frame_id) + 1, np.int64)
         np.add.at(step, self.begin[picked], 1)
         np.add.at(step, self.end[picked], -1)
@@ -184,7 +184,7 @@ class Units:
         return found
 
     def members(self) -> Iterator[tuple[Ints, Ints]]:
-        """Yield chunks of pairs: the index of a clip or trace, and the index of a frame in it."""
+        """Yield groups of pairs: index of a clip or trace, and index of a frame in it."""
         ends = np.cumsum(self.sizes)
         low = 0
         while low < len(self):
@@ -216,7 +216,7 @@ class Units:
         return self.summed(self.weights(measure), measure)
 
     def summed(self, weights: Floats, measure: Measure) -> Floats:
-        """Return the total weight of the frames in each clip or trace, (U,); always positive."""
+        """Return the total weight of the frames in each clip or trace, (U,). It is always positive."""
         if not len(self):
             return np.zeros(0)
         ranges = np.stack([self.begin, self.end], axis=1).ravel()
@@ -225,7 +225,7 @@ class Units:
         return np.maximum(found, 1e-3 if measure == "seconds" else 1.0)
 
     def together(self, picked: Ints, measure: Measure) -> float:
-        """Return the total cost of some clips or traces; a shared frame costs once."""
+        """Return the total cost of some clips or traces. A shared frame is counted once."""
         if measure == "units":
             return float(len(picked))
         if not self.overlap:
@@ -233,7 +233,7 @@ class Units:
         return float(self.weights(measure)[self.rows_of(picked)].sum())
 
     def ranks(self, seed: int) -> Ints:
-        """Return a random order of the clips or traces, (U,), equal in all stores with the same traces."""
+        """Return random ranks of the clips or traces, (U,), equal in all stores with the same traces."""
         mixed = _mixed(self.first.astype(np.uint64) + np.uint64(seed * int(_STEP) % (1 << 64)))
         order = np.lexsort((self.first, mixed))
         rank = np.empty(len(order), np.int64)
@@ -247,7 +247,7 @@ _STEP: Final = np.uint64(0x9E3779B97F4A7C15)
 def _mixed(
     words: np.ndarray[tuple[int], np.dtype[np.uint64]],
 ) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
-    """Return 64-bit words mixed to pseudo-random numbers by SplitMix64 (Steele, Lea, Flood, 2014)."""
+    """Return pseudo-random numbers computed from 64-bit words by SplitMix64 (Steele, Lea, Flood, 2014)."""
     words = words + _STEP
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -335,7 +335,7 @@ def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tupl
 
 @dataclass(frozen=True)
 class Holdings:
-    """Elements of each selection unit: the scene classes, feature combinations or sequences in its frames.
+    """Scene classes, feature combinations or sequences (the elements) that each selection unit contains.
 
     Attributes
     ----------
@@ -372,7 +372,7 @@ class Holdings:
         return replace(found, weight=self.weight)
 
     def over(self, units: Units) -> Holdings:
-        """Return the scene classes or combinations that other clips of the same frames contain.
+        """Return the same elements for other clips of the same frames.
 
         Raises
         ------
@@ -419,7 +419,7 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
 
 
 def kind_of(abstraction: str) -> str:
-    """Return a description of the counted elements: classes in an abstraction."""
+    """Return the name of the counted elements for a message, such as classes in an abstraction."""
     return f"classes in {abstraction}"
 
 
@@ -479,7 +479,7 @@ def classes_of(units: Units, of: Classed) -> Ints:
 
 
 def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
-    """Return the feature combinations of each scene class, with combinations of equal frames merged.
+    """Return the feature combinations of the scene classes. Combinations with the same frames are merged.
 
     Also return the multiplicity and the number of frames of each.
     """
@@ -513,7 +513,7 @@ def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
 
 
 def _of_units(pairs: Ints, has: Bools) -> Ints:
-    """Return pairs of a clip and a feature combination, from the scene classes in each clip."""
+    """Return pairs of a clip and a feature combination, from pairs of a clip and a scene class."""
     held = 0
     parts: list[Ints] = []
     unit, row = pairs
@@ -532,7 +532,7 @@ def _of_units(pairs: Ints, has: Bools) -> Ints:
 
 
 def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges of about ``step`` array rows that never divide a clip or trace."""
+    """Yield ranges of about ``step`` rows. A range never ends inside a clip or trace."""
     low = 0
     while low < len(unit):
         high = int(np.searchsorted(unit, unit[min(low + step, len(unit)) - 1], side="right"))
@@ -541,7 +541,7 @@ def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
 
 
 def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
-    """Return the number of scene classes (or combinations) in the first n selected clips, for each n."""
+    """Return, for each n, the number of scene classes (or combinations) in the first n selected clips."""
     place = np.full(units, -1)
     place[picked] = np.arange(len(picked))
     rows = place[pairs[0]] >= 0
