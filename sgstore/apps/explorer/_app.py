@@ -42,26 +42,26 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MOST_QUESTIONS: Final = 8
-"""Greatest number of long running queries; further ones are rejected with 503."""
+"""Largest number of long queries at the same time. Further queries are rejected with status 503."""
 
 SMALL: Final = "parts", "why"
-"""Short queries about one match; they have one more slot and sandbox process each."""
+"""Names of short queries about one match. They have an additional slot and sandbox process."""
 
 TIMEOUT_S: Final = 60.0
 """Time limit of a query of a user; s."""
 
 LONGEST_S: Final = 86_400.0
-"""Time limit of a lock, an export, or a comparison of stores; s."""
+"""Time limit for writing a lock, an export, or a comparison of stores; s."""
 
 MOST_MATCHES: Final = 50_000
-"""Greatest number of matches and rows of a query; the page shows that there are more."""
+"""Largest number of matches and rows of a query. The page shows if there are more."""
 
 MOST_TAGGED: Final = 10_000
-"""Greatest number of frames of one tag."""
+"""Largest number of frames that can have the same tag."""
 
 WORKER: Final = "sgstore.apps.explorer._worker"
 FIRST: Final = {"ask": "rows", "text": "MATCH (e:Ego) RETURN e.id LIMIT 1", "parameters": {}}
-"""First query of each sandbox: loads the language, the catalogue and the database."""
+"""First query of each sandbox. It loads the language, the catalogue and the database."""
 
 _NONCE: Final = "{{nonce}}"
 _SCRIPT: Final = "js/main.js"
@@ -79,7 +79,7 @@ async def _last(replies: Replies) -> AsyncGenerator[bytes]:
 
 
 class _Answer(StreamingResponse):
-    """Streamed HTTP response with the results of a query. The end of the response cancels the query.
+    """Streamed HTTP response with the results of a query. If the response ends early, the query is cancelled.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class _Answer(StreamingResponse):
             self.end()
 
     def ask(self) -> None:
-        """Run the query of the HTTP response in a thread. An error becomes a reply."""
+        """Run the query of the HTTP response in a thread. An error is sent as a reply."""
         tell = partial(self._loop.call_soon_threadsafe, self._found.put_nowait)
         try:
             self._asked = self._pool()
@@ -183,7 +183,7 @@ class Explorer:
         self.busy = set[_Answer]()
 
     def warm(self) -> None:
-        """Start reading the road maps of the stores in a thread, before the first request."""
+        """Start a thread that reads the road maps of the stores before the first request."""
         for reads in self.reads.values():
             self._threads.submit(reads.warm, self._ended)
 
@@ -193,7 +193,7 @@ class Explorer:
             answer.end()
 
     def close(self) -> None:
-        """Stop the sandboxes, wait for running reads, and close the stores."""
+        """Stop the sandboxes, wait until running reads have ended, and close the stores."""
         self._ended.set()
         self.stop()
         for pool in self._pools.values():
@@ -216,7 +216,7 @@ class Explorer:
         )
 
     def _tables(self) -> dict[str, Path]:
-        """Return the tags of users as a file for queries, by table name; empty without tags."""
+        """Return the files with the tags of users, by table name, for queries. Empty without tags."""
         found = self.notes.read()
         if not found:
             return {}
@@ -225,7 +225,7 @@ class Explorer:
         return {"notes": table}
 
     def pool(self, side: str, text: str) -> SandboxPool:
-        """Return the sandbox processes for a query on a store. A query about tags gets the current tags."""
+        """Return the sandbox processes for a query on a store. Queries about tags get the current tags."""
         if side == "a" and "notes" in text.lower() and self._stamp != self.notes.stamp():
             self._stamp = self.notes.stamp()
             old, self._pools["a"] = self._pools["a"], self._pool("a")
@@ -304,13 +304,13 @@ class Explorer:
         return answered(await self.threaded(ask))
 
     async def about(self, _: Request) -> Response:
-        """Endpoint with the traces of each store, and whether the page may write files."""
+        """Endpoint with the traces of each store. It also states if the page may write files."""
         sides = {side: await self.threaded(reads.about) for side, reads in self.reads.items()}
         writing = self.write_to is not None
         return JSONResponse({**sides["a"], "other": sides.get("b"), "writing": writing})
 
     async def stamps(self, _: Request) -> Response:
-        """Endpoint with a text for each store that changes with the store."""
+        """Endpoint with a short text for each store. The text changes whenever the store changes."""
         return JSONResponse({side: one.file.stamp for side, one in self.stores.items()})
 
     async def tags(self, request: Request) -> Response:
@@ -378,7 +378,7 @@ _WORK: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(("lock", "export"), ("clips", "name", "format")),
     "diff": ("abstraction",),
 }
-"""Fields of each query and of each longer task, by name."""
+"""Names of queries and longer tasks → fields of their requests."""
 
 
 _METHODS: Final = {name: "POST" if "frames" in told else "GET" for name, told in READS.items()}

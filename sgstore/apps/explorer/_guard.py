@@ -26,11 +26,11 @@ POLICY: Final = (
     " style-src-attr 'unsafe-inline'; img-src 'self' blob: data:; connect-src 'self'; font-src 'self';"
     " base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'"
 )
-"""Content policy of the page; the editor's styles have the nonce, and the browser itself writes
-some attributes."""
+"""Content security policy of the page. Styles of the editor need the nonce; the browser itself sets some
+attributes."""
 
 _AGAIN: Final = 'if (location.search !== "?again") location.replace("/?again" + location.hash);'
-"""A browser sends the cookie for a link on a page of another site only if the page loads itself again."""
+"""Page that loads itself again, because browsers send no cookie for a link on a page of another site."""
 
 _FIRST_PAGE: Final = f"""<!doctype html><html lang="en"><meta charset="utf-8"><title>sgstore</title>
 <p>This page needs the address that 'sgstore serve' printed, with its token.
@@ -49,7 +49,7 @@ _HEADERS: Final = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "no-store",
 }
-"""Headers of all responses, unless the application sets them."""
+"""HTTP headers of all responses, unless the application sets them itself."""
 
 
 class Guard:
@@ -88,7 +88,7 @@ class Guard:
         await (answer or self._app)(scope, receive, send_with_headers)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """Return the response that rejects a request or sets the login cookie.
+        """Return a response that rejects the request or sets the login cookie; or None for a valid request.
 
         ``None`` means that the request may pass.
         """

@@ -46,14 +46,14 @@ if TYPE_CHECKING:
     Things = Mapping[int, Mapping[str, Any]]
 
 MOST_FRAMES: Final = 3000
-"""Greatest number of frames kept for pages that are opened later, and their greatest size in bytes."""
+"""Largest number of frames kept for pages opened later. A second limit applies to their bytes."""
 MOST_BYTES: Final = 32 << 20
 
 MOST_NAMES: Final = 20_000
-"""Greatest number of entities with kept names."""
+"""Largest number of entities whose names are kept."""
 
 LOOK_S: Final = 0.02
-"""Polling interval for new frames; s."""
+"""Interval at which the page is checked for new frames; s."""
 
 _STATES: Final = {
     **dict.fromkeys(("x", "y"), np.float64),  # so that places equal those of a store
@@ -73,11 +73,11 @@ ASKED: Final = {
     "POST /api/parts": ("parts", "text", "binding"),
     "POST /api/why": ("why", "text", "seq"),
 }
-"""Requests of the page: the method of :class:`LiveRun` for each, and its fields."""
+"""Request of the page → method of :class:`LiveRun`, and fields of the request."""
 
 
 class LiveRun:
-    """Messages of a running monitor for its web page, with the last frames and their graphs.
+    """Messages of a running monitor for its web page, with the most recent frames and graphs.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class LiveRun:
             self._put("end", as_json(told))
 
     def stop(self) -> None:
-        """End the messages to all pages."""
+        """End the message streams of all pages."""
         self._stopped = True
 
     def _put(self, event: str, data: bytes) -> None:
@@ -160,7 +160,7 @@ class LiveRun:
         return found
 
     def _new_still(self, things: Things) -> list[list[Any]]:
-        """Return static entities that the page does not know yet: node, kind, x, y, heading, length, width."""
+        """Return the static entities that were not sent yet: node, kind, x, y, heading, length, width."""
         x, y = self._origin or (0.0, 0.0)
         new = [n for n, about in things.items() if about["is_static"] and n not in self._still]
         for node in new:
@@ -172,7 +172,7 @@ class LiveRun:
         return [self._still[node] for node in new]
 
     def about(self) -> dict[str, Any]:
-        """Return the description of the live run for the page, in the form of a store with one trace."""
+        """Return the description of the run for the page, in the same form as a store with one trace."""
         key, cameras = "live" * self._has_map, [] if self._cameras is None else self._cameras.topics
         trace = {"name": self.name, "frames": 0, "seconds": 0.0, "period": 0.0, "map": ""}
         trace |= {"map_key": key, "origin": self._origin or (0.0, 0.0), "cameras": [*cameras]}
@@ -261,19 +261,19 @@ class LiveRun:
             return self._recent.view(seq)
 
     def _hello(self) -> tuple[int, bytes]:
-        """Return the number of the oldest stored message, and the first message for a newly opened page."""
+        """Return the number of the oldest stored message, and the first message for a new page."""
         with self._lock:
             told = {"about": self.about(), "names": self._names, "still": [*self._still.values()]}
             return self._gone, b"event: hello\ndata: " + as_json(told) + b"\n\n"
 
     def _since(self, number: int) -> tuple[int, list[bytes]]:
-        """Return the stored messages from a message number on, and the number of the next message."""
+        """Return the stored messages from a number on, and the number of the next message."""
         with self._lock:
             found = list(islice(self._sent, max(number - self._gone, 0), None))
             return self._gone + len(self._sent), found
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield server-sent events for the page: all stored messages, then each frame on arrival."""
+        """Yield server-sent events for the page: first all stored messages, then each new frame."""
         number, hello = self._hello()
         yield hello
         while not self._stopped:
@@ -317,7 +317,7 @@ def _columns(things: Things, ego: int | None, origin: tuple[float, float]) -> di
 
 
 def _origin_of(graph: SceneGraph) -> tuple[float, float]:
-    """Return a point near the entities as the origin."""
+    """Return a point near the entities, to which the coordinates of the page are relative."""
     places = [a for n, a in graph.nodes.items() if n >= 0]
     first = graph.nodes[graph.ego] if graph.ego is not None else next(iter(places), {})
     return float(round(first.get("x", 0.0))), float(round(first.get("y", 0.0)))

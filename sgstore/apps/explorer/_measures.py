@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     Clips = Sequence[tuple[str, int, int]]
 
 MOST_ROWS: Final = 2000
-"""Greatest number of table rows that are sent; the total is sent too."""
+"""Largest number of table rows that are sent. The total number of rows is sent too."""
 
 MOST_PAIRED: Final = 48
-"""Features of the matrix of gaps."""
+"""Number of features in the matrix of missing pairs."""
 
 MOST_IN_WORDS: Final = 60
-"""Classes that are described in words."""
+"""Number of classes that are described in words."""
 
 
 def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
@@ -128,7 +128,7 @@ def _done(done: int, whole: int) -> None:
 
 
 def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], Any, float]]:
-    """Yield clips without overlaps, each with the ids of its frames and its length in seconds."""
+    """Yield the clips without overlaps, with the ids of their frames and their length; s."""
     traces = {one.name: one for one in store.traces()}
     for trace, first, last in _apart(clips):
         of = traces.get(trace) or store.file.trace(
@@ -141,7 +141,7 @@ def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], 
 
 
 def _apart(clips: Clips) -> list[tuple[str, int, int]]:
-    """Return clips sorted by trace and time, with overlapping or adjacent clips merged."""
+    """Return clips sorted by trace and time. Overlapping or adjacent clips are merged."""
     found: list[tuple[str, int, int]] = []
     for trace, first, last in sorted(clips):
         if found and found[-1][0] == trace and first <= found[-1][2] + 1:

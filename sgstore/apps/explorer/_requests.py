@@ -15,23 +15,23 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
 MOST_BODY: Final = 1 << 20
-"""Greatest length of a body; bytes."""
+"""Largest size of the body of a request; bytes."""
 
 MOST_TEXT: Final = 100_000
-"""Greatest length of a text in it; characters."""
+"""Largest length of a text in a request; characters."""
 
 MOST_ITEMS: Final = 10_000
-"""Greatest length of a list in it."""
+"""Largest length of a list in a request."""
 
 MOST_CLIPS: Final = 50_000
-"""Greatest number of clips; the page can select all matches of a query."""
+"""Largest number of clips in a request. The page can select all matches of a query."""
 
 MOST_NUMBER: Final = 1 << 53
-"""Greatest integer that is exact in browsers."""
+"""Largest integer that browsers represent exactly."""
 
 
 LEAST_NODE: Final = -(1 << 31)
-"""Least id of a node."""
+"""Smallest id of a node."""
 
 
 class RequestError(SgstoreError):
@@ -51,7 +51,7 @@ class RequestError(SgstoreError):
 
 
 async def fields_of(request: Request) -> dict[str, Any]:
-    """Return the fields of a request: of its JSON body, or for GET of its address.
+    """Return the fields of a request, from its JSON body or, for GET, from its address.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def taken(fields: Mapping[str, Any], *names: str) -> dict[str, Any]:
 
 
 def one_of(*words: str) -> Callable[[object, str], str]:
-    """Return a function that validates a request field with fixed words; the first word is the default."""
+    """Return a validator for a request field with a fixed list of words. The first word is the default."""
 
     def read(value: object, name: str) -> str:
         if value not in (None, *words):
@@ -103,7 +103,7 @@ def _text(value: object, name: str) -> str:
 
 
 def _parameters(value: Any, _: str) -> dict[str, Any]:
-    """Return the validated values of query parameters: numbers, texts, truth values, or lists of these."""
+    """Validate the values of query parameters: numbers, texts, truth values, or lists of these."""
     found = value or {}
     if not isinstance(found, dict) or len(found) > 100:
         raise RequestError("parameters: expected an object")
@@ -115,7 +115,7 @@ def _parameters(value: Any, _: str) -> dict[str, Any]:
 
 
 def _binding(value: Any, _: str) -> dict[str, int] | None:
-    """Return validated node ids by variable name. ``None`` means that the field is missing."""
+    """Validate a binding (variable name → node id). ``None`` means that the field is missing."""
     if value is None:
         return None
     if not isinstance(value, dict) or len(value) > 1000:
@@ -124,7 +124,7 @@ def _binding(value: Any, _: str) -> dict[str, int] | None:
 
 
 def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
-    """Return validated rows of a request field: a trace name, followed by frame numbers."""
+    """Validate the rows of a request field: a trace name, followed by frame numbers."""
     if not isinstance(rows, list) or len(rows) > MOST_ITEMS:
         raise RequestError(f"{name}: expected a list of at most {MOST_ITEMS}")
     for row in rows:
@@ -134,7 +134,7 @@ def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
 
 
 def _clips(value: object, name: str) -> list[tuple[Any, ...]]:
-    """Return validated rows of clips: the name of a trace, then first and last frame of each clip in it."""
+    """Validate rows of clips: the name of a trace, and the first and last frame of each of its clips."""
     rows: list[Any] = value if isinstance(value, list) else [None]
     if any(
         not isinstance(row, list) or len(row) % 2 == 0 or not isinstance(row[0], str)
@@ -171,7 +171,7 @@ def _refuse_constant(word: str) -> float:
 _node: Final = partial(_whole, least=LEAST_NODE)
 
 USUAL: Final = {"abstraction": "RSV", "format": "mcap", "id": "", "note": ""}
-"""Default values of fields."""
+"""Default values of request fields, by name."""
 
 FIELDS: Final[Mapping[str, Callable[[Any, str], Any]]] = {
     **dict.fromkeys(("text", "trace", "channel", "attribute", "name", "tag", "note", "id"), _text),
@@ -187,4 +187,4 @@ FIELDS: Final[Mapping[str, Callable[[Any, str], Any]]] = {
     "clips": _clips,
     "frames": partial(_spans, width=2),
 }
-"""Validator of each field of a request."""
+"""Name of a request field → function that validates it."""

@@ -1,4 +1,4 @@
-"""Start of the local web server: it prints an address with a token, and Ctrl-C ends it."""
+"""Start of the local web server. It prints an address with a token, and ends at Ctrl-C."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 HOST: Final = "127.0.0.1"
 EVERYWHERE: Final = {"0.0.0.0", "::", ""}  # noqa: S104 - only where somebody asks for it
-"""Addresses for all interfaces of this machine; then its names are permitted hosts, too."""
+"""Addresses that mean all network interfaces. With them, the host names of this machine are allowed, too."""
 
 
 class _Server(uvicorn.Server):

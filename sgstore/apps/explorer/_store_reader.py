@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MOST_THUMBS: Final = 400
-"""Greatest number of frames per request of thumbnails."""
+"""Largest number of frames in one request for thumbnails."""
 
 READS: Final[Mapping[str, tuple[str, ...]]] = {
     "words": (),
@@ -48,7 +48,7 @@ READS: Final[Mapping[str, tuple[str, ...]]] = {
     "series": ("trace", "attribute", "node", "other"),
     "thumbs": ("frames",),
 }
-"""Methods of :class:`Reads` for the page, each with its fields."""
+"""Names of methods of :class:`Reads` that the page can call → fields of the request."""
 
 _PICTURES: Final = "jpeg", "png", "webp", "bmp"
 """Picture formats that browsers can show."""
@@ -145,7 +145,7 @@ class Reads:
             return self._maps[key]
 
     def warm(self, ended: threading.Event) -> None:
-        """Read all road maps of the store before the first request. The event ``ended`` stops the reading."""
+        """Read all road maps of the store, so that the first request is fast. ``ended`` stops the reading."""
         with suppress(SgstoreError):
             for trace in self._traces()[0]:
                 if ended.is_set():
@@ -191,14 +191,14 @@ class Reads:
 
 
 def _among(traces: Mapping[str, T], name: str) -> T:
-    """Return the entry of a mapping by trace name, or raise an error for an unknown trace."""
+    """Return the entry of a trace in a mapping. An unknown trace raises an error."""
     if name not in traces:
         raise StoreError(f"no trace {name!r} in the store")
     return traces[name]
 
 
 def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
-    """Return a picture in a format of browsers, with its media type; empty without a picture."""
+    """Return a picture in a format that browsers can show, and its media type. Empty without a picture."""
     if media is None:
         return b"", "application/octet-stream"
     if media.form not in _PICTURES:

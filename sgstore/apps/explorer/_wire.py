@@ -1,4 +1,4 @@
-"""Binary format of columns, which the page reads as typed arrays without copying; and JSON for browsers.
+"""Binary format of columns, which the page reads without copying, and JSON text for browsers.
 
 ``u32 length of the header, u32 0``, the header as JSON padded to 8 bytes, then each column, little-endian,
 padded to 8 bytes. The header names the columns with their types and lengths under ``columns``.
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PAGE: Final = Path(__file__).parent / "page"
-"""Files of the page."""
+"""Folder with the files of the web page."""
 
 
 def packed(header: Mapping[str, Any], columns: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return a header and binary columns packed into bytes, for the web page.
+    """Return a header and numeric columns packed into bytes, for the web page.
 
     Parameters
     ----------
@@ -48,5 +48,5 @@ def _padding(data: bytes) -> bytes:
 
 
 def as_json(value: object) -> bytes:
-    """Return a value as JSON for browsers; infinite numbers become texts, such as ``inf``."""
+    """Return a value as JSON for browsers. Infinite numbers become texts, such as ``inf``."""
     return json_text(value, str).encode(errors="replace")

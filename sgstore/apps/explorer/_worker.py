@@ -21,14 +21,14 @@ Reply = dict[str, Any]
 Asked = Callable[[Store, dict[str, Any], int], Iterator[Reply]]
 
 BATCH_S: Final = 0.1
-"""Time to collect matches for one message; s."""
+"""Time for which matches are collected for one message; s."""
 
 BATCH_ROWS: Final = 500
-"""Greatest number of matches per message."""
+"""Largest number of matches in one message."""
 
 
 def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Yield the replies to a pattern query: columns and traces that cannot answer, then batches of matches."""
+    """Yield the replies to a pattern query: columns, traces without an answer, then groups of matches."""
     with store.file.snapshot():
         matches = store.find(question["text"], **question["parameters"])
         names, found = tuple[str, ...](), list[list[Any]]()
@@ -70,7 +70,7 @@ def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Repl
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Yield the first part of a pattern that fails in a frame, and numbers with which it would not fail."""
+    """Yield the first part of a pattern that fails in a frame, and numbers with which it would be true."""
     text, values, frame = question["text"], question["parameters"], question["frame"]
     answer = store.why_not(frame, text, **values)
     steps = answer.steps if isinstance(answer, WhyNotSteps) else (answer,)
@@ -133,7 +133,7 @@ QUESTIONS: Final[Mapping[str, Asked]] = {
     "check": _told_check,
     **dict.fromkeys(("coverage", "select", "lock", "export", "diff"), _measured),
 }
-"""Functions by ``ask``; each gets the store, the query, and the limit of matches or rows."""
+"""Kind of a query → function that answers it from the store, the query, and the limit of rows."""
 
 
 def answer(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
