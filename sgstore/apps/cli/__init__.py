@@ -1,4 +1,4 @@
-"""Command line ``sgstore``: each verb parses its arguments, calls one library function and prints the result.
+"""Command line ``sgstore``. Each command parses arguments, calls a library function, and prints its result.
 
 Results go to stdout, everything else to stderr; with ``--json`` an error is one line of JSON on
 stderr. Exit codes: 0 success; 1 error; 2 wrong usage, including invalid queries and SQL; 3 success,

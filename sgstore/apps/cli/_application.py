@@ -1,4 +1,4 @@
-"""Start of the command line: registration of all verbs, exit codes, reports of errors and interruptions."""
+"""Start of the command line: registration of commands, exit codes, messages of errors and interruptions."""
 
 from __future__ import annotations
 
@@ -85,16 +85,16 @@ for _group, _panel in (
 
 
 def _verb_in(arguments: Sequence[str]) -> Sequence[str]:
-    """Return a list with the verb of a command line, without global options; an empty list without a verb."""
+    """Return a list with the command name of a command line, or an empty list without a command."""
     return [text for text in arguments if text not in {"--quiet", "--verbose"}][:1]
 
 
 _PUBLISHING: Final = ("ingest", "import", "derive")
-"""Verbs that work in parts, where each finished part is already in the store."""
+"""Commands that finish their work in parts. Each finished part is already in the store."""
 
 
 _MULTIPLYING: Final = {"coverage", "select", "diff", "lock"}
-"""Verbs with large matrix products."""
+"""Commands that multiply large matrices."""
 
 
 def main() -> None:
@@ -125,7 +125,7 @@ def _wants_json(arguments: list[str]) -> bool:
 
 
 def run(arguments: list[str]) -> int:
-    """Run one command line of ``sgstore``, and return its exit code.
+    """Run one command line of ``sgstore`` and return its exit code. Errors are printed.
 
     Returns
     -------

@@ -156,7 +156,7 @@ def _read(file: Path) -> None:
 
 @dataclass(frozen=True)
 class ReportFiles:
-    """Files that ``check`` writes for other programs, and the data that they need.
+    """Report files that ``check`` writes for other programs, and the data for them.
 
     Attributes
     ----------
@@ -175,11 +175,11 @@ class ReportFiles:
     draw: Callable[[Sequence[Verdict]], dict[str, str]] | None = None
 
     def __bool__(self) -> bool:
-        """True if there is a file to write."""
+        """True if at least one report file was requested."""
         return self.junit is not None or self.sarif is not None or self.draw is not None
 
     def write(self, verdicts: Sequence[Verdict]) -> None:
-        """Write the files."""
+        """Write the requested report files."""
         evidence = Evidence(self.store, {} if self.draw is None else self.draw(verdicts))
         if self.junit is not None:
             write_junit(self.junit, verdicts, evidence)
@@ -188,7 +188,7 @@ class ReportFiles:
 
 
 _MOST_PICTURES: Final = 50
-"""Largest number of pictures of violations."""
+"""Largest number of violations that are drawn."""
 
 
 def _draw_violations(store: Store, folder: Path, verdicts: Sequence[Verdict]) -> dict[str, str]:
@@ -280,7 +280,7 @@ _DOCUMENT: Final = (
     "witnesses",
     "absent_frames",
 )
-"""Columns of verdicts for programs."""
+"""Column names of verdicts in output for programs."""
 
 
 def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:

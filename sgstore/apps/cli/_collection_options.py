@@ -78,7 +78,7 @@ _collections: Final[list[Any]] = []  # Collection
 
 
 def note_collection(store: Store | Collection) -> None:
-    """Remember the collection of the current command, to report its missing bundles at the end."""
+    """Record the collection that the command uses, so that its missing bundles can be reported at the end."""
     if hasattr(store, "missing"):
         whole: Any = store
         _collections.append(whole)
@@ -90,7 +90,7 @@ def note_collection(store: Store | Collection) -> None:
 
 
 def report_missing(code: int) -> int:
-    """Report the bundles of a collection without a result, and return the final exit code."""
+    """Print the bundles of a collection that gave no result. Return the final exit code."""
     missing = {name: why for whole in _collections for name, why in whole.missing.items()}
     for bundle, why in missing.items():
         say(f"bundle {bundle[:12]}… failed: {why}")

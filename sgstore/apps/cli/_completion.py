@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from sgstore.store import StoredTrace, StoreFile
 
 Offers = Iterator[tuple[str, str]]
-"""Possible values, each with a description."""
+"""Possible values of an argument, each with a description."""
 
 STORE: Final = "SGSTORE_STORE"
-"""Environment variable with the default store."""
+"""Name of the environment variable for the default store."""
 
 STORE_ENDINGS: Final = (".sgstore", ".duckdb", ".db")
 
@@ -62,7 +62,7 @@ def patterns(ctx: typer.Context) -> Offers:
 
 
 def traces(ctx: typer.Context) -> Offers:
-    """Yield completions of a trace name: all traces of the store on the command line."""
+    """Yield completions of a trace name: the traces of the store that the command line names."""
     for one in _traces(ctx):
         yield one.name, _about(one)
 

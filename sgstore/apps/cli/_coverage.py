@@ -50,7 +50,7 @@ Within = Annotated[str, Option("--within")]
 
 @dataclass(frozen=True)
 class FrameAskOptions(CollectionOptions, AskOptions):
-    """Command line options for frames selected from stores or collections."""
+    """Command line options for frames that are selected from stores or collections."""
 
     def frames(self, *texts: str) -> Iterator[ChosenFrames]:
         """Yield the selected frames for each argument: a store, or a store with a query."""
@@ -100,7 +100,7 @@ class SceneOptions(WindowOptions):
 def _report_scenes(
     table: ReportTable, frames: Classed, ask: FrameAskOptions, limit: int | None
 ) -> None:
-    """Print a table of frames; for people with a phrase for each scene."""
+    """Print a table of frames. In text output, each row also describes the scene in words."""
     from sgstore.testsets.scenes import with_scenes
 
     ask.report(with_scenes(table, frames.chosen.store) if ask.for_people else table, limit)
@@ -396,7 +396,7 @@ def _fraction(text: str) -> float:
 def _report_below(
     shares: ReportTable, listed: ReportTable, ask: FrameAskOptions, limit: int | None
 ) -> None:
-    """Print a table, and the notes of a table of shares that it replaces."""
+    """Print a table, and below it the notes of a second table of shares that is not printed."""
     for text in shares.said if listed is not shares else ():
         say(text)
     ask.report(listed, limit)
@@ -410,7 +410,7 @@ def _report_slots(
     table: tuple[int, int | None],
     picture: Path | None,
 ) -> None:
-    """Print a table of declared slots (its number and rows), and draw the pairs of values."""
+    """Print one table about declared slots, and draw the pairs of their values if requested."""
     from sgstore.testsets.coverage import Specification, slot_coverage
 
     (chosen,) = ask.frames(text)

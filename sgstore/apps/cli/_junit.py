@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sgstore.temporal import Verdict
 
 _NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that XML cannot hold, not even as references."""
+"""Regular expression of characters that XML does not allow, not even as references."""
 
 
 def clip_of(span: Interval) -> str:
@@ -27,7 +27,7 @@ def clip_of(span: Interval) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence of violations: the command that shows each, and its picture.
+    """Evidence of violations: the command that shows a violation, and its picture.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Evidence:
     pictures: Mapping[str, str] = field(default_factory=dict[str, str])
 
     def of(self, span: Interval) -> dict[str, str]:
-        """Return the clip, the command and the picture of a violation."""
+        """Return the clip, the command and the picture of one violation."""
         clip = clip_of(span)
         show = ["sgstore", "show", self.store, f"{span.trace}#{span.start_seq}"]
         found = {"clip": clip, "command": shlex.join(show)}
@@ -93,7 +93,7 @@ def write_junit(path: Path, verdicts: Iterable[Verdict], evidence: Evidence) -> 
 
 
 def _word(verdict: Verdict) -> str:
-    """Return a verdict of a check as text for a report, without its reason."""
+    """Return the verdict of a check as a word for a report, without its reason."""
     return (
         "pending at the end of the recording" if verdict.verdict == "pending" else verdict.verdict
     )
@@ -113,5 +113,5 @@ def _violations(verdict: Verdict, evidence: Evidence) -> list[str]:
 
 
 def _plain(text: str) -> str:
-    """Return a text in which escapes replace the characters that XML does not allow."""
+    """Return a text in which characters that XML does not allow are replaced by escapes."""
     return _NO_XML.sub(lambda found: f"\\x{ord(found[0]):02x}", text)

@@ -121,7 +121,7 @@ def monitor(
 
 
 def _sensors(file: Path | None, *, shown: bool) -> list[Sensor]:
-    """Return the CARLA sensors listed in a file. An error means that no live page shows their data."""
+    """Return the CARLA sensors that a file lists. Without a live page to show them, they raise an error."""
     from sgstore.readers import load_sensors
 
     if file is not None and not shown:

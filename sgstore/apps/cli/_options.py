@@ -149,7 +149,7 @@ class Verb(TyperCommand):
 
 
 def _path_of(ctx: Any) -> str:
-    """Return the words of a command after ``sgstore``."""
+    """Return the words that name a command, without ``sgstore``."""
     return str(ctx.command_path).partition(" ")[2]
 
 
@@ -165,7 +165,7 @@ def library_help(path: str) -> dict[str, str]:
 
 
 _GROUPS: Final = {"patterns", "lock", "collection"}
-"""Groups of commands without a method of their name for the group."""
+"""Groups of commands for which the library has no method of the same name."""
 
 OLD_WORDS: Final[dict[str, dict[str, str]]] = {
     "": {"--output": "--to", "--max-rows": "--limit"},
@@ -182,11 +182,11 @@ OLD_WORDS: Final[dict[str, dict[str, str]]] = {
     | {"--temper": "--alpha"},
     "shrink": {"--clip": "--range"},
 }
-"""Old options of a command → the new ones; the empty name means all commands. They work until 0.3."""
+"""Old options of a command → new options; they work until 0.3. An empty command means all commands."""
 
 
 def renamed(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
-    """Return the arguments of a command with new words for old options, and note each on stderr."""
+    """Return the arguments of a command with old options replaced by new ones. Print a note for each."""
     known = {word for one in verb.params for word in (*one.opts, *one.secondary_opts)}
     words = {old: new for old, new in OLD_WORDS[""].items() if new in known}
     words |= OLD_WORDS.get(_path_of(ctx), {})
@@ -204,7 +204,7 @@ def renamed(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
 
 
 def _means_files(path: str, args: Sequence[str]) -> bool:
-    """True if ``--format`` of an old command line is the format of files, not of rows."""
+    """True if ``--format`` in an old command line means the format of written files, not of printed rows."""
     if any(one == "--as" or one.startswith("--as=") for one in args):
         return False
     values = [value for name, value in pairwise(args) if name == "--format"]
@@ -213,11 +213,11 @@ def _means_files(path: str, args: Sequence[str]) -> bool:
 
 
 _TYPES: Final = {"str": "text", "Path": "path", "int": "number", "float": "number"}
-"""Types of Python → placeholders in the help."""
+"""Python types → placeholders in the help."""
 
 
 def _show_plainly(parameter: Any, ctx: Any) -> None:
-    """Give a parameter a placeholder in the help without types of Python; a flag needs none."""
+    """Set the placeholder of a parameter in the help. Flags get none, and Python types are not shown."""
     if getattr(parameter, "is_flag", False):
         parameter.metavar = ""
     kind = parameter.display_type(ctx).strip("<>").removeprefix("list[").removesuffix("]")
@@ -243,7 +243,7 @@ def _write_examples(ctx: Any) -> None:
 
 
 def _with_store(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
-    """Return the arguments of a command, with the store of ``SGSTORE_STORE`` if they have none.
+    """Return the arguments of a command. A missing store is taken from ``SGSTORE_STORE``.
 
     The first argument is a store if it looks like one, or if the number of arguments is complete.
     """
@@ -276,7 +276,7 @@ def _looks_like_store(place: str) -> bool:
 
 
 def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
-    """Add a remedy to the message of a usage error: the right option, or the right place of the store."""
+    """Add a remedy to the message of a usage error: the right option, or the right position of the store."""
     name = getattr(error, "option_name", "")
     if type(error).__name__ == "NoSuchOption" and (line := _option_instead(verb, ctx, args, name)):
         error.possibilities = None
@@ -289,17 +289,17 @@ def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
 
 
 def _places(verb: Verb) -> list[str]:
-    """Return the argument names of a command whose first argument is a store; otherwise an empty list."""
+    """Return the argument names of a command if the first one is a store; otherwise an empty list."""
     names = [one.name or "" for one in verb.params if one.param_type_name == "argument"]
     return names if names[:1] == ["store"] else []
 
 
 _QUERY: Final = re.compile(r"\s*(?:MATCH|CHECK|SELECT|USING|DEFINE|ALWAYS)\b", re.IGNORECASE)
-"""Start of a query in the place of a store."""
+"""Regular expression of the start of a query, to detect a query in the position of the store."""
 
 
 def _refuse_late_store(verb: Verb, ctx: Any, args: list[str]) -> None:
-    """Raise an error for a store file in the place of another argument, such as ``find QUERY STORE``."""
+    """Raise an error if a store file is in the position of another argument, such as ``find QUERY STORE``."""
     values = [ctx.params[name] for name in _places(verb)]
     if not values or _is_database(values[0]):
         return
@@ -354,7 +354,7 @@ class Group(TyperGroup):
     _shows_options = True
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the options of the group; none while the help lists its commands."""
+        """Return the options of the group. While the help lists its commands, return none."""
         return super().get_params(ctx) if self._shows_options else []
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -388,7 +388,7 @@ _WORDS_OF_OTHERS: Final = {
     "config": ("settings", "presets", "parameters"),
     "patterns list": ("library", "pattern", "scenarios"),
 }
-"""Command → its names in other tools."""
+"""Name of a command → names of the same command in other tools."""
 
 
 _OPTIONS_OF_OTHERS: Final = {
@@ -406,7 +406,7 @@ _OPTIONS_OF_OTHERS: Final = {
     "--require": ("--fail", "--exit-code"),
     "--by": ("--versus", "--reference", "--baseline"),
 }
-"""Option → its names in other tools."""
+"""Name of an option → names of the same option in other tools."""
 
 
 def _option_instead(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
@@ -419,7 +419,7 @@ def _option_instead(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
 
 
 _USUAL: Final = {"coverage": "classes", "collection": "verify", "patterns": "run"}
-"""Group of commands → its usual command for a store."""
+"""Group of commands → the command to suggest if the user gives only a store."""
 
 
 def _command_instead(group: TyperGroup, ctx: Any, args: list[str]) -> str:
@@ -446,7 +446,7 @@ def _command_instead(group: TyperGroup, ctx: Any, args: list[str]) -> str:
 
 
 def _says_one_thing(parameter: Any) -> bool:
-    """True if a command line option takes one value, which a repeated option would replace."""
+    """True if a command line option takes one value, so that a repeated option would replace it."""
     if parameter.param_type_name != "option" or parameter.multiple or parameter.count:
         return False
     return not parameter.is_flag or bool(parameter.secondary_opts)  # a repeated flag has no effect
@@ -488,14 +488,14 @@ PLACEHOLDERS: Final = {
     "storage": "VERSION",
     "crs": "CRS",
 }
-"""Placeholders of options whose help is in the docstring of a method of the library."""
+"""Placeholders in the help of options that are described in the docstring of a library method."""
 
 _hints = cache(partial(get_type_hints, include_extras=True))
-"""Types of parameters or fields; many verbs share the dataclasses of options."""
+"""Cached types of parameters and fields, because many commands share the dataclasses of options."""
 
 
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function with plain parameters for typer: each dataclass parameter is replaced by its fields.
+    """Return a function with plain parameters for typer: a dataclass parameter becomes one parameter per field.
 
     Docstrings describe the options: the section *Parameters* has a name, a placeholder such as
     ``TIME`` if the help needs one, and the help.
@@ -554,10 +554,10 @@ ERROR, USAGE, LOSS, NO_MATCH = 1, 2, 3, 4
 """Exit codes; 0 means success."""
 
 IN_TABLE: Final = 40
-"""Default number of report rows on a terminal."""
+"""Default number of report rows that are printed on a terminal."""
 
 COLLECTION_FILE: Final = "COLLECTION.json"
-"""The file that marks a folder as a collection."""
+"""Name of the file that marks a folder as a collection."""
 
 StorePath = Annotated[Path, Argument(envvar=STORE, autocompletion=completion.stores)]
 AskedPath = Annotated[
@@ -599,7 +599,7 @@ Verbose = Annotated[
     bool, Option("--verbose", help="Also log steps and times on stderr.", rich_help_panel=MESSAGES)
 ]
 _VERBOSITY: Final = {"quiet": Quiet, "verbose": Verbose}
-"""Options of every verb."""
+"""Options that every command has."""
 AsJson = Annotated[bool, Option("--json", rich_help_panel=ROWS)]
 To = Annotated[Path | None, Option("--to", "-o", rich_help_panel=ROWS)]
 Limit = Annotated[int, Option("--limit", min=0, rich_help_panel=ROWS)]
@@ -628,12 +628,12 @@ class PrintedRows:
 
     @property
     def chosen(self) -> Format:
-        """Return the output format that results from ``--format``, ``--json`` and the file name."""
+        """Output format according to ``--format``, ``--json`` and the suffix of the output file."""
         return form_of(self.rows_as, self.file, as_json=self.as_json)
 
     @property
     def for_people(self) -> bool:
-        """True if result rows are printed as a text table for people, not in a machine format."""
+        """True if result rows are printed as a text table for users, not in a format for programs."""
         return self.chosen is Format.table
 
     def write(
@@ -708,7 +708,7 @@ class QueryLimits:
     max_spill: Annotated[str | None, Option(show_default="10GB", rich_help_panel=LIMITS)] = None
 
     def spill(self) -> int:
-        """Start the time limit of the command, and return the limit for temporary disk space in bytes.
+        """Start the time limit of the command. Return the limit of temporary disk space; bytes.
 
         Returns
         -------
@@ -756,7 +756,7 @@ class Question:
         return bool(self.query or self.file or self.name)
 
     def typed(self) -> str:
-        """Return the query as typed: its text, the text of its file, or its name; empty without a query."""
+        """Query as the user typed it: its text, the text of its file, or its name. Empty without a query."""
         if sum(source is not None for source in (self.query, self.file, self.name)) > 1:
             raise typer.BadParameter("expected one of: a query, -f FILE, -p NAME")
         return (self.name or query_of(self.query, self.file)) if self else ""
@@ -872,7 +872,7 @@ _ENDINGS: Final = {
 
 
 def given(options: Any) -> dict[str, Any]:
-    """Return the fields of options that have a value, by name."""
+    """Return the fields of an options object that have a value, by name."""
     return {name: value for name, value in vars(options).items() if value is not None}
 
 
@@ -914,7 +914,7 @@ def query_of(text: str | None, file: Path | None) -> str:
 
 
 def named_and_texts(arguments: Iterable[str]) -> tuple[list[str], list[str]]:
-    """Return the arguments that name patterns of the library, and the statements of the others."""
+    """Split arguments into names of library patterns, and texts of statements."""
     from sgstore.lang.library import patterns, statement
 
     named, texts = list[str](), list[str]()
@@ -1022,7 +1022,7 @@ def say_left_out(
     matches: Matches | Answer | ChosenFrames | UserStatement | CollectionRows,
     notes: tuple[str, ...] | None = None,
 ) -> None:
-    """Print the traces that cannot answer a query, with reasons, and likely mistakes in the query."""
+    """Print the traces that cannot answer a query, with reasons, and notes about likely mistakes."""
     of: dict[str, list[str]] = {}
     for name, reason in matches.reasons.items():
         of.setdefault(reason, []).append(name)
@@ -1032,7 +1032,7 @@ def say_left_out(
 
 
 def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
-    """Print one line about the data that settings excluded from the store; as JSON if the results are JSON."""
+    """Print one line about data that the settings excluded from the store, as text or as JSON."""
     if not found:
         return
     if chosen in {Format.json, Format.ndjson}:
@@ -1042,7 +1042,7 @@ def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
 
 
 def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
-    """Print the parts of a query with unknown values, with trace and reason, if there is a reason."""
+    """Print the parts of a query whose values are unknown, with trace and reason."""
     from sgstore.temporal import unknown_notes
 
     for note in unknown_notes((f"{name} is unknown", trace, why) for name, trace, why in told):

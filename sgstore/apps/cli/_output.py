@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 
 def progress(items: Sequence[T], noun: str) -> Iterator[T]:
-    """Yield the items, and show the number of finished ones on stderr, on a terminal."""
+    """Yield the items. On a terminal, show on stderr how many are done."""
     from rich.console import Console
     from rich.progress import track
 
@@ -117,13 +117,13 @@ class Format(StrEnum):
 
 
 _KEYS: Final = frozenset({"frame", "from", "trace"})
-"""Columns that identify a row."""
+"""Names of columns that identify a row."""
 _PATHS: Final = frozenset({"file", "path", "uri"})
-"""Columns whose texts differ at their ends."""
+"""Names of columns with file paths, which differ mostly at their ends."""
 _LEAST: Final = 8
-"""Least width of a column in letters."""
+"""Smallest width of a table column; letters."""
 LONG_TABLE: Final = 20
-"""Least number of rows of a terminal table with a total."""
+"""Number of rows from which a table on a terminal also states the total."""
 BINARY: Final = frozenset({Format.parquet, Format.arrow})
 _WITHOUT_NESTING: Final = frozenset({Format.csv, *BINARY})
 
@@ -140,7 +140,7 @@ def write_rows(
     output: Path | None = None,
     types: Sequence[str] | None = None,
 ) -> int:
-    """Write result rows to stdout or a file while they arrive, in constant memory.
+    """Write result rows to stdout or a file as they arrive, in constant memory.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def write_rows(
 
 
 JSON_VERSION: Final = 1
-"""Version of the keys and types of the JSON of all verbs, as in ``docs/json_shapes.json``."""
+"""Version of the keys and types in the JSON of all commands, as listed in ``docs/json_shapes.json``."""
 
 
 def write_document(values: dict[str, Any], form: Format) -> None:
@@ -194,7 +194,7 @@ def write_document(values: dict[str, Any], form: Format) -> None:
 
 @dataclass(slots=True)
 class _Verbosity:
-    """Current values of the options ``--quiet`` and ``--verbose``."""
+    """Current state of the options ``--quiet`` and ``--verbose``."""
 
     quiet: bool = False
     handler: Any = None
@@ -318,7 +318,7 @@ def _dumps(columns: Sequence[str], row: Sequence[Any]) -> str:
 
 
 _CONTROLS: Final = {code: f"\\u{code:04x}" for code in (*range(0x7F, 0xA0), *BIDIRECTIONAL)}
-"""Control characters for terminals that JSON does not escape."""
+"""Control characters that JSON does not escape → escaped form. They could control a terminal."""
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
@@ -392,7 +392,7 @@ def write_binary(write: Callable[[Path], int], form: Format, output: Path | None
 
 
 def _write_table(columns: Sequence[str], rows: Iterable[Sequence[Any]], stream: TextIO) -> int:
-    """Write rows as a text table, and return their number. Only the first rows set the column widths."""
+    """Write rows as a text table, and return their number. The first rows determine the column widths."""
     rows = iter(rows)
     first = [[_cell(value) for value in row] for row in islice(rows, ROWS_THAT_SET_WIDTHS)]
     if not first:
@@ -431,7 +431,7 @@ class _TableColumn:
     most: int = 0
 
     def text(self, cell: str) -> str:
-        """Return a table cell cut to the column width. Paths keep both ends, and numbers are never cut."""
+        """Return a table cell, cut to the column width. Paths keep both ends, and numbers are not cut."""
         room = self.most or self.width
         if len(cell) > room and not (self.right or self.whole):
             end = (room - 1) * 2 // 3 if self.name in _PATHS else 0
@@ -490,7 +490,7 @@ def _is_number(cell: str) -> bool:
 # Report on a recording as text: one fact per line, then lists.
 
 _MANY: Final = 20
-"""Greatest number of listed losses and warnings; further ones are counted."""
+"""Largest number of losses and warnings that are listed. Further ones are counted."""
 
 
 def write_report(values: dict[str, Any]) -> None:
@@ -512,7 +512,7 @@ def write_report(values: dict[str, Any]) -> None:
 
 
 def _write_implausible(findings: list[dict[str, Any]]) -> None:
-    """Print a table of implausible data, and the remedies."""
+    """Print a table of implausible data and its remedies."""
     if not findings:
         return
     sys.stdout.write("\nimplausible data:\n")

@@ -137,7 +137,7 @@ def prioritize(
 
 
 def _fault_detection(order: Prioritized, known: dict[str, bool], picture: Path | None) -> None:
-    """Print how soon an order of test cases finds the known failures, and draw the curve."""
+    """Print how early an order of test cases finds the known failures, and draw the curve."""
     from sgstore.testsets.selection import failed_in_order, failure_curve, fault_detection
 
     failed = failed_in_order(order, known)

@@ -42,7 +42,7 @@ _ENDS: Final = tuple(
 
 @dataclass(slots=True)
 class _RunEnd:
-    """Reason for the end of a command (signal or deadline), and the previous hook for unraisable errors."""
+    """Reason why a command ends early (signal or deadline), and the earlier hook for unraisable errors."""
 
     signal: int = 0
     deadline_s: float = 0.0
@@ -54,7 +54,7 @@ _run = _RunEnd()
 
 
 def heed_signals() -> None:
-    """Make end signals (such as SIGTERM) act like Ctrl-C, except signals that the parent process ignores."""
+    """Make signals such as SIGTERM act like Ctrl-C, except signals that the parent process ignores."""
     for number in _ENDS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
@@ -62,7 +62,7 @@ def heed_signals() -> None:
 
 
 def ignore_signals() -> None:
-    """Ignore further signals during the last steps of a command."""
+    """Ignore further signals while a command ends."""
     for number in (signal.SIGINT, signal.SIGALRM, *_ENDS):
         signal.signal(number, signal.SIG_IGN)
     # An interruption inside code run from a text, as in libraries that generate classes, makes
@@ -83,7 +83,7 @@ def _hear_of_lost() -> None:
 
 
 def _lost(report: Any) -> None:
-    """Handle an exception that Python could not raise; a keyboard interrupt is raised again later."""
+    """Handle an exception that Python could not raise. A lost keyboard interrupt is raised again later."""
     if not issubclass(report.exc_type, KeyboardInterrupt):
         _run.reported(report)
         return
@@ -154,7 +154,7 @@ def word() -> str:
 
 
 def take_streams() -> None:
-    """Replace the standard streams of Python by streams that report output errors as errors of the library.
+    """Replace the standard streams of Python by streams that raise output errors as errors of the library.
 
     A full disk behind stdout raises :class:`~sgstore.errors.ExportError`, and a reader that has
     exited raises :class:`~sgstore.base.output_files.ReaderGoneError`. Failed writes to stderr are dropped,
@@ -172,7 +172,7 @@ def take_streams() -> None:
 
 
 def _occupy() -> None:
-    """Open the closed file descriptors 0 to 2, so that no later file gets the number of a standard stream."""
+    """Open closed file descriptors 0 to 2, so that no other file becomes a standard stream by mistake."""
     descriptor = os.open(os.devnull, os.O_RDONLY)  # writes to it fail, as to a closed stream
     while descriptor < 3:
         descriptor = os.dup(descriptor)

@@ -136,7 +136,7 @@ def find(
 
 
 def _with_names(text: str) -> str:
-    """Return a query that returns the name of each node instead of its id, if the rows are the same."""
+    """Return a query that returns node names instead of ids, or the same query if its rows would change."""
     from sgstore.lang.syntax import parse
     from sgstore.lang.syntax.tree import AttributeOf, MatchClause, Variable
 
@@ -168,7 +168,7 @@ def _say_absent(matches: Matches, number: int) -> None:
 
 
 def _returns_nothing(text: str) -> bool:
-    """True if a query has no ``RETURN`` clause, so that each match gives one row per frame."""
+    """True if a query has no ``RETURN`` clause, so that each match is one row per frame."""
     from sgstore.lang.sql import each_match
     from sgstore.lang.syntax import parse
     from sgstore.lang.syntax.tree import MatchClause
@@ -178,7 +178,7 @@ def _returns_nothing(text: str) -> bool:
 
 
 def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
-    """Print intervals of matching frames and their totals, and return their number."""
+    """Print intervals of matching frames and their total, and return the number of intervals."""
     traces: set[str] = set()
     frames, seconds = 0, 0.0
 
@@ -203,7 +203,7 @@ def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
 def _write_parted(
     matches: Matches, ask: AskOptions, *, count: bool, explain: bool, require: bool
 ) -> int:
-    """Print the results of a query on a collection, and return the exit code."""
+    """Print the results of a query on a collection of stores, and return the exit code."""
     if explain:
         typer.echo(matches.explain())
         return 0
@@ -220,7 +220,7 @@ def _write_parted(
 
 
 def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
-    """Return the exit code for a number of result rows; on a terminal, report an empty result."""
+    """Return the exit code for a number of result rows. On a terminal, report that nothing matches."""
     if not number and ask.for_people:
         say("nothing matches")
     return NO_MATCH if require and not number else 0
@@ -229,7 +229,7 @@ def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
 def _as_shown(
     answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return the columns and rows of a query for an output format.
+    """Return the columns and rows of a query in the form that an output format needs.
 
     Tables get readable names of entities. JSON gets graphs in the node-link form of networkx.
     """
@@ -334,11 +334,11 @@ def like(
 
 
 _FEATURES_SHOWN: Final = 3
-"""Number of features shown per table row; further ones are counted, or complete in machine formats."""
+"""Number of features in a cell of a text table. Further ones are counted. Other formats have all features."""
 
 
 def _differing(features: dict[str, int]) -> str:
-    """Return the first differing features with their counts as text, and the number of the other features."""
+    """Return differing features with their counts as text: the first ones, and the number of the others."""
     shown = [f"{n} x {text}" if n > 1 else text for text, n in features.items()]
     more = shown[_FEATURES_SHOWN:]
     return ", ".join([*shown[:_FEATURES_SHOWN], *([f"… {len(more)} more"] if more else [])])

@@ -191,7 +191,7 @@ def _say_warnings(outcome: TraceOutcome) -> None:
 
 
 def _no_kind(type_name: str) -> str:
-    """Return advice about a type name of a recording that has no kind of entity."""
+    """Return advice for a type name in a recording that is not mapped to a kind of entity."""
     name = json.dumps(type_name, ensure_ascii=False)
     return (
         "of which nothing says what kind it is; to say it, write into a file for --config:"

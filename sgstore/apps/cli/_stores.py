@@ -390,7 +390,7 @@ def _pages() -> dict[str, Path]:
 
 
 def _title(page: Path) -> str:
-    """Return the first heading of a page."""
+    """Return the first heading of a documentation page."""
     with page.open(encoding="utf-8") as lines:
         return next((line[2:].strip() for line in lines if line.startswith("# ")), "")
 

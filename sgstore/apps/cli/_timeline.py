@@ -98,7 +98,7 @@ def timeline(
 def _asked(
     queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
 ) -> dict[str, tuple[str, Mapping[str, Any]]]:
-    """Return the queries to plot by lane name, each with the values of its parameters."""
+    """Return the queries to plot, by name of the lane, each with its parameter values."""
     from sgstore.lang.library import pattern_named
 
     found: dict[str, tuple[str, Mapping[str, Any]]] = {}
@@ -118,7 +118,7 @@ def _asked(
 
 
 def _free(name: str, longer: str, taken: Mapping[str, object]) -> str:
-    """Return an unused name for a lane of a timeline."""
+    """Return an unused name for a lane of a timeline: the short or the longer name, possibly numbered."""
     if name not in taken:
         return name
     numbers = (f"{longer} ({number})" for number in count(2))
