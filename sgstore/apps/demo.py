@@ -54,10 +54,9 @@ STORE: Final = "demo.sgstore"
 
 _SAMPLE: Final = Path(__file__).parent / "sample"
 RECORDING: Final = _SAMPLE / "town.mcap"
-"""The recording in a checkout. A wheel does not contain it, because of its size: an eighth of the
-installation."""
+"""Complete sample recording, only in a source checkout. The wheel would become much larger with it."""
 SMALL: Final = _SAMPLE / "small" / "town.mcap"
-"""The same drive without lidar, with a picture every two seconds; part of the wheel."""
+"""Small sample recording of the same drive: no lidar, a picture every two seconds. It is part of the wheel."""
 
 MOUNTS: Final = ("ego/lidar=0,0,1.75", "ego/camera/front=0.45,0,1.42,-90,0,-90")
 """Poses of the sensors on the ego."""
@@ -126,7 +125,7 @@ def _ingest(store: Path, sample: Path, say: Say) -> None:
 def _answer(
     store: Store, folder: Path, say: Say, name: str, sentence: str, pattern: str
 ) -> Path | None:
-    """Run a query, report the intervals of its matches, and draw the middle frame of the first interval."""
+    """Run a query, report the intervals of its matches, and draw a frame from the middle of the first."""
     say("")
     say(sentence)
     say("")

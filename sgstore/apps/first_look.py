@@ -32,24 +32,24 @@ if TYPE_CHECKING:
     Each = Callable[[Sequence[Any], str], Iterable[Any]]
 
 MOST_RECORDINGS: Final = 100
-"""Largest number of recordings in the sample, spread over all."""
+"""Largest number of recordings in the sample. They are spread over all recordings."""
 
 SECONDS: Final = 1200.0
-"""Length of the sample; s. Each recording gives its first seconds."""
+"""Length of the sample; s. The first seconds of each recording are read."""
 
 ENTRIES: Final = 10
-"""Entries of a section."""
+"""Largest number of entries in a section of the page."""
 
 CLIP_S: Final = 2.0
 """Length of a critical scene; s."""
 
 STORE: Final = "drives.sgstore"
-"""Name of the store in the lines that reproduce an entry."""
+"""Name of the store in the command lines that reproduce an entry."""
 
 
 @dataclass(frozen=True)
 class FirstLookEntry:
-    """Finding of a first look, with the lines that reproduce it.
+    """Entry of a first look, with the command lines that reproduce it.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class FirstLookEntry:
 
 @dataclass
 class FirstLook:
-    """Page about some recordings.
+    """Report on some recordings: contents, rare and critical scenes, violated rules and missing data.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class FirstLook:
     missing: Counter[str] = field(default_factory=Counter[str])
 
     def contents(self) -> list[tuple[Any, ...]]:
-        """Return a row for each recording: trace, file, frames, entities, and its error or its losses."""
+        """Return a row for each recording: trace, file, frames, entities, and its error or losses."""
         return [
             (
                 one.name,
@@ -109,7 +109,7 @@ class FirstLook:
         ]
 
     def text(self) -> str:
-        """Return the page as text."""
+        """Return the report as text."""
         parts = [self._head(), text_table(_CONTENTS, self.contents()), _STEPS]
         for heading, entries in self.sections.items():
             parts.append(f"{heading}\n" + ("" if entries else "  none"))
@@ -121,7 +121,7 @@ class FirstLook:
         return "\n\n".join(part.rstrip() for part in parts)
 
     def html(self) -> str:
-        """Return the page as HTML with pictures, if the packages for drawing are installed."""
+        """Return the report as HTML, with pictures if the packages for drawing are installed."""
         parts = [f"<p>{html.escape(self._head())}</p>", html_table(_CONTENTS, self.contents())]
         parts.append(f"<pre>{html.escape(_STEPS)}</pre>")
         for heading, entries in self.sections.items():
@@ -167,7 +167,7 @@ def sampled(
     store: Path,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> FirstLook:
-    """Read a bounded sample of recordings into a store, and return a page about its contents.
+    """Read a sample of recordings into a store, and return a report about its contents.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def sampled(
 
 
 def evaluate(look: FirstLook, each: Each = lambda items, _: items) -> None:
-    """Evaluate the library on the sample, and add the findings to the page.
+    """Evaluate the patterns and rules of the library on the sample, and add the results to the report.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def evaluate(look: FirstLook, each: Each = lambda items, _: items) -> None:
 
 
 def _rare(look: FirstLook, each: Each) -> list[FirstLookEntry]:
-    """Return the patterns of the library with the fewest matches, and note those without an answer."""
+    """Return the patterns of the library with the fewest matches. Note the patterns that cannot be answered."""
     found: list[tuple[int, str, str, Interval]] = []
     asked = [one for one in patterns().values() if one.kind in {"concept", "scenario"}]
     traces = len(look.store.traces())
@@ -269,7 +269,7 @@ def _critical(store: Store) -> list[FirstLookEntry]:
 
 
 def _rules(look: FirstLook, each: Each) -> list[FirstLookEntry]:
-    """Return the violated rules of the library, and note those without an answer."""
+    """Return the violated rules of the library. Note the rules that cannot be answered."""
     entries: list[tuple[int, FirstLookEntry]] = []
     for one in each([one for one in patterns().values() if one.is_check], "rules"):
         verdicts = [*look.store.check(one.text)]
@@ -310,7 +310,7 @@ def _oddities(outcome: TraceOutcome) -> Iterator[str]:
 
 
 def _kind_of(text: str) -> str:
-    """Return a warning without its numbers, so that equal ones of several recordings are counted together."""
+    """Return a warning with its numbers replaced, to count equal warnings of several recordings."""
     return " ".join("N" if any(c.isdigit() for c in word) else word for word in text.split())
 
 

@@ -1,4 +1,4 @@
-"""Pytest plugin for driving scenes: one test per clip of a query or lock, or per trace and check.
+"""Pytest plugin for driving scenes: one test for each clip of a query or lock, or for each trace and check.
 
 ::
 
@@ -228,7 +228,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture
 def scene(request: pytest.FixtureRequest) -> ClipScene:
-    """Clip of a test with the mark ``@pytest.mark.scenes(…)``."""
+    """Fixture with the clip of a test that has the mark ``@pytest.mark.scenes(…)``."""
     found = getattr(request, "param", None)
     if isinstance(found, str):
         pytest.fail(found, pytrace=False)
@@ -240,7 +240,7 @@ def scene(request: pytest.FixtureRequest) -> ClipScene:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
-    """Fail a test if its check is violated, also if the test function itself passes."""
+    """Fail a test if its check is violated, even if the test function itself passes."""
     found = pyfuncitem.funcargs.get("scene")
     verdict = found.verdict if isinstance(found, ClipScene) else None
     if verdict is None:
@@ -267,7 +267,7 @@ def violations_text(verdict: Verdict) -> str:
 
 
 _FOUND: Final = pytest.StashKey[dict[str, list[ClipScene]]]()
-"""Cached results of marks, so that tests with the same mark share a query."""
+"""Cached results of the mark ``scenes``, so that tests with equal marks share one query."""
 
 
 def _scenes(config: pytest.Config, folder: Path, mark: pytest.Mark) -> list[ClipScene]:

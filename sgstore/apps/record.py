@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 
 TICK_TIMEOUT_S: Final = 10.0
-"""Time without a tick of the world that counts as an error; s."""
+"""Time without a tick of the simulator after which an error is raised; s."""
 LAST_S: Final = 1.0
-"""Waiting time for the last sensor data at the end; s."""
+"""Time to wait for the last sensor data at the end of a recording; s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +185,7 @@ class _FrameWriter:
 
 
 def _snapshots(world: Any, step_s: float | None) -> Generator[Any]:
-    """Yield snapshots of a CARLA world, which runs freely or is advanced by fixed steps."""
+    """Yield snapshots of a CARLA world. The world runs freely, or is advanced by fixed steps."""
     if step_s is None:
         while True:
             try:

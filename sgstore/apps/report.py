@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
 CHUNK: Final = 300
-"""Frames per states request of the page (``CHUNK`` of ``data.js``)."""
+"""Number of frames in each request of the page for states (``CHUNK`` in ``data.js``)."""
 
 MOST_LOOKED_AT: Final = 20_000
-"""Matches from which those of a report are chosen."""
+"""Largest number of matches from which the matches of a report are selected."""
 
 POLICY: Final = (
     "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}';"
@@ -47,7 +47,7 @@ POLICY: Final = (
 Found = tuple[str, int, int, dict[str, int]]
 """Match: trace, first and last frame, and nodes by variable."""
 Spans = dict[str, list[tuple[int, int]]]
-"""Trace → first and last frame of the stored ranges, ordered and disjoint."""
+"""Trace → ranges of stored frames (first and last), in order and without overlaps."""
 
 
 def report(
@@ -200,7 +200,7 @@ def _kept(
 
 
 def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Return replies with at most ``most`` matches or violations, spread over the traces."""
+    """Return replies with at most ``most`` matches or violations in total, spread over the traces."""
     lists = [(reply, "matches", "") for reply in told if "matches" in reply]
     lists += [(one, "spans", one["trace"]) for one in told[-1].get("verdicts", ())]
     traces = [str(trace or row[0]) for part, key, trace in lists for row in part[key]]
@@ -217,7 +217,7 @@ def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
 
 
 def chosen_spread(traces: list[str], most: int) -> set[int]:
-    """Return the places of ``most`` items, spread over the traces and evenly over the items of each trace.
+    """Return indices of ``most`` items, spread over the traces and evenly over the items of each trace.
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ def _times(store: Store, trace: str, frames: int) -> NDArray[np.float64]:
 
 
 def _spans(found: list[Found], times: Mapping[str, NDArray[np.float64]], around_s: float) -> Spans:
-    """Return the frame ranges that contain the matches and the time around them, by trace."""
+    """Return for each trace the ranges of frames that contain its matches and the time around them."""
     spans: Spans = {}
     for trace, first, last, _ in sorted(found, key=lambda match: match[:3]):
         t, around = times[trace], around_s + 1e-6  # times have six decimals
@@ -290,7 +290,7 @@ def _spans(found: list[Found], times: Mapping[str, NDArray[np.float64]], around_
 
 
 def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dict[str, Any]:
-    """Return, by trace and nodes of a match, the frames in which each part of the pattern is true."""
+    """Return for each trace and match the frames in which each part of the pattern is true."""
     first = {
         _key(trace, nodes or None): (trace, seq, nodes) for trace, seq, _, nodes in found[::-1]
     }
@@ -344,7 +344,7 @@ def _small(data: bytes) -> str:
 def _pictures(
     store: Store, traces: list[dict[str, Any]], matches: list[Found]
 ) -> dict[str, dict[str, str]]:
-    """Return pictures of the first camera of each trace, one per second of a match."""
+    """Return pictures of the first camera of each trace, one for each second of a match."""
     reads, found = Reads(store), dict[str, dict[str, str]]()
     cameras = {one["name"]: one["cameras"] for one in reads.about()["traces"]}
     for about in traces:
@@ -377,7 +377,7 @@ _MINIFIED: Final = re.compile(r"export\{([^}]*)\};?\s*$")
 
 
 def script() -> str:
-    """Return the JavaScript modules of a report page as one script: each module becomes a function."""
+    """Return the JavaScript of a report page as one script. Each module becomes a function."""
     parts: list[str] = []
     names: dict[Path, str] = {}
 

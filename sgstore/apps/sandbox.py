@@ -1,4 +1,4 @@
-"""Sandbox: a separate process that runs untrusted SQL and pattern queries on a store.
+"""Sandbox: a separate process that runs SQL and pattern queries from untrusted sources.
 
 The process can only read the store: the database is opened read-only without file access, and its
 settings are locked. The operating system forbids it to write files and limits its address space. A
@@ -44,22 +44,22 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
     Answering = Callable[[Store, dict[str, Any], int], dict[str, Any] | Iterator[dict[str, Any]]]
-    """Reply to a question, or replies: of the store, the question, and the most rows; see :func:`plain`."""
+    """Function from a store, a question and the largest number of rows to one or more replies."""
 
 TIMEOUT_S: Final = 5.0
 MEMORY: Final = 512 << 20
 MAX_ROWS: Final = 10_000
 MAX_BYTES: Final = 64 << 20
-"""Greatest size of a result in transfer; bytes."""
+"""Largest size of a result that is sent between the processes; bytes."""
 
 MAX_QUESTION: Final = 1 << 20
-"""Greatest length of a query with its values; characters."""
+"""Largest length of a query together with its values; characters."""
 
 START_S: Final = 120.0
-"""Time limit for the start of the process; s. It takes one second, or up to a minute on a very busy machine."""
+"""Time limit for the start of the process; s. It takes one second, or a minute on a very busy machine."""
 
 READ_S: Final = 60.0
-"""Additional time for each table that it reads first; s."""
+"""Additional time for each user table that the sandbox process reads first; s."""
 
 REDUCE: Final = (
     "reduce the query: a label for each node, such as (v:Vehicle), fewer variables, one trace"
@@ -67,11 +67,11 @@ REDUCE: Final = (
 """Remedy for a query that needs too much time or memory."""
 
 _TABLE_BYTES: Final = 4 << 30
-"""Largest file that it may write, only while it reads tables, in its own folder; bytes."""
+"""Largest file that the sandbox process may write; bytes. It may only write while it reads user tables."""
 
 _ADDRESS_SPACE: Final = 4 << 30
-"""Address space for Python, its libraries and the database's threads, in addition to the query
-memory; bytes."""
+"""Address space for Python, its libraries and the threads of the database, in addition to the memory for
+queries; bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class Sandbox:
     """
 
     may_write: ClassVar[bool] = False
-    """True if the process may write files."""
+    """True if the process is allowed to write files."""
 
     def __init__(
         self,
@@ -269,7 +269,7 @@ class Sandbox:
             child.kill()
 
     def start(self) -> None:
-        """Start the sandbox process before the next query needs it."""
+        """Start the sandbox process in advance, before a query needs it."""
         with self._turn:
             self._ready()
 
@@ -280,7 +280,7 @@ class Sandbox:
         return child is not None and child.is_alive
 
     def _ready(self) -> WorkerProcess:
-        """Return the sandbox process; a stopped process is started again."""
+        """Return the running sandbox process. Start it if necessary."""
         if self._child is None or not self._child.is_alive:
             self._kill()
             self._stopped = False
@@ -311,7 +311,7 @@ class Sandbox:
     def _exchange(
         self, child: WorkerProcess, question: Mapping[str, object] | None, timeout_s: float
     ) -> Any:
-        """Send a question (or none) to the sandbox process, and return its reply.
+        """Send a question to the sandbox process (or wait for its start), and return the reply.
 
         The process is killed after the timeout.
 
@@ -368,7 +368,7 @@ def _check_length(question: Mapping[str, object], error: type[SgstoreError]) -> 
 
 
 def _granted(reply: Any) -> dict[str, Any]:
-    """Return the reply of a sandbox process, or raise the error that it contains."""
+    """Return the reply of a sandbox process. An error in the reply is raised."""
     if "query" in reply or "error" in reply:
         raise error_of(reply)
     return reply
@@ -382,7 +382,7 @@ def _answer(reply: dict[str, Any]) -> Answer:
 
 
 class Workshop(Sandbox):
-    """Sandbox process for tasks of the program itself that write files; a task can be cancelled at once."""
+    """Sandbox process for the program's own tasks, which may write files. A task can be cancelled at once."""
 
     may_write: ClassVar[bool] = True
 
@@ -403,13 +403,13 @@ class Errand:
         self._gone = False
 
     def ask(self, question: Mapping[str, object], _key: str) -> Iterator[dict[str, Any]]:
-        """Start the long task, and yield its replies on arrival. A cancelled task has no replies."""
+        """Start the task, and yield its replies as they arrive. A cancelled task has no replies."""
         with self._make() as self._box:
             if not self._gone:
                 yield from self._box.replies(question)
 
     def cancel(self, _key: str = "") -> bool:
-        """Stop the long task, also before its start."""
+        """Stop the task, or prevent its start."""
         self._gone = True
         if self._box is not None:
             self._box.stop()
@@ -544,7 +544,7 @@ class SandboxPool:
         self._ready(box)
 
     def _ready(self, box: Sandbox) -> None:
-        """Add a newly started sandbox process to the pool."""
+        """Run the first query of a new sandbox process, and add the process to the pool."""
         with suppress(SgstoreError):
             if self._first is not None:
                 box.ask(self._first)
@@ -561,7 +561,7 @@ class SandboxPool:
 
 
 def serve(answering: Answering) -> None:
-    """Answer the queries of the parent process until it ends this one.
+    """Answer the queries of the parent process until the parent ends this process.
 
     Parameters
     ----------
@@ -634,13 +634,13 @@ def _refusal(error: SgstoreError) -> dict[str, Any]:
 
 
 def _spilled(error: SgstoreError) -> bool:
-    """True if an error comes from temporary files of the database, which the sandbox forbids."""
+    """True if the cause of an error is a temporary file of the database, which the sandbox forbids."""
     text = str(error)
     return os.strerror(errno.EFBIG) in text and "duckdb_temp" in text
 
 
 def _limit(memory: int, *, files: int | None) -> None:
-    """Limit the memory and the files of the sandbox process permanently, if the system supports it.
+    """Limit the memory and the file size of this process permanently, if the operating system supports it.
 
     ``files``: largest file that it may write; bytes. ``None`` means no limit.
     """

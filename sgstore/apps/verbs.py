@@ -46,7 +46,7 @@ def seconds(value: str | float, option: str) -> float:
 
 
 def one_store(store: Store | Collection) -> Store:
-    """Return a store; a collection is an error."""
+    """Return the store. Raise an error for a collection."""
     if isinstance(store, Store):
         return store
     raise one_store_needed(store.place.url)
@@ -55,7 +55,7 @@ def one_store(store: Store | Collection) -> Store:
 def chosen_frames(
     store: Store | Collection, query: str, parameters: Mapping[str, object] | None, name: str = ""
 ) -> ChosenFrames:
-    """Return the frames that a verb works on: the matches of a query, or all frames."""
+    """Return the frames that a command works on: the matches of a query, or all frames."""
     from sgstore.testsets.coverage import ChosenFrames, frames_of
 
     name = name or (str(store.file.path) if isinstance(store, Store) else store.place.url)
@@ -130,7 +130,7 @@ def selection_spec(  # noqa: PLR0913 - the options of the command
 
 
 def one_of(option: str, value: str, known: Iterable[str]) -> str:
-    """Return a value if it is one of the known ones.
+    """Return the value of an option. Raise an error if the value is not in the list of known values.
 
     Raises
     ------
@@ -243,7 +243,7 @@ def coverage(  # noqa: PLR0913 - the options of the command
 
 
 def _of_classes(kind: str, both: list[Classed], **how: Any) -> ReportTable:
-    """Return a table of classes of frames, of one selection or of two."""
+    """Return a coverage table of one or two selections of frames."""
     from sgstore.testsets import coverage as of
 
     items = {"classes": of.novel, "frames": of.novel_frames, "clips": of.novel_clips}
@@ -263,7 +263,7 @@ def _of_classes(kind: str, both: list[Classed], **how: Any) -> ReportTable:
 
 _COMPARING: Final = ("of", "novel", "venn", "explain")
 KINDS: Final = ("classes", "growth", "combos", "sequences", "spec", *_COMPARING)
-"""Kinds of coverage."""
+"""Kinds of coverage that can be measured."""
 
 
 def diff(

@@ -42,19 +42,19 @@ ROWS: Final = 20
 """Default number of rows of a result."""
 
 MOST_ROWS: Final = 1_000
-"""Default for the greatest number of rows of a result."""
+"""Default for the largest number of rows of a result that a user can request."""
 
 MOST_BYTES: Final = 2 << 20
-"""Greatest size of a result; bytes. A model reads a small part of it, a program more."""
+"""Largest size of a result; bytes. A language model uses only part of it, a program uses more."""
 
 MOST_TEXT: Final = 30_000
-"""Greatest number of characters of rows in one result; about ten thousand tokens."""
+"""Largest number of characters of the rows in a result; about ten thousand tokens."""
 
 LONGEST: Final = 400
-"""Greatest number of characters of one value; longer than a notebook's table for queries."""
+"""Largest number of characters of a single value. It is larger than a notebook needs to show queries."""
 
 SIDE: Final = 1_024
-"""Longest side of a camera picture; pixels: models use no larger ones."""
+"""Longest side of a camera picture for an assistant; pixels. Language models do not use larger pictures."""
 
 FrameName = Annotated[str, Field(description="'town#120' (trace and number) or 'town@12.3s'")]
 Pattern = Annotated[
@@ -91,7 +91,7 @@ class ToolAnswer:
 
 @dataclass(frozen=True)
 class KnownBindings:
-    """Bindings of a query in one frame, computed in the sandbox, for marking matches in a picture."""
+    """Bindings of a query in one frame, computed in the sandbox, to mark the matches in a picture."""
 
     found: list[dict[str, int]]
 
@@ -573,7 +573,7 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
 
 
 def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], int]:
-    """Return result rows as text lines after a header, as far as they fit; and the number of these rows."""
+    """Return a header and the rows that fit, as lines of text. Also return the number of these rows."""
     lines = [" | ".join(columns)]
     left = MOST_TEXT
     for number, row in enumerate(rows):
@@ -586,7 +586,7 @@ def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[
 
 
 def _remarks(reply: Mapping[str, Any]) -> list[str]:
-    """Return sentences about traces that cannot answer a query, and about likely mistakes in it."""
+    """Return sentences about the traces that cannot answer a query, and about likely mistakes in the query."""
     of: dict[str, list[str]] = {}
     for name, reason in reply.get("left_out", {}).items():
         of.setdefault(reason, []).append(name)

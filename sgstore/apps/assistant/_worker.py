@@ -45,7 +45,7 @@ _OF_TRACES: Final = {"find", "check"}
 def _listed(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], limit: int, **about: Any
 ) -> Reply:
-    """Return a reply with result rows up to a limit, and a flag that is true if there are more."""
+    """Return a reply with the rows up to a limit, and a flag that states if there are more rows."""
     found = list(islice(rows, limit + 1))
     truncated = len(found) > limit
     return {"columns": columns, "rows": found[:limit], "truncated": truncated, **about}
@@ -77,7 +77,7 @@ def _named(text: str, parameters: Mapping[str, Any], *, check: bool) -> tuple[st
 def _found(
     store: Store, text: str, parameters: Mapping[str, Any]
 ) -> tuple[Matches, dict[str, Any]]:
-    """Return the matches of a query, with the traces that cannot answer and notes on likely mistakes."""
+    """Return the matches of a query, and a dict of traces without an answer and of notes on mistakes."""
     asked, values = _named(text, parameters, check=False)
     matches = store.find(asked, **values)
     return matches, {"left_out": matches.reasons, "notes": matches.notes}
@@ -306,7 +306,7 @@ ANSWERS: Final = {
     "timeline": _timeline,
     "missing": _missing,
 }
-"""Functions by query name; ``limit`` is the greatest number of rows."""
+"""Kind of a question → function that answers it. Its argument ``limit`` is the largest number of rows."""
 
 
 def main() -> None:
