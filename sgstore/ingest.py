@@ -38,7 +38,7 @@ __all__ = ["ingest", "recordings"]
 
 
 def recordings(names: Iterable[str | Path]) -> list[Path]:
-    """Return the recordings for file names, folders, patterns and URLs, each once.
+    """Return the recordings for names of files and folders, patterns and URLs, without duplicates.
 
     The result has the order of the names. The contents of a folder and the matches of a pattern are sorted.
 
@@ -83,7 +83,7 @@ def _meant(path: Path) -> Iterator[Path]:
 
 
 def _inside(folder: Path) -> Iterator[Path]:
-    """Yield the recordings in a folder and its subfolders. A bag counts once, without its files."""
+    """Yield the recordings in a folder and its subfolders. A bag is one recording; its files are not listed."""
     bags = {path.parent for path in folder.rglob(METADATA) if bag_folder(path.parent) is not None}
     own = {part.path for bag in bags for part in _parts(bag)}
     own.update(bags, *(log_files(bag) or () for bag in bags))
@@ -94,7 +94,7 @@ def _inside(folder: Path) -> Iterator[Path]:
 
 
 def _meant_by(url: str) -> list[str]:
-    """Return the recordings of a URL: the file itself, those below it, or the matches of its pattern."""
+    """Return the recordings of a URL: the file, the files below it, or the matches of its pattern."""
     pattern = has_magic(url)
     if url.startswith("http") or not (pattern or not url.lower().endswith(ENDINGS)):
         return [url]
@@ -133,7 +133,7 @@ def _fits(url: str, pattern: str) -> bool:
 
 
 def _parts(bag: Path) -> tuple[BagPart, ...]:
-    """Return the files of a bag; empty if the bag is unreadable. The later ingest reports the fault."""
+    """Return the files of a bag. It is empty for an unreadable bag; the ingest then reports the fault."""
     try:
         return parts_of(bag)
     except TraceError:
@@ -145,10 +145,10 @@ def _parts(bag: Path) -> tuple[BagPart, ...]:
 # memory), its current recording fails, and a new process replaces it.
 
 _AHEAD: Final = 2
-"""Recordings assigned to a process at once: the current one and the next."""
+"""Number of recordings that are assigned to a process at once: the current one and the next one."""
 
 _WAITING: Final = 64
-"""Recordings per process that may be read before the first of them is published."""
+"""Largest number of recordings per process that are read but not yet published."""
 
 
 def read_in_processes(
@@ -209,7 +209,7 @@ def _lost(path: Path, code: int) -> TraceOutcome:
 # same store as an uninterrupted run.
 
 BLOCK_FRAMES: Final = 4 * BUCKET_FRAMES
-"""Frames per block: whole buckets, so that a mask is one row."""
+"""Number of frames in a block: whole buckets, so that a mask of 64 frames is one row."""
 
 
 def ingest(  # noqa: PLR0913  one option per way to read

@@ -1,4 +1,4 @@
-"""Contradictions between the numbers of bodies in successive frames, as votes for their probable cause.
+"""Contradictions in the motion of bodies from frame to frame, and votes for their probable cause.
 
 Each function compares two columns that describe the same fact, such as recorded velocity and displacement.
 A contradicting row votes for a *cause*: a factor, an angle or an axis. The verdict follows from the votes of
@@ -29,31 +29,31 @@ COLUMNS: Final = (
 X, HEADING, VX, AX, YAW_RATE, LENGTH, HEIGHT, DERIVED, LIGHT = 0, 3, 4, 6, 8, 9, 11, 12, 13
 
 MOVES: Final = 1.5
-"""Least difference between recorded velocity and displacement; m/s. Boxes jitter by 0.3, SUMO people by 1."""
+"""Smallest difference of velocity and displacement that counts; m/s. Boxes jitter by 0.3, SUMO people by 1."""
 
 UNLIKE: Final = 0.3
-"""The same, relative to the larger one. The smallest wrong factor is 1.6 (miles for kilometres)."""
+"""Smallest share of the larger one for this difference. The smallest wrong factor is 1.6 (miles for km)."""
 
 COURSE: Final = 3.0
-"""Least speed at which a vehicle must face its direction of movement; m/s."""
+"""Smallest speed at which a vehicle must face its direction of movement; m/s."""
 
 ASKEW: Final = 0.26
-"""Least angle between heading and movement; rad. A car on a dry road slips by less than 10°, this is 15°."""
+"""Smallest angle between heading and movement that counts; rad (15°). Cars slip by less than 10°."""
 
 BACKWARDS: Final = 8.0
 """Highest speed in reverse gear; m/s."""
 
 AGREEING: Final = 10
-"""Least number of rows that agree on one contradiction: a second at 10 Hz."""
+"""Smallest number of rows that must agree on a contradiction: one second at 10 Hz."""
 
 STANDING: Final = 5
-"""Least number of rows in which a body reports a speed and does not move at all."""
+"""Smallest number of rows in which a body reports a speed, but does not move at all."""
 
 RANDOM: Final = 0.82
-"""Least share of the headings off the movement. Of random headings 84 % are; noise reaches 80 %."""
+"""Share of headings off the movement above which they are random. Random ones have 84 %, noise 80 %."""
 
 SHARE: Final = 0.8
-"""Least share of the contradicting rows that agree."""
+"""Smallest share of the contradicting rows that must agree."""
 
 UNITS: Final = {
     1e3: "in mm/s",
@@ -67,25 +67,25 @@ UNITS: Final = {
     0.01: "in m/s, but positions are in centimetres",
     1e-3: "in m/s, but positions are in millimetres, or time in ms instead of s",
 }
-"""Factor of recorded velocities → the probable unit."""
+"""Factor between recorded and real velocity → the probable wrong unit."""
 
 QUICKEST: Final = {"person": 13.0, "animal": 35.0, "bicycle": 40.0}
-"""Highest speed by kind; m/s. The records of sprinters and cheetahs are 12.4 m/s and 29 m/s."""
+"""Highest possible speed by kind; m/s. The records of a sprinter and a cheetah are 12.4 m/s and 29 m/s."""
 
 SIGHT: Final = 600
-"""Number of frames after which a vanished body is forgotten."""
+"""Number of frames after which an absent body is forgotten."""
 
 _BINS: Final = 10
-"""Votes for a factor: bins of 10 % (a tenth of the natural logarithm)."""
+"""Number of bins of votes for a factor, for each step of the natural logarithm by one: a bin covers 10 %."""
 
 _DEGREES: Final = 5.0
 _HALF: Final = 36
-"""Votes for an angle: bins of 5°, and their number in half a turn."""
+"""Number of bins of votes for an angle in half a turn: a bin covers 5°."""
 
 FROZEN, STILL = 900, 901
 MIRRORED, SWAPPED, REVERSED, LEFT, RIGHT, OWN_AXES = 902, 903, 904, 905, 906, 907
 NEGATIVE, OFFSET, MIRROR, IN_DEGREES = 400, 1_000, 2_000, 3_000
-"""Causes, and offsets of bins: factors are -200 … 200, angles -36 … 36 about the last three."""
+"""Codes of causes. The last three are offsets of angle bins (-36 … 36); factors have bins -200 … 200."""
 
 _NONE, _KEYS = -1_000, 10_000
 
@@ -93,7 +93,7 @@ _VEHICLE: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle"
 
 
 class Contradiction(NamedTuple):
-    """Verdict about one kind of contradiction: first body and frame, all bodies, rows, and a text."""
+    """Result about one kind of contradiction: first body and frame, all bodies, number of rows, and a text."""
 
     kind: str
     node: int
@@ -105,7 +105,7 @@ class Contradiction(NamedTuple):
 
 @dataclass(slots=True)
 class Vote:
-    """Contradicting rows of one body: number, first frame with both values, and votes for causes."""
+    """Contradicting rows of one body: number of rows, first frame, its two values, and votes for causes."""
 
     frame: int
     values: tuple[float, float]
@@ -115,7 +115,7 @@ class Vote:
 
 @dataclass(frozen=True, slots=True)
 class BodyRows:
-    """States of bodies by node and frame: those of a block, and some earlier ones.
+    """States of bodies, sorted by node and frame: those of a block, and the last ones of earlier blocks.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class BodyRows:
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Pairs of successive rows of a body.
+    """Pairs of successive states of a body.
 
     Attributes
     ----------
@@ -203,13 +203,13 @@ class Steps:
 
 @dataclass(slots=True)
 class Tally:
-    """Votes about contradictions, and the number of compared rows, by quantity and body."""
+    """Votes about contradictions and numbers of compared steps, for each quantity and body."""
 
     votes: dict[tuple[str, int], Vote] = field(default_factory=dict[tuple[str, int], Vote])
     compared: dict[str, Ints] = field(default_factory=dict[str, "Ints"])
 
     def total(self, quantity: str, node: int | None = None) -> int:
-        """Return the number of compared rows of a body, or of all bodies."""
+        """Return the number of compared steps of a body, or of all bodies."""
         counts = self.compared.get(quantity, np.zeros(0, np.int64))
         return int((counts if node is None else counts[node : node + 1]).sum())
 
@@ -222,7 +222,7 @@ class Tally:
         values: tuple[Floats, Floats],
         *causes: Floats,
     ) -> None:
-        """Count compared and contradicting steps. A step votes for each of its causes (NaN: no cause).
+        """Count the compared and the contradicting steps. Each of the latter votes for its causes.
 
         ``values`` has a row per step, and a cause per contradicting step.
         """
@@ -250,12 +250,12 @@ class Tally:
 
 
 def factor_of(cause: float) -> float:
-    """Return the factor for a vote."""
+    """Return the factor that a bin of votes represents."""
     return float(np.exp(cause / _BINS))
 
 
 def add_contradictions(steps: Steps, kinds: Ints, tally: Tally) -> None:
-    """Compare recorded numbers with the movement in each step, and add the contradictions to a tally.
+    """Compare the recorded values of each step with the movement, and add the contradictions to a tally.
 
     Parameters
     ----------
@@ -366,7 +366,7 @@ def _rates(
     least: float,
     tally: Tally,
 ) -> None:
-    """Compare recorded accelerations (yaw rates) with changes of velocity (heading)."""
+    """Compare recorded accelerations with changes of velocity, or yaw rates with changes of heading."""
     told, actual = values
     told_size, size = (np.sqrt((one * one).sum(axis=1)) for one in values)
     read &= (size > least) & (told_size > 1e-6)
@@ -378,7 +378,7 @@ def _rates(
 
 
 def judged(tally: Tally) -> Iterator[Contradiction]:
-    """Yield the contradictions whose rows agree: by body, or by recording if no body has enough rows."""
+    """Yield the contradictions on which enough rows agree: by body, otherwise over all bodies."""
     quantities: dict[str, dict[int, Vote]] = {}
     for (quantity, node), vote in tally.votes.items():
         quantities.setdefault(quantity, {})[node] = vote
@@ -401,7 +401,7 @@ def judged(tally: Tally) -> Iterator[Contradiction]:
 def _agreed(
     quantity: str, votes: dict[int, Vote], tally: Tally
 ) -> list[tuple[int, Vote, tuple[str, str]]]:
-    """Return the bodies with a verdict. Without one, the votes of all bodies are joined."""
+    """Return the bodies with a result. If no body has one, the votes of all bodies are added up."""
     told = [
         (node, vote, _verdict(quantity, vote, tally.total(quantity, node)))
         for node, vote in votes.items()
@@ -426,7 +426,7 @@ def _agreed(
 
 
 def _alike(cause: int) -> tuple[int, ...]:
-    """Return the bins of a factor or an angle and its neighbours."""
+    """Return a bin of a factor or an angle, with its two neighbours."""
     base = (cause + 500) // 1_000 * 1_000
     if not base:
         return cause - 1, cause, cause + 1
@@ -434,7 +434,7 @@ def _alike(cause: int) -> tuple[int, ...]:
 
 
 def _verdict(quantity: str, vote: Vote, compared: int) -> tuple[str, str] | None:
-    """Return the kind of a contradiction and its text; ``None`` if the rows do not agree."""
+    """Return the kind and the text of a contradiction. ``None`` if the rows do not agree."""
     causes = vote.causes
     if quantity == "velocity" and causes[FROZEN] >= STANDING:
         return "frozen", f"speed {vote.values[0]:.3g} m/s is recorded, but it does not move"
@@ -499,7 +499,7 @@ def _of_yaw_rate(cause: int, recorded: float, actual: float) -> tuple[str, str] 
 
 
 def _near(factor: float, names: dict[float, str]) -> str:
-    """Return the name of the factor that differs by at most 12 %; empty without one."""
+    """Return the name of the factor that is at most 12 % away, or an empty text."""
     near = min(names, key=lambda one: abs(np.log(one / factor)))
     return names[near] if abs(np.log(near / factor)) < 0.12 else ""
 

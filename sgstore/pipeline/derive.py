@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 
 _ASIDE: Final = 10.0
-"""Maximum distance from the ego to the start of a corridor line; m."""
+"""Largest distance between the ego and the start of the line of its corridor; m."""
 
 _NOT_RELATIONS: Final = ("ego", "egos", "payloads", "mapping", "rate")
-"""Settings of the reading, not of relations; the values of the ingest apply."""
+"""Settings for reading a recording. They do not concern relations, so those of the ingest stay valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +213,7 @@ def _digest(config: Config) -> str:
 
 
 def _settings(trace: StoredTrace, wanted: Config) -> Config:
-    """Return the settings for deriving relations of a trace, or raise an error if its states do not suffice.
+    """Return the settings for deriving relations of a trace. Stored states that do not suffice are an error.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Check for well-formed but impossible data: wrong units, wrong axes, jumps, reused ids, impossible lights.
+"""Check for impossible data in valid recordings: wrong units or axes, jumps, reused ids, impossible lights.
 
 :class:`Plausibility` sees the blocks of a recording during an ingest or ``doctor``. It compares values that
 describe the same fact: recorded velocities with displacements, headings with directions of movement, lights
@@ -55,48 +55,48 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, Ints
 
 JUMP: Final = 2.5
-"""Least jump of a vehicle, beyond the speeds before and after it; m. Half a car's length."""
+"""Smallest jump of a vehicle that counts, beyond the movement that its speed explains; m. Half a car."""
 
 STRIDE: Final = 5.0
-"""The same of other bodies; m. People in SUMO jump by up to 3.8 m from lane to lane."""
+"""Smallest jump of other bodies that counts; m. People in SUMO jump by up to 3.8 m between lanes."""
 
 BRAKING: Final = 10.0
-"""Greatest acceleration of a body while it is not recorded; m/s². The limit of tyres on dry roads."""
+"""Largest acceleration of a body while it is absent; m/s². It is the limit of tyres on dry roads."""
 
 GROWTH: Final = 1.5
 GROWN: Final = 0.5
-"""Least factor, and least difference (m), between two sizes of a rigid body."""
+"""Smallest relative difference between two sizes of a rigid body that counts, and smallest difference in m."""
 
 NOISY: Final = 4.0
-"""The factor for bodies whose size changes often, as in measured tracks."""
+"""Factor between the sizes of bodies whose size changes often, as in measured tracks, that counts."""
 
 LARGEST: Final = {"person": 3.0, "bicycle": 5.0, "motorcycle": 6.0, "train": 500.0}
-"""Greatest length and width by kind; m. Other vehicles: 60 m. Road trains have 53.5 m."""
+"""Largest possible length and width by kind; m. For other vehicles: 60 m. Road trains have 53.5 m."""
 
 LEAST: Final = {"person": 0.1, "bicycle": 0.5, "motorcycle": 0.8}
-"""Least length by kind; m. Other vehicles: 1 m."""
+"""Smallest possible length by kind; m. Other vehicles: 1 m."""
 
 FLICKER_NS: Final = 400_000_000
-"""Least duration of a light state; ns. A flashing light is on for half a second."""
+"""Smallest duration of a light state; ns. A flashing light is on for half a second."""
 
 CYCLE_NS: Final = 120_000_000_000
-"""Longest time in which no light changes; ns. The longest cycle of the German guidelines (RiLSA)."""
+"""Longest time without a change of any light; ns. It is the longest cycle of the German guidelines (RiLSA)."""
 
 FAR: Final = 1e6
-"""Least coordinate at which positions of 32 bits are coarse; m. Their steps are 6 cm and more."""
+"""Coordinate from which positions in 32 bits are coarse; m. Their steps are then 6 cm or more."""
 
 ASIDE: Final = 30.0
-"""Greatest distance of the ego from all lanes; m. Parking areas are nearer."""
+"""Largest distance of the ego from all lanes; m. Parking areas are nearer than this."""
 
 ON_LANES: Final = 0.5
-"""Greatest share of moving vehicles on no lane. It is 0.22 in Argoverse 2, and 0.5 to 1 in mirrored axes."""
+"""Largest share of moving vehicles outside all lanes: 0.22 in Argoverse 2, 0.5 to 1 with mirrored axes."""
 
 SAMPLED: Final = 10
-"""One frame in this number is compared with the map, and searched for doubled bodies."""
+"""Interval of frames that are compared with the map, and searched for duplicate bodies."""
 
 SHORTEST_NS: Final = 100_000
 LONGEST_NS: Final = 10_000_000_000
-"""Limits of the usual time between frames; ns. Outside, the unit of time is wrong."""
+"""Longest plausible time between frames; ns. A longer time means a wrong unit."""
 
 REMEDY: Final = {
     "velocity unit": "write m/s, metres and nanoseconds",
@@ -135,7 +135,7 @@ REMEDY: Final = {
     "lights never change": "check the source of the light states",
     "control range": "write throttle and brake from 0 to 1, steering from -1 to 1",
 }
-"""Kind of implausible data → what the user can do."""
+"""Kind of implausible data → what the user can do about it."""
 
 _VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle") or ()])
 _ON_ROAD: Final = np.array([KIND_CODE[kind] for kind in ("car", "truck", "van", "bus")])
@@ -188,7 +188,7 @@ class Finding:
 
 @dataclass(slots=True)
 class _Event:
-    """Occurrences of one kind: the first one, the entities, and their number."""
+    """Occurrences of one kind of implausible data: the first one, the entities, and the number."""
 
     node: int
     frame: int
@@ -239,7 +239,7 @@ class Plausibility:
         )
 
     def see(self, block: FrameBlock) -> None:
-        """Compare the states of the next block of frames."""
+        """Examine the next block of frames."""
         entities = block.entities
         before = len(self._idents)
         self._idents += entities.ident
@@ -269,7 +269,7 @@ class Plausibility:
             self._see_lights(rows)
 
     def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Yield the frames of a client unchanged, and check them: for monitors and running simulators.
+        """Yield the frames of a client (monitor or running simulator) unchanged, and check them.
 
         Examples
         --------
@@ -292,7 +292,7 @@ class Plausibility:
             self._see_frames(waiting)
 
     def _see_frames(self, frames: list[Frame]) -> None:
-        """Check frames of a client, which have the same columns as a block."""
+        """Check frames of a client after their conversion to a block."""
         if not frames:
             return
         known = self._client_nodes
@@ -384,7 +384,7 @@ class Plausibility:
         event.nodes.add(node)
 
     def _happen_each(self, kind: str, block: FrameBlock, rows: Bools, value: str) -> None:
-        """Add an event for each row of a block in a mask. ``value`` names columns in braces."""
+        """Record an occurrence for each row in a mask. ``value`` is a text with columns in braces."""
         at = np.flatnonzero(rows)
         states, first = block.states, int(at[0])
         shown = {name: float(getattr(states, name)[first]) for name in _SHOWN}
@@ -397,7 +397,7 @@ class Plausibility:
     # Numbers that contradict the movement.
 
     def _lost(self, losses: Sequence[Loss]) -> Iterator[Finding]:
-        """Yield findings from losses of values that are impossible alone."""
+        """Yield findings for losses: values that readers removed because they are impossible."""
         kinds: dict[str, list[tuple[str, str, int, int]]] = {}
         for loss in losses:
             if (told := _FAULT.fullmatch(loss.reason)) is not None:
@@ -414,7 +414,7 @@ class Plausibility:
     # Jumps, reused ids, sizes.
 
     def _see_jumps(self, rows: BodyRows) -> None:
-        """Find steps that are far longer or shorter than the steps before and after them."""
+        """Find steps that are much longer or much shorter than the steps before and after them."""
         values, frame = rows.values, rows.frame
         seconds = np.diff(rows.time_ns) / 1e9
         joined = (np.diff(rows.node) == 0) & (np.diff(frame) == 1) & (seconds > 0)
@@ -436,7 +436,7 @@ class Plausibility:
             self._moves.append(_Move(node, frame, complex(*start), complex(*end)))
 
     def _see_returned(self, rows: BodyRows, before: int) -> None:
-        """Find bodies whose id belonged to another body just before."""
+        """Find bodies whose id belonged to another body immediately before."""
         if not self._nodes:
             self._nodes = {ident: node for node, ident in enumerate(self._idents[:before])}
         for node in range(before, len(self._idents)):
@@ -455,7 +455,7 @@ class Plausibility:
                 self._happen("reused id", node, frame, "it returns as another body")
 
     def _see_absences(self, steps: Steps) -> None:
-        """Find bodies that return farther away than they can have moved."""
+        """Find bodies that are absent and then return farther away than they can have moved."""
         values, at, seconds = steps.rows.values, steps.at, steps.seconds
         speeds = [np.hypot(*np.nan_to_num(values[row, VX : VX + 2]).T) for row in (at, at + 1)]
         reach = (speeds[0] + speeds[1]) / 2 * seconds + BRAKING / 4 * seconds**2 + STRIDE
@@ -490,7 +490,7 @@ class Plausibility:
                 self._grown.setdefault(node, (frame, value))
 
     def _judge_moves(self) -> None:
-        """Add events for jumps. Two bodies that change places in a frame have swapped ids."""
+        """Record jumps as occurrences. Two bodies that exchange places in one frame have exchanged ids."""
         frames: dict[int, list[_Move]] = {}
         step = _USUAL * float(np.median(np.diff(self._times))) / 1e9 if self._moves else 0.0
         for move in self._moves:
@@ -513,7 +513,7 @@ class Plausibility:
                 self._happen("size jump", node, frame, value)
 
     def _see_bodies(self, block: FrameBlock) -> None:
-        """Find impossible sizes, angles and controls, and bodies with placeholders."""
+        """Find impossible sizes, angles and controls, and bodies with placeholder values."""
         states = block.states
         kinds = self._kinds[states.node]
         body = states.light_state < 0
@@ -566,7 +566,7 @@ class Plausibility:
         self._shares["vehicles"] += int(vehicle.sum())
 
     def _judge(self) -> None:
-        """Drop events that are rare among their like, and add those of sizes and heights."""
+        """Drop kinds of occurrences that are too rare, and add those of sizes and heights."""
         events, shares = self._events, self._shares
         rare = {
             kind
@@ -682,7 +682,7 @@ class Plausibility:
     # Traffic lights.
 
     def _see_lights(self, rows: BodyRows) -> None:
-        """Follow the states of lights, and compare their references with the map."""
+        """Compare the states of lights with their earlier states, and their references with the map."""
         shown = rows.values[:, LIGHT].astype(np.int64)
         lit = rows.fresh & (shown >= 0)
         # A light that is always off needs no lanes.
@@ -730,14 +730,14 @@ _SHOWN: Final = (
     *("throttle", "brake", "steer"),
 )
 _STEADY: Final = 3
-"""Number of small changes of a size that mark it as measured."""
+"""Number of small changes of size after which the size counts as measured."""
 _USUAL: Final = 30.0
-"""Speed of the bodies that are compared with each other's places; m/s."""
+"""Speed up to which positions of different bodies are compared with each other; m/s."""
 _MOST_MOVES: Final = 10_000
 _MOST_SAMPLES: Final = 5_000
-"""Number of positions that are compared with the map."""
+"""Largest number of positions that are compared with the map."""
 _TOGETHER: Final = 120
-"""Frames of a client that are checked together."""
+"""Number of frames of a client that are checked together."""
 _COLOURS: Final = [
     LIGHT_STATE_CODE[name] for name in ("red", "yellow", "green", "red_yellow", "flashing")
 ]
@@ -750,7 +750,7 @@ _IMPOSSIBLE: Final = {
 
 
 class _Move(NamedTuple):
-    """Jump of a body between two frames: node, frame after it, and both places."""
+    """Jump of a body between two frames: node, later frame, and positions before and after."""
 
     node: int
     frame: int

@@ -39,7 +39,7 @@ except ImportError:  # not on Windows, where two runs would collide at the new f
 
 
 _SHOWN: Final = 10
-"""Maximum number of recordings in a message; further ones are only counted."""
+"""Largest number of recordings that a message names. Further ones are counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ class Rebuilt:
 
 @dataclass(frozen=True, slots=True)
 class _ReadingStep:
-    """Traces of a rebuild that are read together, because settings, time range and map are equal."""
+    """Traces of a rebuild that are read together, because they have equal settings, time range and map."""
 
     config: Config
     part: tuple[float | None, float | None]
@@ -162,7 +162,7 @@ def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
 
 @contextmanager
 def _alone(fresh: Path) -> Generator[None]:
-    """Context manager with a lock file, so that only one process rebuilds a store."""
+    """Context manager that holds a lock file, so that only one process rebuilds a store."""
     lock = fresh.with_name(f"{fresh.name}-lock")
     try:
         held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
@@ -243,7 +243,7 @@ def _by_size(folders: Sequence[str | Path]) -> dict[int, list[Path]]:
 
 
 def _resume(fresh: Path, old: Remains) -> None:
-    """Prepare the new store file after an interrupted rebuild: keep valid traces, delete an invalid file."""
+    """Prepare the new store after an interrupted rebuild: keep its valid traces, or delete an invalid file."""
     if not fresh.exists():
         return
     try:
@@ -278,7 +278,7 @@ def _settings(trace: OldTrace) -> Config:
 def _steps(
     traces: Sequence[OldTrace], places: dict[int, Path]
 ) -> Iterator[_ReadingStep | OldTrace]:
-    """Yield the groups of traces to read together, and imported traces, in the order of the old store."""
+    """Yield the traces to read together, and the imported traces, in the order of the old store."""
     steps: list[_ReadingStep | OldTrace] = []
     alike = groupby(traces, key=lambda t: (t.digest, t.settings, t.since, t.until, t.map_id))
     for _, views in alike:
@@ -298,7 +298,7 @@ def _steps(
 
 
 def _as_egos(path: Path, views: Sequence[OldTrace]) -> Config:
-    """Return settings with which a recording gets the same egos as in the old store."""
+    """Return settings with which the ingest of a recording selects the same egos as in the old store."""
     config = _settings(views[0])
     if len(views) > 1:
         return replace(config, egos=tuple(one.ego for one in views))
@@ -314,7 +314,7 @@ def _read(
     jobs: int,
     on_progress: Callable[[Progress], None] | None,
 ) -> None:
-    """Ingest the recordings of some traces into the new store. Traces that it already has stay."""
+    """Ingest the recordings of some traces into the new store. Traces that are already in it are skipped."""
     with _map_file(maps.get(step.map_id) if step.map_id is not None else None) as road_map:
         outcomes = ingest(
             fresh,
@@ -350,7 +350,7 @@ def _map_file(road_map: OldMap | None) -> Generator[Path | None]:
 
 
 def _import(fresh: Path, trace: OldTrace, path: Path, maps: dict[int, OldMap]) -> None:
-    """Import a file of graphs of another tool into the new store, with the same options as before."""
+    """Import a graph file of another tool into the new store, with the same options as for the old store."""
     how: dict[str, Any] = {"relations": trace.answers, "period_s": trace.period_ns / 1e9 or 1.0}
     how |= trace.imported or {}
     form, words = how.pop("form"), how.pop("words", {})

@@ -212,7 +212,7 @@ class Job:
 # Counters during the reading of a trace: frames, entities by kind, steps of the clock.
 
 SHOWN: Final = 20
-"""Maximum number of listed jumps and gaps; further ones are only counted."""
+"""Largest number of jumps and gaps that a report lists. Further ones are counted."""
 
 
 @dataclass(slots=True)
@@ -290,14 +290,14 @@ class TraceTally:
 # One recording → sealed segments, one per ego.
 
 EGOS_AT_ONCE: Final = 8
-"""Egos per pass over a recording; each needs the memory of one segment."""
+"""Number of egos that one pass over a recording processes. Each ego needs the memory of one segment."""
 
 _VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle") or ()])
 
 
 @dataclass(slots=True)
 class _EgoView:
-    """State of the ingest of a recording for one of its egos: its segment and its result.
+    """State of an ingest for one of the recording's egos: its segment and its result.
 
     Attributes
     ----------
@@ -323,7 +323,7 @@ class _EgoView:
 
 
 class SegmentReader:
-    """Reader that converts recordings to segments (files of one trace), one recording after another.
+    """Reader that converts recordings to segments (files of one trace each), one recording after another.
 
     Parameters
     ----------
@@ -373,14 +373,14 @@ class SegmentReader:
         return found
 
     def _store(self) -> StoreFile | None:
-        """Return the store that can have the traces already; ``None`` means that all are read."""
+        """Return the store that may already have the traces. ``None`` means that every recording is read."""
         if self._file is None and self._job.store.exists():
             self._file = StoreFile(self._job.store)
         return None if self._job.force else self._file
 
     @cached_property
     def _request(self) -> str:
-        """All that decides which trace a recording gives, as JSON; empty if more than that decides.
+        """Return all inputs that determine the trace of a recording, as JSON. Empty if other files matter, too.
 
         A list of egos gives several traces. A folder of maps and a file of a mapping can change.
         """
@@ -391,7 +391,7 @@ class SegmentReader:
         return json.dumps([version("sgstore"), config.as_dict(), maps.digest, parts])
 
     def _present(self, path: Path) -> TraceOutcome | None:
-        """Return the result for a recording whose trace the store has, without opening the recording.
+        """Return the result for a recording whose trace is already in the store, without opening the recording.
 
         ``None`` means not known: the file has changed, or the trace was read by another request.
         """
@@ -464,7 +464,7 @@ class SegmentReader:
         return tuple(dict.fromkeys(found))
 
     def _ident(self, trace: MessageTrace, name: str) -> str:
-        """Return the id of an ego in a recording, from its id, role or name."""
+        """Return the id of an ego in a recording, given by its id, role or name."""
         info = trace.info
         try:
             found = trace.ego_named(name)
@@ -488,7 +488,7 @@ class SegmentReader:
         return found
 
     def _is_new(self, store: StoreFile, view: _EgoView, road_map: RoadMap | None) -> bool:
-        """True if the store has no trace of this recording and ego. Otherwise, the result gets its status."""
+        """True if the store has no trace of this recording and ego. Otherwise, set the status of the result."""
         job, outcome = self._job, view.outcome
         try:
             shown = map_of_graphs(road_map, job.config)
@@ -614,12 +614,12 @@ class SegmentReader:
         ]
 
     def _meant(self, block: FrameBlock) -> FrameBlock:
-        """Return a block of frames after applying the configured mapping from type names to kinds."""
+        """Return a block of frames with the configured mapping from type names to kinds applied."""
         return replace(block, entities=renamed(block.entities, self._job.config.types))
 
 
 def _kept(segments: Sequence[Segment], block: FrameBlock) -> FrameBlock:
-    """Return a block as all segments store it: origins do not depend on the ego."""
+    """Return a block with the values that all segments store. They are equal for all egos."""
     kept, *_ = [segment.as_kept(block) for segment in segments]
     return kept
 
@@ -636,7 +636,7 @@ def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
 
 
 def _reached(frames: FrameBlock, size: int) -> int:
-    """Return the approximate number of bytes of the recording that have been read."""
+    """Return the approximate number of bytes that have been read from the recording."""
     messages = frames.messages
     places = np.where(messages.chunk_offset < 0, messages.offset, messages.chunk_offset)
     return min(int(places.max(initial=0)), size)

@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 
 
 MAX_LINE: Final = 32 << 20
-"""Maximum length of a line; bytes. A graph of 100,000 nodes with attributes needs half of it."""
+"""Maximum length of a line; bytes. A graph of 100,000 nodes with attributes needs half of this."""
 
 MAX_TEXT: Final = 1 << 36
 """Maximum size of a decompressed file; bytes: 64 GiB."""
 
 MAX_RATIO: Final = 2_000
-"""Maximum compression ratio after the first GiB. Text never reaches it."""
+"""Maximum compression ratio after the first GiB. Real text never reaches it."""
 
 _FREE: Final = 1 << 30
 _PACKED: Final = {".xz": lzma.open, ".gz": gzip.open, ".bz2": bz2.open}
@@ -106,7 +106,7 @@ def _lines(path: Path, file: Any, size: int) -> Iterator[str]:
 # The rows of a graph are consecutive. A row without relation and second node adds a single node.
 
 S3C: Final = ("ds", "sg", "n_img", "t_id", "node1", "edge", "node2")
-"""The header of S3C's files. (Woodlief et al., "S3C", ICSE 2024.)"""
+"""Header line of S3C's files. (Woodlief et al., "S3C", ICSE 2024.)"""
 
 _NAMES: Final = {
     "graph": ("graph", "frame", "frame_id", "sg", "image"),
@@ -121,13 +121,13 @@ _NAMES: Final = {
     "time_ns": ("time_ns",),
     "images": ("images", "n_img"),
 }
-"""Column → its accepted names."""
+"""Name of a column → names that are accepted in its place."""
 
 _IGNORED: Final = frozenset({"ds", "t_id"})
-"""Ignored columns of S3C: the data set, and the row number."""
+"""Columns of S3C that are ignored: the data set and the row number."""
 
 MAX_ROW: Final = 1 << 20
-"""Maximum length of a row, over all its lines; characters."""
+"""Maximum length of a table row, which can have several lines; characters."""
 
 
 def read_s3c(path: Path) -> Iterator[GivenGraph]:
@@ -182,7 +182,7 @@ class _EdgeTable:
             raise wrong(self._path, f"row {reader.line_num}", f"no CSV: {error}") from error
 
     def _bounded(self) -> Iterator[str]:
-        """Yield the lines of the file for the CSV parser, or raise an error for a row that is too long."""
+        """Yield the lines of the file for the CSV parser. A row that is too long raises an error."""
         for line in self._lines:
             self._line += 1
             self._taken += len(line)
@@ -315,7 +315,7 @@ class _EdgeTable:
 # Node-link JSON of networkx: one graph per line, a list of graphs, or one graph.
 
 MAX_DOCUMENT: Final = 32 << 20
-"""Maximum length of a text that is not one graph per line; characters."""
+"""Maximum length of a document that does not have one graph per line; characters."""
 
 MAX_VALUES: Final = 3_000_000
 """Maximum number of values in a JSON document, counted before parsing. A value needs up to 100 bytes."""
@@ -325,10 +325,10 @@ _TOO_MANY: Final = f"more than {MAX_VALUES:,} values in one JSON document; write
 _WHOLE: Final = re.compile(r"-?[0-9]{1,18}")
 
 _LABELS: Final = ("kind", "base_class", "label")
-"""Attributes with the label of a node, the first one counts. (sgstore, CARLASGG, networkx.)"""
+"""Attributes for the label of a node in sgstore, CARLASGG and networkx. The first one present is used."""
 
 _RELATIONS: Final = ("relation", "label", "type")
-"""Attributes with the relation of an edge, the first one counts. Otherwise its key, if it is a text."""
+"""Attributes for the relation of an edge. The first one present is used; else the key, if it is a text."""
 
 
 def read_nodelink(path: Path) -> Iterator[GivenGraph]:
@@ -407,12 +407,12 @@ def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, A
 
 
 def _values(text: str) -> int:
-    """Return an upper bound for the number of values in a JSON text, before it is parsed."""
+    """Return an upper bound for the number of values in a JSON text, without parsing it."""
     return sum(map(text.count, "[{,"))
 
 
 def _parsed(text: str) -> Any:
-    """Return the content of a JSON text, or raise an error for an invalid or too large text.
+    """Return the content of a JSON text. An invalid or too large text raises an error.
 
     Raises
     ------

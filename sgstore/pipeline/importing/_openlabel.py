@@ -46,9 +46,9 @@ SECTIONS: Final = {
     "context": "contexts",
     "tag": "tags",
 }
-"""Elements that become nodes, and their keys in the file. Each type except objects is a separate kind."""
+"""Sections whose elements become nodes → key in the file. Types other than objects become new kinds."""
 UID: Final = "uid"
-"""Attribute of a node: the key of its element in the file."""
+"""Name of the node attribute with the key of the element in the file."""
 
 MAX_DOCUMENT: Final = 256 << 20
 MAX_VALUES: Final = 20_000_000
@@ -58,9 +58,9 @@ MAX_FRAMES: Final = 10_000_000
 _VECTORS: Final = {"velocity": ("vx", "vy", "vz"), "acceleration": ("ax", "ay", "az")}
 _IN_AXES: Final = ("cuboid", "point3d")
 _FARTHEST: Final = 20
-"""Maximum length of a chain of coordinate systems."""
+"""Maximum length of a chain of coordinate systems, each defined relative to the next."""
 _UNITS: Final = ((4e9, 1e9), (4e12, 1e6), (4e15, 1e3), (4e18, 1.0))
-"""Upper limits of times in s, ms, µs and ns, each with its unit; ns."""
+"""Upper limit of a plausible time in a unit → length of the unit; ns. For s, ms, µs and ns."""
 
 
 def read_openlabel(path: Path) -> Iterator[GivenGraph]:
@@ -382,7 +382,7 @@ def _tail(told: Any) -> str:
 
 
 class _Axes:
-    """Coordinate systems of an OpenLABEL file, each with its parent and its pose."""
+    """Coordinate systems of an OpenLABEL file, each with its parent system and its pose."""
 
     def __init__(self, systems: Mapping[str, Any]) -> None:
         self._systems = {name: of if isinstance(of, dict) else {} for name, of in systems.items()}

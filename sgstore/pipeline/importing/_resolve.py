@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 MAX_NODES: Final = 200_000
 MAX_EDGES: Final = 1_000_000
 MAX_NAMES: Final = 32 << 20
-"""Maximum number of nodes, edges and name characters of a graph, for at most a few hundred MB."""
+"""Maximum number of nodes, edges and characters of names in a graph, to limit the memory."""
 
 LONGEST: Final = 1_000
 """Maximum length of a name; characters."""
@@ -161,7 +161,7 @@ def wrong(path: Path, where: str, reason: str) -> TraceError:
 # Labels and relations of other tools, mapped to the vocabulary.
 
 EGOS: Final = frozenset({"ego", "egocar", "egovehicle", "hero"})
-"""Normalised labels of the ego; by default a car. (S3C, RoadScene2Vec, CARLA.)"""
+"""Labels of the ego in S3C, RoadScene2Vec and CARLA, normalised. By default, the ego is a car."""
 
 _PARTS: Final = (
     ("off_road", re.compile(r"off[ _]?road", re.IGNORECASE)),
@@ -178,7 +178,7 @@ _PARTS: Final = (
     ("junction", re.compile(r"(junction|intersection)( .+)?", re.IGNORECASE)),
     ("crosswalk", re.compile(r"crosswalk( .+)?", re.IGNORECASE)),
 )
-"""Map parts as named by S3C, CARLASGG and RoadScene2Vec."""
+"""Kind of a map part, and regular expression of its names in S3C, CARLASGG and RoadScene2Vec."""
 
 _SHORT: Final = {
     "moto": "motorcycle",
@@ -191,16 +191,16 @@ _SHORT: Final = {
     "stopsign": "stop_sign",
     "tree": "vegetation",
 }
-"""Other names of kinds, from RoadScene2Vec and Scenic."""
+"""Names of kinds in RoadScene2Vec and Scenic → kind of sgstore."""
 
 _NUMBERED: Final = re.compile(r"(.+?)[_ ](\d+)")
-"""A label with a number: ``car_3``, ``car 3``."""
+"""Regular expression of a label with a number, such as ``car_3`` or ``car 3``."""
 
 OTHER: Final = "other"
-"""Value of ``unknown_as`` for the kind ``unknown``."""
+"""Value of the option ``unknown_as`` that turns unknown labels into the kind ``unknown``."""
 
 OWN: Final = "own"
-"""Value of ``unknown_as`` that turns unknown labels and relations into new kinds and relations."""
+"""Value of the option ``unknown_as`` that turns unknown labels and relations into new kinds and relations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -398,11 +398,11 @@ def _no_kind(what: str, kind: str) -> str:
 # Attributes of nodes and edges in files, converted into columns with internal units.
 
 _RADIANS: Final = frozenset({"heading", "pitch", "roll", "yaw_rate", "heading_error"})
-"""Attributes in degrees in files and in radians in columns."""
+"""Attributes that are in degrees in files, but in radians in columns."""
 
 STATE_NUMBERS: Final = (*POSE, *INPUTS[:3])
 _SHIFTED: Final = {"gear": range(-HIGHEST_GEAR, HIGHEST_GEAR + 1), "hand_brake": (False, True)}
-"""Allowed values of these columns; other values (``"D"``) are custom attributes."""
+"""Columns → valid values. Other values, such as ``"D"``, become user-defined attributes."""
 PART_NUMBERS: Final = ("x", "y", "z", "heading", "length", "width", "speed_limit", "curvature")
 PART_TEXTS: Final = ("lane_type", "road", "junction", "turn")
 PART_WHOLE: Final = ("section", "lane")
@@ -418,24 +418,24 @@ LANE_NUMBERS: Final = {
 _SAID: Final = frozenset(
     {"kind", "base_class", "label", "name", "ident", "is_ego", "is_static", "id"}
 )
-"""Attributes that are read elsewhere, or are redundant."""
+"""Names of attributes that are read elsewhere, or that repeat other data."""
 
 _FIXED: Final = frozenset({"speed", "vx", "vy", "vz"})
-"""Attributes of static signs and lights in exported graphs; always zero."""
+"""Attributes of static signs and lights in exported graphs that are always zero."""
 
 _FOLLOWING: Final = frozenset({"accel", "node_id"})
-"""Attributes that can be computed from others."""
+"""Names of attributes that follow from other attributes."""
 
 _BITS: Final = {
     "lights": VEHICLE_LIGHTS,
     "derived": ("derived_velocity", "derived_acceleration", "derived_yaw_rate"),
 }
-"""Bit columns, and the attribute of each bit."""
+"""Columns of bits → the attribute of each bit."""
 _TEXTS: Final = frozenset({"special", "subkind", "type_name", "type", "map_ref"})
 
 
 Own = dict[str, Any]
-"""Custom attributes by name, without a column."""
+"""User-defined attributes (without a column) by name."""
 
 
 def state_of(
@@ -597,22 +597,22 @@ def _light_state(path: Path, where: str, value: Any, *, any_state: bool) -> int:
 # Resolved graphs of a file: entities, map parts, relations, and their common results.
 
 OFF_ROAD: Final = ("off_road", "off_road")
-"""The map part for entities outside all lanes."""
+"""Map part that contains the entities outside all lanes: kind and name."""
 
 MAX_PARTS: Final = 500_000
 MAX_ENTITIES: Final = 500_000
-"""Maximum number of map parts, and of entities, in a file."""
+"""Maximum number of map parts in a file, and of entities."""
 
 _REMEMBERED: Final = 1 << 16
-"""Maximum number of cached resolved names."""
+"""Maximum number of names whose meaning is cached."""
 
 Part = tuple[str, str]
-"""Map part: kind and name."""
+"""Reference to a map part: its kind and name."""
 
 
 @dataclass(slots=True)
 class Meant:
-    """Imported graph whose labels and relations are converted to kinds and relations of sgstore.
+    """Imported graph in which labels and relations are replaced by kinds and relations of sgstore.
 
     Attributes
     ----------
@@ -635,7 +635,7 @@ class Meant:
 
 
 class Understanding:
-    """Converter of the graphs of a file to the kinds and relations of sgstore."""
+    """Converter from the labels and relations of a file to the kinds and relations of sgstore."""
 
     def __init__(self, path: Path, words: Words) -> None:
         self._path = path
@@ -644,7 +644,7 @@ class Understanding:
         self._relations = lru_cache(_REMEMBERED)(words.relation)
 
     def of(self, graph: GivenGraph) -> Meant:
-        """Return a graph with kinds and relations of sgstore.
+        """Return an imported graph with the kinds and relations of sgstore.
 
         Unknown labels are dropped and counted, or raise an error.
 
@@ -704,7 +704,7 @@ class Understanding:
 
 @dataclass(slots=True)
 class FileMeaning:
-    """Result of the first reading of an imported file: its number of graphs, map parts, relations and ego.
+    """Result of the first pass over an imported file: number of graphs, map parts, relations and ego.
 
     Attributes
     ----------
@@ -727,7 +727,7 @@ class FileMeaning:
 
 
 def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeaning:
-    """Read all graphs of a file once, and return the data that the graphs share. Raise its first error.
+    """Read all graphs of a file once, and return the facts that they share. Raise the first error.
 
     Raises
     ------

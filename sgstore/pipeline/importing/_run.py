@@ -73,14 +73,14 @@ FORMATS: Final = {
     "csv": read_csv,
     "openlabel": read_openlabel,
 }
-"""Format → reader of its graphs."""
+"""Name of a format → function that reads its graphs."""
 
 _ANSWERED: Final = {"s3c": ("isIn", *PROXIMITY[1:], *DIRECTIONS, "toLeftOf", "toRightOf")}
-"""Relations that all graphs of a format can contain, even if they do not occur."""
+"""Format → relations that its graphs can contain, even if no graph of a file has them."""
 
 _BLOCK: Final = 2 * BUCKET_FRAMES
 _BLOCK_SIZE: Final = 200_000
-"""Maximum number of graphs, and of nodes and edges, in a block. A larger graph is a block of its own."""
+"""Largest number of graphs, and of nodes and edges, in a block. A larger graph gets its own block."""
 
 
 @dataclass(slots=True)
@@ -278,7 +278,7 @@ class _ImportRun:
         return graph
 
     def _variant(self, found: FileMeaning) -> str:
-        """Return a JSON text that identifies the map of an imported file: its parts and the import options."""
+        """Return a JSON text that identifies the map of an imported file: its parts and import options."""
         about = {
             "of": self._form,
             "words": self._words.as_dict(),
@@ -311,13 +311,13 @@ _FOLLOWS: Final = RELATION_CODE["follows"]
 _LEADS: Final = RELATION_CODE["leads"]
 _LANE_COLUMNS: Final = ("overlap", "offset", "heading_error", "along")
 _OF_EDGES: Final = frozenset({"lane_dist"})
-"""Edge attributes of exported graphs that can be computed from others."""
+"""Attributes of exported edges that follow from other attributes."""
 _LONGEST_VALUE: Final = 10_000
-"""Maximum length of a custom attribute value, as JSON; characters."""
+"""Largest length of a user-defined attribute value as JSON; characters."""
 
 
 def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) -> RoadMap:
-    """Return a road map with the names of imported lanes and roads, without geometry and without edges.
+    """Return a road map that contains only the names of the imported lanes and roads, without geometry.
 
     Parameters
     ----------
@@ -532,7 +532,7 @@ def _entities(first: int, new: Sequence[tuple[GivenNode, LabelMeaning]]) -> Enti
 
 
 def _lane_states(inside: Mapping[tuple[int, int, int], dict[str, float]]) -> LaneStates:
-    """Return the lanes of imported entities. A lane is primary if it is marked so, or is the only one."""
+    """Return the lanes of imported entities. A lane is primary if it is marked so, or if it is the only one."""
     frame, node, lane = _whole(list(inside), 3)
     rows = list(inside.values())
     known = {
