@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 
 BUCKET_BITS: Final = 18
-"""Bits of the bucket number in a trace."""
+"""Number of bits of a bucket number within a trace."""
 
 FRAME_BITS: Final = 6
-"""Bits of the frame number in a bucket."""
+"""Number of bits of a frame number within a bucket."""
 
 MAX_FRAMES: Final = BUCKET_FRAMES << BUCKET_BITS
 """Largest number of frames of a trace."""
 
 SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
-"""Bits of a frame id below the trace id."""
+"""Number of bits of a frame id below its trace id."""
 
 
 def trace_bucket(trace_id: int | Ints, seq: Ints) -> Ints:
@@ -40,7 +40,7 @@ def frame_ids(trace_id: int | Ints, seq: Ints) -> Ints:
 
 
 def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
-    """Return the frame ids in bit masks of 64 frames, and the mask's row for each frame id."""
+    """Return the frame ids that bit masks of 64 frames contain, and the row of the mask for each."""
     ids: list[Ints] = []
     rows: list[Ints] = []
     for bit in range(BUCKET_FRAMES):

@@ -35,7 +35,7 @@ K = TypeVar("K")
 V = TypeVar("V")
 
 IS_IN, LEADS, FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
-"""Codes of the relations whose edges can have attributes."""
+"""Codes of the relations whose edges can have attributes (``isIn``, ``leads``, ``follows``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Edges:
 
     @classmethod
     def chained(cls, parts: Sequence[Edges]) -> Edges:
-        """Concatenate tables of edges. Without tables, the result is an empty table."""
+        """Concatenate tables of edges. Without any table, return an empty table."""
         none = np.empty(0, np.int8)
         parts = [cls(none, none, none, none), *parts]
         frame, src, dst = (
@@ -205,7 +205,7 @@ class WorldBlock:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Counts of recorded object states that the settings exclude from the graphs. Static objects do not count.
+    """Counts of recorded object states that the settings exclude from the graphs, without static objects.
 
     Attributes
     ----------
@@ -362,7 +362,7 @@ class LaneDistances:
     """
 
     FARTHEST: Final = 200.0
-    """Longest distance along lanes; m. The view ``pairs`` contains the same number."""
+    """Longest distance along lanes that is computed; m. The view ``pairs`` has the same limit."""
 
     def __init__(
         self,
@@ -425,7 +425,7 @@ class LaneDistances:
         return stretches[bisect_right(stretches, max(along, 0.0), key=itemgetter(0)) - 1][1:]
 
     def stretches(self, node: int) -> Stretches:
-        """Return the lanes that a map part covers, with its start and end along each lane; m."""
+        """Return the lanes that a map part lies on, with its start and end along each lane; m."""
         return self._of_parts.get(node, ())
 
     def stretches_of(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
@@ -456,7 +456,7 @@ class LaneDistances:
         return nearest if abs(nearest) <= self.FARTHEST else None
 
     def next(self, one: Stretches, what: str) -> float | None:
-        """Return the driving distance to the next map part of a kind (such as crosswalk); m; 0 on the part."""
+        """Return the distance along lanes to the next map part of a kind, such as crosswalk; m. 0 on it."""
         found = math.inf
         for lane, first, last in one:
             for to, way in self._onward.get(lane, ()):
@@ -467,7 +467,7 @@ class LaneDistances:
 
 
 class EdgeColumns(Sequence["EdgeRecord"]):
-    """Edges of one scene graph, stored as columns. An edge object is created on access.
+    """Edges of one scene graph, stored as columns. The object of an edge is created when it is accessed.
 
     A record takes about 250 bytes, a row ten. The object equals any sequence of the same records.
 
@@ -482,7 +482,7 @@ class EdgeColumns(Sequence["EdgeRecord"]):
     """
 
     AT_ONCE: Final = 4096
-    """Rows converted to records at once during iteration."""
+    """Number of rows that are converted to objects at once during iteration."""
 
     def __init__(
         self, src: Whole, relation: Codes, dst: Whole, about: Mapping[int, dict[str, Any]]
@@ -653,7 +653,7 @@ class SceneGraph:
         return dict(found)
 
     def _stops(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
-        """Return the stop positions along a lane before traffic signals of a kind."""
+        """Return the positions along a lane where vehicles stop for traffic signals of a kind."""
         known = self.reach.stretches_of(what, lane) if self.reach is not None else ()
         about = self.nodes.get(lane, {})
         if not known and ("junction" in about or "length" in about):
@@ -685,7 +685,7 @@ class SceneGraph:
         return self.reach.between(*ends)
 
     def to_next(self, node: int, what: str) -> float | None:
-        """Return the distance along lanes to the next map part of a kind (such as crosswalk); m; 0 on the part.
+        """Return the distance along lanes to the next map part of a kind, such as crosswalk; m. 0 on the part.
 
         ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
         means none within 200 m.

@@ -1,4 +1,4 @@
-"""Motion from noisy positions: noise of a recording, smooth velocities, and vehicles that stand.
+"""Motion computed from noisy positions: noise of a recording, smooth velocities, and standing vehicles.
 
 Positions of measured recordings tremble, those of simulators do not. :func:`noise_of` estimates the noise
 from the first frames. :class:`Smoother` fits polynomials to the noisy positions around each frame.
@@ -29,37 +29,37 @@ ESTIMATED: Final = 120
 """Number of first frames from which the noise of a recording is estimated."""
 
 HALF: Final = 0.5
-"""Half the window in which a body that stands must not move; s."""
+"""Half the length of the time window in which the position of a standing body must not change; s."""
 
 WIDE: Final = 1.0
-"""Half the window of accelerations, and the greatest of velocities; s."""
+"""Half the length of the time window for accelerations. Windows for velocities are not longer; s."""
 
 MOST_ROWS: Final = 30
-"""Greatest number of frames on each side of a window."""
+"""Largest number of frames on each side of a time window."""
 
 CALM: Final = 0.05
-"""Standard deviation of velocities that the window aims at; m/s."""
+"""Standard deviation that velocities should not exceed. It determines the length of the time window; m/s."""
 
 STILL: Final = 0.01
-"""Positions whose noise is below this value are exact; m."""
+"""Noise below which positions count as exact; m."""
 
 BODIES: Final = 5
-"""Number of bodies whose kinks show that positions are interpolated."""
+"""Smallest number of bodies that must show kinks, for positions to count as interpolated."""
 
 KINKED: Final = 0.9
-"""Share of the bend that positions between two kinks lack."""
+"""Smallest share of curvature at kinks, relative to a smooth curve, for positions to count as interpolated."""
 
 USUAL: Final = 1.5
-"""Usual acceleration of a body: that of a short noisy window counts less; m/s²."""
+"""Usual acceleration of a body. An acceleration from a short, noisy window is reduced towards 0; m/s²."""
 
 JUMP: Final = 0.5
-"""A step that differs by more from its neighbours divides a track, beside noise and acceleration; m."""
+"""Difference of a step from its neighbours, beyond noise and acceleration, that divides a track; m."""
 
 UNREAL: Final = 12.0
-"""Accelerations above this value, along or across, are physically impossible; m/s²."""
+"""Acceleration, along or across, above which a value is physically impossible; m/s²."""
 
 SPINNING: Final = np.radians(120.0)
-"""Yaw rates above this value are physically impossible for a vehicle; rad/s."""
+"""Yaw rate above which a value is physically impossible for a vehicle; rad/s."""
 
 _X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = (
     POSE.index(name) for name in ("x", "heading", "vx", "ax", "yaw_rate")
@@ -67,7 +67,7 @@ _X, _HEADING, _VELOCITY, _ACCELERATION, _YAW_RATE = (
 
 
 FROM_POSITIONS: Final = ("position_speed", "position_accel", "position_yaw_rate")
-"""Attributes with motion from positions, of bodies with recorded motion; m/s, m/s², degrees/s."""
+"""Attributes with motion from positions, if the motion is also recorded; m/s, m/s², degrees/s."""
 
 
 class Noise(NamedTuple):
@@ -89,16 +89,16 @@ class Noise(NamedTuple):
 
     @property
     def enter(self) -> float:
-        """Speed below which a body begins to stand; m/s."""
+        """Speed below which a moving body starts to count as standing; m/s."""
         return float(np.clip(0.1 + 3 * self.wander, 0.1, 0.35))
 
     @property
     def leave(self) -> float:
-        """Speed from which a standing body moves again; m/s."""
+        """Speed above which a standing body counts as moving again; m/s."""
         return 1.3 * self.enter
 
     def half(self, period: float) -> float:
-        """Return half the window of velocities: the shortest in which they are calm; s."""
+        """Return half the length of the shortest window in which the noise of velocities is small enough; s."""
         most = max(1, min(MOST_ROWS, int(WIDE / period)))
         squares = 2 * np.cumsum(np.arange(1, most + 1) ** 2.0)
         calm = self.jitter / (period * np.sqrt(squares)) <= CALM
@@ -107,7 +107,7 @@ class Noise(NamedTuple):
 
 @dataclass(slots=True)
 class Tracks:
-    """Rows of frames in the order of node and time, divided where a body cannot have moved.
+    """States sorted by node and time. A track is divided where the body cannot have moved so far.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Tracks:
         jitter: float,
         period: float,
     ) -> Tracks:
-        """Return the tracks of frames; arguments as of :meth:`Smoother.fill`."""
+        """Return the tracks of the states in some frames. See :meth:`Smoother.fill` for the arguments."""
         order = np.lexsort([frame, node])
         # Whole nanoseconds: differences are then the same in every block.
         clock = np.cumsum(np.rint(np.where(seconds > 0, seconds, 0.0) * 1e9).astype(np.int64))
@@ -177,17 +177,17 @@ class Tracks:
         )
 
     def shifted(self, by: int) -> tuple[Ints, Bools]:
-        """Return the rows some places later in the same part, and a mask of those that exist."""
+        """Return the rows that are ``by`` places later in the same track part, and a mask of existing ones."""
         rows = np.arange(len(self.order)) + by
         there = np.clip(rows, 0, len(rows) - 1)
         return there, (rows == there) & (self.part[there] == self.part) & self.used[there]
 
     def most(self, half: float) -> int:
-        """Return the greatest number of frames on each side of a window."""
+        """Return the largest number of frames on each side of a window."""
         return min(MOST_ROWS, round(half / self.period))
 
     def fits(self, values: Floats, half: float, degree: int, turn: float = 0.0) -> Fit:
-        """Return the polynomial through the values around each row, by least squares.
+        """Fit a polynomial by least squares to the values around each row.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Tracks:
 
 @dataclass(slots=True)
 class Fit:
-    """Polynomials around rows: slope and bend at the middle of their windows.
+    """Polynomials fitted around rows: first and second derivative at the middle of their windows.
 
     Attributes
     ----------
@@ -250,7 +250,7 @@ class Fit:
 
     @classmethod
     def of(cls, sums: Floats, moments: Floats, span: Floats) -> Fit:
-        """Return the solution of the normal equations."""
+        """Compute the polynomials from sums of powers of time and from moments of the values."""
         with np.errstate(all="ignore"):
             middle = sums[1] / sums[0]
             degree = len(moments) - 1
@@ -277,7 +277,7 @@ class Fit:
         return cls(slope, bend, middle, span, loose)
 
     def instead(self, other: Fit, rows: Bools) -> Fit:
-        """Return the fit with some rows of another one."""
+        """Return the fits, with some rows replaced by those of another fit."""
         return Fit(
             np.where(rows[:, None], other.slope, self.slope),
             np.where(rows[:, None], other.bend, self.bend),
@@ -288,7 +288,7 @@ class Fit:
 
 
 def _jumps(time: Ints, place: Floats, part: Ints, jitter: float) -> Bools:
-    """Return a mask of the rows to which the body cannot have moved from the row before."""
+    """Return a mask of the rows whose distance from the row before is too large for a movement."""
     step = np.diff(time) / 1e9
     moved = np.diff(place, axis=0)
     whole = np.diff(part) == 0
@@ -307,7 +307,7 @@ def _jumps(time: Ints, place: Floats, part: Ints, jitter: float) -> Bools:
 
 
 def _median(values: Floats) -> Floats:
-    """Return the median over the first axis without NaN; NaN if all are."""
+    """Return the median over the first axis, ignoring NaN. It is NaN if all values are NaN."""
     ranked = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0)
     low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)
@@ -319,7 +319,7 @@ def _nth(values: Floats, which: Ints) -> Floats:
 
 
 def _close(time: Ints, place: Floats, rows: Ints, jitter: float) -> Bools:
-    """Return a mask of the rows whose neighbours on both sides fit together without them."""
+    """Return a mask of rows that are outliers: without them, their neighbours on both sides fit together."""
     inside = (rows >= 2) & (rows + 2 < len(time))
     rows = np.clip(rows, 2, max(2, len(time) - 3))
     with np.errstate(all="ignore"):  # Rows of other bodies and times do not count.
@@ -334,7 +334,7 @@ def _close(time: Ints, place: Floats, rows: Ints, jitter: float) -> Bools:
 
 @dataclass(slots=True)
 class GapFiller:
-    """Missing motion of noisy bodies, from motion that a subclass estimates from positions.
+    """Base class that fills in missing motion of noisy bodies. Subclasses estimate the motion from positions.
 
     Parameters
     ----------
@@ -356,7 +356,7 @@ class GapFiller:
     apart: Ints = field(default_factory=lambda: np.zeros(5001, np.int64))
 
     def second(self, values: Floats, found: Floats) -> list[Mapping[str, float] | None]:
-        """Return speed and acceleration from positions as attributes of rows with recorded velocities."""
+        """Return motion computed from positions as attributes, for rows whose velocity is also recorded."""
         added: list[Mapping[str, float] | None] = [None] * len(values)
         rows = np.flatnonzero(np.isfinite(values[:, _VELOCITY]))
         if not len(rows):
@@ -381,7 +381,7 @@ class GapFiller:
     def filled(
         self, values: Floats, found: Floats, fixed: Bools, stands: Bools
     ) -> tuple[Floats, Ints]:
-        """Return values with derived motion in place of missing motion, and their bits."""
+        """Return the values with missing motion filled in, and their bits ``derived``."""
         wanted, derived = values.copy(), np.zeros(len(values), np.int64)
         for bit, (column, first, width) in enumerate(
             ((_VELOCITY, 0, 3), (_ACCELERATION, 3, 3), (_YAW_RATE, 6, 1))
@@ -408,7 +408,7 @@ class GapFiller:
         return wanted, derived
 
     def warnings(self) -> list[str]:
-        """Return the noise and the numbers of impossible values as warnings of a report."""
+        """Return warnings about the noise and about impossible values, for a report."""
         noise, (hard, spun) = self.noise, self.unreal.tolist()
         found = [f"positions have a noise of {max(noise):.2g} m: missing motion is smoothed"]
         if count := int(self.apart.sum()):
@@ -424,7 +424,7 @@ class GapFiller:
 
 @dataclass(slots=True)
 class Smoother(GapFiller):
-    """Velocities, accelerations and yaw rates from noisy positions, block after block.
+    """Velocities, accelerations and yaw rates computed from noisy positions, one block after another.
 
     The windows are centred: a block needs frames after it. See :class:`OnlineSmoother` for the causal form.
     """
@@ -433,13 +433,13 @@ class Smoother(GapFiller):
 
     @property
     def reach(self) -> int:
-        """Number of frames on each side that the values of a frame depend on."""
+        """Number of frames before and after a frame that its values depend on."""
         return min(MOST_ROWS, int(np.ceil(WIDE / self.period))) + 3
 
     def fill(
         self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
     ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
-        """Return the values of rows without gaps of motion, their bits ``derived``, and further attributes.
+        """Return the values of rows with missing motion filled in, their bits ``derived``, and attributes.
 
         Parameters and result are those of :func:`sgstore.readers._blocks.derive`. The attributes are motion
         from positions, of rows whose motion is recorded.
@@ -467,7 +467,7 @@ class Smoother(GapFiller):
         return filled, derived, self.second(values[rows], found)
 
     def _standing(self, node: Ints, frame: Ints, speed: Floats) -> Bools:
-        """Return a mask of the rows with a standing body: slow enough, or not faster since then."""
+        """Return a mask of the rows with a standing body: slow enough, or not faster since it stood still."""
         enter, leave = self.noise.enter, self.noise.leave
         sure = np.where(speed <= enter, 1, np.where(speed > leave, -1, 0))
         order = np.lexsort([frame, node])
@@ -486,7 +486,7 @@ class Smoother(GapFiller):
 
 
 def noise_of(node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools) -> Noise:
-    """Estimate the noise of positions from frames; parameters as of :meth:`Smoother.fill`.
+    """Estimate the noise of positions. See :meth:`Smoother.fill` for the parameters.
 
     A noisy body that stands stays within a metre for two seconds, and turns back on its way. Bodies of a
     simulator stay exactly, or move on. Third differences show the noise from frame to frame.
@@ -514,7 +514,7 @@ def noise_of(node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bo
 
 
 def _jitter(tracks: Tracks) -> tuple[float, bool]:
-    """Return the noise from frame to frame, in m. True: positions are interpolated, with kinks between."""
+    """Return the noise from frame to frame (m), and True if positions are interpolated between kinks."""
     place, n = tracks.place[:, :2], len(tracks.place)
     if n < 20:
         return 0.0, False

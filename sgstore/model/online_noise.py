@@ -1,4 +1,4 @@
-"""Motion from noisy positions without later frames: the form of :mod:`sgstore.model.noise` for the online mode.
+"""Motion computed from noisy positions without later frames: online version of :mod:`sgstore.model.noise`.
 
 Notes
 -----
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, FrameBlock, Ints
 
 ACCELERATION: Final = 2.0
-"""Usual acceleration of a body; m/s², and rad/s² for its heading."""
+"""Usual acceleration of a body; m/s². For its heading; rad/s²."""
 
 FADES: Final = 2.0
-"""Time in which an acceleration fades; s."""
+"""Time constant with which an acceleration decreases; s."""
 
 SPEED: Final = 15.0
-"""Usual speed of a new body; m/s."""
+"""Usual speed of a body that is seen for the first time; m/s."""
 
 CALMEST: Final = 0.3
-"""Least time in which the weights of the line fade; s. The greatest is :data:`~sgstore.model.noise.WIDE`."""
+"""Smallest time constant for the weights of earlier positions; s. The largest is that of ``WIDE``."""
 
 TRIED: Final = (30, 60, ESTIMATED)
-"""Numbers of frames after which the noise is estimated."""
+"""Numbers of frames after which an estimate of the noise is tried."""
 
 _FOLLOWED: Final = [POSE.index(name) for name in ("x", "y", "z", "heading")]
 _VELOCITY: Final = POSE.index("vx")
@@ -53,7 +53,7 @@ _VELOCITY: Final = POSE.index("vx")
 
 @dataclass(slots=True)
 class _Followed:
-    """Bodies of the last frames, in the order of their nodes.
+    """State of the filter for each body of the last frames, sorted by node.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class _Followed:
 
     @classmethod
     def new(cls, node: Ints, place: Floats, now: float, variance: float) -> _Followed:
-        """Return bodies that are seen for the first time."""
+        """Return the initial filter state of bodies that are seen for the first time."""
         n = len(node)
         mean, sums = np.zeros((n, 3, 4)), np.zeros((n, 3))
         mean[:, 0], sums[:, 0] = np.nan_to_num(place), 1.0
@@ -97,14 +97,14 @@ class _Followed:
         return cls(*seen, no, no.copy())
 
     def put(self, rows: Ints | Bools, other: _Followed) -> None:
-        """Replace rows by those of another table, except their nodes."""
+        """Replace some rows by the rows of another table. The node ids stay."""
         for column in fields(self)[1:]:
             getattr(self, column.name)[rows] = getattr(other, column.name)
 
 
 @dataclass(slots=True)
 class OnlineSmoother(GapFiller):
-    """Velocities, accelerations and yaw rates from noisy positions so far, frame after frame."""
+    """Velocities, accelerations and yaw rates computed from earlier noisy positions, frame by frame."""
 
     _clock: float = 0.0
     _bodies: _Followed = field(
@@ -114,7 +114,7 @@ class OnlineSmoother(GapFiller):
     def fill(
         self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
     ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
-        """Return the values of the next frames without gaps of motion, their bits, and further attributes.
+        """Return the values of the next frames with missing motion filled in, their bits, and attributes.
 
         Parameters and result are those of :meth:`sgstore.model.noise.Smoother.fill`.
         """
@@ -132,7 +132,7 @@ class OnlineSmoother(GapFiller):
         return filled, derived, self.second(values, found)
 
     def smoothed(self, block: FrameBlock, node: Ints, seconds: float) -> FrameBlock:
-        """Return a block of one frame with motion; ``node``: final node ids, ``seconds``: since the last frame.
+        """Return a block of one frame with motion filled in. ``seconds``: time since the last frame.
 
         Rows that a reader has smoothed stay the same.
         """
@@ -150,7 +150,7 @@ class OnlineSmoother(GapFiller):
         return replace(block, states=moved)
 
     def _step(self, node: Ints, seconds: float, place: Floats) -> tuple[Floats, Bools]:
-        """Return motion (velocity, acceleration, yaw rate) of the bodies of the next frame, and which stand."""
+        """Return velocity, acceleration and yaw rate of the next frame's bodies, and a mask: which stand."""
         before, step = self._bodies, seconds if seconds > 0 else self.period
         variance, calm = self._white(step)
         longest = max(HALF, 3.01 * step) if seconds > 0 else -1.0
@@ -168,7 +168,7 @@ class OnlineSmoother(GapFiller):
         return motion
 
     def _white(self, step: float) -> tuple[float, float]:
-        """Return the variance of white noise that equals the noise, and the time in which weights fade; s."""
+        """Return the variance of equivalent white noise, and the time constant of the weights; s."""
         jitter, wander = self.noise
         slow = max(0.0, wander**2 - jitter**2) * max(1.0, HALF / step)
         variance = jitter**2 + slow
@@ -178,7 +178,7 @@ class OnlineSmoother(GapFiller):
     def _followed(
         self, bodies: _Followed, place: Floats, variance: float, calm: float
     ) -> _Followed:
-        """Return known bodies at the next frame."""
+        """Return the filter state of known bodies after the next frame."""
         step = self._clock - bodies.seen
         mean, spread = _predicted(bodies, step)
         rest = place - mean[:, 0]
@@ -221,7 +221,7 @@ class OnlineSmoother(GapFiller):
 
 
 def _predicted(bodies: _Followed, step: Floats) -> tuple[Floats, Floats]:
-    """Return mean and covariance some time later, by Singer's model; ``step``: s."""
+    """Return the predicted mean and covariance after a time ``step`` (s), by Singer's motion model."""
     fade = np.exp(-step / FADES)
     speed = FADES * (1 - fade)
     ahead = np.tile(np.eye(3), (len(step), 1, 1))
@@ -238,7 +238,7 @@ def _predicted(bodies: _Followed, step: Floats) -> tuple[Floats, Floats]:
 
 
 def _faded(bodies: _Followed, moved: Floats, step: Floats, calm: float) -> tuple[Floats, Floats]:
-    """Return sums and moments some time later, from a position that moved; ``calm``: time to fade, s."""
+    """Return the weighted sums and moments after a time step, relative to the new position."""
     s0, s1, s2 = bodies.sums.T
     m0, m1 = bodies.moments[:, 0], bodies.moments[:, 1]
     fade = np.exp(-step / calm)
@@ -250,7 +250,7 @@ def _faded(bodies: _Followed, moved: Floats, step: Floats, calm: float) -> tuple
 
 @dataclass(slots=True)
 class ClientNoise:
-    """Smoothing of a client's frames: with the noise of the settings, or of the first frames.
+    """Smoother for the frames of a client. The noise comes from the settings or from the first frames.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ class ClientNoise:
     _first: list[_Seen] | None = field(default_factory=list["_Seen"])
 
     def smoothed(self, block: FrameBlock, node: Ints) -> FrameBlock:
-        """Return a block of one frame with motion, if the source has noise; ``node``: final node ids."""
+        """Return a block of one frame with motion filled in, if the positions have noise."""
         now = int(block.time_ns[0])
         before, self._time_ns = self._time_ns, now
         seconds = (now - before) / 1e9 if before is not None else np.nan
@@ -273,7 +273,7 @@ class ClientNoise:
         return self._smoother.smoothed(block, node, seconds) if self._smoother else block
 
     def _watch(self, first: list[_Seen], seen: _Seen) -> None:
-        """Choose the smoother, as soon as the noise of the first frames is known."""
+        """Create the smoother as soon as the noise is known from the settings or the first frames."""
         states, noise = seen.block.states, Noise(self.noise, self.noise)
         if self.noise < 0:
             moved = np.isfinite(states.vx) | (states.derived & SMOOTHED > 0)
@@ -295,7 +295,7 @@ class ClientNoise:
 
 
 class _Seen(NamedTuple):
-    """Frame of a client: block, final node ids, and time since the frame before in s."""
+    """Frame of a client: block, final node ids, and time since the previous frame; s."""
 
     block: FrameBlock
     node: Ints

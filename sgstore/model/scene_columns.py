@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     EdgeRecord = tuple[int, str, int, Attributes]
 
 MOST_RECORDS: Final = 1 << 16
-"""Largest number of edges of a graph stored as records; larger graphs store columns."""
+"""Largest number of edges of a graph that are stored as objects. Larger graphs store columns."""
 
 
 class MapRecords:

@@ -1,4 +1,4 @@
-"""Counts of data that settings exclude from a query, summed over all traces."""
+"""Sums over all traces of the data that the settings exclude from a query."""
 
 from __future__ import annotations
 

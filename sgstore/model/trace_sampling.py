@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 _NONE: Final = np.zeros(0, np.intp)
 
 MAX_MESSAGES: Final = 200_000
-"""Maximum number of message references in an incomplete block."""
+"""Largest number of message references that wait in an incomplete block."""
 
 _SLACK_NS: Final = TOLERANCE_NS
-"""Tolerance for an early frame of a step, because simulators round their clocks; ns."""
+"""Time by which a frame may be too early for its step, because simulators round their clocks; ns."""
 _SLACK: Final = _SLACK_NS / 1e9
-"""The same in seconds; also the tolerance at both ends of the part. The median period is not known yet."""
+"""The tolerance for early frames in seconds. It also applies at both ends of the selected part."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -83,7 +83,7 @@ class NotesFile:
         return found.st_size, found.st_mtime_ns
 
     def add(self, note: Note, last: int, *, gone: bool = False) -> None:
-        """Append a tag (or the removal of a tag) to the file, for each frame from that of the note to ``last``.
+        """Append a tag (or its removal) to the file, for each frame from that of ``note`` to ``last``.
 
         Raises
         ------

@@ -49,7 +49,7 @@ EVENT_KINDS: Final = {"collision": 2, "lane_invasion": 1, "environment": 0}
 """Kinds of recorded events, with the number of involved entities. Environment means weather and light."""
 
 OWN_KINDS: Final = OWN_ENTITY_KINDS + MAP_KINDS
-"""Built-in kinds: entities, then map elements."""
+"""Built-in kinds: entities first, then map elements."""
 
 _entity_kinds: Final[list[str]] = list(OWN_ENTITY_KINDS)
 ENTITY_KINDS: Final[Sequence[str]] = _entity_kinds
@@ -94,10 +94,10 @@ DIRECTIONS: Final = tuple(name for name in _declared_in("_bearing") if name not 
 """Usual names of direction relations, from ahead to behind."""
 
 BEYOND: Final = ("isIn", "controlsTrafficOf", "leads", "follows")
-"""Relations of entities that are also stored outside the graphs."""
+"""Relations between entities that are also stored for entities outside the graphs."""
 
 MAP_ONLY: Final = _declared_in("_map")
-"""Relations between map elements only. They come with the map, and settings cannot exclude them."""
+"""Relations between map elements only. They belong to the map, and settings cannot exclude them."""
 
 _BETWEEN_ENTITIES: Final = (("entity", "entity"),)
 _BETWEEN_LANES: Final = (("lane", "lane"),)
@@ -115,7 +115,7 @@ RELATION_ENDS: Final[Mapping[str, Sequence[tuple[str, str]]]] = {
     **dict.fromkeys((*PROXIMITY, *DIRECTIONS, "overlaps", "sees"), _BETWEEN_ENTITIES),
     **dict.fromkeys(("leads", "follows", "tows"), (("vehicle", "vehicle"),)),
 }
-"""Built-in relations → pairs of source and target. A *body* is an entity that is not a signal.
+"""Built-in relation → pairs of source and target. A *body* is an entity that is not a signal.
 
 Only recordings have these ends. Imported graphs may have others.
 """
@@ -136,16 +136,16 @@ LANE_TYPES: Final = (
     *("roadWorks", "tram", "rail", "entry", "exit", "offRamp", "onRamp", "connectingRamp"),
     *("slipLane", "bus", "taxi", "HOV", "mwyEntry", "mwyExit", "curb", "shared", "roadMarks"),
 )
-"""Types of lanes. (ASAM OpenDRIVE 1.4 to 1.8, ``e_laneType``.)"""
+"""Types of lanes, as in ASAM OpenDRIVE 1.4 to 1.8 (``e_laneType``)."""
 
 DRIVING: Final = frozenset(
     {"driving", "bidirectional", "entry", "exit", "onRamp", "offRamp", "connectingRamp", "slipLane"}
     | {"bus", "taxi", "HOV", "mwyEntry", "mwyExit"}
 )
-"""Types of lanes for motor traffic. (ASAM OpenDRIVE 1.4 to 1.8, lane types.)"""
+"""Types of lanes for motor traffic, as in ASAM OpenDRIVE 1.4 to 1.8."""
 
 TRAFFIC: Final = DRIVING | {"biking", "special1", "special2", "special3"}
-"""Types of lanes whose travel direction matters to neighbouring lanes."""
+"""Types of lanes whose direction of travel matters for neighbouring lanes."""
 
 OWN_LIGHT_STATES: Final = ("unknown", "off", "red", "yellow", "green", "red_yellow", "flashing")
 """Built-in traffic light states. ``flashing`` is a flashing lamp of any colour."""
@@ -158,17 +158,17 @@ SPECIALS: Final = ("emergency", "taxi", "electric", "public_transport", "service
 """Special roles of an entity: CARLASGG's ``special_type`` and OSI's vehicle roles."""
 
 CONTROL: Final = "control_"
-"""Prefix of commanded control inputs: ``control_steer`` beside the applied ``steer``."""
+"""Prefix for attributes of commanded control inputs: ``control_steer``. The applied input is ``steer``."""
 
 NOISE_MARKS: Final = ("stands", "unreal_accel", "unreal_yaw_rate")
-"""Attributes of bodies in recordings with noise, in the order of their bits after ``derived_yaw_rate``."""
+"""Attributes of bodies only in recordings with noise, in order of their bits after ``derived_yaw_rate``."""
 
 VEHICLE_LIGHTS: Final = (
     *("light_left", "light_right", "light_brake", "light_reverse", "light_position"),
     *("light_low_beam", "light_high_beam", "light_fog", "light_interior"),
     *("light_special1", "light_special2"),
 )
-"""Lights of a vehicle; the index is the bit of a light in a mask (hazard lights are left and right)."""
+"""Lights of a vehicle by their bit in a mask. Hazard lights are the left and the right light together."""
 
 _kind_code: Final = {name: code for code, name in enumerate(KINDS)}
 KIND_CODE: Final[Mapping[str, int]] = _kind_code
@@ -187,10 +187,10 @@ _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 _growing: Final = Lock()
 
 MOST_RELATIONS: Final = 63
-"""Largest number of relations in a process: a set is a 64-bit number."""
+"""Largest number of relations in a process, because a set of relations is a 64-bit number."""
 
 MOST_KINDS: Final = 127
-"""Largest number of kinds, and of light states, in a process: a code is an 8-bit number."""
+"""Largest number of kinds, and of light states, in a process, because a code is an 8-bit number."""
 
 _OWN_RELATIONS_FOLDED: Final[Mapping[str, str]] = {
     normalize_name(name): name for name in OWN_RELATIONS

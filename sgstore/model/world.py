@@ -33,10 +33,10 @@ Codes: TypeAlias = "NDArray[np.int8]"
 Bools: TypeAlias = "NDArray[np.bool_]"
 
 BUCKET_FRAMES = 60
-"""Frames per mask of the store. Blocks should start at multiples of it."""
+"""Number of frames in a mask of the store. Blocks should start at multiples of it."""
 
 GAP: Final = 2.5
-"""Frames are missing between two frames if their gap exceeds this number of median periods."""
+"""Number of median periods above which frames are missing between two frames."""
 
 JUMP_NS: Final = 86_400_000_000_000
 """Assumed time between two frames at a backward clock jump: a day; ns."""
@@ -45,7 +45,7 @@ TOLERANCE_NS: Final = 1_000
 """Smallest time tolerance for equality; ns."""
 
 TOLERANCE_SHARE: Final = 100
-"""Time tolerance as a fraction of the median period: one part in this number."""
+"""Divisor of the median period for the time tolerance."""
 
 
 LONGEST_NAME: Final = 200
@@ -55,7 +55,7 @@ LONGEST_TEXT: Final = 10_000
 """Maximum length of an attribute text; characters."""
 
 ATTRIBUTE: Final = "attribute:"
-"""Start of an OSI identifier with an attribute without an OSI field: ``attribute:control_steer=0.2``."""
+"""Prefix of an OSI identifier for an attribute without an OSI field: ``attribute:control_steer=0.2``."""
 
 
 def seconds_of(ns: int) -> float:
@@ -138,7 +138,7 @@ POSE: Final = (
     *("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
     *("length", "width", "height"),
 )
-"""Columns of :class:`States` with pose, motion and size of a body, in order."""
+"""Columns of :class:`States` for the pose, motion and size of a body, in order."""
 
 LARGEST: Final = 1_000.0
 """Largest valid length, width or height of a body; m."""
@@ -150,13 +150,13 @@ HARDEST: Final = 30.0
 """Highest valid acceleration derived from positions or velocities; m/s²."""
 
 STANDS, UNREAL_ACCELERATION, UNREAL_TURN, SMOOTHED = 8, 16, 32, 64
-"""Bits of ``derived`` in recordings with noise, see :class:`States`."""
+"""Bits of ``derived`` that only recordings with noise have; see :class:`States`."""
 
 LEAP: Final = 5.0
-"""A position belongs to another body if it is this far beyond the reach at :data:`FASTEST`; m."""
+"""Distance beyond the reach at :data:`FASTEST` from which a position belongs to another body; m."""
 
 INPUTS: Final = ("steer", "throttle", "brake", "gear", "hand_brake")
-"""Columns of :class:`States` with the control inputs of a vehicle, in order."""
+"""Columns of :class:`States` for the control inputs of a vehicle, in order."""
 
 _SPEEDS: Final = slice(POSE.index("vx"), POSE.index("vz") + 1)
 _SIZES: Final = slice(POSE.index("length"), POSE.index("height") + 1)
@@ -231,7 +231,7 @@ class FaultTally:
     """Counts of impossible values (sizes, velocities) by object, with the first value of each."""
 
     MOST: Final = 1000
-    """Number of listed faults. Further faults are only counted."""
+    """Largest number of faults that are listed. Further faults are only counted."""
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[str, int, int]] = {}
@@ -281,10 +281,10 @@ def leaps(away: Floats, seconds: Floats) -> Bools:
 
 
 TWINS_NS: Final = 1_000_000_000
-"""Longest absence of an entity whose id another entity uses meanwhile; ns."""
+"""Longest absence of an entity if another entity uses the same id in the meantime; ns."""
 
 TWINS: Final = 4
-"""Number of earlier entities that can share an id in turns."""
+"""Largest number of entities that are remembered for one shared id."""
 
 AnyEntity = TypeVar("AnyEntity")
 
@@ -400,10 +400,10 @@ class Lives(Generic[AnyEntity]):
 
 
 UNTOLD: Final = -2
-"""Carrier value set by readers: the generator computes the carrier."""
+"""Value of the carrier that readers set if the generator is to compute the carrier."""
 
 HIGHEST_GEAR: Final = 127
-"""Highest valid gear, forwards and backwards. A store has 8 bits for it."""
+"""Highest valid gear, forwards and backwards, because a store has 8 bits for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -744,7 +744,7 @@ class Event:
 
 
 FAR_NS: Final = 1_000_000_000
-"""An event is assigned by log time if its simulation time is this far from all near frames; ns."""
+"""Distance of an event's simulation time from all near frames above which its log time is used; ns."""
 _PIECE: Final = 4096
 
 
@@ -829,7 +829,7 @@ KEPT: Final = (
     *("pitch", "roll", "vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"),
     *("length", "width", "height", *INPUTS),
 )
-"""Columns of :class:`States` that a store keeps as float32."""
+"""Columns of :class:`States` that a store has as float32."""
 
 _VELOCITY: Final = slice(KEPT.index("vx"), KEPT.index("vz") + 1)
 _GEAR: Final = KEPT.index("gear")
@@ -879,7 +879,7 @@ def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
 
 
 def _as_kept(states: States, origin: Origin) -> States:
-    """Convert object states to float32 relative to the coordinate origin, as in the store.
+    """Convert object states to the form in the store: float32, relative to the coordinate origin.
 
     A second call, or storage, changes nothing.
 

@@ -48,7 +48,7 @@ ALL_EGOS: Final = "all"
 
 MOST_CORNERS: Final = 64
 MOST_LENGTH: Final = 100_000.0
-"""Largest length of a range; m. No map is larger, and numbers stay exact."""
+"""Largest length in a range of settings; m. No map is larger, and numbers stay exact."""
 
 _WORD: Final = re.compile(r"[a-z0-9][a-z0-9_]{0,39}|")
 
@@ -133,7 +133,7 @@ class RangeSettings:
             check_polygon("range.polygon", self.polygon)
 
     def beyond(self) -> RangeSettings | None:
-        """Return the circle around the ego with known objects outside the graphs.
+        """Return the circle around the ego in which the store has known objects outside the graphs.
 
         ``None`` means no such objects.
         """
@@ -141,7 +141,7 @@ class RangeSettings:
 
     @property
     def boundless(self) -> bool:
-        """True if the store has all objects of the recording, at any distance from the ego."""
+        """True if the store has all objects of the recording, regardless of their distance from the ego."""
         return self.world >= MOST_LENGTH
 
 
@@ -187,7 +187,7 @@ class LaneSettings:
 
 @dataclass(frozen=True, slots=True)
 class Proximity:
-    """Distance relations. The first one with an upper bound at or above the distance holds.
+    """Distance relations with their upper bounds. The first relation whose bound is not exceeded holds.
 
     Attributes
     ----------
@@ -455,7 +455,7 @@ class Config:
 
     @property
     def notes(self) -> list[str]:
-        """Return hints about user-defined relation names that resemble a built-in name, perhaps by mistake.
+        """Return hints about user-defined relation names that are similar to a built-in name, maybe by mistake.
 
         Examples
         --------
@@ -483,7 +483,7 @@ class Config:
         return {name: n for name, n in types.items() if name.lower() not in self.types}
 
     def as_stored(self) -> dict[str, Any]:
-        """Return the settings as a store keeps them. Settings that older stores lack are left out by default.
+        """Return the settings as a store keeps them. Settings that older stores lack are omitted by default.
 
         Examples
         --------

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 WIDTH: Final = 98
-"""Line width of comments; characters."""
+"""Line width of comments in TOML; characters."""
 
 
 def as_toml(config: Config) -> str:

@@ -54,13 +54,13 @@ def unknown_setting(prefix: str, name: str, known: set[str]) -> ConfigError:
 
 
 _ENDLESS: Final = frozenset({"range.world"})
-"""Settings that can be infinite."""
+"""Names of settings that can be infinite."""
 
 _PLAIN: Final[dict[object, str]] = {str: "a text", bool: "true or false", int: "a whole number"}
 
 
 def value_of(hint: Any, value: Any, name: str, default: Any = None) -> Any:
-    """Convert a plain value to the type of a setting."""
+    """Convert a plain value to the type of a setting. An invalid value raises an error."""
     if is_dataclass(hint):
         return _table(hint, value, name, default)
     if get_origin(hint) is Mapping:

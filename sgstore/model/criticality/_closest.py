@@ -1,4 +1,4 @@
-"""Closest encounter and first contact of two objects in the recording, seen from each frame on.
+"""Smallest distance and first contact of two objects in the recording, seen from each frame.
 
 dce_recorded(t) (m) = min { gap(t′) : t′ ≥ t }, ttce_recorded(t) (s) = the first such t′ minus t.
 Source: Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014.
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 def dce_recorded(of: Encounter) -> Floats:
-    """Return the smallest later gap between two objects for each frame, (T,); m. NaN if unknown."""
+    """Return the smallest gap between two objects from each frame on, (T,); m. NaN if unknown."""
     gap = of.numbers["gap"]
     least = np.minimum.accumulate(np.where(np.isnan(gap), np.inf, gap)[::-1])[::-1]
     return np.where(np.isfinite(least), least, np.nan)
 
 
 def ttce_recorded(of: Encounter) -> Floats:
-    """Return the time until the smallest later gap between two objects, for each frame, (T,); s."""
+    """Return the time until two objects have their smallest gap, from each frame on, (T,); s."""
     gap, times, least = of.numbers["gap"], of.times, dce_recorded(of)
     found = np.full(len(times), np.nan)
     when = np.nan

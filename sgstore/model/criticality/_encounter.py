@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, Ints
 
 _BLOCK: Final = 16
-"""States with a common bounding circle."""
+"""Number of states that share one bounding circle."""
 _CIRCLES: Final = 1 << 20
-"""Pairs of circles whose distances are computed together."""
+"""Number of pairs of bounding circles whose distances are computed at once."""
 _TOGETHER: Final = 256
-"""Pairs of circles whose states are compared together."""
+"""Number of pairs of bounding circles whose states are compared at once."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Track:
 
     @cached_property
     def circles(self) -> tuple[Floats, Floats, Floats]:
-        """Circles around the object's footprints, one per block of consecutive frames: centre and radius."""
+        """Bounding circles of the footprints, one per group of consecutive frames: x, y and radius."""
         count = -(-len(self) // _BLOCK)
         rows = np.minimum(np.arange(count * _BLOCK), len(self) - 1).reshape(count, _BLOCK)
         x, y = self.states[rows, 0], self.states[rows, 1]

@@ -70,7 +70,7 @@ def _et(when: Floats) -> Floats:
 
 
 OF_AREAS: Final[dict[str, Callable[[Floats], Floats]]] = {"pet": _pet, "et_recorded": _et}
-"""Measures of pairs, (P,), from the entry and exit times of both objects, (P, 4)."""
+"""Name of a measure → function from the entry and exit times of both objects, (P, 4), to its values, (P,)."""
 
 
 def pet(of: Encounter) -> float:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sgstore.model.criticality._encounter import Encounter
 
 TAU: Final = 2.0
-"""Time to collision at or below which an entity is exposed; s."""
+"""Limit of the time to collision at or below which an entity counts as exposed; s."""
 
 
 def tet(of: Encounter, tau: float = TAU) -> float:

@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, Ints
 
 _FAN: Final = 8
-"""Number of rows in a bounding box, and of boxes in a larger one."""
+"""Number of rows in a bounding box, and of boxes in a larger box."""
 _TOGETHER: Final = 1 << 13
-"""Pairs of bounding boxes that are divided together."""
+"""Number of pairs of bounding boxes that are divided at once."""
 FOOTPRINT: Final = [COLUMNS.index(name) for name in ("x", "y", "heading", "length", "width")]
-"""Columns of a state that form the footprint of an object."""
+"""Columns of a state that describe the footprint of an object."""
 _MARGIN: Final = 1e-6
-"""Enlargement of bounding boxes, more than their rounding errors; m."""
+"""Enlargement of bounding boxes, to exceed rounding errors; m."""
 
 
 @dataclass(frozen=True)
 class _Level:
-    """Bounding boxes of one level of the tree: sides, first row and first box of the level below."""
+    """Bounding boxes on one level of a tree: their sides, first rows, and first boxes of the level below."""
 
     sides: Floats
     rows: Ints
@@ -41,7 +41,7 @@ class _Level:
 
 
 class Footprints:
-    """Footprints of objects: one row for each frame in which an object has another footprint than before.
+    """Footprints of objects. A row is a frame in which the footprint differs from that in the frame before.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class Footprints:
 
     @cached_property
     def levels(self) -> list[_Level]:
-        """Tree of bounding boxes: the rows first, and finally one box for each object."""
+        """Tree of bounding boxes, by level: first the footprints, last one box for each object."""
         x, y = self.boxes[0], self.boxes[1]
         wide = self.reach * (1 + 1e-9) + _MARGIN
         sides = np.stack([x - wide, y - wide, -x - wide, -y - wide])
@@ -139,7 +139,7 @@ class Footprints:
 
 
 class AreaSearch:
-    """Search for the first and last rows of pairs of objects in their common areas.
+    """Search for the first and last footprints of two objects in their common area, for many pairs.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class AreaSearch:
                 waiting.append((level - 1, *_divided(below, pair, a, b)))
 
     def _near(self, level: int, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:
-        """Return the pairs of bounding boxes that overlap, and may have a new first or last row."""
+        """Return the pairs of bounding boxes that overlap and may contain a new first or last row."""
         boxes = self._of.levels[level]
         on = self._boxes_overlap(level, a, b)
         pair, a, b = pair[on], a[on], b[on]
@@ -189,7 +189,7 @@ class AreaSearch:
         return on
 
     def _rows(self, pair: Ints, a: Ints, b: Ints) -> None:
-        """Compare the footprints of pairs of rows."""
+        """Compare the footprints of pairs of rows, and update the first and last rows."""
         sure = self._apart(a, b) < self._sure(a, b)
         self._found(pair[sure], a[sure], b[sure])
         near = np.flatnonzero(~sure & self._circles_overlap(a, b))
@@ -223,11 +223,11 @@ class AreaSearch:
         return away_x * away_x + away_y * away_y
 
     def _sure(self, a: Ints, b: Ints) -> Floats:
-        """Return squared distances below which the circles inside two footprints overlap; m²."""
+        """Return squared distances below which the inner circles of two footprints overlap; m²."""
         return ((self._inner[a] + self._inner[b]) * (1 - 1e-9)) ** 2
 
     def _new(self, pair: Ints, first: tuple[Ints, Ints], last: tuple[Ints, Ints]) -> Bools:
-        """Return a mask of the ranges of rows that are not between known rows of their pair."""
+        """Return a mask of the ranges that may contain a new first or last row of their pair."""
         new = np.zeros(len(pair), np.bool_)
         for one in (0, 1):
             new |= (first[one] < self.first[one, pair]) | (last[one] > self.last[one, pair])
@@ -240,7 +240,7 @@ class AreaSearch:
 
 
 def _divided(below: Ints, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return all pairs of the parts of two bounding boxes, for many pairs of boxes."""
+    """Return the pairs of all parts of two bounding boxes, for many pairs of boxes."""
     count_a, count_b = below[a + 1] - below[a], below[b + 1] - below[b]
     count = count_a * count_b
     of = np.repeat(np.arange(len(pair)), count)

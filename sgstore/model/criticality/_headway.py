@@ -1,4 +1,4 @@
-"""Recorded headway: time until object a is at the present position of object b.
+"""Recorded headway: time until object a reaches the present position of object b.
 
 headway_recorded(t) (s) = min { t′ − t : t′ ≥ t, the footprint of a at t′ touches the one of b at t
 }. Source: Jansson, Collision Avoidance Theory, 2005. Here the path is the recorded one, so that it
@@ -76,7 +76,7 @@ class HeadwaySearch(AreaSearch):
         return pair[on], a[on], b[on]
 
     def _rows(self, pair: Ints, a: Ints, b: Ints) -> None:
-        """Compare the footprints of pairs of rows."""
+        """Compare the footprints of pairs of rows, and update the smallest headways."""
         near = np.flatnonzero(self._circles_overlap(a, b))
         headway = self._headways(a[near], b[near])
         less = headway < self.least[pair[near]]
@@ -85,7 +85,7 @@ class HeadwaySearch(AreaSearch):
         np.minimum.at(self.least, pair[near[on]], headway[on])
 
     def _headways(self, a: Ints, b: Ints) -> Floats:
-        """Return the time from b's last frame with both objects in a row until a is there; inf for none."""
+        """Return the time from b's last frame at its position until a is there; s. Infinite if never."""
         key = self._object[b] * len(self._times) + self._end[a]
         last = np.minimum(self._keys.searchsorted(key, "right") - 1, self._ends[b])
         last = np.where(last >= 0, self._last_both[last], -1)

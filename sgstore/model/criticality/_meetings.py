@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 _MARGIN: Final = 1e-6
 """Enlargement of bounds, more than their rounding errors; m."""
 _TOGETHER: Final = 1 << 14
-"""Pairs whose exact numbers are computed together."""
+"""Number of pairs whose exact values are computed at once."""
 _SEQ: Final = (1 << SEQ_BITS) - 1
 _DENSE: Final = 1 << 16
-"""Range of node ids up to which a table has a place for each."""
+"""Largest range of node ids for which a table with one entry per id is used."""
 
 
 def _numbered(ids: Ints) -> tuple[Ints, Ints]:
-    """Return ascending ids with all of the given ones, and the place of each given id among them."""
+    """Return the ids in ascending order (possibly with further ones), and the index of each given id."""
     low = int(ids.min())
     if int(ids.max()) - low < _DENSE:
         return np.arange(low, int(ids.max()) + 1), ids - low
@@ -44,7 +44,7 @@ def _numbered(ids: Ints) -> tuple[Ints, Ints]:
 
 
 class Meetings:
-    """Frames that have both objects of a pair, for the pairs of one object of each trace and all others.
+    """Frames that contain both objects of a pair: pairs of one object of each trace with all other objects.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class Meetings:
         return len(self.nodes)
 
     def least(self, rows: Ints, values: Floats) -> Floats:
-        """Return the least value of some rows for each pair, (P,); infinite for none."""
+        """Return the least of the given values for each pair, (P,). Infinite for a pair without values."""
         found = np.full(len(self), np.inf)
         np.minimum.at(found, self.pair[rows], values)
         return found
@@ -137,18 +137,18 @@ class Meetings:
 
     @cached_property
     def away(self) -> Floats:
-        """Distance of both centres in each row, (R,); m."""
+        """Distance between the centres of both objects in each row, (R,); m."""
         x, y = self._states[:, 0], self._states[:, 1]
         return np.hypot(x[self.b] - x[self.a], y[self.b] - y[self.a])
 
     @cached_property
     def beyond(self) -> Floats:
-        """Distance of the circles around both footprints in each row, (R,); m. Negative if they overlap."""
+        """Distance between the circles around both footprints in each row, (R,); m. Negative for an overlap."""
         reach = np.hypot(self._states[:, 4], self._states[:, 5]) / 2
         return self.away - reach[self.a] - reach[self.b]
 
     def numbers(self, rows: Ints, of: Callable[[PairNumbers], Floats]) -> Floats:
-        """Return numbers of pairs in some rows, (K,)."""
+        """Return the values of a measure for the objects in the given rows, (K,)."""
         found = np.empty(len(rows))
         for start in range(0, len(rows), _TOGETHER):
             part = rows[start : start + _TOGETHER]
@@ -157,14 +157,14 @@ class Meetings:
         return found
 
     def ordered(self, pairs: Bools) -> tuple[Ints, Ints]:
-        """Return the rows of some pairs by pair and time, and the first of them of each pair."""
+        """Return the rows of the selected pairs, by pair and time, and the index of each pair's first row."""
         rows = np.flatnonzero(pairs[self.pair])
         rows = rows[np.lexsort((self.when[rows], self.pair[rows]))]
         return rows, np.flatnonzero(np.diff(self.pair[rows], prepend=-1))
 
     @cached_property
     def ahead(self) -> Ints:
-        """Rows in which b may be ahead in a's path, and a few more."""
+        """Return a superset of the rows in which object b is ahead in the path of object a."""
         x, y, _, heading, length, width, *_ = self._states.T
         cosine, sine = np.cos(heading), np.sin(heading)
         dx, dy = x[self.b] - x[self.a], y[self.b] - y[self.a]
@@ -175,7 +175,7 @@ class Meetings:
 
     @cached_property
     def closest(self) -> tuple[Floats, Floats]:
-        """Least gap of each pair (m), and the time of its first row with this gap (s), (P,)."""
+        """Smallest gap of each pair (m), and time of its first row with this gap (s), (P,)."""
         inner = np.minimum(self._states[:, 4], self._states[:, 5]) / 2
         known = np.flatnonzero(self.known)
         most = (self.away - inner[self.a] - inner[self.b])[known]
@@ -188,7 +188,7 @@ class Meetings:
 
     @cached_property
     def exposed(self) -> tuple[Ints, Ints, Floats, Floats]:
-        """Rows with a small ttc, by pair and time: their pairs, and their begins; ttc and time step (s)."""
+        """Rows of pairs with a short time to collision, first row of each pair, ttc and time step (s)."""
         vx, vy = self._states[:, 6], self._states[:, 7]
         speed = np.hypot(vx[self.b] - vx[self.a], vy[self.b] - vy[self.a])
         near = np.flatnonzero(self.known & (self.beyond - TAU * speed <= _MARGIN))
@@ -205,7 +205,7 @@ class Meetings:
 
     @cached_property
     def _near(self) -> tuple[Ints, Ints]:
-        """Pairs whose surroundings overlap, and the states of their objects by object and time."""
+        """Pairs whose regions overlap, and the states of their objects by object and time."""
         others, sources = self._objects
         code, when, place, _ = self._tracks
         reach = np.hypot(self._states[:, 4], self._states[:, 5]) / 2 + _MARGIN
@@ -232,7 +232,7 @@ class Meetings:
         return found, sources, others
 
     def headways(self) -> Floats:
-        """Return the least recorded headway of each pair, (P,); s. Infinite for none."""
+        """Return the smallest recorded headway of each pair, (P,); s. Infinite if a never reaches b's place."""
         footprints, a, b = self._footprints
         pairs, rows = self._near
         _, when, _, both = self._tracks
@@ -302,4 +302,4 @@ _OF_ROWS: Final[dict[str, Callable[[Meetings], Floats]]] = {
     "tit": lambda of: _summed(of, 1),
     "cpi": _cpi,
 }
-"""Measures of pairs, (P,), from the frames that have both objects; not finite means unknown."""
+"""Name of a measure → function from the frames with both objects to its values, (P,). Not finite: unknown."""

@@ -49,7 +49,7 @@ def cpi(of: Encounter) -> float:
 
 
 def crash_chances(numbers: PairNumbers) -> Floats:
-    """Return the probability per frame that braking is not enough, (K,). Frames with NaN do not count."""
+    """Return the probability for each frame that braking is not enough, (K,). Unknown frames are left out."""
     needed = -numbers["a_long_req"]
     placed = ~np.isnan(numbers["lon"] + numbers["reach1"] + numbers["reach2"])
     lost = (numbers["lead"] == 0) & (numbers["closing"] > 0)

@@ -97,13 +97,13 @@ RECORDED: Final = {
         ),
     )
 }
-"""Measures by name."""
+"""Criticality measures of whole recordings by name."""
 
 
 _FRAMES: Final = 2**24
-"""Range of frame ids per trace, which makes database look-ups fast."""
+"""Number of frame ids that a trace occupies. It makes database look-ups fast."""
 FIXED_KINDS: Final = f"({', '.join(map(literal, _FIXED))})"
-"""Fixed kinds, which nothing can meet, as SQL."""
+"""SQL list of the kinds of entities that never move and cannot be met."""
 
 _columns = ", ".join(f"{column}::DOUBLE AS s{i}" for i, column in enumerate(_STATES))
 TRACKS: Final = f"""
@@ -111,10 +111,10 @@ TRACKS: Final = f"""
   FROM {{nodes}} n JOIN frames f USING (frame_id)
   WHERE n.frame_id BETWEEN $1::BIGINT * {_FRAMES} AND $1::BIGINT * {_FRAMES} + {_FRAMES - 1}
     AND n.kind NOT IN {FIXED_KINDS}"""  # noqa: S608  names of ours
-"""Statement for the states of a trace from a view ``nodes``, as input of :func:`tracks_of`."""
+"""SQL that selects the states of a trace from a view ``nodes``, as input of :func:`tracks_of`."""
 
 KNOWN: Final = "known "
-"""Prefix of the name of a measure of all known states, also outside the graphs."""
+"""Prefix in the name of a measure that also uses states outside the graphs."""
 
 
 def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:

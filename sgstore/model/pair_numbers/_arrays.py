@@ -21,7 +21,7 @@ Floats: TypeAlias = "NDArray[np.float64]"
 Formula = Callable[[Mapping[str, Any]], Any]
 
 COLUMNS: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy", "ax", "ay")
-"""Columns of an entity that numbers of pairs use."""
+"""Columns of an entity from which numbers of pairs are computed."""
 
 
 class PairNumbers(dict[str, "Floats"]):
@@ -77,7 +77,7 @@ def gap(a: Floats, b: Floats) -> Floats:
 
 
 _TOGETHER: Final = 1 << 14
-"""Pairs that are processed at once: few enough for the caches of a processor."""
+"""Number of pairs that are processed at once, so that they fit into the processor cache."""
 
 _FOOTPRINT: Final = [COLUMNS.index(name) for name in ("x", "y", "heading", "length", "width")]
 

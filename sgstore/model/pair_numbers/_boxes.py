@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # Not within a branch of a CASE, because DuckDB would compute all parts again.
 GAP: Final = "coalesce(sqrt(least(square1, square2, square3, square4)), 0) + 0 * (out1 + out2)"
-"""The distance of b's centre from the octagon; NULL if a position or size is unknown."""
+"""SQL for the distance of b's centre from an octagon around a. NULL if a position or size is unknown."""
 
 BEYOND: Final = {
     "out1": "abs(lon) - reach1",
@@ -30,8 +30,8 @@ BEYOND: Final = {
         for i in (1, 2, 3, 4)
     },
 }
-"""Distances of b's centre beyond edges of the octagon, and beyond their ends; squared distances
-from the edges."""
+"""SQL for the distances of b's centre beyond the edges of the octagon and beyond their ends, and for squared
+distances from the edges."""
 
 
 _MEETS: Final = "meets1, meets2, meets3, meets4"
@@ -48,7 +48,7 @@ _TILT: Final = "greatest(abs(sin(coalesce(a_pitch, 0))), abs(sin(coalesce(b_pitc
 _CLIMB: Final = (
     f"greatest(least({GRADE}e0 * {_SPREAD}, {STOREY}e0), {_SPREAD} * least({STEEPEST}e0, {_TILT}))"
 )
-"""Height that a road may climb between two bodies."""
+"""SQL for the height difference that a road can have between two bodies."""
 
 NUMBERS: Final[Mapping[str, PairFunction]] = {
     "dist": PairFunction(

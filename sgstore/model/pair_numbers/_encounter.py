@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _EGGERT: Final = "Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014"
 _MOVED: Final = re.compile(r"\b(lon|lat|back|side|(?:out|past|square)[1-4])\b")
 _HALVES: Final = ((1, "la", 1, 2), (2, "wa", 2, 1), (3, "lb", 3, 4), (4, "wb", 4, 3))
-"""Half extents of both boxes, each with its axis and the axis across."""
+"""Half extents of both boxes in SQL, each with the axis along it and the axis across it."""
 
 
 def _after_3s(text: str) -> str:

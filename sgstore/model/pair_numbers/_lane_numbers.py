@@ -8,9 +8,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 LANE_DIST: Final = "lane_dist"
-"""Distance along the lanes from one entity to another."""
+"""Name of the function "distance along lanes from one entity to another"."""
 PART_DIST: Final = "part_dist"
-"""``lane_dist`` with one part of the map, recognised by the labels of a query."""
+"""Name of ``lane_dist`` if one argument is a map part, which the labels of a query show."""
 
 NEXT_PARTS: Final[Mapping[str, str]] = {
     "to_junction": "junction",
@@ -26,14 +26,14 @@ NEXT_PARTS: Final[Mapping[str, str]] = {
     "to_yield_sign": "yield_sign",
     "to_speed_limit": "speed_limit",
 }
-"""Functions of one entity → the kind of the next map part along the lanes."""
+"""Function of one entity → kind of the map part to which it measures the distance along lanes."""
 
 COURSES: Final = ("curvature", "slope")
-"""Functions of one entity for the course of its lane: columns of ``map_course``."""
+"""Functions of one entity for the curvature and slope of its lane, which are columns of ``map_course``."""
 
 WAYS: Final = frozenset({LANE_DIST, PART_DIST, *NEXT_PARTS, *COURSES})
 OF_ONE: Final = (*NEXT_PARTS, *COURSES)
-"""Functions of one entity, used for both entities of a pair."""
+"""Functions of a single entity. Views have them for both entities of a pair."""
 
 
 def as_written(name: str, a: str, b: str) -> str:

@@ -1,4 +1,4 @@
-"""Heights of the lower and upper side of objects, to distinguish storeys (bridges) and flat objects.
+"""Heights of the lower and upper side of objects. They distinguish storeys (bridges) and flat objects.
 
 Signals hang over the road and belong to no storey: they have no such heights. An upright kind never
 has height 0: there 0 means an unrecorded height, as in recordings without heights.
@@ -24,36 +24,36 @@ if TYPE_CHECKING:
     Bools = NDArray[np.bool_]
 
 HUNG: Final = ("traffic_light", "stop_sign", "yield_sign", "speed_limit", "sign")
-"""Kinds without a storey: the signals of the vocabulary."""
+"""Kinds of entities that belong to no storey, such as traffic lights."""
 
 UPRIGHT: Final = (
     *("car", "truck", "van", "bus", "motorcycle", "bicycle", "trailer", "train", "vehicle"),
     *("person", "animal", "building", "pole", "barrier", "vegetation"),
 )
-"""Kinds that have a height, recorded or not: the vehicles of the vocabulary, and others."""
+"""Kinds of entities that always have a height, even if it is not recorded, such as vehicles."""
 
 OPTIONAL: Final = ("low", "high", "node_id", "carrier", "pitch")
-"""Optional columns of an entity: a number of a pair has a value without them.
+"""Columns of an entity that may be unknown. A pair number has a value without them.
 
 Heights of its lower and upper side (m), node id, node id of its carrier, and its pitch (rad).
 """
 
 TOUCH: Final = 1e-4
-"""Distances below this count as zero: rounding of positions far from the origin; m."""
+"""Distance below which two bodies count as touching, because positions far from the origin are rounded; m."""
 
 STOREY: Final = 2.5
-"""Least difference of the lower sides of different storeys, for an unknown height; m."""
+"""Smallest difference between the lower sides of objects on different storeys, if a height is unknown; m."""
 
 
 GRADE: Final = 0.1
-"""Grade that a road may have if the pitch is unknown."""
+"""Largest grade of a road for objects without a known pitch."""
 
 STEEPEST: Final = 0.25
-"""Greatest grade that is derived from a pitch."""
+"""Largest grade of a road that is derived from the pitch of an object."""
 
 
 UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_storeys": 16}
-"""Bits of special pairs in a trace; ``near``: among moving entities and static road users."""
+"""Bits for the special pairs in a trace. ``near``: among moving entities and static road users."""
 
 
 def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None) -> bool:

@@ -16,7 +16,7 @@ _RSS: Final = (
 )
 
 _STANDS: Final = "1e-3"
-"""Greatest speed of a standing entity: above rounding for crossing traffic; m/s."""
+"""Speed up to which crossing traffic counts as standing, because of rounding; m/s."""
 
 NUMBERS: Final[Mapping[str, PairFunction]] = {
     # Response time 1 s with an acceleration of 3.5 m/s² (0.2 sideways). Then braking by at least 4

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _WRITTEN_OUT: Final = 2000
-"""Greatest number of columns in an expanded number that DuckDB may inline; ``ttc`` has 1,500."""
+"""Largest number of columns in an expanded measure that DuckDB may inline. ``ttc`` has 1,500."""
 
 
 @cache
@@ -55,7 +55,7 @@ def pair_sql(name: str, column: Callable[[str], str], without: Marks = frozenset
 _KEPT: Final = ("frame_id", "src", "dst", "src_kind", "dst_kind", "src_is_ego", "dst_is_ego")
 
 _BEFORE_KINDS: Final = 10
-"""Numbers before the kinds in the views, which keep the order of their columns; new ones are appended."""
+"""Names of measures before the kinds in the views. Later ones are appended, to keep the order of columns."""
 
 
 def _is_of(name: str, one: str) -> bool:
@@ -85,7 +85,7 @@ _DOUBTFUL: Final = (
     " OR coalesce(a.carrier = b.node_id OR b.carrier = a.node_id OR a.carrier = b.carrier, FALSE)"
     " ELSE FALSE END AS doubtful"
 )
-"""Test for pairs with a mark. Most have none: their boxes are solid and overlap in height."""
+"""SQL test for pairs that may be special. Most pairs are not: their boxes are solid and overlap in height."""
 
 _CALLED: Final = {
     "a_kind": "src_kind",
@@ -93,7 +93,7 @@ _CALLED: Final = {
     "a_node_id": "src",
     "b_node_id": "dst",
 }
-"""Columns of the views that marks use."""
+"""Input column of the special pairs test → column of the views."""
 
 
 def _marked(pairs: str) -> str:

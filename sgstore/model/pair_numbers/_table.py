@@ -28,21 +28,21 @@ _FAMILIES: Final = (boxes, encounter, following, crossing, rss, evading, mild, c
 PAIR_FUNCTIONS: Final[Mapping[str, PairFunction]] = {
     name: one for family in _FAMILIES for name, one in family.NUMBERS.items()
 }
-"""Numbers of two entities by name, in the order of the views; NULL if an input is unknown."""
+"""Numbers of two entities by name, in the order of the views. A number is NULL if an input is unknown."""
 
 EXPRESSIONS: Final[Mapping[str, str]] = {
     **{name: sql for family in _FAMILIES for name, sql in family.PARTS.items()},
     **{name: one.sql for name, one in PAIR_FUNCTIONS.items() if one.sql},
 }
-"""Expressions of SQL by name: shared parts, and numbers."""
+"""SQL expressions by name: the numbers, and the parts that they share."""
 
 NAME: Final = re.compile(r"\b[a-z]\w*\b(?!\()")
-"""A part: words of SQL are in capitals, functions are followed by a bracket."""
+"""Regular expression for the name of a part. Words of SQL are in capitals; functions have a bracket."""
 
 MARKS: Final = frozenset({"level", "solid"})
-"""Parts of almost all numbers; they are NULL for special pairs, such as an entity and its carrier."""
+"""Parts of almost all numbers that make them NULL for special pairs, such as an entity and its carrier."""
 STOREYS: Final = "apart"
-"""Part of ``level`` for storeys; the rest of ``level`` handles trailers and riders."""
+"""Part of ``level`` for storeys. The rest of ``level`` is for trailers and riders."""
 Marks = frozenset[str]
 
 
