@@ -28,13 +28,13 @@ MAX_MAP_BYTES: Final = 1 << 27
 NO_MAP: Final = "no road map: without road nodes and without relations that need them"
 
 _SHOWN_WARNINGS: Final = 1_000
-"""Number of named defects of a road map in a report; further defects are counted."""
+"""Number of map defects that a report lists. Further defects are counted."""
 
 PROJECTOR_INFO: Final = "map_projector_info.yaml"
-"""Autoware's file next to a Lanelet2 map, with its projection."""
+"""Name of Autoware's file with the projection, next to a Lanelet2 map."""
 
 AUTOWARE_MAP: Final = "lanelet2_map.osm"
-"""Name of the map file in Autoware's map folders."""
+"""Name of the map file in map folders of Autoware."""
 
 _LOOKED_AT: Final = 4096
 _LANELETS: Final = re.compile(r"<osm[\s>/]")
@@ -156,7 +156,7 @@ class Maps:
 
     @property
     def digest(self) -> str:
-        """Digest of the map file of the caller; empty without a file."""
+        """Digest of the map file that the caller has chosen. Empty without a file."""
         return self._given.digest if self._given is not None else ""
 
     def of(self, info: TraceInfo) -> tuple[RoadMap | None, list[str]]:
@@ -193,7 +193,7 @@ class Maps:
         return self._read[text]
 
     def _named(self, name: str, warnings: list[str]) -> RoadMap | None:
-        """Find the map file for a map name in a folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
+        """Return the map in a file of a folder, by the map's name: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
         if self.folder is None:
             return None
         stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)

@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 WIDTH: Final = 3.2
-"""SUMO's default width of a lane; m."""
+"""Default width of a lane in SUMO; m."""
 CROSSING_WIDTH: Final = 4.0
-"""SUMO's default width of a crossing; m."""
+"""Default width of a crossing in SUMO; m."""
 _LANE_TYPES: Final = (
     ({"pedestrian", "wheelchair"}, "sidewalk"),
     ({"bicycle", "scooter"}, "biking"),
@@ -52,14 +52,14 @@ _LANE_TYPES: Final = (
     ({"rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car"}, "rail"),
     ({"bus", "coach", "taxi", "emergency", "authority"}, "bus"),
 )
-"""Classes of vehicles, and the lane type for these and all previous classes only."""
+"""Vehicle classes → lane type for lanes on which only these and all previous classes are permitted."""
 _HEAD: Final = 1 << 16
-"""Characters at the start of a text that decide whether it is a SUMO network."""
+"""Number of characters at the start of a text that are checked to recognise a SUMO network."""
 _ODD_LENGTH: Final = 5.0
 _ODD_SHARE: Final = 0.2
-"""A greater difference of a lane's length to its shape is a contradiction; m, share of the shape."""
+"""Difference between a lane's length and its shape that counts as a contradiction: m, and share."""
 _MAX_GAP: Final = 1.0
-"""Greatest gap between neighbouring lanes, in addition to their widths; m."""
+"""Largest gap between neighbouring lanes, beyond their widths; m."""
 
 
 @dataclass(slots=True)
@@ -78,12 +78,12 @@ class _SumoNet:
     edges: list[_SumoEdge] = field(default_factory=list[_SumoEdge])
     connections: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
     phases: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
-    """States of the links of each traffic light, in all phases of all programs."""
+    """Traffic light → states of its links in all phases of all programs."""
     roundabouts: list[dict[str, str]] = field(default_factory=list[dict[str, str]])
     beside: dict[str, str] = field(default_factory=dict[str, str])
-    """Lane → its left neighbour with the opposite direction."""
+    """Lane → its left neighbour, which has the opposite direction."""
     logic: str = ""
-    """Traffic light of the present phases."""
+    """Id of the traffic light whose phases are being read."""
 
     def start(self, tag: str, attributes: dict[str, str], depth: int) -> None:
         """Handle the start tag of an XML element."""
@@ -170,7 +170,7 @@ def _lines(net: _SumoNet, notes: list[str]) -> tuple[dict[str, LaneLine], list[P
 
 
 def _fault(ident: str, centre: Floats, width: float, lines: dict[str, LaneLine]) -> str:
-    """Return the reason to leave out a SUMO lane, or an empty text."""
+    """Return the reason why a SUMO lane is left out, or an empty text if it is valid."""
     if not ident or len(ident) > MAX_NAME or len(centre) < 2:
         return "left out, because its shape is not a line"
     if not 0 < width < 1000:
@@ -262,7 +262,7 @@ def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
 
 
 def _joined(net: _SumoNet, lines: dict[str, LaneLine], notes: list[str]) -> list[LaneLine]:
-    """Return SUMO lanes with predecessors and successors, also through junctions with inner lanes.
+    """Return SUMO lanes with predecessors and successors, also through junctions with internal lanes.
 
     An inner lane without a connection leads to the end of the connection through it.
     """
@@ -338,7 +338,7 @@ def _from_lane(connection: dict[str, str]) -> str:
 
 
 def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -> list[PlainSignal]:
-    """Return the traffic lights of a SUMO network: one for all lanes of a junction with equal states."""
+    """Return the traffic lights of a SUMO network. Lanes of a junction with equal states share one light."""
     links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
     for connection in net.connections:
         name, index = connection.get("tl", ""), connection.get("linkIndex", "0")

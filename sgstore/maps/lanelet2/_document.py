@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 LISTED: Final = 1_000
-"""Greatest number of elements that a warning names."""
+"""Largest number of elements that a warning lists."""
 _FAR: Final = 1e8
-"""Greatest distance of a point from the origin; m."""
+"""Largest distance of a point from the origin; m."""
 _NODE_TAGS: Final = ("ele", "local_x", "local_y")
 
 

@@ -40,13 +40,13 @@ _TYPES: Final = {
     "rail": "rail",
     CROSSWALK: CROSSWALK,
 }
-"""Subtypes of lanelets, of Lanelet2 and Autoware → lane types of OpenDRIVE."""
+"""Subtype of a lanelet in Lanelet2 or Autoware → OpenDRIVE lane type."""
 
 _OF_PARTICIPANT: Final = (("vehicle", "driving"), ("bicycle", "biking"), ("pedestrian", "sidewalk"))
-"""Participant of a lanelet → type of its lane; the first match counts."""
+"""Participant that may use a lanelet → lane type. The first match counts."""
 
 _BOTH_WAYS: Final = frozenset({CROSSWALK, "walkway", "shared_walkway", "stairs", "pedestrian_lane"})
-"""Subtypes that are used in both directions by default."""
+"""Subtypes of lanelets that by default are used in both directions."""
 
 _YES: Final = frozenset({"yes", "true", "1"})
 
@@ -57,7 +57,7 @@ _CROSSED: Final = {
     "dashed_solid": (False, True),
     "solid_dashed": (True, False),
 }
-"""Subtype of a painted line → permission to change from its right to its left, and back."""
+"""Subtype of a painted line → True if a change is permitted from its right to its left, and back."""
 
 _SPEED: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(km/?h|kmph|mph|m/s|mps)?", re.IGNORECASE)
 
@@ -67,10 +67,10 @@ COUNTRY: Final = re.compile(r"^[a-z]{2}(?=[A-Z0-9])")
 """Country prefix of a sign code: ``de205``, ``usR1-1``."""
 
 _MOST_BESIDE: Final = 100
-"""Greatest number of lanelets along one way, or at one place."""
+"""Largest number of lanelets that share one way or one place."""
 
 SHORTEST: Final = 0.01
-"""Least length of the line of a signal, because an upright signal is a point from above; m."""
+"""Smallest length of the line of a signal; m. An upright signal would be a point when seen from above."""
 
 
 class LaneletShape(NamedTuple):
@@ -126,7 +126,7 @@ def roundabout_names(document: OsmDocument) -> dict[str, str]:
 
 
 def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
-    """Return, for the left and right border, True if its points run against the lanelet's direction."""
+    """Return True for the left and for the right border if its points run against the lanelet's direction."""
     along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
     across = np.hypot(*(left[[0, -1]] - right[[-1, 0]])[:, :2].T).sum()
     apart = bool(along > across)
@@ -137,7 +137,7 @@ def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
 
 
 def type_of(element: OsmElement) -> str:
-    """Return the lane type of a lanelet, from its subtype, else from its permitted participants."""
+    """Return the lane type of a lanelet from its subtype; without one, from its permitted participants."""
     subtype = element.tags.get("subtype", "")
     told = {
         key.removeprefix("participant:").partition(":")[0]

@@ -85,7 +85,7 @@ def lanelet2_text(text: str, projection: Projection | None = None) -> str:
 
 
 _AREAS: Final = {"building": "building", "vegetation": "vegetation", "traffic_island": "prop"}
-"""Subtype of an area without traffic → kind of an object."""
+"""Subtype of an area without traffic → kind of object."""
 
 
 def _areas(document: OsmDocument) -> list[PlainObject]:

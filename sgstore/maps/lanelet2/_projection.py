@@ -26,16 +26,16 @@ PROJECTIONS: Final = (
     "TransverseMercator",
     "Local",
 )
-"""``UTM`` has no origin; the others are defined by Autoware."""
+"""Names of map projections. ``UTM`` has no origin; Autoware defines the others."""
 
 _A: Final = 6378137.0
 _F: Final = 1 / 298.257223563
-"""Equatorial radius and flattening of WGS 84; m."""
+"""Equatorial radius (m) and flattening of the ellipsoid WGS 84."""
 _N: Final = _F / (2 - _F)
 _E: Final = float(np.sqrt(_F * (2 - _F)))
 _UTM_SCALE: Final = 0.9996
 _SQUARE: Final = 100_000.0
-"""Side of a square of MGRS; m."""
+"""Side length of a grid square of MGRS; m."""
 _SERIES: Final = (
     (1 / 2, -2 / 3, 5 / 16, 41 / 180, -127 / 288, 7891 / 37800),
     (13 / 48, -3 / 5, 557 / 1440, 281 / 630, -1983433 / 1935360),
@@ -44,7 +44,7 @@ _SERIES: Final = (
     (34729 / 80640, -3418889 / 1995840),
     (212378941 / 319334400,),
 )
-"""Row j: the coefficients of n^(j+1), n^(j+2), … in the term of sin 2(j+1)ξ. (Karney 2011, equation 35.)"""
+"""Row j: coefficients of n^(j+1), n^(j+2), … in the term of sin 2(j+1)ξ of a series. (Karney 2011, eq. 35.)"""
 _ALPHA: Final = tuple(
     sum(value * _N ** (row + 1 + power) for power, value in enumerate(values))
     for row, values in enumerate(_SERIES)

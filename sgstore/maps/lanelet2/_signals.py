@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Rules:
-    """Regulatory elements (traffic rules) of a Lanelet2 map, with the lanelets that they apply to."""
+    """Traffic rules (regulatory elements) of a Lanelet2 map, with the lanelets to which they apply."""
 
     elements: list[tuple[OsmElement, list[str]]] = field(
         default_factory=list[tuple[OsmElement, list[str]]]
     )
     signs: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
-    """Way of a sign → lanelets that it applies to."""
+    """Way of a sign → lanelets to which the sign applies."""
     stop_lines: list[str] = field(default_factory=list[str])
     limits: dict[str, float] = field(default_factory=dict[str, float])
     """Lanelet → its speed limit from a regulatory element; m/s."""

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from sgstore.maps.opendrive._lanes import LaneTable
 
 APART: Final = 0.1
-"""Smaller differences of lengths and positions are rounding; m."""
+"""Difference of lengths and positions up to which they count as equal; m."""
 _WIDTH: Final = "road/laneSection/lane/width"
 _PLACED: Final = (
     *("road/signal", "road/signalReference", "road/object", "road/elevation"),
     *("road/laneOffset", "road/type"),
 )
-"""Elements with a position s on their road."""
+"""Kinds of elements that have a position s on their road."""
 
 
 def contradictions(document: Document, lanes: LaneTable, plan: PlanView) -> list[str]:
@@ -77,7 +77,7 @@ def _lengths(document: Document, plan: PlanView) -> Iterator[str]:
 
 
 def _sections(document: Document, lanes: LaneTable) -> Iterator[str]:
-    """Yield lane sections that begin beyond their road, late, or where another one begins."""
+    """Yield lane sections that begin outside their road, too late, or at the same place as another section."""
     sections, length = lanes.sections, document.numbers("road", "length")
     start, first = sections.start, sections.number == 0
     same = np.append(False, np.diff(start) <= 0)[: len(start)] & ~first
@@ -92,7 +92,7 @@ def _sections(document: Document, lanes: LaneTable) -> Iterator[str]:
 
 
 def _widths(document: Document, lanes: LaneTable) -> Iterator[str]:
-    """Yield lanes without a width, and widths that begin beyond or late in their section."""
+    """Yield lanes without a width, and widths that begin outside their section or too late."""
     has = np.zeros(len(lanes), bool)
     first = np.full(len(lanes), np.inf)
     for kind in (_WIDTH, "road/laneSection/lane/border"):
@@ -113,7 +113,7 @@ def _widths(document: Document, lanes: LaneTable) -> Iterator[str]:
 
 
 def _beyond(document: Document) -> Iterator[str]:
-    """Yield signals, objects and records that are beyond their road."""
+    """Yield signals, objects and records that are outside their road."""
     length = document.numbers("road", "length")
     for kind in _PLACED:
         table, s = document[kind], document.rough_numbers(kind, "s")
@@ -129,7 +129,7 @@ def _beyond(document: Document) -> Iterator[str]:
 
 
 def _validities(document: Document, lanes: LaneTable) -> Iterator[str]:
-    """Yield signals whose validity names only lanes that are missing at their position."""
+    """Yield signals that are valid only for lanes that do not exist at their position."""
     for kind in ("road/signal", "road/signalReference"):
         table, valid = document[kind], document[f"{kind}/validity"]
         if not len(valid):
@@ -151,7 +151,7 @@ def _validities(document: Document, lanes: LaneTable) -> Iterator[str]:
 
 
 def _references(document: Document) -> Iterator[str]:
-    """Yield references to signals and junctions that are missing."""
+    """Yield references to signals and junctions that do not exist."""
     signals = {*document["road/signal"].texts("id")}
     junctions, roads = {*document["junction"].texts("id")}, {*document.road_ids}
     controllers = document["controller"].texts("id")
@@ -177,7 +177,7 @@ def _references(document: Document) -> Iterator[str]:
 
 
 def _doubled(document: Document) -> Iterator[str]:
-    """Yield ids of signals and junctions that occur twice, and roads with two links at one end."""
+    """Yield ids that occur twice for signals and junctions, and roads with two links at one end."""
     for kind in ("road/signal", "junction", "controller"):
         for name, count in Counter(document[kind].texts("id")).items():
             if count > 1:
@@ -190,7 +190,7 @@ def _doubled(document: Document) -> Iterator[str]:
 
 
 def _junctions(document: Document) -> Iterator[str]:
-    """Yield roads of missing junctions, and roads that no connection of their junction names."""
+    """Yield roads of junctions that do not exist, and roads without a connection in their junction."""
     names = document["junction"].texts("id")
     kinds = dict(zip(names, document["junction"].texts("type"), strict=True))
     table = document["junction/connection"]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 MAX_MAGNITUDE: Final = 1e12
-"""Greatest absolute value of a number; larger values count as defects."""
+"""Largest absolute value of a number. Larger values count as defects."""
 
 _Shape = dict[str, Any]
 
@@ -64,7 +64,7 @@ _TRANSPARENT: Final = {
     *("link", "planView", "elevationProfile", "lanes", "left", "center", "right"),
     *("objects", "signals", "outlines"),
 }
-"""Elements that only group others: their children become rows of the parent element."""
+"""Elements that only group other elements. Their children become rows that belong to the parent."""
 
 RECORDS: Final = frozenset(
     {
@@ -74,14 +74,14 @@ RECORDS: Final = frozenset(
         "road/laneSection/lane/border",
     }
 )
-"""Kinds of elements with local defects: a broken one is left out, and the previous one applies."""
+"""Kinds of elements that can be left out if they are defective. The previous element then applies."""
 
 Record = tuple[str, int, int]
-"""An element: its kind, the number of its road in the text, and its own number in this road."""
+"""Reference to an element: its kind, number of its road in the text, and its own number within the road."""
 
 
 class Spoiled(Exception):  # noqa: N818 (control flow inside the package; a road is spoiled, not the map)
-    """Error: roads or records (such as lane widths) of an OpenDRIVE map are unusable, with reasons."""
+    """Error: some roads or records (such as lane widths) of an OpenDRIVE map are unusable, with reasons."""
 
     def __init__(self, roads: dict[int, MapError], records: dict[Record, MapError]) -> None:
         self.roads = roads
@@ -213,7 +213,7 @@ class Document:
         return values
 
     def accuse(self, kind: str, wrong: Bools, reason: str) -> None:
-        """Record a defect of the roads that have the given elements."""
+        """Record a defect of the roads that contain the given elements."""
         table = self.tables[kind]
         rows = np.flatnonzero(wrong)
         if kind in RECORDS and len(rows):
@@ -228,7 +228,7 @@ class Document:
                 self.blame[road] = MapError(reason, road=self.road_ids[road], element=table.element)
 
     def settle(self) -> None:
-        """Raise an error if a road or record (such as a lane width) of the map has a defect so far."""
+        """Raise an error if defects of roads or records (such as lane widths) have been recorded."""
         if self.blame or self.odd:
             raise Spoiled(self.blame, self.odd)
 

@@ -1,4 +1,4 @@
-"""Connections between OpenDRIVE lanes: traffic goes from the first lane to the second.
+"""Connections between OpenDRIVE lanes: traffic can go from the first lane to the second.
 
 A lane ends at one end of its section, or at both if traffic runs both ways. The lanes after it come
 from links to the next section or road (also into a road, in its middle), or from the connecting
@@ -45,24 +45,24 @@ if TYPE_CHECKING:
     from sgstore.model.world import Ints
 
 TOUCH: Final = 0.5
-"""Greatest distance between the centre lines of two lanes whose ends touch; m."""
+"""Largest distance between the centre lines of two lane ends that touch; m."""
 FAR: Final = 5.0
-"""A greater distance between two linked lane ends is a contradiction; m."""
+"""Distance between the ends of two linked lanes above which the link is a contradiction; m."""
 NARROW: Final = 0.3
-"""A lane that is narrower at its end ends there; m."""
+"""Width below which a lane counts as ended; m."""
 OTHER: Final = {START: END, END: START}
 
 _End = tuple[int, str]
-"""End of a lane: the lane, and ``start`` or ``end`` of its section; ``+``, ``-`` or empty: within."""
+"""Place on a lane: its row; ``start`` or ``end`` of its section, or ``+``, ``-`` or empty for within."""
 _Named = dict[_End, list[_End]]
-"""End of a lane → ends of other lanes that its links name."""
+"""End of a lane → ends of other lanes to which its links refer."""
 _LanePairs = tuple[tuple[int, int], ...]
 _Way = tuple[Target, _LanePairs]
-"""Way through a junction: its target, and the pairs of lanes that it connects."""
+"""Path through a junction: its target, and the pairs of lanes that it connects."""
 
 
 def flows(document: Document, network: Network, ribbons: Ribbons) -> tuple[Ints, Ints]:
-    """Return all pairs of connected OpenDRIVE lanes: traffic goes from the first to the second."""
+    """Return all pairs of connected OpenDRIVE lanes. Traffic goes from the first lane to the second."""
     links = _Links(document, network, ribbons)
     named = links.named()
     pairs = {
@@ -128,7 +128,7 @@ class _Links:
         return self._both[lane] or not contact or self._forward[lane] == (contact in {START, "+"})
 
     def named(self) -> _Named:
-        """Return the lane ends that the links of each lane name, except missing lanes."""
+        """Return, for each lane end, the lane ends to which its links refer, without missing lanes."""
         found: _Named = {}
         for contact, links in self._lane_links.items():
             ends = self._road_links[contact]
@@ -168,7 +168,7 @@ class _Links:
         return None
 
     def _across(self, lane: int, contact: str, linked: list[int]) -> Iterator[tuple[Target, int]]:
-        """Yield the lanes of other roads that a lane leads to: their section, and their id."""
+        """Yield the lanes of other roads to which a lane leads: their section, and their lane id."""
         road = self._road[lane]
         link = self._road_links[contact].get(road, {})
         if link.get("elementType") == "junction":
@@ -185,7 +185,7 @@ class _Links:
             yield from ((self._touched(lane, contact, target, to), to) for to in linked)
 
     def _touched(self, lane: int, contact: str, target: Target, to: int) -> Target:
-        """Return the end of the linked road that touches a lane: the named one, else the other."""
+        """Return the end of a linked road that touches a lane: the end in the link, or else the other end."""
         key = (self._road[lane], contact, target)
         if target.contact not in OTHER:
             return target
@@ -215,7 +215,7 @@ class _Links:
         return math.dist(self._middle[one[1]][one[0]], self._middle[other[1]][other[0]])
 
     def _check(self, named: _Named) -> None:
-        """Report linked lanes that are far apart, or whose traffic meets head on."""
+        """Report linked lanes that are far apart, or that lead traffic against each other."""
         rows = [
             (lane, contact == END, other, at == END)
             for (lane, contact), others in named.items()
@@ -246,7 +246,7 @@ class _Links:
                 )
 
     def _at_junction(self, lane: int, contact: str) -> bool:
-        """Return True if a lane end is at a junction, which lists the ways into it alone."""
+        """Return True if a lane end is at a junction. Then only the junction lists the lanes that follow."""
         link = self._road_links[contact].get(self._road[lane], {})
         return self._inner(lane, contact) is None and link.get("elementType") == "junction"
 
@@ -260,7 +260,7 @@ class _Links:
             self._network.warnings.append(warning)
 
     def _ways(self) -> dict[tuple[str, str], list[_Way]]:
-        """Return the ways through junctions: (junction, incoming road) → list of ways."""
+        """Return the paths through junctions: (junction, incoming road) → list of paths."""
         network, document = self._network, self._document
         ways: dict[tuple[str, str], list[_Way]] = defaultdict(list)
         ends: dict[tuple[str, str], list[str]] = defaultdict(list)
@@ -302,7 +302,7 @@ class _Links:
     def _check_sources(
         self, junction: str, incoming: str, ends: list[str], pairs: _LanePairs
     ) -> None:
-        """Report lanes of a connection that its incoming road does not have at the junction."""
+        """Report lanes in a connection that its incoming road does not have at the junction."""
         sections = dict(self._sections(self._network.roads[incoming]))
         for source, _ in pairs:
             if ends and not any((sections[at], source) in self._network.lane for at in ends):
@@ -314,7 +314,7 @@ class _Links:
     def _entrances(
         self, junction: str, incoming: str, target: Target, pairs: _LanePairs
     ) -> list[str]:
-        """Link the end of a road to a junction whose connection names the road, if their lanes touch."""
+        """Link ends of a road to a junction that has a connection from this road, if their lanes touch."""
         road = self._network.roads[incoming]
         for contact, section in self._sections(road):
             lanes = [(self._network.lane.get((section, source)), to) for source, to in pairs]
@@ -333,11 +333,11 @@ class _Links:
         return []
 
     def _sections(self, road: int) -> tuple[tuple[str, int], ...]:
-        """Return the sections at the end and at the start of a road."""
+        """Return the last section of a road with its end, and the first section with its start."""
         return (END, self._network.last[road]), (START, self._network.first[road])
 
     def named_by_next(self, named: _Named) -> Iterator[tuple[int, int]]:
-        """Yield pairs of touching lanes whose only link is at the second lane."""
+        """Yield pairs of touching lanes that are linked only from the second lane to the first."""
         for (after, at), others in named.items():
             for before, end in others:
                 if (
@@ -358,7 +358,7 @@ class _Links:
                     yield before, after
 
     def _admits(self, before: int, end: str, after: int) -> bool:
-        """Return True unless a junction ahead of a lane has no connection into another lane."""
+        """Return True unless the junction after a lane has no connection to the other lane."""
         link = self._road_links[end].get(self._road[before], {})
         if self._inner(before, end) is not None or not link:
             return True
@@ -374,7 +374,7 @@ class _Links:
         return bool(into) and not any(into)
 
     def touching(self, pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
-        """Return pairs of lanes that no link names: a lane, and the only lane ahead that touches it."""
+        """Return pairs of lanes without a link: a lane, and the only lane ahead that touches it."""
         lanes, found = self._network.lanes, set[tuple[int, int]]()
         onward = {lane for lane, _ in pairs}
         for lane in range(len(self._road)):
@@ -402,7 +402,7 @@ class _Links:
         return len(kinds) == 1 or DRIVING.issuperset(kinds)
 
     def _ahead(self, lane: int, contact: str) -> list[Target]:
-        """Return the ends of sections where a lane without a link can lead on.
+        """Return the ends of sections that may follow a lane without a link.
 
         They are in its road, at the link of its road, or around the junction of its road.
         """
@@ -422,7 +422,7 @@ class _Links:
         return around or self._back.get((self._names[road], contact), [])
 
     def _is_lost(self, lane: int, contact: str, onward: set[int]) -> bool:
-        """Return True if a lane has a road ahead but no lane, like all lanes of its direction."""
+        """Return True if a lane leads to a road but to no lane, like all lanes in its direction."""
         road = self._road[lane]
         if self._inner(lane, contact) is None:
             link = self._road_links[contact].get(road, {})
@@ -472,7 +472,7 @@ def _lane_pairs(document: Document) -> dict[int, _LanePairs]:
 
 
 def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]:
-    """Yield pairs of lanes in virtual junctions: lane of the main road, and lane that branches off."""
+    """Yield pairs of lanes in virtual junctions: a lane of the main road, and a lane that branches off."""
     links = _lane_pairs(document)
     table = document["junction/connection"]
     junctions = document["junction"].attributes

@@ -35,10 +35,10 @@ _ATTRIBUTE: Final = {
     "increase": (True, False),
     "decrease": (False, True),
 }
-"""``laneChange`` → permission to change towards higher ids (to the left along s), and towards lower ids."""
+"""``laneChange`` → True if changes are permitted to higher lane ids (left along s), and to lower ids."""
 
 _CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
-"""Types of marks that may be crossed from both sides."""
+"""Types of road marks that may be crossed from both sides."""
 
 
 def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
@@ -65,7 +65,7 @@ def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
 
 
 _Stretch = tuple[float, float, bool, bool]
-"""Part of a border: start and end, and the permission to change to the left and to the right."""
+"""Part of a lane border: start, end, and True if changes to the left and to the right are permitted."""
 
 
 def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> LaneChanges:
@@ -114,7 +114,7 @@ def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_S
 
 
 def _records(document: Document, name: str) -> dict[int, list[tuple[float, str, str]]]:
-    """Return the road marks of each lane in the text: offset, type, and one more attribute."""
+    """Return the road marks of each lane as in the text: offset, type, and one more attribute."""
     kind = "road/laneSection/lane/roadMark"
     table, offsets = document[kind], document.rough_numbers(kind, "sOffset").tolist()
     columns = table.parent, offsets, table.texts("type", "none"), table.texts(name)
@@ -186,7 +186,7 @@ def read_markings(
 def _beside(
     lanes: LaneTable, row: int, ident: int
 ) -> Callable[[tuple[str, str, str, float]], Attributes]:
-    """Return the attributes of a lane by a marking at the border outside lane ``ident``."""
+    """Return a function from a marking on the border next to lane ``ident`` to attributes of a lane."""
     # Outside is right for a lane on the right of its road's direction.
     forward = bool(lanes.forward[row])
     is_left = (lanes.ident[row] == ident) == ((lanes.ident[row] < 0) != forward)
@@ -202,9 +202,9 @@ def _beside(
 
 
 _WIDEST: Final = 10.0
-"""Greatest width of a marking; m."""
+"""Largest width of a marking; m."""
 _LONGEST: Final = 40
-"""Longest text of a marking; characters."""
+"""Largest length of a text of a marking; characters."""
 
 
 def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:
@@ -242,7 +242,7 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
 
 
 def _along(ribbons: Ribbons, lane: Ints, to: Ints, ends: Floats) -> LaneChanges:
-    """Convert intervals from road positions s to lengths along lane centre lines, and join consecutive ones."""
+    """Convert intervals of road positions s to intervals along lane centre lines. Adjacent ones are joined."""
     one, other = ribbons.along_at(lane, ends[:, 0]), ribbons.along_at(lane, ends[:, 1])
     start, end = np.minimum(one, other), np.maximum(one, other)
     order = np.lexsort((start, to, lane))

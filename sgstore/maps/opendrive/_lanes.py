@@ -36,40 +36,39 @@ if TYPE_CHECKING:
 
 
 SAGITTA: Final = 2e-3
-"""Greatest distance between a border and its approximation by straight pieces; m.
+"""Largest distance between a curved border and its straight pieces; m.
 
 Half the tolerance would need half as many pieces more in every look-up. Centre lines are smoother,
 because headings of the cross sections define their curves.
 """
 RISE: Final = 2e-2
-"""Greatest error of heights; m."""
+"""Largest error of heights; m."""
 MAX_STEP: Final = 10.0
-"""Greatest length of a piece, so that its bounding box stays small; m."""
+"""Largest length of a piece, so that its bounding box stays small; m."""
 MAX_STATIONS: Final = 250_000
-"""Greatest number of cross sections of the lanes of one road: 100 km of a winding motorway of eight lanes.
+"""Largest number of cross sections on one road: 100 km of a winding motorway with eight lanes.
 
 A cross section takes up to 700 bytes until the look-up of its lanes is ready.
 """
 MAX_TOTAL: Final = 4_000_000
-"""Greatest number of cross sections of all lanes of a map."""
+"""Largest number of cross sections in a map."""
 MAX_OF_SMALL: Final = 500_000
-"""Greatest number of cross sections in a map below :data:`CHARACTERS` times as many characters. It
-prevents that a short text with some wrong numbers becomes a gigabyte. Towns have 70 characters or
-more for each."""
+"""Largest number of cross sections in a map whose text has fewer than :data:`CHARACTERS` characters for each.
+It stops short texts with wrong numbers from needing gigabytes. Towns have 70 characters or more."""
 CHARACTERS: Final = 8
-"""Least number of characters per cross section of a larger map."""
+"""Smallest number of characters for each cross section of a larger map."""
 MAX_LANES: Final = 1_000
-"""Greatest number of lanes of a section."""
+"""Largest number of lanes in a lane section."""
 MAX_COORDINATE: Final = 1e8
 JUMP: Final = 2e-4
-"""Least distance of a jump at a cut; m."""
+"""Smallest sideways jump of a border between two intervals that counts as a jump; m."""
 CORNER: Final = 2e-4
-"""Least change of direction at a cut that makes a corner; rad."""
+"""Smallest change of direction between two intervals that counts as a corner; rad."""
 NEGATIVE: Final = 1e-3
-"""A width below minus this value is negative, not rounded; m."""
+"""Width below which a lane width counts as negative, and not as rounded; m. The sign is opposite."""
 _SAME_PLACE: Final = 1e-6
 _SAMPLES: Final = 5
-"""Sample places between two cuts for the curvature."""
+"""Number of places in an interval at which the curvature is sampled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +204,7 @@ def _read_sections(document: Document) -> tuple[LaneSections, Ints]:
 
 
 def _stack(section: Ints, ident: Ints) -> tuple[Ints, Ints]:
-    """Return, for each lane, the next lane towards the road centre, and the number of lanes between."""
+    """Return the next lane towards the road centre, and the number of lanes in between, for each lane."""
     n = len(ident)
     order = np.lexsort((np.abs(ident), ident > 0, section))
     same = (np.diff(section[order]) == 0) & (np.diff((ident > 0)[order].astype(np.int8)) == 0)
@@ -264,7 +263,7 @@ def _intervals(document: Document, lanes: LaneTable, plan: PlanView) -> _LaneInt
 
 
 def _ends_of_width(document: Document, lanes: LaneTable) -> list[tuple[Ints, Floats]]:
-    """Return the places where the width of a lane becomes negative or positive, by section.
+    """Return the positions at which the width of a lane becomes negative or positive, by section.
 
     Each lane with a negative width causes a warning. Between the places its width counts as 0.
     """
@@ -295,7 +294,7 @@ def _ends_of_width(document: Document, lanes: LaneTable) -> list[tuple[Ints, Flo
 
 
 def _shifted(coefficients: Floats, by: Floats) -> Floats:
-    """Convert cubic polynomials in ``x`` to cubic polynomials in ``x - by``."""
+    """Return cubic polynomials, shifted so that their variable starts at ``by``."""
     return np.stack(
         (
             cubic(coefficients, by),
@@ -367,7 +366,7 @@ def _borders(
 def _of_lanes(
     document: Document, tag: str, lanes: LaneTable, at: tuple[Ints, Floats, Floats]
 ) -> tuple[Floats, Bools]:
-    """Return the cubics of lane records (width or border) at given positions, and a mask of existing ones."""
+    """Return the cubics of lane records (width or border) at some positions, and a mask of existing records."""
     kind = f"road/laneSection/lane/{tag}"
     lane, middle, start = at
     of = lanes.row[document[kind].of]
@@ -386,7 +385,7 @@ def _pieces(
     plan: PlanView,
     parts: tuple[_LaneIntervals, _LaneBorders, Floats],
 ) -> tuple[Ints, Ints]:
-    """Return the number of straight pieces of each interval of a road, and its reference line record."""
+    """Return the number of straight pieces of each road interval, and its record of the reference line."""
     intervals, borders, heights = parts
     length = intervals.end - intervals.start
     road = lanes.sections.road[intervals.section]
@@ -419,7 +418,7 @@ def _pieces(
 
 
 def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, pieces: Floats) -> None:
-    """Reject OpenDRIVE roads, or the whole map, that need too many surface pieces."""
+    """Reject roads, or the whole map, if their surfaces need too many pieces."""
     road = lanes.sections.road[intervals.section]
     lanes_here = np.bincount(lanes.section, minlength=len(lanes.sections.start)) + 1.0
     points = (pieces + 1) * lanes_here[intervals.section]
@@ -433,8 +432,8 @@ def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, piec
 
 
 _Stations = tuple["Ints", "Ints", "Floats", Poses, "Floats"]
-"""Places of cross sections, by section and s: starts per section (sections + 1,), and the interval,
-s, pose and z of each place."""
+"""Positions of cross sections, sorted by section and s: first position of each section (sections + 1,), then
+interval, s, pose and z of each position."""
 
 
 def _stations(
@@ -465,7 +464,7 @@ def _stations(
 def _lateral_jumps(
     intervals: _LaneIntervals, borders: _LaneBorders
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the greatest offset, jump and turn of lane borders at the end of each road interval."""
+    """Return the largest offset, jump and change of direction of lane borders at the end of each interval."""
     n = len(intervals.section)
     length = (intervals.end - intervals.start)[borders.interval]
     reach, step, corner = np.zeros(n), np.zeros(n), np.zeros(n)

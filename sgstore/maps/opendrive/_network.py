@@ -21,11 +21,11 @@ END: Final = "end"
 
 
 class Target(NamedTuple):
-    """End point of an OpenDRIVE link: a lane section, and where traffic enters it (start, end or within)."""
+    """Place to which an OpenDRIVE link leads: a lane section, and where traffic enters it."""
 
     section: int
     contact: str
-    """``start``, ``end``, ``+`` or ``-`` (within, along or against s), or empty: within, in both directions."""
+    """``start`` or ``end`` of the section; or within it: ``+`` along s, ``-`` against s, empty for both."""
 
 
 @dataclass(slots=True)
@@ -103,7 +103,7 @@ def junction_ends(document: Document) -> Iterator[tuple[int, str, str]]:
 
 
 def whole(text: str) -> int:
-    """Parse an OpenDRIVE lane id; 0 (the centre lane, without traffic) for an invalid one."""
+    """Return the integer of an OpenDRIVE lane id, or 0 (the centre lane, without traffic) if it is invalid."""
     try:
         return int(text)
     except ValueError:

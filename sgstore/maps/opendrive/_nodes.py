@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, Ints
 
 NARROW: Final = 1e-2
-"""A lane that is nowhere wider has no neighbours: the lanes on both sides are neighbours; m."""
+"""Width that a lane must exceed somewhere, or else the lanes on both sides of it are neighbours; m."""
 
 SPEED_UNITS: Final = {"": 1.0, "m/s": 1.0, "mph": 0.44704, "km/h": 1 / 3.6, "kmh": 1 / 3.6}
-"""Units of speed → m/s. (ASAM OpenDRIVE 1.8, ``e_unitSpeed``.)"""
+"""Unit of speed → factor to m/s, as in ASAM OpenDRIVE 1.8 (``e_unitSpeed``)."""
 
 FIRST_LANE: Final = 1
-"""Row of the first lane: row 0 is ``off_road``."""
+"""Row of the first lane among the map nodes, because row 0 is ``off_road``."""
 
 
 def lane_nodes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapNodes:
@@ -80,7 +80,7 @@ def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str,
 
 
 def _speed_limits(document: Document, lanes: LaneTable) -> Floats:
-    """Return the speed limit of each lane at its middle: its own record, else the road's; m/s."""
+    """Return the speed limit at the middle of each lane: its own, or else that of the road; m/s."""
     sections = lanes.sections
     start, end = sections.start[lanes.section], sections.end[lanes.section]
     middle = (start + end) / 2
@@ -108,7 +108,7 @@ def _speeds(document: Document, kind: str) -> Floats:
 
 
 def speed(value: str, unit: str) -> float:
-    """Convert an OpenDRIVE speed to m/s; NaN for ``no limit``, ``undefined`` and invalid values."""
+    """Return an OpenDRIVE speed in m/s. NaN for ``no limit``, ``undefined`` and invalid values."""
     try:
         metres = float(value) * SPEED_UNITS[unit.strip().lower()]
     except (ValueError, KeyError):

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 
 PARKING: Final = "parking"
-"""Marker for a parking space: it is a lane of this type, not an entity."""
+"""Kind that marks a parking space. It becomes a lane of this type, not an entity."""
 PAINT: Final = "paint"
-"""Marker for paint, which is not an entity either."""
+"""Kind that marks paint on the road, which does not become an entity."""
 
 KIND_OF_TYPE: Final = {
     **dict.fromkeys(
@@ -50,7 +50,7 @@ KIND_OF_TYPE: Final = {
     "pedestrian": "person",
     "parkingspace": PARKING,
 }
-"""Types of objects, in lower case → kinds. (ASAM OpenDRIVE 1.8, ``e_objectType``; words of older maps.)"""
+"""Object type in lower case → kind, for ASAM OpenDRIVE 1.8 (``e_objectType``) and words of older maps."""
 
 _PHRASES: Final = (
     (("crosswalk", "zebra"), "crosswalk"),
@@ -62,11 +62,11 @@ _PHRASES: Final = (
     (("tree", "bush", "hedge", "shrub", "vegetation"), "vegetation"),
     (("parking space", "parking lot"), PARKING),
 )
-"""Words in a name or unknown type → kinds, for maps without types; the first match counts."""
+"""Regular expression for a name or unknown type → kind, for maps without types. The first match counts."""
 _WORD: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 
 MOST_POINTS: Final = 1_000_000
-"""Greatest number of corners of all objects of a map, with copies; more are left out with a warning."""
+"""Largest number of corners of all objects in a map, with copies. Further objects cause a warning."""
 _STRIP_STEP: Final = 1.0
 """Distance between the corners of a strip along a road; m."""
 _MOST_STEPS: Final = 5_000
@@ -74,7 +74,7 @@ _CIRCLE: Final = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
 
 
 def kind_of_object(type_name: str, name: str) -> str:
-    """Return the kind of an OpenDRIVE object, from its type, else from words in its name.
+    """Return the kind of an OpenDRIVE object from its type; for an unknown type, from words in its name.
 
     :data:`PARKING` and :data:`PAINT` for objects that are not entities; ``prop`` for all others.
     """
@@ -231,7 +231,7 @@ class _Repeat:
     width: tuple[float, float]
 
     def copies(self) -> int:
-        """Return the number of copies of an object; for a strip, the number of steps along the road."""
+        """Return the number of copies of the object. For a strip, it is the number of steps along the road."""
         step = self.distance if self.distance > 0 else max(_STRIP_STEP, self.length / _MOST_STEPS)
         return int(min(np.floor(self.length / step + 1e-9), MOST_POINTS)) + 1
 
@@ -278,7 +278,7 @@ class _Outlines:
         return (local if local or along else [self._plain(row)]), along
 
     def _plain(self, row: int) -> Floats:
-        """Return an object's outline made from its length, width or radius, or a point."""
+        """Return the outline of an object made from its length and width or its radius; otherwise a point."""
         length, width, radius = (self.own[name][row] for name in ("length", "width", "radius"))
         if length > 0 and width > 0:
             return np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (length / 2, width / 2)
@@ -337,7 +337,7 @@ _Rings = tuple[list["Floats"], list["Floats"]]
 
 
 def _stand(items: _Items, item: int, rings: _Rings) -> None:
-    """Add outlines to one copy of an object, moved to its position."""
+    """Add outlines to one copy of an object, at the position of the copy."""
     s, t, _ = items.place[item]
     items.local.extend(_Ring(item, ring) for ring in rings[0])
     items.along.extend(_Ring(item, ring + np.array((s, t))) for ring in rings[1])
@@ -363,7 +363,7 @@ def _copy(
 
 
 def _stretch(items: _Items, row: int, name: str, repeat: _Repeat) -> None:
-    """Add the continuous strip along the road that a ``repeat`` element without distance describes."""
+    """Add the continuous strip that a ``repeat`` element without a distance describes."""
     n = repeat.copies() + 1
     share = repeat.shares(n)
     s, t = repeat.s + share * repeat.length, np.interp(share, (0, 1), repeat.t)
@@ -402,7 +402,7 @@ def _laid_out(rings: list[_Ring]) -> tuple[Floats, Ints]:
 
 
 def _moved(rings: list[_Ring], points: Floats) -> Iterator[_Ring]:
-    """Yield outlines with their corners replaced by new points, in order."""
+    """Yield copies of outlines whose corners are replaced by new points, in order."""
     end = 0
     for ring in rings:
         begin, end = end, end + len(ring.corners)

@@ -1,4 +1,4 @@
-"""Arrays divided into groups, and piecewise cubic polynomials along roads."""
+"""Arrays divided into groups, and cubic polynomials that apply to parts of a road."""
 
 from __future__ import annotations
 

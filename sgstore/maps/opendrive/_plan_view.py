@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 LINE, ARC, SPIRAL, CUBIC = range(4)
 
 MAX_TURN: Final = 12 * np.pi
-"""Greatest change of heading within one spiral; rad. Up to it the quadrature is exact to far below 1 mm."""
+"""Largest change of heading within one spiral; rad. Up to it, the integration error is far below 1 mm."""
 
 _NODES, _WEIGHTS = (np.asarray(a, np.float64) for a in np.polynomial.legendre.leggauss(32))
 
 _FEW_NODES, _FEW_WEIGHTS = (np.asarray(a, np.float64) for a in np.polynomial.legendre.leggauss(5))
 
 _CELLS: Final = 64
-"""Cells of a table of arc length."""
+"""Number of steps in a table of arc lengths."""
 
 _TINY: Final = 1e-9
 
@@ -32,7 +32,7 @@ _BELOW_ONE: Final = 1 - 1e-12
 
 @dataclass(frozen=True, slots=True)
 class _Measure:
-    """Arc lengths of cubic curves, with the share of the length at 65 equal parameter steps."""
+    """Arc lengths of cubic curves, each with the share of the length at 65 equal steps of the parameter."""
 
     span: Floats
     length: Floats
@@ -140,7 +140,7 @@ def _read_spirals(
 
 
 def _curve_between(columns: dict[str, Any], row: int, after: int | None) -> tuple[Floats, Floats]:
-    """Return the cubic from a geometry to the next one, in its axes; a line if they do not fit."""
+    """Return the cubic from one geometry record to the next, in axes of the first; a line if they differ."""
     length, heading = columns["length"][row], columns["heading"][row]
     start, end = np.array([1.0, 0.0]) * length, np.array([length, 0.0])
     slope = start
@@ -173,7 +173,7 @@ def _read_cubics(document: Document, kind: Codes, length: Floats) -> tuple[Float
 
 
 def _measured(u: Floats, v: Floats, span: Floats, length: Floats) -> _Measure:
-    """Compute arc lengths of cubic curves, and shares of the length at equal parameter steps."""
+    """Compute the arc lengths of cubic curves, and the shares of the length at equal parameter steps."""
     unknown = np.isnan(span)
     reach = np.where(unknown, length, span)  # the arc length is never shorter than u
     arc = _arc_table(u, v, reach)

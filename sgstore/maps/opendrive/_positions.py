@@ -43,7 +43,7 @@ def places(
 
 
 def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> Ints:
-    """Return the rows of signals or objects with a valid position. Other rows cause warnings."""
+    """Return the rows of signals or objects with a valid position. Other rows add a warning."""
     table = document[kind]
     placed = np.ones(len(table), bool)
     for name in _PLACE:

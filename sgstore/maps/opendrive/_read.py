@@ -56,12 +56,12 @@ if TYPE_CHECKING:
 
 
 SIGNS: Final = Signs()
-"""Default interpretation of signals."""
+"""Default settings for reading traffic signals."""
 _ROUNDS: Final = 8
-"""Greatest number of readings of a text; each leaves out the roads with defects of the previous one."""
+"""Largest number of attempts to read a text. Each one leaves out the defective roads of the previous one."""
 
 _KEPT: Final = 4
-"""Number of cached maps: a map with 30 MB of text and 6,000 lanes takes 95 MB, a town a tenth."""
+"""Number of cached maps. A map with 30 MB of text and 6,000 lanes takes 95 MB, a town a tenth of this."""
 
 
 @lru_cache(maxsize=_KEPT)
@@ -120,7 +120,7 @@ def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _without(odd: Mapping[Record, MapError], skip: Container[int]) -> list[str]:
-    """Return warnings about skipped records (such as lane widths) of roads: one line per road and kind."""
+    """Return warnings about records (such as lane widths) that are left out: one for each road and kind."""
     groups: dict[tuple[str, int], list[MapError]] = {}
     for (kind, road, _), error in odd.items():
         if road not in skip:
@@ -188,7 +188,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
 
 
 def _at_the_end(shapes: list[Any], number: int) -> NDArray[Any]:
-    """Return the shapes of all nodes; only the last nodes have one."""
+    """Return an array of shapes for all map nodes, in which only the last nodes have a shape."""
     found = np.full(number, None, object)
     found[number - len(shapes) :] = shapes
     return found

@@ -36,16 +36,16 @@ if TYPE_CHECKING:
 
 
 NEAR: Final = 50.0
-"""A signal farther from a junction than this does not count as before it; m along the road."""
+"""Largest distance between a signal and a junction for which the signal is before it; m along the road."""
 LISTED: Final = 8
-"""Greatest number of signals that a warning names."""
+"""Largest number of signals that a warning lists."""
 _BEFORE_JUNCTIONS: Final = frozenset({"traffic_light", "stop_sign", "yield_sign"})
 _READERS: Final = {"asam": "as ASAM OpenDRIVE reads it", "carla": "as CARLA reads it"}
 
 
 @dataclass(slots=True)
 class Doubts:
-    """Collector of OpenDRIVE signals whose orientation contradicts their lanes.
+    """Collector of signals in an OpenDRIVE map whose orientation contradicts the direction of their lanes.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class Doubts:
         return bool(lanes.both[lane] or lanes.forward[lane] == (end == END))
 
     def _before(self, road: int, s: float) -> str:
-        """Return the end of the road with a junction near a position, or an empty text."""
+        """Return the end of a road that has a junction near the given position, or an empty text."""
         if not self._junctions:
             self._lengths = self.document.rough_numbers("road", "length").tolist()
             ends = [(road, at) for road, at, _ in junction_ends(self.document)]
@@ -153,16 +153,16 @@ KIND_OF_TYPE: Final = {
 """Codes of traffic signs → kinds: StVO (Germany), used by CARLA and esmini, and MUTCD (United States)."""
 
 _LIGHT: Final = re.compile(r"10000(0[1-9]|1\d|2\d)$")
-"""Codes of traffic lights in the catalogue of OpenDRIVE's country ``OpenDRIVE``."""
+"""Type codes of traffic lights for the country ``OpenDRIVE``."""
 _NOT_LIGHTS: Final = {"1000003", "1000004"}
-"""Crossings for people and bicycles, painted on the road."""
+"""Type codes of painted crossings for people and bicycles, which are not traffic lights."""
 _STOP_LINE: Final = "294"
-"""Code of a stop line: StVO (Germany), also used in maps of other countries."""
+"""Type code of a stop line in StVO (Germany), which maps of other countries also use."""
 _SPEED_OBJECT: Final = re.compile(r"speed_(\d+(?:\.\d+)?)", re.IGNORECASE)
 _STOP_STENCIL: Final = "stencil_stop"
 
 Stops = frozenset[tuple[int, float]]
-"""Lanes, counted from 0, and places ``s`` on their roads; m."""
+"""Lanes (counted from 0) and positions ``s`` on their roads at which a signal applies; m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +197,7 @@ class Signals:
         return ("controlsTrafficOf", signal, FIRST_LANE + lane)
 
     def places(self, first: int) -> tuple[Ints, Ints, Floats]:
-        """Return signals, their lanes, and the road positions ``s`` where they apply, as columns."""
+        """Return as columns: signals, their lanes, and the road positions ``s`` at which they apply."""
         rows = [(row, *one) for row, lanes in enumerate(self.lanes) for one in sorted(lanes)]
         row, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
         return first + row, lane, np.array([s for *_, s in rows], np.float64)
@@ -272,7 +272,7 @@ class _Reach:
         self._known: dict[tuple[int, object], frozenset[int]] = {}
 
     def valid(self, element: tuple[str, int, str], place: tuple[int, float]) -> frozenset[int]:
-        """Return the driving lanes at a road position to which the signal's validity element applies."""
+        """Return the driving lanes at a road position to which a validity element of a signal applies."""
         kind, row, signal = element
         ranges = self._ranges[kind].get(row)
         orientation = self._tables[kind].attributes[row].get("orientation", "")
@@ -369,7 +369,7 @@ def _elements(
 
 _TOLD: Final = ("text", "unit", "country", "type", "subtype")
 _LONGEST: Final = 200
-"""Longest text of a signal; characters."""
+"""Largest length of a text of a signal; characters."""
 
 
 def _stops(lanes: frozenset[int], place: tuple[int, float]) -> Stops:

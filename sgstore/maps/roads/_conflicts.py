@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 SAME_PLACE: Final = 0.5
-"""Ends of lanes this close, in about the same direction, are one place; m."""
+"""Largest distance between two lane ends with about the same direction that count as one place; m."""
 
 MOST_PAIRS: Final = 2_000_000
-"""Greatest number of compared pairs of lanes: a junction of 200 lanes has 20,000."""
+"""Largest number of pairs of lanes that are compared. A junction of 200 lanes has 20,000."""
 
 
 def conflicts(

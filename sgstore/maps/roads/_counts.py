@@ -80,7 +80,7 @@ def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]
 
 
 def _stretches(road_map: RoadMap, kinds: list[str]) -> Iterable[tuple[str, float]]:
-    """Yield type and length of each part of a road with one road type; empty for an unknown type."""
+    """Yield road type and length of each part of the roads. The type is empty if it is unknown."""
     nodes = road_map.nodes
     for row in _of(kinds, "road"):
         length = float(nodes.length[row])

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     Heights = Callable[[Ints, Floats], Floats]
 
 STRETCH: Final = 1.0
-"""Approximate length of a stretch; curvature and slope are means over it; m."""
+"""Approximate length of a lane interval over which curvature and slope are averaged; m."""
 _MOST: Final = 10_000
-"""Greatest number of stretches of a lane. A lane longer than 10 km has longer stretches."""
+"""Largest number of intervals of a lane. Lanes longer than 10 km have longer intervals."""
 _MOST_IN_ALL: Final = 1 << 20
-"""Approximate greatest number of stretches of all lanes together: maps from other sources can have any size."""
+"""Approximate largest number of intervals of all lanes together. It limits large maps from other sources."""
 _DIGITS: Final = 7
-"""Digits of curvature and slope. Rounding joins the stretches of a straight line or an arc."""
+"""Digits of curvature and slope. Rounding makes the intervals of a straight line or an arc equal."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,31 +17,30 @@ if TYPE_CHECKING:
 
 
 APART: Final = 0.05
-"""Least distance between kept points of a line, and between cross sections; m."""
+"""Smallest distance between points of a line, and between cross sections; m."""
 
 WIDE: Final = 3.5
-"""Default lane width; m."""
+"""Default width of a lane; m."""
 
 NEIGHBOURS: Final = (2.0, 6.0)
-"""Range of centre line distances from which the width of neighbouring lanes is derived; m."""
+"""Range of distances between centre lines for which two lanes count as neighbours, to derive their width; m."""
 
 _LOOKS: Final = 9
-"""Number of sample places along a lane for the distance to its neighbours."""
+"""Number of places along a lane at which the distance to its neighbours is measured."""
 
 _STEP: Final = 1.0
-"""Distance between the cross sections of a way through an area; m."""
+"""Distance between the cross sections of a lane through an area; m."""
 
 _FEW: Final = 20_000
-"""Up to this number of pairs (place, piece of a line), brute force is faster than a tree."""
+"""Number of comparisons (position with line piece) up to which brute force is faster than a tree."""
 
 _AHEAD: Final = 0.2, 0.1, 0.5
-"""Greatest offset along the lane between a cross section and a border end that is used for it:
-metres, and the share of its sideways distance; at the ends of a lane, which can be oblique, the
-last share."""
+"""Largest offset along the lane between a cross section and a border end that it uses: a length in m, plus a
+share of the sideways distance. At the ends of a lane, which may be oblique, the second share applies."""
 
 
 _SWAPPED: Final = 0.1
-"""Least distance between two borders that are on the wrong sides; m."""
+"""Smallest distance between two borders on the wrong sides for which they are exchanged; m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,17 +51,17 @@ class Sections:
     right: Floats
     z: Floats
     middle: Floats = field(init=False)
-    """(n, 2): the centre line."""
+    """Points of the centre line, (n, 2)."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "middle", (self.left + self.right) / 2)
 
     def turned_round(self) -> Sections:
-        """Return the cross sections of the lane in the opposite direction."""
+        """Return the cross sections for the lane in the opposite direction."""
         return Sections(self.right[::-1], self.left[::-1], self.z[::-1])
 
     def is_crossed(self) -> bool:
-        """Return True if the left border is on the right for more than a metre."""
+        """Return True if the left border is on the right for more than a metre of the lane."""
         step = np.diff(self.middle, axis=0)
         across = (self.left - self.right)[1:] + (self.left - self.right)[:-1]
         length = np.hypot(*step.T)
@@ -70,7 +69,7 @@ class Sections:
         return bool(length[width < -_SWAPPED * length].sum() > 1.0)
 
     def up_to(self, left: Floats, right: Floats, z: float) -> Sections:
-        """Return the cross sections of the lane with one more section at the end."""
+        """Return the cross sections with one more section added at the end."""
         return Sections(
             np.vstack((self.left, left)), np.vstack((self.right, right)), np.append(self.z, z)
         )
@@ -185,7 +184,7 @@ class Feet:
 
 
 def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
-    """Find the nearest point on lines for each of some positions (n, 2)."""
+    """Return the nearest point on the given lines for each position (n, 2)."""
     start = np.concatenate([line[:-1, :2] for line in lines])
     way = np.concatenate([line[1:, :2] for line in lines]) - start
     x, y = places.T
@@ -218,7 +217,7 @@ def along_line(line: Floats, places: Floats) -> Floats:
 
 
 def _cuts(run: Floats, more: Sequence[Floats]) -> Floats:
-    """Return the lengths along a lane's centre line at which cross sections are placed."""
+    """Return the lengths along the centre line of a lane at which it gets cross sections."""
     inner = np.concatenate([run[1:-1], *more])
     own = np.arange(len(inner)) < len(run) - 2
     inside = (inner > APART) & (inner < run[-1] - APART)
@@ -241,7 +240,7 @@ class _Side:
 
 
 def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats]) -> _Side | None:
-    """Return the left or right ends of a lane's cross sections; ``None`` without a border on this side."""
+    """Return the left or right ends of cross sections of a lane, or ``None`` without a border on this side."""
     if not borders:
         return None
     found = feet(places, borders)
@@ -261,7 +260,7 @@ def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats
 
 
 def half_width(centre: Floats, others: Sequence[Floats]) -> float:
-    """Return half the width of a lane without borders, from the distance to its neighbours; m."""
+    """Return half the width of a lane without borders, computed from the distance to its neighbours; m."""
     run = run_of(centre)
     places = np.linspace(0.0, run[-1], _LOOKS)
     middle = np.column_stack([np.interp(places, run, column) for column in centre[:, :2].T])

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from sgstore.maps.roads._map import RoadMap
 
 TOLERANCE: Final = 0.05
-"""Greatest distance between a simplified outline and the original; m."""
+"""Largest distance between a simplified outline and the original; m."""
 
 
 @dataclass(frozen=True, slots=True)

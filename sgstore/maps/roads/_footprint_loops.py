@@ -102,7 +102,7 @@ def touching(
 
 @compiled
 def _counts_here(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
-    """Return True if a pair counts in a grid cell: the first cell that both share."""
+    """Return True in one of the grid cells that a footprint and a lane piece share, to count it once."""
     if cell_x > first[0] and quad_first[0] != cell_x:
         return False
     return cell_y == first[1] or quad_first[1] == cell_y
@@ -151,7 +151,7 @@ def _meet(
 
 @compiled
 def _along_middle(x: Floats, y: Floats) -> tuple[float, float]:
-    """Return the relative position of a footprint along the lane piece, and the squared distance."""
+    """Return the relative position of a footprint along a lane piece, and the squared distance between them."""
     from_x, from_y = (x[0] + x[3]) / 2, (y[0] + y[3]) / 2
     along_x, along_y = (x[1] + x[2]) / 2 - from_x, (y[1] + y[2]) / 2 - from_y
     share = -(from_x * along_x + from_y * along_y) / max(along_x**2 + along_y**2, 1e-18)

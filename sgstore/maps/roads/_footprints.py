@@ -26,22 +26,21 @@ if TYPE_CHECKING:
 
 
 TOUCH: Final = 1e-3
-"""A footprint this close to a lane touches it, so that a seam between lanes is not a gap; m."""
+"""Distance up to which a footprint touches a lane, so that a seam between lanes is no gap; m."""
 
 _CELL: Final = 4.0
-"""Edge of a grid cell; m."""
+"""Side length of a grid cell; m."""
 _CHUNK: Final = 1 << 13
-"""Pairs of a footprint and a cell that are processed at a time."""
+"""Number of pairs (footprint, grid cell) that are processed at once."""
 _MOST_ENTRIES: Final = 32
-"""Greatest mean number of cells per quadrangle; a grid above it is made coarser."""
+"""Largest mean number of cells for each lane piece. A finer grid is made coarser."""
 _MOST_IN_ALL: Final = 1 << 21
-"""Greatest number of entries in a grid (an entry is a quadrangle in a cell). A larger map may have
-four entries for each of its quadrangles. An entry takes about 60 bytes. Lanes of towns need 2 to 7
-entries each."""
+"""Largest number of entries (lane piece in a cell) in a grid. A larger map may have four entries for each
+lane piece. An entry takes about 60 bytes. Lanes of towns need 2 to 7 entries each."""
 _POINT: Final = 1e-9
-"""Lengths below this count as zero; m."""
+"""Length below which a value counts as zero; m."""
 _MOST_STEPS: Final = 256
-"""Greatest number of quadrangles between a footprint and the quadrangle at its centre."""
+"""Largest number of lane pieces between a footprint and the piece at its centre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +117,7 @@ def _quads(ribbons: Ribbons) -> _Quads:
 
 
 def _unfold(x: Floats, y: Floats) -> None:
-    """Correct twisted pieces of lane surfaces in place: crossing ends are cut at the crossing point.
+    """Correct twisted pieces of lane surfaces in place. Crossing ends are cut at the crossing point.
 
     In a bend that is tighter than the lane is wide, the inner border runs backwards, beyond the
     centre of the bend. This part adds no area to the lane.
@@ -166,7 +165,7 @@ class _Grid:
         self.keys, self.begin = key[begin], np.append(begin, len(key))
 
     def cells(self, places: Floats) -> Ints:
-        """Return the grid cell (two integers) of each position; (2, N)."""
+        """Return the grid cell (two integers) of each position, (2, N)."""
         return np.floor((places - self.origin) / self.cell).astype(np.int64)
 
     def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
@@ -192,7 +191,7 @@ class _Grid:
 
 
 def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
-    """List the cells in rectangles of a grid, as pairs (rectangle, cell)."""
+    """Return the cells in rectangles of a grid, as pairs (rectangle, cell)."""
     spans = np.maximum(last - first + 1, 0)
     sizes = spans[0] * spans[1]
     row, number = spread(np.zeros_like(sizes), sizes)
@@ -218,7 +217,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, boxes: Floats, z: Floats) -> _Shapes:
-        """Make footprints from boxes (N, 5). A missing or zero side becomes very short."""
+        """Return the footprints of boxes (N, 5). A missing or zero side becomes very short."""
         half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5].T)) / 2, TOUCH / 2)
         heading = np.nan_to_num(boxes[:, 2])
         x, y = np.ascontiguousarray(boxes[:, :2].T)
@@ -292,7 +291,7 @@ class LaneIndex:
         return rows, first, last
 
     def _candidates(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints]]:
-        """Yield pairs of a footprint and a close lane piece, each pair once, in chunks of footprints."""
+        """Yield pairs of a footprint and a close lane piece without duplicates, in groups of footprints."""
         grid, quads = self._grid, self._quads
         rows, first, last = self._cells(shapes)
         if not len(rows):

@@ -41,24 +41,24 @@ if TYPE_CHECKING:
 
 
 MAX_POINTS: Final = 2_000_000
-"""Greatest number of points of all lines together."""
+"""Largest number of points of all lines together."""
 MAX_LANES: Final = 30_000
 MAX_WAYS: Final = 20_000
-"""Greatest number of ways through areas."""
+"""Largest number of lanes that are added through junction areas."""
 MAX_RELATED: Final = 500_000
-"""Greatest number of references between lanes (ends that touch, and neighbours)."""
+"""Largest number of references between lanes (touching ends and neighbours)."""
 GAP: Final = 5.0
-"""Ends of lanes with a larger gap do not touch, even if the file links them; m."""
+"""Gap above which the ends of two lanes do not touch, even if the file links them; m."""
 SEAM: Final = 1.0
-"""Gaps up to this length between a lane and the next one are closed; m."""
+"""Largest gap between a lane and the next one that is closed; m."""
 LISTED: Final = 1_000
-"""Greatest number of lanes that a warning names."""
+"""Largest number of lanes that a warning lists."""
 _FEW: Final = 8
-"""The same of a warning about a guess."""
+"""Largest number of lanes that a warning about a guess lists."""
 _MOST_ACROSS: Final = 16
-"""Greatest number of lanes without traffic between two lanes that count as neighbours."""
+"""Largest number of lanes without traffic between two lanes that count as neighbours."""
 _ABOUT: Final = 1.0
-"""Lanes of a junction belong together if their centre lines come this close; m."""
+"""Distance between centre lines up to which two lanes of a junction belong together; m."""
 
 
 class Joint(NamedTuple):
@@ -353,7 +353,7 @@ def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[
 
 
 def about_lanes(lanes: Sequence[str], what: str, most: int = LISTED) -> str:
-    """Return a warning text that names several lanes, up to a greatest number."""
+    """Return a warning text that lists at most ``most`` lanes by name."""
     return f"{'lanes' if len(lanes) > 1 else 'lane'} {first_of(lanes, most)}: {what}"
 
 
@@ -447,7 +447,7 @@ def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, fl
 
 
 _Joined = tuple[int, str, int, str]
-"""Ends of lanes that touch: lane, its end, other lane, end of that lane."""
+"""Touching ends of two lanes: lane, its end, other lane, end of the other lane."""
 
 
 def _joints(network: _Network) -> set[_Joined]:
@@ -510,7 +510,7 @@ def _onto(network: _Network, joints: Iterable[_Joined]) -> list[set[int]]:
 
 
 def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
-    """Extend lanes to the next lane across small gaps."""
+    """Extend lanes to the next lane if the gap between them is small."""
     nearest: dict[int, tuple[float, str, int, str]] = {}
     for row, end, other, contact in sorted(joints):
         gap = network.gap(row, end, other, contact)
@@ -526,11 +526,11 @@ def _close_seams(network: _Network, joints: Iterable[_Joined]) -> None:
 
 
 _Sides = tuple[set[int], set[int]]
-"""Lanes to the left and to the right of a line."""
+"""Two sets of lanes: those to the left of a line, and those to its right."""
 
 
 def _beside(network: _Network) -> list[_Sides]:
-    """Return the left and right neighbours of each lane. A link from one of two neighbours is enough."""
+    """Return the left and right neighbours of each lane. It suffices if one of two neighbours has the link."""
     beside: list[_Sides] = [(set(), set()) for _ in network.lines]
     for row, line in enumerate(network.lines):
         for side, idents in enumerate((line.left_beside, line.right_beside)):
@@ -563,7 +563,7 @@ def _turned_round(one: Floats, other: Floats) -> bool:
 
 
 def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set[int]:
-    """Return driving lanes that only lanes without traffic separate from a given lane."""
+    """Return the driving lanes that are separated from a lane only by lanes without traffic."""
     if network.lines[row].type not in TRAFFIC:
         return set()
     found: set[int] = set()
@@ -689,7 +689,7 @@ def _junctions(network: _Network) -> list[str]:
 
 
 _ON_ANOTHER: Final = 0.5
-"""Least length of a centre line inside another lane that makes both a junction; m."""
+"""Smallest length of a centre line inside another lane for which both lanes form a junction; m."""
 _ASKED_AT_ONCE: Final = 100
 
 

@@ -1,4 +1,4 @@
-"""Lane text format of sgstore (JSON), in which stores keep road maps that are not OpenDRIVE.
+"""Lane text format of sgstore (JSON), which stores use for road maps that are not OpenDRIVE.
 
 The text is JSON with one lane per line, so that people can read it and tools can compare it::
 
@@ -45,16 +45,16 @@ MAX_CHARACTERS: Final = 64 << 20
 MAX_LANES: Final = 100_000
 MAX_SIGNALS: Final = 100_000
 MAX_SECTIONS: Final = 4_000_000
-"""Greatest number of cross sections of all lanes."""
+"""Largest number of cross sections of all lanes."""
 MAX_COORDINATE: Final = 1e8
-"""Greatest distance from the origin; m."""
+"""Largest distance from the origin; m."""
 MAX_NAME: Final = 200
 MAX_RELATED: Final = 1_000
-"""Greatest number of lanes that a lane can be related to in one way."""
+"""Largest number of lanes that one relation can link to a lane."""
 OF_LANES: Final = " (lanes)"
-"""Suffix of the names of such maps: they hold less than the OpenDRIVE of the same name."""
+"""Suffix of the names of such maps, because they contain less than the OpenDRIVE map of the same name."""
 DIGITS: Final = 4
-"""Decimal digits of a length in metres."""
+"""Number of decimal digits of a length in metres."""
 
 _NAMES: Final = ("name", "type", "road", "junction", "roundabout")
 _POSE: Final = ("x", "y", "z", "heading")
@@ -295,7 +295,7 @@ class _TextRow:
         return tuple(values)
 
     def _stretches(self, key: str, numbers: int) -> tuple[tuple[int, float, float], ...]:
-        """Read a JSON list of intervals: lane, start, and optionally end along the lane."""
+        """Read a JSON list of lane intervals: lane, start, and optionally the end along the lane."""
         values = self._fields.get(key, [])
         shape = "[lane, start, end]" if numbers == 3 else "[lane, along]"
         expected = f"at most {MAX_RELATED} stretches {shape}"

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 
 _SIDEWAYS: Final = 0.9
-"""A step is a jump if a larger share of it goes across the lane."""
+"""Share of a step that must go across the lane for the step to count as a jump."""
 _FIRST_LANE: Final = 1
-"""Row of the first lane among the nodes: row 0 is ``off_road``."""
+"""Row of the first lane among the map nodes, because row 0 is ``off_road``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class PlainLane:
     def painted_across(
         lanes: Sequence[PlainLane], lines: Sequence[Floats]
     ) -> list[dict[int, float]]:
-        """Find the driving lanes below painted lines (such as stop lines), and the position along each lane.
+        """Return the driving lanes below painted lines (such as stop lines), with the position along each lane.
 
         A line between two consecutive lanes belongs to the first.
         """
@@ -444,7 +444,7 @@ def _edges(
 
 
 Edge = tuple[str, "Ints", "Ints"]
-"""Relation, with the rows of sources and destinations among the nodes."""
+"""Edges of one relation: its name, rows of the sources, and rows of the destinations among the nodes."""
 
 
 def edges_of(parts: Sequence[Edge]) -> MapEdges:
@@ -473,6 +473,6 @@ def _lane_changes(lanes: Sequence[PlainLane]) -> LaneChanges:
 
 
 _ON_LANE: Final = 0.1
-"""Greatest distance between a stop line and the centre line of its lane; m."""
+"""Largest distance between a stop line and the centre line of its lane; m."""
 _AT_START: Final = 0.5
-"""A line this close to the start of a lane belongs to the previous lane, if it is on that lane too; m."""
+"""Distance from the start of a lane up to which a line can belong to the previous lane instead; m."""

@@ -40,19 +40,19 @@ if TYPE_CHECKING:
 
 
 FARTHEST: Final = 200.0
-"""Greatest search distance along the lanes from one entity to another; m. The view ``pairs`` uses it too."""
+"""Largest search distance along lanes from one entity to another; m. The view ``pairs`` has the same limit."""
 _CELL: Final = 8.0
-"""Cell size of the grid that finds bodies far from all crosswalks; m."""
+"""Cell size of the grid that excludes bodies far from all crosswalks; m."""
 _MOST_CELLS: Final = 1 << 16
 
 _MOST_AT_ONCE: Final = 1 << 22
-"""Pairs of lanes whose distances are in memory at a time."""
+"""Number of pairs of lanes whose distances are in memory at once."""
 
 
 def _downstream(
     lengths: Floats, src: Ints, dst: Ints, limit: float
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
-    """Yield pairs of lanes and their distance, if the second lane starts within ``limit`` after the first.
+    """Yield pairs of lanes with their distance, if the second starts within ``limit`` after the first.
 
     Traffic flows from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
     """
@@ -77,36 +77,36 @@ def _downstream(
 
 
 STRAIGHT: Final = np.radians(30.0)
-"""A lane through a junction with a smaller turn goes straight on; rad."""
+"""Turn angle below which a lane through a junction goes straight on; rad."""
 
 
 def turn_words(turn: Floats) -> list[str]:
-    """Return ``left``, ``right`` or ``straight`` for turn angles, positive to the left; rad."""
+    """Return ``left``, ``right`` or ``straight`` for turn angles; rad. Positive angles turn left."""
     words = np.where(turn > STRAIGHT, "left", np.where(turn < -STRAIGHT, "right", "straight"))
     return list(map(str, words))
 
 
 OFF_ROAD: Final = -1
-"""Node id of the single node for all places outside driving lanes."""
+"""Node id of the single node that stands for all places outside driving lanes."""
 
 STOREY: Final = 2.5
-"""Greatest difference of height between a footprint and its lane; m."""
+"""Largest difference in height between a footprint and its lane; m."""
 
 Geometries = NDArray[np.object_]
-"""An array of shapely geometries."""
+"""Array of shapely geometries."""
 
 _FIRST_LANE: Final = OFF_ROAD - 1
 _QUADRANT: Final = np.pi / 4
 _ROUNDING: Final = 1e-3
-"""Difference of overlaps and headings that is rounding: equal lanes stay equal in a turned world."""
+"""Difference of overlaps and headings that counts as rounding, so that results survive a rotation."""
 _MOST_PRESENT: Final = 1 << 24
-"""Greatest number of (node, point) pairs processed at once."""
+"""Largest number of (node, point) pairs that are processed at once."""
 _CORNERS: Final = 8
-"""Corners of a shape for the quick test of nearness."""
+"""Number of corners of a shape that the quick test of distance uses."""
 _TOUCH: Final = 1e-6
-"""Distances that differ by less need no exact test; m."""
+"""Difference of distances below which no exact test is needed; m."""
 _MERGED: Final = " without sections"
-"""Suffix of the variant of a map with one node for all sections of a lane."""
+"""Suffix that marks a map with a single node for all sections of a lane."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class MapNodes:
 
     @classmethod
     def of(cls, kind: str | Sequence[str], name: Sequence[str], **columns: Any) -> MapNodes:
-        """Make a table of map parts from given columns. Missing columns are empty, 0 or NaN.
+        """Return a table of map parts from columns. Missing columns are empty, 0 or NaN.
 
         ``kind``: one, or one per node.
         """
@@ -395,7 +395,7 @@ class RoadMap:
         )
 
     def crosswalks_of(self, boxes: Floats, z: Floats) -> tuple[Ints, Ints]:
-        """Find the crosswalks below object footprints. Return pairs of footprint index and node id.
+        """Return the crosswalks below object footprints, as pairs of footprint index and node id.
 
         Boxes and heights as in :meth:`lanes_of`.
         """
@@ -415,7 +415,7 @@ class RoadMap:
         return row[order], -1 - column[order]
 
     def near(self, x: Floats, y: Floats, radius: float) -> tuple[Ints, Ints]:
-        """Find the map parts within ``radius`` of points. Return pairs of point index and node id.
+        """Return the map parts within ``radius`` of points, as pairs of point index and node id.
 
         A road or junction is near if one of its lanes is near. Ordered by row and by descending
         node id.
@@ -457,7 +457,7 @@ class RoadMap:
         return present
 
     def near_shapes(self, corners: Floats, distance: float) -> tuple[Ints, Ints]:
-        """Find the map parts within ``distance`` of shapes. Return pairs of shape index and node id.
+        """Return the map parts within a distance of shapes, as pairs of shape index and node id.
 
         Parameters
         ----------
@@ -727,7 +727,7 @@ class RoadMap:
 
     @staticmethod
     def lanes_ref(names: Iterable[str]) -> str:
-        """Return a substitute id, made of lane names, for a traffic signal that the map lacks."""
+        """Return an id made of lane names for a traffic signal that the map does not contain."""
         return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
 
     @staticmethod

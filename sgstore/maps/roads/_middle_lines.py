@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 MAX_PIECES: Final = 1_000
-"""Greatest number of pieces of a border. A lane with more is left out and named in a warning."""
+"""Largest number of pieces of a border. A lane with more is left out with a warning."""
 
 _DOUBLE: Final = 1.0
-"""Pieces of a border this close are parallel (a double line), unless one continues the other; m."""
+"""Distance up to which two pieces of a border are parallel (double line), unless one continues the other; m."""
 
 _ONE_SIDED: Final = 0.5
-"""Least share of the way between two borders along which left and right must be correct."""
+"""Smallest share of the length along which the left and right borders must be on the correct sides."""
 
 
 def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
@@ -64,7 +64,7 @@ def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
 
 
 def _joined_pieces(pieces: Sequence[Floats], side: str) -> Floats:
-    """Join the pieces of a lane border, from the longest piece on, each time with the nearest end."""
+    """Join the pieces of a lane border, starting from the longest, each time with the nearest end."""
     free = [thin for piece in pieces if len(thin := thinned(piece)) > 1 and run_of(thin)[-1] > 0]
     if not free:
         raise ValueError(f"neither a centre line nor a boundary to its {side}")
@@ -90,7 +90,7 @@ def _joined_pieces(pieces: Sequence[Floats], side: str) -> Floats:
 
 
 def _is_parallel(piece: Floats, chain: Floats) -> bool:
-    """Return True if the midpoint of a border piece is close to the joined pieces: a double line."""
+    """Return True if the midpoint of a piece is close to the joined pieces, as in a double line."""
     run = run_of(piece)
     midpoint = np.array([[np.interp(run[-1] / 2, run, column) for column in piece[:, :2].T]])
     foot = feet(midpoint, [chain])

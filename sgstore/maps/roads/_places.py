@@ -28,7 +28,7 @@ STOP_LINE: Final = "stop_line"
 
 
 BROAD_LINES: Final = ("broad_line_left", "broad_line_right")
-"""Kinds of broad markings to the left and to the right of a lane, seen in its direction of travel."""
+"""Names of broad markings to the left and to the right of a lane, in its direction of travel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +72,14 @@ class MapPlaces:
     def of(
         cls, part: Ints, what: Sequence[str], lane: Ints, start: Floats, end: Floats
     ) -> MapPlaces:
-        """Make a sorted table of lane intervals from columns in any order."""
+        """Return a sorted table of lane intervals from columns in any order."""
         order = np.lexsort((end, start, lane, part))
         kinds = tuple(what[int(row)] for row in order)
         return cls(part[order], kinds, lane[order], start[order], end[order])
 
     @classmethod
     def of_broad_lines(cls, rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
-        """Make a table of lane intervals with broad markings.
+        """Return a table of lane intervals with broad markings.
 
         A row is the lane, True if the marking is on its left, and start and end; m.
         """
@@ -92,7 +92,7 @@ class MapPlaces:
 def whole_lanes(
     ribbons: Ribbons, what: str, names: Sequence[str], column: dict[str, int]
 ) -> MapPlaces:
-    """Return whole lanes as lane intervals of their road or junction.
+    """Return lane intervals that cover whole lanes, for their road or junction.
 
     Parameters
     ----------

@@ -153,7 +153,7 @@ class Ribbons:
     def _place(
         self, column: Floats, sign: Floats, lane: Ints, value: Floats
     ) -> tuple[Ints, Floats]:
-        """Find the cross section before each position on a lane, and the relative position to the next.
+        """Return the cross section before each position on a lane, and the relative position to the next one.
 
         ``column`` rises along lanes where ``sign`` is 1 and falls where it is -1. All lanes are
         searched at once, laid end to end with gaps of 1 m.

@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 _SAMPLES: Final = 9
-"""Number of sample places along a lane and along a border."""
+"""Number of places along a lane and along a border that are compared."""
 
 _LEAST_COMMON: Final = 0.1
-"""Least common part of a border of two neighbouring lanes, as a share of the shorter lane."""
+"""Smallest common part of a border for two neighbouring lanes, as a share of the shorter lane."""
 
 _LaneSide: TypeAlias = "tuple[int, int]"
-"""Row of a lane, and its side: 0 left, 1 right."""
+"""Row of a lane, and its side: 0 for left, 1 for right."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Part of a border that a lane follows: start and end along the border, and the side of the lane; m."""
+    """Part of a border that belongs to a lane: start and end along the border (m), and the side of the lane."""
 
     start: float
     end: float
@@ -91,7 +91,7 @@ def _has_neighbour(lines: Sequence[LaneLine], lane_side: _LaneSide) -> bool:
 
 
 def _stretch(centre: Floats, border: Floats) -> _Stretch:
-    """Return the part of a border that a lane follows; without length if the lane is beyond its ends."""
+    """Return the part of a border that belongs to a lane. Beyond the border's ends, it has no length."""
     centre, border = thinned(centre)[:, :2], border[:, :2]
     on_lane, on_border = _sampled(centre), _sampled(border)
     onto, back = feet(on_lane, [border]), feet(on_border, [centre])

@@ -29,11 +29,10 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats, Ints
 
 LONG: Final = 250.0
-"""Length of a zone that does not follow from lane types: acceleration lanes of German motorways
-(RAA 2008); m."""
+"""Length of a zone that does not follow from lane types; m. It is that of German acceleration lanes (RAA
+2008)."""
 _MOST: Final = 1_000
-"""Greatest number of searched lanes of a junction per entering lane: maps from other sources can
-have any size."""
+"""Largest number of junction lanes that are searched for each entering lane, because maps can have any size."""
 MERGE_ZONE: Final = "merge_zone"
 DEPARTURE_ZONE: Final = "departure_zone"
 _LEADING: Final[Mapping[str, frozenset[str]]] = {
@@ -117,7 +116,7 @@ class _Lanes:
         return found
 
     def _joining(self) -> Iterable[int]:
-        """Yield the lanes directly before the position where several roads become one road."""
+        """Yield the lanes that end where several roads become one road."""
         reached: dict[int, set[int]] = {}
         coming: dict[int, set[int]] = {}
         last: dict[int, set[int]] = {}
@@ -133,7 +132,7 @@ class _Lanes:
                 yield from last[target]
 
     def _onto(self, lane: int) -> Iterable[tuple[int, int]]:
-        """Yield the lane groups behind the next junction of a lane, with the last lane before each group."""
+        """Yield the lane groups after the next junction of a lane, with the last lane before each group."""
         queue, seen = [lane], {lane}
         while queue and len(seen) < _MOST:
             at = queue.pop()
@@ -147,7 +146,7 @@ class _Lanes:
     def _walk_back(
         self, lane: int, groups: Mapping[int, Sequence[int]], found: dict[int, float]
     ) -> None:
-        """Add a lane, its neighbours and predecessors to a merge zone, within the zone's greatest length."""
+        """Add a lane, its neighbours and predecessors to a merge zone, up to the largest length of the zone."""
         queue = [(lane, LONG)]
         while queue:
             at, left = queue.pop()
