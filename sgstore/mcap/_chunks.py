@@ -107,7 +107,7 @@ class Recording(Protocol):
 
 
 LAST_NS: Final = (1 << 63) - 1
-"""Greatest time in signed 64 bits: the year 2262; ns."""
+"""Largest time in signed 64 bits, in the year 2262; ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,16 +154,16 @@ except ImportError:  # The extra [fast] computes the same checksums ten times fa
 
 
 MAX_CHUNK: Final = 256 << 20
-"""Maximum size of a chunk, stored or decompressed, and of a message outside chunks; bytes."""
+"""Maximum size of a chunk (compressed or not), and of a message outside chunks; bytes."""
 
 MAX_RECORDS: Final = 2_000_000
-"""Maximum number of records in a chunk: more than 60 MB of the smallest messages."""
+"""Maximum number of records in a chunk. It equals more than 60 MB of the smallest messages."""
 
 IDS: Final = 1 << 16
 """Maximum number of channel ids, and of schema ids, in a file; an id has 16 bits."""
 
 MIN_WINDOW: Final = 32 << 20
-"""Window size that a zstd frame may always use; bytes. A larger window must not exceed the chunk."""
+"""Window size up to which a zstd frame is always accepted; bytes. A larger window must not exceed the chunk."""
 
 READ_ERRORS: Final = (
     McapError,
@@ -178,13 +178,13 @@ READ_ERRORS: Final = (
     MemoryError,
     OSError,
 )
-"""Known exceptions of the parsers and decompressors for malformed bytes."""
+"""Exceptions that parsers and decompressors raise for malformed bytes."""
 
 Records = bytes | bytearray | memoryview
-"""The records of a chunk, uncompressed."""
+"""Decompressed bytes of all records in a chunk."""
 
 HEAD: Final = struct.Struct("<BQ")
-"""Head of every record: opcode, length of its content."""
+"""Header of every record: opcode and length of the content."""
 
 MESSAGE_HEAD: Final = np.dtype(
     [
@@ -196,14 +196,14 @@ MESSAGE_HEAD: Final = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-"""Head of a message record, packed: 31 bytes, then the data."""
+"""Header of a message record: 31 bytes, followed by the data."""
 
 CHUNK_FIELDS: Final = struct.Struct("<QQQI")
 _PIECE: Final = 1 << 20
 _LZ4_PIECE: Final = 16 << 20  # The decompressor copies the remaining input for every piece.
 _MESSAGE: Final = int(Opcode.MESSAGE)
 MESSAGE_FIELDS: Final = MESSAGE_HEAD.itemsize - HEAD.size
-"""Bytes of a message record between its head and the data."""
+"""Number of bytes in a message record between the record header and the data."""
 _DEFINITIONS: Final = frozenset({int(Opcode.SCHEMA), int(Opcode.CHANNEL)})
 
 

@@ -43,7 +43,7 @@ _Found = TypeVar("_Found")
 
 METADATA: Final = "metadata.yaml"
 MAX_METADATA: Final = 16 << 20
-"""Maximum size of ``metadata.yaml``; bytes. It repeats the settings of every channel."""
+"""Maximum size of ``metadata.yaml``; bytes. The file repeats the settings of every channel."""
 MAX_PARTS: Final = 10_000
 """Maximum number of files in a bag."""
 
@@ -101,11 +101,11 @@ FOLDERS: Final = {
         "map.arrow",
     ),
 }
-"""File in each folder of a format → patterns of the other files of a recording; the first is required."""
+"""File that identifies a folder of recordings → patterns of the other files. The first one is required."""
 
 
 def log_files(path: Path) -> list[Path] | None:
-    """Return the files of a recording that is a folder of another format. ``None`` means another path."""
+    """Return the files of a recording in a folder of another format. ``None`` for any other path."""
     if url_named(path) is not None:
         return None
     if (stored := _sqlite_bag(path)) is not None:

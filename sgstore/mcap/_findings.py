@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 MAX_LOSSES: Final = 1000
-"""Maximum number of listed losses; the last one sums up all further ones."""
+"""Maximum number of losses that are listed. The last entry sums up all further losses."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,11 +50,11 @@ BATCH_MESSAGES: Final = 16_384
 BATCH_BYTES: Final = 8 << 20
 """Maximum size of the copied data of a batch; bytes. A single message may be larger."""
 CACHED: Final = 24 << 20
-"""Memory for chunks cached between batches; bytes."""
+"""Memory for chunks that are cached between two batches; bytes."""
 COLUMN_BYTES: Final = 8 * 6
-"""Memory of the columns of a message, without its data; bytes."""
+"""Memory that the columns of one message need, without its data; bytes."""
 OFTEN: Final = 2
-"""A chunk read more often than this in one reading is reported."""
+"""Number of times that a chunk may be read in one pass without a warning."""
 
 _ENTRY: Final = np.dtype([("log", "i8"), ("publish", "u8"), ("channel", "u2"), ("row", "u2")])
 _BLOCK: Final = 1 << 15  # A block has less than twice as many messages, because a row has 16 bits.
@@ -62,11 +62,11 @@ _PARTS: Final = 64
 _SAMPLE: Final = 4096
 _KEYS: Final = ("log", "publish", "channel")
 _SIZES: Final = np.floor(2 ** (np.arange(256) / 8)).astype(np.int64)
-"""Size code → bytes. A code has one byte; sizes are rounded up by at most 9 %."""
+"""Size code → size; bytes. A code fits into one byte, because sizes are rounded up by at most 9 %."""
 
 
 class OutOfOrder(Exception):  # noqa: N818  (a signal, not an error)
-    """Signal: the messages are not in order of time, so the next reading must sort them."""
+    """Signal: the messages are not in order of time. The next pass must sort them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ class ChannelRanks:
 
 
 def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Times:
-    """Return publish times, increased where a message was published before its predecessor on the channel."""
+    """Return publish times that do not decrease within a channel. Earlier ones are raised."""
     order = np.lexsort((channel, log_time))  # stable: equal messages keep their place
     log, number, times = log_time[order], channel[order], publish_time[order]
     same = (log[1:] == log[:-1]) & (number[1:] == number[:-1])
@@ -229,7 +229,7 @@ class _IndexBlock:
         self.entries = self.entries[np.argsort(self.entries[key], kind="stable")]
 
     def split(self, key: str, edge: Edge) -> _IndexBlock:
-        """Remove the index entries before a key value, and return them.
+        """Remove the index entries before a given value of the key, and return them.
 
         ``None`` means all. The entries must be sorted by the key.
         """
@@ -312,7 +312,7 @@ class TimeOrder:
             yield _block_of(waiting, first)
 
     def _note(self, run: Messages, keeps: Callable[[int], bool]) -> None:
-        """Record position and channels of a group of messages, and how far its log times run backwards."""
+        """Record the position and channels of a group of messages, and by how much its log times decrease."""
         for number in np.unique(run.channel).tolist():
             self._kept[number] = keeps(number)
             times = run.log_time_ns[run.channel == number]
@@ -443,7 +443,7 @@ def _block_of(entries: bytearray, first: int) -> _IndexBlock:
 
 
 def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> Iterator[Numbers]:
-    """Yield message numbers of a file in order of time, part by part. The given index becomes empty.
+    """Yield the message numbers of a file in order of time, part by part. The given index is emptied.
 
     Parameters
     ----------
@@ -474,7 +474,7 @@ def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> 
 
 
 def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
-    """Return limits (such as times) that divide the messages of an index into parts small enough to sort.
+    """Return values of the key (such as times) that divide an index into parts that are small enough to sort.
 
     A value with many messages becomes a separate part. The last part begins at the greatest value.
     """
@@ -492,7 +492,7 @@ def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
 
 
 def _raise_publish_times(blocks: Sequence[_IndexBlock]) -> None:
-    """Increase publish times in an index that are before those of the previous message of the channel."""
+    """Raise publish times in an index that are earlier than that of the previous message of the channel."""
     latest = np.zeros(IDS, np.uint64)
     for block in blocks:
         channel = block.entries["channel"]

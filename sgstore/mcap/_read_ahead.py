@@ -50,13 +50,13 @@ if TYPE_CHECKING:
 
 
 MOST_BUFFERED: Final = 48 << 20
-"""Maximum memory of :class:`Buffers` for reuse; bytes."""
+"""Maximum total size of the buffers that are kept for reuse; bytes."""
 MOST_BUFFERS: Final = 128
-"""Maximum number of buffers for reuse."""
+"""Maximum number of buffers that are kept for reuse."""
 
 
 class Buffers:
-    """Memory buffers for decompressed chunks, used again for later chunks.
+    """Memory buffers for decompressed chunks. Later chunks reuse them.
 
     One thread owns the buffers; other threads may fill them.
     """
@@ -65,7 +65,7 @@ class Buffers:
         self._kept: list[bytearray] = []
 
     def take(self, size: int) -> memoryview:
-        """Return memory of ``size`` bytes with undefined contents. It is reserved while a view of it exists."""
+        """Return memory of ``size`` bytes, with undefined content. It is in use while a view of it exists."""
         if not size:
             return memoryview(bytearray())
         for buffer in self._kept:
@@ -90,7 +90,7 @@ class Buffers:
 
 
 def _is_free(buffer: bytearray) -> bool:
-    """Return True if a memory buffer has no view. Only then can its size change."""
+    """Return True if no view of a memory buffer exists, so that its size can change."""
     try:
         buffer.append(buffer.pop())
     except BufferError:
@@ -103,14 +103,14 @@ def _is_free(buffer: bytearray) -> bool:
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 FOOTER: Final = struct.Struct("<BQQQI8s")
-"""Opcode, length, start of the summary, start of its offsets, CRC-32, magic."""
+"""Format of the end of a file: opcode, length, start of the summary, start of its offsets, CRC-32, magic."""
 MAX_SUMMARY: Final = 64 << 20
-"""Maximum size of a summary; bytes. A larger one is ignored."""
+"""Maximum size of a summary; bytes. A larger summary is ignored."""
 
 
 @dataclass(slots=True)
 class Summary:
-    """Summary section of an MCAP file: schemas, channels, and a list of chunks; empty if absent.
+    """Summary section of an MCAP file: schemas, channels, and a list of chunks. Empty without a summary.
 
     Attributes
     ----------
@@ -197,9 +197,9 @@ def _parsed(content: bytes) -> Summary:
 # reached, later chunks are decompressed again. Cached data were verified by the first reading.
 
 IN_MEMORY: Final = 32 << 20
-"""Maximum size of the cache in memory; bytes."""
+"""Maximum size of the cache in memory; bytes. A larger cache is on disk."""
 MOST_SPOOLED: Final = 1 << 30
-"""Maximum size of the cache; bytes. It holds the ground truth of many hours."""
+"""Maximum size of the cache; bytes. It is enough for the ground truth of many hours."""
 
 _COLUMNS: Final = 7
 
@@ -243,7 +243,7 @@ class Spool:
         return (path, chunk_offset) in self._places
 
     def get(self, path: Path, chunk_offset: int, anew: Callable[[], Read]) -> Messages | None:
-        """Return the messages of a chunk from the cache. ``None`` means not cached, or no longer readable.
+        """Return the messages of a chunk from the cache. ``None`` if not cached, or not readable again.
 
         Parameters
         ----------
@@ -303,24 +303,24 @@ def _reader(starts: dict[int, int], data: memoryview, anew: Callable[[], Read]) 
 # chunk is reported at its turn, with the same message as without threads.
 
 THREADS: Final = 2
-"""Number of threads for decompression. A single processor gains nothing."""
+"""Number of threads for decompression. Threads have no advantage on a single processor."""
 BATCH: Final = 2 << 20
-"""Approximate total size of the chunks of one task; bytes."""
+"""Approximate size of the chunks that one task decompresses together; bytes."""
 AHEAD: Final = 8 << 20
-"""Approximate total size of chunks decompressed in advance; bytes."""
+"""Approximate size of the chunks that are decompressed in advance; bytes."""
 LARGEST: Final = 16 << 20
-"""Maximum size of a chunk, stored or decompressed, for read-ahead; bytes."""
+"""Maximum size of a chunk (compressed or not) that is decompressed in advance; bytes."""
 
 WORTH: Final = 0.9
-"""Maximum compression ratio for read-ahead. JPEG pictures exceed it."""
+"""Largest ratio of compressed to original size for read-ahead. JPEG pictures exceed it."""
 LEAST: Final = 64 << 10
-"""Minimum size that a chunk counts for; bytes."""
+"""Smallest size that a chunk counts for in these limits; bytes."""
 BETWEEN: Final = 1000
-"""Maximum number of records between two chunks. One message index per channel is usual."""
+"""Maximum number of records between two chunks. Usually, there is one message index for each channel."""
 _TRIED: Final = 256  # offsets tested per batch; some may not be chunks
 
 Found = dict[int, "tuple[ChunkHead, Records | TraceError]"]
-"""Byte offset of a chunk → its head, and its records or its error."""
+"""Byte offset of a chunk → its header, and its records or the error."""
 
 
 def chunks_in(file: BufferedReader) -> Iterator[int]:
@@ -464,7 +464,7 @@ def _cost(head: ChunkHead) -> int:
 
 
 def _is_apt(head: ChunkHead) -> bool:
-    """Return True if decompression of a chunk in another thread saves time."""
+    """Return True if it saves time to decompress a chunk in another thread."""
     compressed = bool(head.compression) and head.data_length < WORTH * head.size
     return compressed and _cost(head) <= LARGEST
 

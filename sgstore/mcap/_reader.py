@@ -75,17 +75,17 @@ if TYPE_CHECKING:
 
 
 CLIP: Final = "sgstore.clip"
-"""Name of the metadata record of a clip, with ``start_ns`` and ``end_ns`` of its interval."""
+"""Name of the metadata record that marks a clip. It has ``start_ns`` and ``end_ns`` of the interval."""
 MAX_DEFINITION: Final = 16 << 20
 """Maximum size of a schema, channel or metadata record; bytes."""
 MAX_DEFINITIONS: Final = 64 << 20
 """Maximum total size of all schemas, channels and metadata of a file; bytes."""
 SMALL: Final = 4 << 20
-"""Files up to this size are read chunk by chunk, without threads; bytes."""
+"""Size up to which a file is read chunk by chunk, without threads; bytes."""
 RUN_MESSAGES: Final = 1024
-"""Maximum number of messages outside chunks in one run."""
+"""Maximum number of messages outside chunks in one group."""
 MOST_OPEN: Final = 32
-"""Maximum number of open files of a bag."""
+"""Maximum number of files of a bag that are open at once."""
 
 _PIECE: Final = 1 << 20
 _HOLDS_CONTENT: Final = frozenset(
@@ -159,7 +159,7 @@ class McapFile:
     has_log_times = True
 
     def __new__(cls, path: Path, spool: Spool | None = None) -> Self:
-        """Create a reader of an MCAP file, or of all files of a bag."""
+        """Return a new reader of an MCAP file, or of all files of a bag."""
         del spool
         if cls is McapFile and bag_folder(path) is not None:
             return object.__new__(cast("type[Self]", McapBag))
@@ -305,7 +305,7 @@ class McapFile:
                 return found
 
     def _again(self, place: int, count: int) -> Messages:
-        """Read a group of consecutive messages again, from a byte position."""
+        """Read a group of consecutive messages again, starting at a byte position."""
         runs = self._in_file_order(Findings(), _all, None, place)
         for run in runs:
             runs.close()
@@ -319,7 +319,7 @@ class McapFile:
         keep: Callable[[int], bool] | None,
         start: int = len(MAGIC),
     ) -> Generator[Messages]:
-        """Yield all messages in file order, from a byte position on."""
+        """Yield all messages in file order, starting at a byte position."""
         walk = _FileWalk(report, self._read_ahead(wanted), wanted, keep, start)
         self._aheads.append(walk.ahead)
         try:
@@ -382,7 +382,7 @@ class McapFile:
         return HEAD.unpack(head) if len(head) == HEAD.size else None
 
     def _passes(self, walk: _FileWalk, length: int) -> bool:
-        """Skip a record without useful content. Return True if its length is valid."""
+        """Skip a record without useful content. Return False if its length is impossible."""
         stop = walk.position + HEAD.size + length
         sound = walk.pending is None and stop <= self.size
         sound = sound and self._chunk_behind(walk.position, stop) is None
@@ -445,7 +445,7 @@ class McapFile:
         return message_columns(np.frombuffer(heads, MESSAGE_HEAD), offsets, -1, self._at)
 
     def _end(self, walk: _FileWalk, start: int) -> Iterator[Messages]:
-        """Handle the end of the data. If the file's summary lists later chunks, continue there."""
+        """Handle the end of the data. If the summary lists later chunks, continue with them."""
         yield from self._flush(walk)
         resume = self._chunk_behind(start, self.size)
         walk.closed = resume is None
@@ -497,7 +497,7 @@ class McapFile:
         return found
 
     def _known(self, walk: _FileWalk, messages: Messages) -> Iterator[Messages]:
-        """Yield messages without those of undefined channels, which are reported as lost."""
+        """Yield the messages of defined channels. Report the others as lost."""
         lost = ~self._known_channels[messages.channel]
         if lost.any():
             unknown: list[int] = np.unique(messages.channel[lost]).tolist()
@@ -516,7 +516,7 @@ class McapFile:
             yield messages
 
     def _chunk_behind(self, start: int, stop: int) -> int | None:
-        """Return the offset of the first chunk between two offsets, from the file's summary, or ``None``.
+        """Return the offset of the first chunk between two offsets according to the summary, or ``None``.
 
         An offset of the summary counts only if a valid chunk head is at this place.
         """
@@ -529,7 +529,7 @@ class McapFile:
         return None
 
     def _broken(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
-        """Handle a record with an impossible length: continue at the next chunk of the summary, or end."""
+        """Handle a record with an impossible length: continue at the next chunk in the summary, or stop."""
         resume = self._chunk_behind(walk.position, self.size)
         start = walk.position
         stop = self.size if resume is None else resume
@@ -577,20 +577,20 @@ class McapFile:
             return head, None, []
 
     def _count(self, walk: _FileWalk, length: int) -> None:
-        """Add the message counts of an index record to the report of its lost chunk."""
+        """Add the messages that an index record lists to the count of a lost chunk."""
         if walk.pending is None:
             return
         entries = max(length - 6, 0) // 16
         walk.pending = replace(walk.pending, messages=max(walk.pending.messages, 0) + entries)
 
     def _settle(self, walk: _FileWalk) -> None:
-        """Report a lost chunk, after the records with its message counts are read."""
+        """Report a lost chunk, after the index records with its message counts are read."""
         if walk.pending is not None:
             walk.report.lose(walk.pending)
             walk.pending = None
 
     def _closing_words(self, walk: _FileWalk) -> None:
-        """Add warnings about oddities of the whole file that lose no data."""
+        """Add warnings about unusual properties of the whole file that lose no data."""
         warn = walk.report.warnings.append
         left = self.size - walk.position
         if not walk.closed:
@@ -683,7 +683,7 @@ class McapFile:
 
 
 class McapBag(McapFile):
-    """Reader of a bag (folder of MCAP files) as one recording. Positions count from the first file.
+    """Reader of a bag (folder of MCAP files) as one recording. Byte positions count through all files.
 
     Parameters
     ----------
@@ -759,7 +759,7 @@ class McapBag(McapFile):
 
     @property
     def compression(self) -> str:
-        """Name of the compression of the first chunk; ``zstd`` before the first chunk."""
+        """Name of the compression of the first chunk. Before the first chunk is read, it is ``zstd``."""
         return next(iter(self._files.values())).compression
 
     def _in_file_order(
@@ -844,7 +844,7 @@ class McapBag(McapFile):
         self.attachments += [place for place in moved if place not in known]
 
     def _take(self, number: int, file: McapFile, key: tuple[Any, ...], alike: list[int]) -> int:
-        """Return the channel id in the bag for a channel of one file.
+        """Return the channel id in the bag for a channel of one file. Add the channel if it is new.
 
         ``alike``: the file's channels with this key.
         """
@@ -867,7 +867,7 @@ class McapBag(McapFile):
         return number
 
     def _free(self, number: int, taken: dict[int, Any]) -> int:
-        """Return the given channel id if it is unused in the bag, else the next unused id."""
+        """Return the given channel id if the bag does not use it yet; otherwise the next unused id."""
         free = number if number not in taken else max(taken) + 1
         if free >= IDS:  # The limit applies to all files together.
             raise TraceError(f"more than {IDS} channels or schemas", path=self.path)
@@ -878,7 +878,7 @@ class McapBag(McapFile):
         return lambda number: keep(self._own[file.path, number])
 
     def _placed(self, file: McapFile, run: Messages, base: int) -> Messages:
-        """Return the messages of a file with channel ids and positions of the whole bag."""
+        """Return the messages of a file with the channel ids and byte positions of the whole bag."""
         ids, index = np.unique(run.channel, return_inverse=True)
         own = np.array([self._own[file.path, number] for number in ids.tolist()], np.int64)
         if run.chunk_offset >= 0:
@@ -895,7 +895,7 @@ def _all(_channel: int) -> bool:
 
 
 def _key_of(channel: Channel, file: McapFile) -> tuple[Any, ...]:
-    """Return a key for a channel: channels of two files with equal keys are one channel of the bag."""
+    """Return a key of a channel. Channels of two files with equal keys are one channel of the bag."""
     schema = file.schemas.get(channel.schema_id)
     definition = (schema.name, schema.encoding, schema.data) if schema else ()
     return channel.topic, channel.message_encoding, *definition

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TRIES: Final = 4
-"""Number of tries for an incomplete response of an object store."""
+"""Number of attempts if a response of an object store is incomplete."""
 
 PIECE: Final = 1 << 20
-"""Size of a request for single messages; bytes."""
+"""Size of a request when single messages are read; bytes."""
 
 COPIED: Final = 16 << 20
-"""Size of a request for a complete copy; bytes."""
+"""Size of a request when a whole object is copied; bytes."""
 
 _copies: Final[dict[str, Path]] = {}
 """URL → path of its current local copy."""
@@ -310,7 +310,7 @@ class RemoteFile(io.RawIOBase):
 
 
 def whole(url: str, size: int, ask: Callable[[], memoryview]) -> memoryview:
-    """Repeat a download request a few times, until all bytes arrive.
+    """Repeat a download request up to a few times, until all bytes have arrived.
 
     Raises
     ------
