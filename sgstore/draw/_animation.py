@@ -1,4 +1,4 @@
-"""Writers of animations (GIF, MP4, WebM). Each picture is written at once, so that memory is bounded."""
+"""Writers of animations (GIF, MP4, WebM). Each picture is written immediately, to limit the memory."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 
 LEAST_DELAY: Final = 2
-"""Shortest display time of a frame in hundredths of a second: many players show shorter frames for
-a tenth of a second."""
+"""Shortest display time of a picture, in hundredths of a second. Many players show shorter ones for a tenth
+of a second."""
 MOST_DELAY: Final = 65535
 CODECS: Final[dict[str, tuple[tuple[str, ...], dict[str, str]]]] = {
     ".mp4": (("libx264", "libopenh264"), {"preset": "veryfast", "crf": "20", "rc-lookahead": "8"}),
@@ -39,9 +39,9 @@ CODECS: Final[dict[str, tuple[tuple[str, ...], dict[str, str]]]] = {
         {"crf": "30", "deadline": "good", "cpu-used": "6", "lag-in-frames": "8"},
     ),
 }
-"""Encoders of each kind of video, best first, with their settings."""
+"""Kind of video → possible encoders, best first, with their settings."""
 FILM_CHANGE: Final = 40
-"""Greatest change of a colour channel by an earlier palette, 0 … 255."""
+"""Largest change of a colour channel (0 … 255) for which a picture uses the palette of an earlier one."""
 
 
 class Animation(ABC):
@@ -54,7 +54,7 @@ class Animation(ABC):
     """
 
     TICKS: ClassVar[int]
-    """Ticks of its clock per second."""
+    """Number of time units per second in the file format."""
 
     def __init__(self, to: Path) -> None:
         self._output = OutputFile(to)
@@ -98,7 +98,7 @@ class Animation(ABC):
 
     @abstractmethod
     def _drop(self) -> None:
-        """Release all resources of the animation writer except its file."""
+        """Release all resources of the animation writer, but keep the file."""
 
 
 def animation(to: Path) -> Animation:
@@ -134,7 +134,7 @@ class Gif(Animation):
         self._stream.write(b";")  # the trailer of a GIF
 
     def _drop(self) -> None:
-        """Do nothing, because the output file closes its stream itself."""
+        """Do nothing: the output file closes its stream itself."""
 
     def _write(self, pixels: Pixels, delay: int) -> None:
         """Write a picture to the GIF file, with its display time in hundredths of a second."""
@@ -158,7 +158,7 @@ class Gif(Animation):
         self.frames += 1
 
     def _indexed(self, picture: Image.Image, box: tuple[int, int, int, int]) -> Image.Image:
-        """Return a part of the picture in the palette of an earlier one, or with new colours in its own."""
+        """Return part of a picture in the palette of an earlier picture, or with new colours."""
         if self._palette is not None:
             part = picture.crop(box)
             made = part.quantize(palette=self._palette, dither=Image.Dither.NONE)

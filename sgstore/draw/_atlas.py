@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 
 _BORDER: Final = 1.05
-"""Side of the window, as a share of the map's extent."""
+"""Factor between the size of the window and the extent of the map, which leaves a margin."""
 _NAMED_ROADS: Final = 150
 _SIGNAL: Final = 3.4
 
 _TOLD: Final = 11
-"""Greatest number of kinds of map parts in one line."""
+"""Largest number of kinds of map parts in one line."""
 
 
 def paint_atlas(page: Page, road_map: RoadMap, window: Rect, side: Rect) -> str:

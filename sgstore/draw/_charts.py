@@ -30,16 +30,16 @@ _RIGHT: Final = 24.0
 _BELOW: Final = 46.0
 _ABOVE: Final = 72.0
 _LETTER: Final = 3.9
-"""Approximate width of a letter of 7 points."""
+"""Approximate width of a letter in a font of 7 points; points."""
 
 CHOSEN: Final[Mapping[str, Any]] = {"color": ROAD_EDGE, "linewidth": 1.8}
-"""Look of the main line of a chart."""
+"""Style of the main line of a chart."""
 AT_RANDOM: Final[Mapping[str, Any]] = {
     "color": FAINT_INK,
     "linewidth": 1.2,
     "linestyle": (0, (4, 3)),
 }
-"""Look of the line for comparison."""
+"""Style of the line for comparison in a chart."""
 
 
 @contextmanager
@@ -102,7 +102,7 @@ _GAP: Final = "#f5b877"
 _CANNOT: Final = "#dcdcdc"
 _CELL: Final = 11.0
 MOST_FEATURES: Final = 120
-"""Greatest number of features in a matrix; those with the most gaps are chosen."""
+"""Largest number of features in a matrix. Features with the most missing pairs are selected."""
 
 
 def draw_rank_sizes(
@@ -291,7 +291,7 @@ def draw_matrix(
 def _most_surprising(
     shown: NDArray[np.int64], frames: NDArray[np.int64], gaps: NDArray[np.bool_], most: int
 ) -> NDArray[np.int64]:
-    """Return the features with the most gaps, weighted by frame counts, in the given order."""
+    """Return the features with the most unexpected missing pairs: pairs of features that occur often."""
     often = np.diagonal(frames) + 1.0
     surprise = (gaps[np.ix_(shown, shown)] * often[shown]).sum(axis=1) * often[shown]
     return np.sort(shown[np.argsort(-surprise, kind="stable")[:most]])
@@ -303,7 +303,7 @@ def _cells(
     wanted: NDArray[np.bool_],
     groups: Sequence[str],
 ) -> NDArray[np.float64]:
-    """Return the cell colours below the diagonal; pairs of one slot are white, other impossible ones grey."""
+    """Return the cell colours below the diagonal. Pairs of one slot are white, other impossible pairs grey."""
     from matplotlib.colors import to_rgb
 
     image = _colours(frames, gaps)
@@ -321,7 +321,7 @@ _LARGEST_CELL: Final = 24.0
 
 
 def _compared(groups: Sequence[str], count: int) -> tuple[slice, slice]:
-    """Return the rows and columns that have pairs: all, or those without the first and the last slot."""
+    """Return the rows and columns that have pairs: all of them, or without the first or the last slot."""
     if len({*groups}) < 2:
         return slice(count), slice(count)
     return slice(groups.count(groups[0]), count), slice(count - groups.count(groups[-1]))
@@ -330,7 +330,7 @@ def _compared(groups: Sequence[str], count: int) -> tuple[slice, slice]:
 def _one_direction(
     names: Sequence[str], frames: NDArray[np.int64], wanted: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return the indices of features without duplicates: of features in the same frames, one is kept."""
+    """Return indices of features. Of several features that occur in the same frames, only one is included."""
     order = np.array(
         sorted(range(len(names)), key=lambda i: not names[i].startswith("ego ")), np.intp
     )

@@ -37,12 +37,12 @@ Tier = Literal["entity", "lane", "road", "junction"]
 Family = Literal["ego", "matched", "entity", "light", "isIn", "map", "part"]
 
 NEIGHBOURS: Final = 12
-"""Greatest number of entities around the ego, nearest first."""
+"""Largest number of entities around the ego, nearest first."""
 MOST: Final = 60
-"""Greatest number of entities with ``relations="all"``."""
+"""Largest number of entities if ``relations="all"``."""
 
 MOST_WORDS: Final = 2
-"""Greatest number of relations on a line in each direction; the most informative first."""
+"""Largest number of relation names on a line for each direction. The most informative ones are selected."""
 
 _TIERS: Final[dict[str, Tier]] = {"road": "road", "junction": "junction", "roundabout": "junction"}
 
@@ -250,12 +250,12 @@ def _is_asked(family: Family, src: int, dst: int, graph: SceneGraph, relations: 
 # nodes stay visible. Then overlapping nodes push each other apart. All measures are points.
 
 GAP: Final = (26.0, 11.0)
-"""Least gap between two nodes, horizontal and vertical, so that lines between them are visible."""
+"""Smallest gap between two nodes (horizontal, vertical), so that lines between them stay visible; points."""
 ROUNDS: Final = 200
 ROW: Final = 17.0
-"""Height of a row of map parts."""
+"""Height of a row of map parts; points."""
 _PULL: Final = 0.06
-"""Share of the way to its wanted place that a node returns in each round."""
+"""Share of the way back to its desired place by which a node moves in each round."""
 
 
 def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> Floats:
@@ -393,14 +393,14 @@ def _rows_needed(widths: NDArray[np.float64], room: float) -> int:
 
 _SIZE: Final = 6.6
 _PAD: Final = (9.0, 6.0)
-"""Total margin of a node around its text; points."""
+"""Margin on both sides of a node's text together; points."""
 _WORDS: Final = 5.4
 _ARCS: Final = 46.0
-"""Height of the arcs between lanes."""
+"""Height of the arcs between lanes; points."""
 _GAP: Final = 16.0
 _LINES, _SLIPS, _NODES = 2.0, 3.0, 4.0
 _SPOTS: Final = 0.5 + 0.03 * np.array([step * sign for step in range(13) for sign in (-1, 1)][1:])
-"""Candidate places of words on a line, as shares of its length, the middle first."""
+"""Possible places of a text on a line, as shares of its length. The middle is tried first."""
 _WHOLE: Final = np.linspace(0.0, 1.0, 41)
 _QUIET: Final[dict[str, tuple[str, float, dict[str, Any]]]] = {
     "entity": (palette.ENTITY_EDGE, 0.5, {"alpha": 0.35}),
@@ -475,7 +475,7 @@ class _Diagram:
             self._placer.block((left - 2, bottom - 2, right + 2, top + 2))
 
     def paint(self) -> int:
-        """Draw the nodes, lines and texts of the diagram; return the number of lines without room for text."""
+        """Draw the nodes, lines and texts. Return the number of lines that had no space for their text."""
         for line in self._lines:
             self._paint_line(line)
         # The most important line is written first.
@@ -581,7 +581,7 @@ class _Diagram:
         return (1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end
 
     def _paint_words(self, line: DiagramLine) -> bool:
-        """Write the text of a line where few other lines are; return False without room for the text."""
+        """Write the text of a line where few other lines are. Return False without space for the text."""
         text = line.text
         if not text or line.family == "entity":
             return True

@@ -32,7 +32,7 @@ RANK: Final[dict[str, int]] = {name: rank for rank, name in enumerate(PROXIMITY)
 ALONG: Final = ("leads", "follows", "overlaps")
 
 _UNMET: Final = frozenset(MAP_KINDS) | SCENERY
-"""Kinds without proximity lines to the ego: map parts and scenery."""
+"""Kinds of nodes that get no proximity line to the ego: map parts and scenery."""
 
 _ORDER: Final = (*PROXIMITY, *ALONG, *DIRECTIONS, *SIDES)
 

@@ -1,4 +1,4 @@
-"""Page that is drawn again for each picture of an animation, as pixels.
+"""Page for animations. It is drawn again for each picture, as pixels.
 
 matplotlib makes an object for everything that is drawn; these objects take most of the time. This
 page sends shapes and texts directly to the renderer. The legend is drawn once, and drawn texts are
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 Sprite = tuple["Pixels", int, int]
-"""A drawn text, (height, width, 4) from below, and the offset of its corner; pixels."""
+"""Text as pixels, (height, width, 4) from the bottom up, and the offset of its corner; pixels."""
 
 _NOWHERE = IdentityTransform()
 _AT_ONE_PLACE = np.zeros((1, 2))
@@ -95,7 +95,7 @@ class FilmPage(Page):
         self._draw(axes, artist.zorder, partial(artist.draw, self._renderer))
 
     def once(self, key: Hashable, box: Rect, paint: Callable[[], None]) -> None:
-        """Draw content in a free rectangle of the page. The pixels are cached by key for later pictures."""
+        """Draw content that is equal in all pictures. After the first time, its pixels come from a cache."""
         if key in self._blocks:
             pixels, left, below = self._blocks[key]
             pen = self._renderer.new_gc()
@@ -204,7 +204,7 @@ class FilmPage(Page):
         return self._pens[key]
 
     def _has_room(self, outline: Outline, scale: Affine2D) -> bool:
-        """True if an outline is smaller than the page, so that matplotlib can draw it as a marker."""
+        """True if an outline is small enough for the page, so that matplotlib can draw it as a marker."""
         extents, page = outline.get_extents(scale), self._figure.bbox
         return extents.width < page.width and extents.height < page.height
 

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 
 STOREY_HEIGHT: Final = 4.0
-"""Least difference of height for drawing one lane above another; m. Clearance between crossing
-roads is larger."""
+"""Smallest difference in height for which one lane is drawn above another; m. Crossing roads have a larger
+clearance."""
 MOST_STOREYS: Final = 12
 
 _SHAPES: Final[WeakKeyDictionary[RoadMap, dict[int, tuple[Any, Outline | None]]]] = (
@@ -237,7 +237,7 @@ def _paint_lanes(
 
 
 def tint(stage: Stage, ground: GroundView, node: int, colour: str, alpha: float) -> None:
-    """Draw a transparent colour over a map part. In an SVG file, the shape has the id of the node."""
+    """Draw a transparent colour over a map part. In an SVG file, the shape gets the id of the node."""
     parts = ground.parts(node)
     outlines, gid = ground.outlines_of(parts), f"node-{node}"
     if outlines:

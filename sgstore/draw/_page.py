@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 
 Rect = tuple[float, float, float, float]
-"""Left, bottom, right, top."""
+"""Rectangle: left, bottom, right and top."""
 
 WINDOW: Final = 0.0
 LANES: Final = 1.0
 STOREY: Final = 0.03
-"""Distance between two storeys of roads in drawing order; the highest is below the tints."""
+"""Difference in drawing order between two storeys of roads. The highest storey stays below the tints."""
 TINTS: Final = 1.4
 MARKS: Final = 1.6
 SCENERY: Final = 1.8
@@ -60,7 +60,7 @@ FURNITURE: Final = 9.0
 
 
 MOST_CHANGE: Final = 24
-"""Pictures whose colours a palette changes by more stay without a palette; 0 … 255."""
+"""Largest change of a colour channel (0 … 255) by a palette. A picture with a larger change gets no palette."""
 
 
 # Pictures use 256 colours if that is enough: a third of the bytes, without a visible difference. Of
@@ -68,7 +68,7 @@ MOST_CHANGE: Final = 24
 
 
 LEARNED: Final = 2_000_000
-"""Most pixels that the colours of a palette are chosen from; the time grows faster than their number."""
+"""Largest number of pixels from which a palette is computed. The time grows faster than their number."""
 
 
 def quantized(picture: Image.Image) -> Image.Image:
@@ -91,9 +91,9 @@ def greatest_change(made: Image.Image, picture: Image.Image) -> int:
 DPI: Final = 130
 FORMATS: Final = (".png", ".svg")
 TEXT: Final[dict[str, Any]] = {"fontsize": 7.0, "color": INK, "va": "baseline"}
-"""Default look of texts."""
+"""Default style of texts."""
 PICTURE_PIXELS: Final = 64_000_000
-"""Greatest number of pixels of a camera picture."""
+"""Largest number of pixels of a camera picture."""
 PICTURE_SIDE: Final = 640
 """Longest side of a reduced camera picture; pixels."""
 

@@ -47,10 +47,10 @@ DIAGRAM_TINTS: Final[Mapping[str, str]] = {
     "junction": "#1d3a66",
     "roundabout": "#1d3a66",
 }
-"""Diagram nodes of map parts; entities have their own colours."""
+"""Colours of the nodes of map parts in diagrams. Entities have other colours."""
 
 TRAVELLED: Final = DrawnOutlines.MOTOR_LANES
-"""Lane types for motor traffic: they have markings, and arrows along their centre lines."""
+"""Lane types for motor traffic, which have markings and arrows along their centre lines."""
 
 LANE_TINTS: Final[Mapping[str, str]] = {
     **dict.fromkeys(TRAVELLED, "#c9d2df"),
@@ -66,7 +66,7 @@ LANE_TINTS: Final[Mapping[str, str]] = {
     "restricted": "#ebd0c6",
     "none": "#e7eae9",
 }
-"""Tint of each OpenDRIVE lane type; :func:`lane_tint` handles unknown types.
+"""Lane type of OpenDRIVE → colour. See :func:`lane_tint` for unknown types.
 
 All tints are light enough for dark text, and any two are distinguishable (tested).
 """
@@ -95,7 +95,7 @@ LIGHT_TINTS: Final[Mapping[str, tuple[str, str, str]]] = {
     "off": ("#5a626f", "#5a626f", "#5a626f"),
     "unknown": ("#8d95a3", "#8d95a3", "#8d95a3"),
 }
-"""The three lamps of a traffic light, from the top, by state."""
+"""State of a traffic light → colours of its three lamps, from top to bottom."""
 
 SIGNAL_TINTS: Final[Mapping[str, str]] = {
     "traffic_light": INK,
@@ -104,7 +104,7 @@ SIGNAL_TINTS: Final[Mapping[str, str]] = {
     "speed_limit": "#2f6fb0",
     "sign": "#8d95a3",
 }
-"""Dots of signals on a complete map, without room for their shapes."""
+"""Kind of signal → colour of its dot on a map of a whole town, which has no space for its shape."""
 
 LIGHT_EDGES: Final[Mapping[str, str]] = {
     "red": "#e5383b",
@@ -112,7 +112,7 @@ LIGHT_EDGES: Final[Mapping[str, str]] = {
     "yellow": "#d69a00",
     "green": "#1f9d80",
 }
-"""Colour of the line from a light to the lane that it controls."""
+"""State of a traffic light → colour of the line to the lane that it controls."""
 
 CLOSENESS: Final[Mapping[str, tuple[str, float]]] = dict(
     zip(
@@ -128,7 +128,7 @@ CLOSENESS: Final[Mapping[str, tuple[str, float]]] = dict(
         strict=True,
     )
 )
-"""Colour and width (points) of the line for each proximity relation, closest first."""
+"""Proximity relation → colour and width (points) of its line. The closest relation is first."""
 
 
 def lane_tint(lane_type: str) -> str:

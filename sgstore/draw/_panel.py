@@ -29,7 +29,7 @@ _SMALL: Final = 6.6
 _SWATCH: Final = 20.0
 
 _NEIGHBOURS: Final = 18
-"""Greatest number of rows for the ego's surroundings."""
+"""Largest number of rows for the surroundings of the ego."""
 
 _LEFT_OUT: Final = "… and {} more"
 
@@ -54,7 +54,7 @@ class Panel:
     y: float
 
     def room(self) -> float:
-        """Return the height of the free part of the panel."""
+        """Height of the free part of the panel; points."""
         return self.y - self.bottom
 
     def head(self, text: str) -> None:
@@ -74,7 +74,7 @@ class Panel:
             self.page.text(self.left + x, self.y + 2, self._cut(text, end - x - 4), **style)
 
     def _cut(self, text: str, width: float) -> str:
-        """Return a text shortened to a width in points, because names of traces can be long."""
+        """Return a text cut to a width in points, because names of traces can be long."""
         if self.page.text_size(text, _SMALL)[0] <= width:
             return text
         while len(text) > 1 and self.page.text_size(text + "…", _SMALL)[0] > width:
@@ -165,7 +165,7 @@ _KEY_COLUMNS: Final = 9
 
 
 def key_height(entries: int) -> float:
-    """Return the height in points of a legend below a picture, for a number of entries."""
+    """Return the height of a legend below a picture for a number of entries; points."""
     return ROW * math.ceil(entries / _KEY_COLUMNS)
 
 

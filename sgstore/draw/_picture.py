@@ -235,7 +235,7 @@ def drawing(to: str | Path) -> Generator[None]:
 
 
 def checked(radius: float | None) -> float | None:
-    """Return the radius of a view in metres, or raise an error for an invalid value.
+    """Return the radius of a view in metres. An invalid value raises an error.
 
     Raises
     ------

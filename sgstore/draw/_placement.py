@@ -25,11 +25,11 @@ _ROUND: Final = tuple(
 _STEPS: Final = (2.0, 8.0, 16.0, 26.0)
 
 _CLEAR: Final = 4.0
-"""Least distance by which a name must be nearer to its own object than to others; points."""
+"""Smallest difference by which a name must be closer to its own object than to others; points."""
 
 
 class Placer:
-    """Free and occupied space of a picture, for placing texts.
+    """Occupied places of a picture, to find free places for texts.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Placer:
         self._things: list[Rect] = []
 
     def stand(self, x: float, y: float, reach: tuple[float, float]) -> None:
-        """Register an object that can have a name, so that names of other objects keep a distance."""
+        """Record the place of an object, so that the names of other objects are not put next to it."""
         self._things.append(_around(x, y, reach))
 
     def block(self, rect: Rect) -> None:
@@ -74,7 +74,7 @@ class Placer:
     def named(
         self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
     ) -> tuple[tuple[float, float], bool] | None:
-        """Reserve a place for the name of an object; return its middle and a flag.
+        """Reserve a place for an object's name. Return its middle, and True if it clearly belongs to it.
 
         The flag is true if no other object is as near to the name.
 
@@ -106,7 +106,7 @@ class Placer:
     def first_free(
         self, spots: list[tuple[float, float]], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """Reserve the first free place for a text of a given size; return its middle, or ``None``."""
+        """Reserve the first free place for a text. Return its middle, or ``None`` if all are occupied."""
         middles = np.array(spots)
         half = np.array(size) / 2
         low, high = middles - half, middles + half

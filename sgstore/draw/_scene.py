@@ -40,16 +40,16 @@ if TYPE_CHECKING:
 
 
 LABELLED_LINKS: Final = 10
-"""Number of the ego's lines with relations as text, nearest first; the panel has the others."""
+"""Number of the ego's lines that have their relations as text, nearest first. The panel lists the others."""
 _LEADER: Final = 9.0
-"""A name farther from its object is connected to it by a line; points."""
+"""Distance between a name and its object above which a line connects them; points."""
 _PEN: Final = 4.5
 _CLEAR: Final = 15.0
-"""Least distance to all entities of a line between map parts; m."""
+"""Smallest distance between all entities and a line between map parts; m."""
 
 
 def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect]) -> int:
-    """Write names of nodes and relations into a picture, important ones first; return the omitted number.
+    """Write names of nodes and relations into a picture, important ones first. Return the number left out.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def _write(stage: Stage, spot: tuple[float, float], text: str, **look: Any) -> N
 
 
 def _slip(alpha: float) -> dict[str, Any]:
-    """Return the style of a text background, which keeps the text readable on any colour."""
+    """Return the style of a text background that keeps the text readable on any colour."""
     return {
         "boxstyle": "round,pad=0.15",
         "facecolor": palette.PAPER,
@@ -175,7 +175,7 @@ def _is_named(body: Body) -> bool:
 
 
 def _room(stage: Stage, body: Body) -> list[Rect]:
-    """Return the area of an entity's symbol and arrow as small squares, to keep texts away."""
+    """Return the area of an entity's symbol and arrow as small squares, which texts must not cover."""
     half_x, half_y = half_extents(stage, body)
     taken = [stage.rect(half_x * stage.metre, half_y * stage.metre, (body.x, body.y))]
     way = velocity_arrow(body)
@@ -190,7 +190,7 @@ def _room(stage: Stage, body: Body) -> list[Rect]:
 Point = tuple[float, float]
 
 _SLOPE: Final = 0.1
-"""Typical greatest slope of roads: height per distance."""
+"""Largest usual slope of roads: height per distance."""
 
 _QUIET: Final[dict[Family, str]] = {
     "entity": palette.ENTITY_EDGE,
@@ -252,7 +252,7 @@ class DrawnFrame:
         return x, y
 
     def anchor(self, node: int) -> Point:
-        """Return the point for the name of a node; for a lane, a near visible point."""
+        """Return the point for the name of a node. For a lane, it is a near visible point."""
         spot = self.ground.spot(node) if self.ground is not None and node < 0 else None
         return spot or self.place(node) or (0.0, 0.0)
 
@@ -273,7 +273,7 @@ class DrawnFrame:
         return None if a is None or b is None else (a, b)
 
     def _beside_one_another(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Return both ends of a line between two map parts, away from entities, or ``None``."""
+        """Return both ends of a line between two map parts, at a distance from entities; or ``None``."""
         ground = self.ground
         if ground is None or link.a in self.bodies or link.b in self.bodies:
             return None
@@ -320,7 +320,7 @@ class DrawnFrame:
 
 
 def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | None) -> list[Body]:
-    """Return entities with their depth in metres below a road that is drawn above them.
+    """Return the entities with their depth below a road that is drawn above them; m.
 
     Without a map the reference is the ego: a body a storey deeper than the ego, beyond a slope.
     """
@@ -342,7 +342,7 @@ def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | No
 
 
 def paint_scene(stage: Stage, scene: DrawnFrame) -> int:
-    """Draw a frame in its window; return the number of names without room."""
+    """Draw a frame in its window. Return the number of names without space."""
     if scene.ground is not None:
         _paint_map(stage, scene, scene.ground)
     rings = paint_rings(stage) if scene.graph.ego in scene.bodies else []

@@ -43,15 +43,15 @@ if TYPE_CHECKING:
 
 
 DPI: Final = 85.0
-"""Pixels per inch: lower than for single pictures, because animations have many."""
+"""Pixels per inch of an animation. It is lower than for a single picture, to save time."""
 
 Shot = tuple["SceneGraph", "Mapping[str, int]", "bytes | None"]
-"""Frame of a clip: its graph; marked nodes, as in :func:`sgstore.draw.draw_frame`; the camera picture.
+"""Frame of a clip: its graph, the nodes to mark (see :func:`sgstore.draw.draw_frame`), and the camera picture.
 
 Without a new camera picture the previous one stays.
 """
 FrameRange = tuple[str, str]
-"""First and last frame of a range, both included, in the usual notation: ``town@12s``."""
+"""Names of the first and the last frame of a range (both included), such as ``town@12s``."""
 
 
 def filmed(  # noqa: PLR0913  as many options as the picture has
@@ -66,7 +66,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
     diagram: bool = False,
     start_ns: int | None = None,
 ) -> Iterator[Shot]:
-    """Draw the frames of a clip into an animation file; yield each frame after it is drawn.
+    """Draw the frames of a clip into an animation file. Yield each frame after it is drawn.
 
     Parameters
     ----------
@@ -142,20 +142,20 @@ def _legend(scenes: Iterable[DrawnFrame]) -> list[Entry]:
 NO_CAMERA: Final = "none"
 
 FPS: Final = 10.0
-"""Pictures per second of an animation."""
+"""Default number of pictures per second in an animation."""
 MOST_FPS: Final = 50.0
-"""Limit of players: see :data:`sgstore.draw._animation.LEAST_DELAY`."""
+"""Largest number of pictures per second in players; :data:`sgstore.draw._animation.LEAST_DELAY`."""
 SAMPLES: Final = 8
-"""Sample frames of a clip for scale and legend."""
+"""Number of sample frames of a clip that determine its scale and legend."""
 AT_ONCE: Final = 8
-"""Frames that are read at a time."""
+"""Number of frames that are read at once."""
 
 _PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
-"""First bytes of JPEG and PNG. A message contains the complete picture in any encoding."""
+"""First bytes of JPEG and PNG pictures. Every message encoding contains a picture unchanged."""
 
 
 class Bindings(Protocol):
-    """Object with the bindings of a query in a frame, to mark matches in a picture."""
+    """Interface of an object that returns the bindings of a query in a frame, to mark matches in a picture."""
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
         """Return the node ids by variable name, for each match in a frame."""
@@ -239,7 +239,7 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     fps: float = FPS,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Draw a clip of a store as an animation at its original speed; return the number of frames with matches.
+    """Draw a clip of a store as an animation at its original speed. Return the number of frames with matches.
 
     Parameters
     ----------

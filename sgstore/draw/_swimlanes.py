@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 
 LETTERS: Final = 60
-"""Length of the timeline of a trace in letters."""
+"""Length of the timeline of a trace as text; letters."""
 
 FULL, PART, NONE = "█", "▌", "·"
 NAME: Final = 36
-"""Greatest length of a lane's name in letters."""
+"""Largest length of a lane's name; letters."""
 
 
 LaneSpan = tuple[float, float, bool]
-"""Start and end of a time span, in s since the start of the trace; True for a violation."""
+"""Start and end of a time span since the start of the trace (s), and True for a violation."""
 
 
 @dataclass(slots=True)
@@ -124,7 +124,7 @@ def timelines(
 def parts_timeline(
     store: Store, text: str, frame: int | str, values: Mapping[str, Any]
 ) -> Timeline:
-    """Return a timeline of one match: the times in which each part of the pattern is true.
+    """Return a timeline of one match: the times at which each part of the pattern is true.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _spans(intervals: Iterable[Interval], *, violation: bool) -> list[LaneSpan]:
 
 
 def lines_of(timeline: Timeline, letters: int = LETTERS, longest: float = 0.0) -> list[str]:
-    """Return a timeline as lines of text, in which each letter is an equal part of time.
+    """Return a timeline as lines of text, in which each letter represents an equal part of the time.
 
     ``█``: true, or violated, for most of the part; ``▌``: for some of it; ``·``: for none of it.
 
@@ -268,22 +268,22 @@ def _cut(text: str, most: int) -> str:
 
 
 MOST_LANES: Final = 400
-"""Greatest number of lanes in a picture; the legend counts the others."""
+"""Largest number of lanes in a picture. The legend states the number of the others."""
 
 _WIDTH: Final = 720.0
 _LEFT: Final = 190.0
 _RIGHT: Final = 130.0
-"""Space after a lane for its verdict or count."""
+"""Width after a lane for its verdict or count; points."""
 _LANE: Final = 15.0
 _BAR: Final = 9.0
 _ABOVE: Final = 26.0
 _BELOW: Final = 26.0
 _TOP: Final = 34.0
 _LEAST: Final = 1.5
-"""Width of the shortest bar; points."""
+"""Width of the shortest bar of a timeline; points."""
 _LETTERS: Final = 44
 _REASON: Final = 100
-"""Greatest length of a reason in letters."""
+"""Largest length of a reason; letters."""
 
 
 def draw_timelines(timelines: list[Timeline], to: Path) -> None:

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from sgstore.model.world import Floats
 
 SMALLEST: Final = 3.6
-"""Least width of an entity's box; points."""
+"""Smallest width of an entity's box; points."""
 
 LAMP: Final = (5.0, 11.5)
-"""Width and height of a traffic light; points."""
+"""Width and height of the symbol of a traffic light; points."""
 
 BELOW: Final = 0.3
-"""Opacity of objects below a drawn road."""
+"""Opacity of objects that are below a drawn road."""
 
 ROUND_KINDS: Final = frozenset({"person", "animal"})
 

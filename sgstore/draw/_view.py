@@ -29,10 +29,10 @@ SMALLEST_RADIUS: Final = 30.0
 GREATEST_RADIUS: Final = 60.0
 SIGHT: Final = 150.0
 ARROW_SECONDS: Final = 1.0
-"""A velocity arrow has the length of the way in this time; s."""
+"""Time for the length of a velocity arrow: the entity moves by this length in this time; s."""
 
 TEXT_LENGTH: Final = 48
-"""Longest text from a trace, in characters; the rest is cut."""
+"""Largest length of a text from a trace; characters. The rest is cut."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,14 +126,14 @@ def counted(number: int, thing: str) -> str:
 
 
 CALLED: Final = "called"
-"""Attribute of a node of a drawn graph with its label."""
+"""Name of the node attribute with the label, in a graph to be drawn."""
 
 Names = Literal["number", "ident", "type"]
-"""Labels of entities in pictures: ``car 17``; the simulator's id; the simulator's type name."""
+"""Choice of labels of entities in pictures: ``car 17``, the simulator's id, or the simulator's type name."""
 
 
 def called(graph: SceneGraph, names: Names) -> SceneGraph:
-    """Return a scene graph whose entities are named by their ids or types, where these are known."""
+    """Return a scene graph whose entities are labelled by their recorded ids or types, if known."""
     if names == "number":
         return graph
     key = {"ident": "ident", "type": "type_name"}[names]
